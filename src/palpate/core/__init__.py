@@ -1,0 +1,16 @@
+"""The vocabulary that every room shares; needs NumPy alone."""
+
+from palpate.core.digest import digest_file, digest_folder, digest_json, digest_lines, short
+from palpate.core.errors import MissingExtraError, PalpateError, Problem, ProblemsError
+from palpate.core.files import atomic_folder, atomic_path, inside, read_json, write_json, write_text
+from palpate.core.progress import Progress, quiet, track
+from palpate.core.random import rng_for, seed_for
+from palpate.core.results import Audit, GalleryItem, LeakPair, Results, SampleRef
+from palpate.core.score import FeatureSet, Score, columns, require_comparable
+from palpate.core.split import PARTS, Split
+
+__all__ = [
+    "PARTS", "Audit", "FeatureSet", "GalleryItem", "LeakPair", "MissingExtraError", "PalpateError", "Problem", "ProblemsError", "Progress",
+    "Results", "SampleRef", "Score", "Split", "atomic_folder", "atomic_path", "columns", "digest_file", "digest_folder", "digest_json",
+    "digest_lines", "inside", "quiet", "read_json", "require_comparable", "rng_for", "seed_for", "short", "track", "write_json", "write_text",
+]  # fmt: skip

@@ -1,0 +1,89 @@
+"""Files that are either whole or absent: everything is written beside its place and then renamed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from palpate.core.errors import PalpateError
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary sibling of ``path`` to write to; renamed to ``path`` on success, removed on failure."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
+    os.close(handle)
+    part = Path(name)
+    part.chmod(0o644)
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """A temporary sibling folder to fill; renamed to ``folder`` on success, removed on failure.
+
+    Raises:
+        PalpateError: if ``folder`` exists and is not empty.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise PalpateError(f"{folder} must be absent or an empty folder", "something there", "Choose another folder or remove it")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    part.chmod(0o755)
+    try:
+        yield part
+        if folder.exists():
+            folder.rmdir()
+        part.replace(folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes UTF-8 text atomically."""
+    with atomic_path(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes indented JSON atomically; NaN and infinity are refused, as JSON has none."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def read_json(path: Path, what: str) -> Any:
+    """Reads a JSON file.
+
+    Args:
+        what: the file's role, for the error (``"split file"``).
+
+    Raises:
+        PalpateError: if the file is missing or is not JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise PalpateError(f"The {what} must exist", f"no file {path}", "Check the path") from None
+    except IsADirectoryError:
+        raise PalpateError(f"The {what} must be a file", f"the folder {path}", "Name the file itself") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise PalpateError(f"The {what} {path} must be JSON", str(error), "Write it again with palpate") from None
+
+
+def inside(root: Path, relative: str) -> Path | None:
+    """``root / relative`` if that stays inside ``root`` (links resolved), else None."""
+    root = root.resolve()
+    path = (root / relative).resolve()
+    return path if path.is_relative_to(root) else None

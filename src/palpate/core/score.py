@@ -1,0 +1,191 @@
+"""Scores and features: numbers that carry everything needed to believe or to compare them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.core.errors import PalpateError
+from palpate.core.files import atomic_path
+
+#: Settings that must agree before two scores may stand in one column.
+COMPARABLE = ("metric", "estimator", "bandwidth", "scale", "settings", "encoder", "split")
+
+
+@dataclass(frozen=True)
+class Score:
+    """One number with its interval and its settings.
+
+    Attributes:
+        metric: e.g. ``"TMMD"``, ``"SSIM"``.
+        subject: what was scored: ``"generated"``, ``"real"``, ``"background"``, a generator's name.
+        value: the score, or None where it is undefined (``note`` says why).
+        interval: (low, high), or None where none can be given.
+        level: coverage the interval aims at.
+        interval_method: how it was made (``"leave-one-video-out jackknife, t, 23 df"``).
+        null: the range that a meaningless difference would fall into, or None.
+        floor: the same metric on real touches, or None.
+        estimator: ``"unbiased"``, ``"biased"``, ``"grouped"``, ``"per-image mean"``.
+        bandwidth: kernel bandwidth sigma, or None.
+        scale: factor that the raw value was multiplied by.
+        n: samples scored; m: reference samples, or None.
+        seed: seed of any random halving, or None.
+        encoder, split: digests, or None.
+        higher_is_better: direction.
+        settings: further settings that must agree for a comparison.
+        details: anything else worth keeping (per class values, matrices as lists); not compared.
+        note: a sentence for people, or ''.
+    """
+
+    metric: str
+    subject: str
+    value: float | None
+    interval: tuple[float, float] | None = None
+    level: float = 0.95
+    interval_method: str = ""
+    null: tuple[float, float] | None = None
+    floor: float | None = None
+    estimator: str = ""
+    bandwidth: float | None = None
+    scale: float = 1.0
+    n: int = 0
+    m: int | None = None
+    seed: int | None = None
+    encoder: str | None = None
+    split: str | None = None
+    higher_is_better: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object; NaN and infinity become null."""
+        return _finite(asdict(self))
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Score:
+        """The inverse of :meth:`to_json`."""
+        pairs = {k: tuple(data[k]) if data.get(k) is not None else None for k in ("interval", "null")}
+        return cls(**{**data, **pairs})
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def require_comparable(scores: Sequence[Score]) -> None:
+    """Refuses scores that may not stand in one column.
+
+    Raises:
+        PalpateError: naming the first setting in which two of them differ.
+    """
+    for other in scores[1:]:
+        for name in COMPARABLE:
+            a, b = getattr(scores[0], name), getattr(other, name)
+            if _finite(a) != _finite(b):
+                raise PalpateError(
+                    f"Scores in one column must agree in {name}",
+                    f"{a!r} for {scores[0].subject!r} and {b!r} for {other.subject!r}",
+                    "Score both again with the same settings, or put them into two tables",
+                )
+
+
+def columns(scores: Iterable[Score]) -> dict[str, list[Score]]:
+    """Scores by metric, each list checked by :func:`require_comparable`; the order of first appearance is kept."""
+    table: dict[str, list[Score]] = {}
+    for score in scores:
+        table.setdefault(score.metric, []).append(score)
+    for column in table.values():
+        require_comparable(column)
+    return table
+
+
+@dataclass(frozen=True)
+class FeatureSet:
+    """Features of samples, in one order.
+
+    Attributes:
+        ids: n sample ids.
+        features: float32 array (n, d); towers give L2-normalised rows.
+        labels: n materials, or None.
+        groups: n groups (videos, or touches), or None.
+        encoder: digest of the encoder that made them.
+
+    Raises:
+        PalpateError: on unequal lengths, a wrong shape, or values that are not finite (the first such row is named).
+    """
+
+    ids: Sequence[str]
+    features: np.ndarray
+    labels: Sequence[str] | None = None
+    groups: Sequence[str] | None = None
+    encoder: str | None = None
+
+    def __post_init__(self) -> None:
+        shape = self.features.shape
+        if len(shape) != 2 or shape[0] != len(self.ids):
+            raise PalpateError(f"Features must have shape ({len(self.ids)}, d), one row an id", f"shape {shape}", "Pass one row per id")
+        for name in ("labels", "groups"):
+            column = getattr(self, name)
+            if column is not None and len(column) != shape[0]:
+                raise PalpateError(f"{name} must have one entry a row ({shape[0]})", f"{len(column)}", f"Pass {name} in the order of ids")
+        bad = np.flatnonzero(~np.isfinite(self.features).all(axis=1))
+        if bad.size:
+            raise PalpateError(
+                "Features must be finite",
+                f"NaN or infinity in {bad.size} rows, first {self.ids[int(bad[0])]!r}",
+                "Check the images of those ids",
+            )
+
+    def take(self, ids: Sequence[str]) -> FeatureSet:
+        """The rows of ``ids``, in that order.
+
+        Raises:
+            PalpateError: if an id is missing.
+        """
+        row = {name: k for k, name in enumerate(self.ids)}
+        missing = [i for i in ids if i not in row]
+        if missing:
+            raise PalpateError(
+                "Every id asked for must have features", f"{len(missing)} without, first {missing[0]!r}", "Embed those samples as well"
+            )
+        at = [row[i] for i in ids]
+        pick = lambda column: None if column is None else [column[k] for k in at]  # noqa: E731
+        return FeatureSet(list(ids), self.features[at], pick(self.labels), pick(self.groups), self.encoder)
+
+    def save(self, path: Path) -> None:
+        """Writes an ``.npz`` of plain arrays (no pickles), atomically."""
+        arrays: dict[str, np.ndarray] = {"ids": np.array(list(self.ids), dtype=str), "features": self.features}
+        for name in ("labels", "groups"):
+            if (column := getattr(self, name)) is not None:
+                arrays[name] = np.array(["" if c is None else c for c in column], dtype=str)
+        if self.encoder:
+            arrays["encoder"] = np.array(self.encoder)
+        with atomic_path(Path(path)) as part, open(part, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> FeatureSet:
+        """Reads what :meth:`save` wrote; never a pickle."""
+        with np.load(path, allow_pickle=False) as data:
+            column = lambda name: [str(v) for v in data[name]] if name in data else None  # noqa: E731
+            return cls(
+                column("ids") or [],
+                data["features"],
+                column("labels"),
+                column("groups"),
+                str(data["encoder"]) if "encoder" in data else None,
+            )

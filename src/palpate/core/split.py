@@ -1,0 +1,97 @@
+"""A split: sample id -> part, as a file with a digest and with the rule that made it.
+
+The file is JSON::
+
+    {"format": "palpate-split/1", "digest": "<sha256>", "rule": {...}, "manifest": "<sha256>",
+     "parts": {"train": [ids], "val": [ids], "test": [ids]}}
+
+The digest is SHA-256 over the lines ``id TAB part``, sorted by id: it names the assignment, not the rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from palpate.core.digest import digest_lines
+from palpate.core.errors import PalpateError
+from palpate.core.files import read_json, write_json
+
+PARTS = ("train", "val", "test")
+FORMAT = "palpate-split/1"
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which part each sample belongs to.
+
+    Attributes:
+        parts: id -> ``"train"``, ``"val"`` or ``"test"``.
+        rule: how it was made (method, group, ratios, seed, source files); any JSON object.
+        manifest: digest of the manifest it was made on, or None.
+
+    Raises:
+        PalpateError: on an unknown part.
+    """
+
+    parts: Mapping[str, str]
+    rule: Mapping[str, Any] = field(default_factory=dict)
+    manifest: str | None = None
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.parts.values()) - set(PARTS))
+        if unknown:
+            raise PalpateError(f"A part must be one of {', '.join(PARTS)}", repr(unknown[0]), "Rename the part")
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the assignment."""
+        return digest_lines(f"{i}\t{self.parts[i]}" for i in sorted(self.parts))
+
+    def ids(self, *parts: str) -> list[str]:
+        """The ids in the given parts, in the order of the split."""
+        return [i for i, part in self.parts.items() if part in parts]
+
+    def counts(self) -> dict[str, int]:
+        """Number of samples by part; parts without samples are left out."""
+        return {part: n for part in PARTS if (n := len(self.ids(part)))}
+
+    @classmethod
+    def from_ids(cls, *, rule: Mapping[str, Any] | None = None, manifest: str | None = None, **parts: Iterable[str]) -> Split:
+        """A split from ``train=[...], test=[...]``.
+
+        Raises:
+            PalpateError: if an id stands in two parts, or twice in one.
+        """
+        table: dict[str, str] = {}
+        for part, ids in parts.items():
+            for i in ids:
+                if i in table:
+                    raise PalpateError("An id must stand in one part only", f"{i!r} in {table[i]} and {part}", "Remove one of the two")
+                table[i] = part
+        return cls(table, rule or {}, manifest)
+
+    def save(self, path: Path) -> None:
+        """Writes the split file atomically."""
+        parts = {part: self.ids(part) for part in PARTS if part in self.counts()}
+        write_json(path, {"format": FORMAT, "digest": self.digest, "rule": dict(self.rule), "manifest": self.manifest, "parts": parts})
+
+    @classmethod
+    def load(cls, path: Path) -> Split:
+        """Reads a split file and checks its digest.
+
+        Raises:
+            PalpateError: if the file is missing, of another format, or its digest does not match its content.
+        """
+        data = read_json(path, "split file")
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise PalpateError(f"{path} must be a split file ({FORMAT})", "another kind of file", "Write one with: palpate split")
+        split = cls.from_ids(rule=data.get("rule"), manifest=data.get("manifest"), **data["parts"])
+        if split.digest != data.get("digest"):
+            raise PalpateError(
+                f"The digest in {path} must match its content", "a split that was edited by hand", "Write it again with: palpate split"
+            )
+        return split

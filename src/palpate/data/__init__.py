@@ -1,0 +1,1 @@
+"""Data: the manifest, one file a data-set format, images and video frames."""

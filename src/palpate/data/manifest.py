@@ -1,0 +1,216 @@
+"""The manifest: one row a touch of one surface at one instant, as a table with a root and a digest.
+
+=============  =======  ==========================================================================
+column         type     meaning (null where the data set has none; never invented)
+=============  =======  ==========================================================================
+``id``         string   unique; ``video/frame`` for video data
+``video``      string   the continuous recording it comes from
+``frame``      int      position in both videos of the recording
+``touch``      string   the run of consecutive in-contact frames it belongs to, unique across videos
+``object``     string   the thing touched
+``material``   string   class name
+``text``       string   what the touch feels like, in words
+``vision``     string   path of the photo, relative to the root
+``tactile``    string   path of the tactile image
+``background`` string   path of the sensor's image when it touches nothing
+``sensor``     string   sensor or gel unit
+``domain``     string   recording condition that changes the look (rig, lighting)
+=============  =======  ==========================================================================
+
+Paths use ``/`` and may not leave the root. The digest is SHA-256 over the rows in order; it does not
+depend on the root, so a data set has one digest on every disk.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from palpate.core import PalpateError, Problem, ProblemsError, SampleRef, Split, atomic_path, digest_lines, inside
+
+SCHEMA: dict[str, type[pl.DataType]] = {
+    "id": pl.String, "video": pl.String, "frame": pl.Int64, "touch": pl.String, "object": pl.String, "material": pl.String,
+    "text": pl.String, "vision": pl.String, "tactile": pl.String, "background": pl.String, "sensor": pl.String, "domain": pl.String,
+}  # fmt: skip
+IMAGE_COLUMNS = ("vision", "tactile", "background")
+FORMAT = "palpate-manifest/1"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Samples and where their images lie.
+
+    Attributes:
+        table: the rows, with exactly the columns of ``SCHEMA``.
+        root: folder that the image paths are relative to.
+        facts: JSON facts about the source (``dataset``, ``text_source`` ...), kept in the file, not in the digest.
+    """
+
+    table: pl.DataFrame
+    root: Path
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_rows(cls, rows: Iterable[Mapping[str, Any]], root: Path, facts: Mapping[str, str] | None = None) -> Manifest:
+        """A manifest from dictionaries; absent columns become null.
+
+        Raises:
+            PalpateError: on an unknown column.
+        """
+        rows = list(rows)
+        unknown = sorted({name for row in rows for name in row} - set(SCHEMA))
+        if unknown:
+            raise PalpateError(f"Manifest columns must be among {', '.join(SCHEMA)}", repr(unknown[0]), "Map the column to one of these")
+        return cls(
+            pl.DataFrame([{name: row.get(name) for name in SCHEMA} for row in rows], schema=SCHEMA, orient="row"), Path(root), facts or {}
+        )
+
+    def __len__(self) -> int:
+        return self.table.height
+
+    @property
+    def ids(self) -> list[str]:
+        """The ids in row order."""
+        return self.table["id"].to_list()
+
+    def column(self, name: str) -> list[Any]:
+        """One column as a list, in row order."""
+        return self.table[name].to_list()
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over all rows in order, columns in the order of ``SCHEMA``."""
+        text = self.table.select(pl.concat_str([pl.col(c).cast(pl.String).fill_null("\x00") for c in SCHEMA], separator="\x1f"))
+        return digest_lines(text.to_series().to_list())
+
+    def path(self, relative: str) -> Path:
+        """The absolute path of an image named in the table."""
+        return self.root / relative
+
+    def paths(self, column: str) -> list[Path]:
+        """Absolute paths of one image column.
+
+        Raises:
+            PalpateError: if a row has no such image.
+        """
+        values = self.column(column)
+        if (missing := sum(v is None for v in values)) > 0:
+            first = self.ids[values.index(None)]
+            raise PalpateError(
+                f"Every sample must have a {column} image here",
+                f"{missing} without, first {first!r}",
+                f"Leave those samples out, or fill the column {column}",
+            )
+        return [self.root / v for v in values]
+
+    def take(self, ids: Sequence[str]) -> Manifest:
+        """The rows of ``ids``, in that order.
+
+        Raises:
+            PalpateError: if an id is not in the manifest.
+        """
+        row = {name: k for k, name in enumerate(self.ids)}
+        missing = [i for i in ids if i not in row]
+        if missing:
+            raise PalpateError(
+                "Every id of the split must be in the manifest",
+                f"{len(missing)} that are not, first {missing[0]!r}",
+                "Use the split made for this manifest",
+            )
+        return Manifest(self.table[[row[i] for i in ids]], self.root, self.facts)
+
+    def part(self, split: Split, *parts: str) -> Manifest:
+        """The rows in the given parts of a split, in manifest order.
+
+        Raises:
+            PalpateError: if the split names ids that the manifest lacks.
+        """
+        self.take(split.ids(*parts))  # names ids that are missing
+        return Manifest(self.table.filter(pl.col("id").is_in(split.ids(*parts))), self.root, self.facts)
+
+    def ref(self, row: Mapping[str, Any]) -> SampleRef:
+        """A row (a dictionary of the table) as a reference with absolute image paths, for reports."""
+        full = lambda name: str(self.path(row[name]).resolve()) if row[name] else None  # noqa: E731
+        return SampleRef(row["id"], row["video"], row["frame"], row["material"], full("vision"), full("tactile"))
+
+    def problems(self, *, files: bool = True) -> list[Problem]:
+        """Everything wrong with the table: empty, null or double ids, paths outside the root and, if ``files``, missing files."""
+        found = [Problem("manifest", "empty", "there are no samples")] if not len(self) else []
+        seen: dict[str, int] = {}
+        for line, i in enumerate(self.ids, 1):
+            if i is None or i == "":
+                found.append(Problem(f"row {line}", "null-id", "the id is empty"))
+            elif i in seen:
+                found.append(Problem(f"row {line}", "duplicate-id", f"the id {i!r} stands in row {seen[i]} already"))
+            else:
+                seen[i] = line
+        known: dict[str, str | None] = {}
+        for name in IMAGE_COLUMNS:
+            for line, value in enumerate(self.column(name), 1):
+                if value is None:
+                    continue
+                if value not in known:
+                    path = inside(self.root, value)
+                    known[value] = "outside-root" if path is None else "missing-file" if files and not path.is_file() else None
+                if known[value] == "outside-root":
+                    found.append(Problem(f"row {line}", "outside-root", f"the {name} path {value!r} leaves the root"))
+                elif known[value] == "missing-file":
+                    found.append(Problem(f"row {line}", "missing-file", f"no {name} file {value!r}"))
+        return found
+
+    def require_valid(self, *, files: bool = True) -> Manifest:
+        """This manifest, if it has no problems.
+
+        Raises:
+            ProblemsError: with every problem at once.
+        """
+        if found := self.problems(files=files):
+            raise ProblemsError(found, "Mend the rows, or import again with --skip-bad")
+        return self
+
+    def save(self, path: Path) -> None:
+        """Writes Parquet, atomically, with format, digest and root (relative to the file) as metadata."""
+        path = Path(path)
+        root = os.path.relpath(self.root.resolve(), path.parent.resolve())
+        with atomic_path(path) as part:
+            facts = {f"palpate.fact.{k}": v for k, v in self.facts.items()}
+            self.table.write_parquet(
+                part, metadata={"palpate.format": FORMAT, "palpate.digest": self.digest, "palpate.root": root, **facts}
+            )
+
+    @classmethod
+    def load(cls, path: Path, root: Path | None = None) -> Manifest:
+        """Reads a manifest file.
+
+        Args:
+            path: a ``.parquet`` file, or the folder that holds ``manifest.parquet``.
+            root: where the images lie now; default: where they lay relative to the file.
+
+        Raises:
+            PalpateError: if the file is missing, is no manifest, or does not match its digest.
+        """
+        path = Path(path)
+        path = path / "manifest.parquet" if path.is_dir() else path
+        fix = "Write one with: palpate import"
+        if not path.is_file():
+            raise PalpateError("The manifest must exist", f"no file {path}", fix)
+        try:
+            meta = pl.read_parquet_metadata(path)
+            table = pl.read_parquet(path)
+        except Exception as error:  # polars raises several kinds for a file that is not Parquet
+            raise PalpateError(f"The manifest {path} must be a Parquet file", str(error).splitlines()[0], fix) from None
+        if meta.get("palpate.format") != FORMAT or list(table.columns) != list(SCHEMA):
+            raise PalpateError(
+                f"The manifest {path} must have the format {FORMAT}", meta.get("palpate.format") or "a foreign Parquet file", fix
+            )
+        facts = {k.removeprefix("palpate.fact."): v for k, v in meta.items() if k.startswith("palpate.fact.")}
+        manifest = cls(table, Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"])), facts)
+        if manifest.digest != meta["palpate.digest"]:
+            raise PalpateError(f"The digest in {path} must match its rows", "rows that were changed by another program", fix)
+        return manifest
