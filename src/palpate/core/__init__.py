@@ -8,9 +8,10 @@ from palpate.core.random import rng_for, seed_for
 from palpate.core.results import Audit, GalleryItem, LeakPair, Results, SampleRef
 from palpate.core.score import FeatureSet, Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
+from palpate.core.stages import Run, Stage
 
 __all__ = [
     "PARTS", "Audit", "FeatureSet", "GalleryItem", "LeakPair", "MissingExtraError", "PalpateError", "Problem", "ProblemsError", "Progress",
-    "Results", "SampleRef", "Score", "Split", "atomic_folder", "atomic_path", "columns", "digest_file", "digest_folder", "digest_json",
+    "Results", "Run", "SampleRef", "Score", "Split", "Stage", "atomic_folder", "atomic_path", "columns", "digest_file", "digest_folder", "digest_json",
     "digest_lines", "inside", "quiet", "read_json", "require_comparable", "rng_for", "seed_for", "short", "track", "write_json", "write_text",
 ]  # fmt: skip

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 
 def canonical_json(value: Any) -> str:
     """``value`` as JSON with sorted keys and no spaces; dataclasses and paths are accepted.
@@ -26,7 +28,7 @@ def _plain(value: Any) -> Any:
         return value.as_posix()
     if isinstance(value, Mapping):
         return dict(value)
-    if hasattr(value, "item"):  # a NumPy scalar
+    if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"cannot put a {type(value).__name__} into a digest")
 

@@ -59,6 +59,7 @@ class ProblemsError(PalpateError):
         super().__init__("Every row and file of the input must be readable and consistent", got, fix)
 
     def to_json(self) -> dict[str, object]:
+        """The error as a JSON object, with the list ``problems``."""
         return super().to_json() | {"problems": [asdict(p) for p in self.problems]}
 
 

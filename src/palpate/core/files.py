@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from palpate.core.errors import PalpateError
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path) -> Generator[Path]:
     """A temporary sibling of ``path`` to write to; renamed to ``path`` on success, removed on failure."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -31,7 +31,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(folder: Path) -> Iterator[Path]:
+def atomic_folder(folder: Path) -> Generator[Path]:
     """A temporary sibling folder to fill; renamed to ``folder`` on success, removed on failure.
 
     Raises:
@@ -67,7 +67,8 @@ def read_json(path: Path, what: str) -> Any:
     """Reads a JSON file.
 
     Args:
-        what: the file's role, for the error (``"split file"``).
+        path: the file.
+        what: its role, for the error (``"split file"``).
 
     Raises:
         PalpateError: if the file is missing or is not JSON.

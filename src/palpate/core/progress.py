@@ -14,7 +14,9 @@ T = TypeVar("T")
 class Progress(Protocol):
     """Called with what is being done, how much of it is done, of how much (0 = unknown), and a short remark."""
 
-    def __call__(self, what: str, done: int, total: int, remark: str = "") -> None: ...
+    def __call__(self, what: str, done: int, total: int, remark: str = "") -> None:
+        """Reports once."""
+        ...
 
 
 def quiet(what: str, done: int, total: int, remark: str = "") -> None:

@@ -73,7 +73,8 @@ class Audit:
     def from_json(cls, data: Mapping[str, Any]) -> Audit:
         """The inverse of ``dataclasses.asdict``."""
         worst = [LeakPair(SampleRef(**w["test"]), SampleRef(**w["train"]), w["gap"]) for w in data.get("worst", ())]
-        return cls(**{**data, "worst": worst})
+        fields: dict[str, Any] = {**data, "worst": worst}
+        return cls(**fields)
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,8 @@ class Score:
     def from_json(cls, data: Mapping[str, Any]) -> Score:
         """The inverse of :meth:`to_json`."""
         pairs = {k: tuple(data[k]) if data.get(k) is not None else None for k in ("interval", "null")}
-        return cls(**{**data, **pairs})
+        fields: dict[str, Any] = {**data, **pairs}
+        return cls(**fields)
 
 
 def _finite(value: Any) -> Any:

@@ -143,8 +143,8 @@ class Manifest:
         """Everything wrong with the table: empty, null or double ids, paths outside the root and, if ``files``, missing files."""
         found = [Problem("manifest", "empty", "there are no samples")] if not len(self) else []
         seen: dict[str, int] = {}
-        for line, i in enumerate(self.ids, 1):
-            if i is None or i == "":
+        for line, i in enumerate(self.column("id"), 1):
+            if not i:
                 found.append(Problem(f"row {line}", "null-id", "the id is empty"))
             elif i in seen:
                 found.append(Problem(f"row {line}", "duplicate-id", f"the id {i!r} stands in row {seen[i]} already"))

@@ -1,1 +1,6 @@
-"""leakage"""
+"""Leakage: does a split leak, where, and a split that does not."""
+
+from palpate.leakage.audit import audit_lists, audit_parts, audit_split
+from palpate.leakage.splits import SplitPlan, choose_group, describe, leak_free_split
+
+__all__ = ["SplitPlan", "audit_lists", "audit_parts", "audit_split", "choose_group", "describe", "leak_free_split"]

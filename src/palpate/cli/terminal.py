@@ -1,0 +1,186 @@
+"""What all verbs share: parsing with tyro, progress, tables, JSON, and errors in one line.
+
+A verb's module has a frozen dataclass ``Options`` (its docstring and field docstrings are the help) that
+derives from :class:`Common`, and ``run(options, terminal) -> dict | tuple[dict, int]``: the JSON that
+``--json`` prints, and an exit status if it is not 0.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import importlib
+import io
+import json
+import os
+import re
+import sys
+import time
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from palpate.cli import FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
+from palpate.core import PalpateError, Problem, ProblemsError, Progress, quiet
+
+#: Lines of problems shown in the terminal; ``--json`` gives all.
+SHOWN_PROBLEMS = 40
+
+JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON object on standard output instead of text.")]
+QuietFlag = Annotated[bool, tyro.conf.arg(aliases=["-q"], help="No progress.")]
+OutPath = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """Options of every verb."""
+
+    as_json: JsonFlag = False
+    quiet: QuietFlag = False
+
+
+class Terminal:
+    """Where a verb writes: results on standard output, progress and remarks on standard error."""
+
+    def __init__(self, options: Common) -> None:
+        self.json = options.as_json
+        self.silent = options.quiet
+        self.out = Console(highlight=False, quiet=self.json)
+        self.err = Console(stderr=True, highlight=False, quiet=self.silent)
+
+    def say(self, line: str) -> None:
+        """A remark on standard error."""
+        self.err.print(line, markup=False)
+
+    def skipped(self, problems: Sequence[Problem]) -> None:
+        """Lists what ``--skip-bad`` left out."""
+        if problems:
+            self.say(f"Skipped {len(problems)}:")
+            _list_problems(problems, self.say)
+
+    def facts(self, title: str, rows: Mapping[str, Any]) -> None:
+        """Prints a two-column table of names and values."""
+        self.out.print(title, style="bold")
+        table = Table(show_header=False, box=None, pad_edge=False)
+        table.add_column(style="dim")
+        table.add_column(overflow="fold")
+        for name, value in rows.items():
+            table.add_row(name, "-" if value is None else str(value))
+        self.out.print(table)
+
+    @contextlib.contextmanager
+    def progress(self) -> Generator[Progress]:
+        """A progress callback: bars on a terminal, a line now and then in a log, nothing with ``--quiet``."""
+        if self.silent:
+            yield quiet
+        elif not self.err.is_terminal:
+            yield _LogProgress(self.say)
+        else:
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import Progress as Bars
+
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[remark]}"),
+            )
+            with Bars(*columns, console=self.err) as bars:
+                tasks: dict[str, Any] = {}
+
+                def report(what: str, done: int, total: int, remark: str = "") -> None:
+                    if what not in tasks:
+                        tasks[what] = bars.add_task(what, total=total or None, remark="")
+                    bars.update(tasks[what], completed=done, total=total or None, remark=remark)
+                    if total and done >= total:  # finished: a task of the same name begins anew
+                        tasks.pop(what)
+
+                yield report
+
+
+class _LogProgress:
+    """Progress for logs: at most a line every ten seconds, and one at the end of what took long."""
+
+    def __init__(self, say: Any, every: float = 10.0) -> None:
+        self.say, self.every = say, every
+        self.last = time.monotonic()
+        self.shown: set[str] = set()
+
+    def __call__(self, what: str, done: int, total: int, remark: str = "") -> None:
+        ended = bool(total) and done >= total and what in self.shown
+        if ended or time.monotonic() - self.last >= self.every:
+            self.say(f"  {what} {done}{f'/{total}' if total else ''} {remark}".rstrip())
+            self.last = time.monotonic()
+            self.shown = self.shown - {what} if ended else self.shown | {what}
+
+
+def _list_problems(problems: Sequence[Problem], say: Any) -> None:
+    for problem in problems[:SHOWN_PROBLEMS]:
+        say(f"  {problem}")
+    if len(problems) > SHOWN_PROBLEMS:
+        say(f"  ... and {len(problems) - SHOWN_PROBLEMS} more (--json lists all)")
+
+
+def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
+    """``args`` as an ``Options`` of the verb; ``--help`` prints and exits.
+
+    Raises:
+        PalpateError: one line for what tyro would draw a box around.
+    """
+    verb = VERBS[name]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            text = f"{options.__doc__}\n\nExample: {verb.example}"
+            return tyro.cli(options, prog=f"palpate {name}", args=list(args), description=text, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        words = re.sub(r"[\u2500-\u257f]+|─+", " ", said.getvalue())
+        words = re.split(r"For full helptext", " ".join(words.split()))[0].strip() or "arguments that cannot be parsed"
+        raise PalpateError(f"The options of palpate {name} must be as its help says", words, f"See: palpate {name} --help") from None
+
+
+def run_verb(name: str, args: Sequence[str]) -> int:
+    """Runs one verb with its arguments; see :func:`palpate.cli.main` for the exit statuses."""
+    # Spinning OpenMP threads make two busy cores 3-9 times slower than one; must be set before torch loads.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    as_json = "--json" in args
+    try:
+        if name not in VERBS:
+            near = difflib.get_close_matches(name, VERBS, 1)
+            raise PalpateError(
+                f"The verb must be one of {', '.join(VERBS)}",
+                repr(name),
+                f"Did you mean: palpate {near[0]}" if near else "See: palpate --help",
+            )
+        module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
+        options = parse(name, module.Options, args)
+        terminal = Terminal(options)
+        answer = module.run(options, terminal)
+        result, status = answer if isinstance(answer, tuple) else (answer, OK)
+        if as_json:
+            sys.stdout.write(json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        return int(status)
+    except PalpateError as error:
+        sys.stderr.write(f"palpate {name}: {error}\n")
+        if isinstance(error, ProblemsError):
+            _list_problems(error.problems, lambda line: sys.stderr.write(f"{line}\n"))
+        if as_json:
+            sys.stdout.write(json.dumps(error.to_json(), indent=1, ensure_ascii=False) + "\n")
+        return USER_ERROR
+    except KeyboardInterrupt:
+        sys.stderr.write(f"\npalpate {name}: stopped. Run the same command again to go on from what is done.\n")
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of a pipe went away: not an error of ours
+        sys.stderr.close()
+        return OK
+
+
+__all__ = ["FAILED_CHECK", "Common", "OutPath", "Terminal", "run_verb"]

@@ -1,0 +1,145 @@
+"""Core: errors, digests, files, splits, scores, results, stages."""
+
+import json
+
+import numpy as np
+import pytest
+
+from palpate.core import (
+    Audit, FeatureSet, GalleryItem, LeakPair, PalpateError, Problem, ProblemsError, Results, Run, SampleRef, Score, Split,
+    atomic_folder, atomic_path, columns, digest_json, inside, rng_for, seed_for,
+)  # fmt: skip
+
+
+def test_an_error_is_one_line_of_must_got_fix():
+    error = PalpateError("--ratio must lie in (0, 1)", "1.5", "Pass 0.8")
+    assert str(error) == "--ratio must lie in (0, 1). Got 1.5. Pass 0.8."
+    many = ProblemsError([Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")], "Mend them")
+    assert "2 problems: 2 bad-line" in str(many)
+    assert many.to_json()["problems"] == [
+        {"where": "a:1", "kind": "bad-line", "text": "x"},
+        {"where": "a:2", "kind": "bad-line", "text": "y"},
+    ]
+
+
+def test_seeds_depend_on_names_alone_and_are_stable_across_versions():
+    assert seed_for(0, "noise", "a/1") == seed_for(0, "noise", "a/1") != seed_for(0, "noise", "a/2")
+    assert seed_for(0, "ab", "c") != seed_for(0, "a", "bc")
+    assert seed_for(0, "noise", "a/1") == 7037779842902421232  # a change here would change every generated image
+    assert rng_for(1, "x").random() == rng_for(1, "x").random()
+
+
+def test_digests_are_canonical():
+    assert digest_json({"a": 1, "b": (1, 2)}) == digest_json({"b": [1, 2], "a": np.int64(1)})
+    with pytest.raises(ValueError, match="JSON"):
+        digest_json(float("nan"))
+
+
+def test_atomic_writing_leaves_nothing_half(tmp_path):
+    def fail_in(context, write):
+        with pytest.raises(RuntimeError), context as part:
+            write(part)
+            raise RuntimeError
+
+    fail_in(atomic_path(tmp_path / "a.txt"), lambda part: part.write_text("half"))
+    fail_in(atomic_folder(tmp_path / "b"), lambda part: (part / "x").write_text("half"))
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "x").touch()
+    with pytest.raises(PalpateError, match="empty folder"), atomic_folder(tmp_path / "full"):
+        pass
+
+
+def test_a_path_may_not_climb_out(tmp_path):
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root" / "link").symlink_to(tmp_path)
+    assert inside(tmp_path / "root", "a/../b.png") == (tmp_path / "root" / "b.png").resolve()
+    for bad in ("../x", "a/../../x", "/etc/passwd", "link/x"):
+        assert inside(tmp_path / "root", bad) is None
+
+
+def test_split_round_trip_and_tampering(tmp_path):
+    split = Split.from_ids(train=["a", "b"], test=["c"], rule={"name": "x"})
+    split.save(tmp_path / "s.json")
+    again = Split.load(tmp_path / "s.json")
+    assert again.digest == split.digest
+    assert again.counts() == {"train": 2, "test": 1}
+    data = json.loads((tmp_path / "s.json").read_text())
+    data["parts"]["train"].remove("a")
+    (tmp_path / "s.json").write_text(json.dumps(data))
+    with pytest.raises(PalpateError, match="edited by hand"):
+        Split.load(tmp_path / "s.json")
+    with pytest.raises(PalpateError, match="one part only"):
+        Split.from_ids(train=["a"], test=["a"])
+    with pytest.raises(PalpateError, match="train, val, test"):
+        Split({"a": "holdout"})
+    with pytest.raises(PalpateError, match="must exist"):
+        Split.load(tmp_path / "absent.json")
+
+
+def test_incomparable_scores_refuse_one_column():
+    a = Score("TMMD", "ours", 1.0, bandwidth=10.0, encoder="e1")
+    assert columns([a, Score("TMMD", "theirs", 2.0, bandwidth=10.0, encoder="e1"), Score("SSIM", "ours", 0.5)]).keys() == {"TMMD", "SSIM"}
+    with pytest.raises(PalpateError, match="bandwidth"):
+        columns([a, Score("TMMD", "theirs", 2.0, bandwidth=5.0, encoder="e1")])
+    with pytest.raises(PalpateError, match="encoder"):
+        columns([a, Score("TMMD", "theirs", 2.0, bandwidth=10.0, encoder="e2")])
+
+
+def test_features_name_the_bad_row_and_round_trip(tmp_path):
+    x = np.eye(3, dtype=np.float32)
+    features = FeatureSet(["a", "b", "c"], x, labels=["w", "w", "g"], groups=["v", "v", "u"], encoder="e")
+    features.save(tmp_path / "f.npz")
+    again = FeatureSet.load(tmp_path / "f.npz").take(["c", "a"])
+    assert again.labels == ["g", "w"]
+    assert again.encoder == "e"
+    assert np.array_equal(again.features, x[[2, 0]])
+    with pytest.raises(PalpateError, match="first 'b'"):
+        FeatureSet(["a", "b", "c"], np.where(np.arange(3)[:, None] == 1, np.nan, x))
+    with pytest.raises(PalpateError, match="without, first 'z'"):
+        features.take(["z"])
+
+
+def test_results_round_trip(tmp_path):
+    ref = SampleRef("v/1", "v", 1, "Wood", "a.png", "b.png")
+    audit = Audit("Orig", "video", 1, 1, 1, 1, 1, 1, 1.0, 0, 2, 2, 2, [0, 3], [1], [LeakPair(ref, ref, 2)])
+    results = Results("t", ["f"], [audit], [Score("TMMD", "g", float("inf"), interval=(0.0, 1.0))], [GalleryItem(ref, "g.png")])
+    results.save(tmp_path / "r.json")
+    again = Results.load(tmp_path / "r.json")
+    assert again.audits[0].worst[0].test == ref
+    assert again.scores[0].value is None  # JSON has no infinity
+    assert again.scores[0].interval == (0.0, 1.0)
+    assert again.gallery[0].sample == ref
+
+
+def test_a_stage_is_built_once_and_again_for_other_inputs(tmp_path):
+    calls = []
+
+    def build(folder):
+        calls.append(1)
+        (folder / "out.txt").write_text("x")
+        return {"n": len(calls)}
+
+    first = Run(tmp_path).stage("a", {"k": 1}, build)
+    again = Run(tmp_path).stage("a", {"k": 1}, build)
+    assert (first.facts, again.facts, again.reused, len(calls)) == ({"n": 1}, {"n": 1}, True, 1)
+    other = Run(tmp_path).stage("a", {"k": 2}, build)
+    assert (other.facts, len(calls)) == ({"n": 2}, 2)
+    assert other.digest != first.digest
+
+
+def test_a_killed_stage_keeps_its_partial_folder_for_the_same_inputs_only(tmp_path):
+    def killed(folder):
+        (folder / "checkpoint").write_text("half")
+        raise KeyboardInterrupt
+
+    for inputs, found in (({"k": 1}, True), ({"k": 2}, False)):
+        with pytest.raises(KeyboardInterrupt):
+            Run(tmp_path).stage("a", {"k": 1}, killed)
+        assert not (tmp_path / "a").exists()
+        seen = []
+        Run(tmp_path).stage("a", inputs, lambda folder, seen=seen: seen.append((folder / "checkpoint").exists()))
+        assert seen == [found]
+        for path in (tmp_path / "a").iterdir():
+            path.unlink()
+        (tmp_path / "a").rmdir()
