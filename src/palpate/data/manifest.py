@@ -134,6 +134,25 @@ class Manifest:
         self.take(split.ids(*parts))  # names ids that are missing
         return Manifest(self.table.filter(pl.col("id").is_in(split.ids(*parts))), self.root, self.facts)
 
+    @classmethod
+    def join(cls, *manifests: Manifest) -> Manifest:
+        """The samples of several manifests in one, rooted at the folder that holds all their roots.
+
+        Raises:
+            PalpateError: if an id stands in two of them.
+        """
+        root = Path(os.path.commonpath([m.root.resolve() for m in manifests]))
+        tables: list[pl.DataFrame] = []
+        for m in manifests:
+            prefix = m.root.resolve().relative_to(root).as_posix()
+            prefix = "" if prefix == "." else prefix + "/"
+            tables.append(m.table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in IMAGE_COLUMNS))
+        table = pl.concat(tables)
+        double = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
+        if len(double):
+            raise PalpateError("Joined manifests must not share ids", f"{len(double)} shared, first {double[0]!r}", "Rename the videos of one of them")
+        return cls(table, root, {"dataset": " + ".join(m.facts.get("dataset", "?") for m in manifests)})
+
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row (a dictionary of the table) as a reference with absolute image paths, for reports."""
         full = lambda name: str(self.path(row[name]).resolve()) if row[name] else None  # noqa: E731

@@ -1,0 +1,80 @@
+"""The manifest: round trip, digest, validation with every problem at once, joining."""
+
+import polars as pl
+import pytest
+
+from palpate.core import PalpateError, ProblemsError, Split
+from palpate.data.manifest import Manifest
+
+
+def test_round_trip_keeps_rows_digest_facts_and_a_root_that_moves_along(small_manifest, tmp_path):
+    small_manifest.save(tmp_path / "root" / "manifest.parquet")
+    (tmp_path / "root").rename(tmp_path / "moved")
+    again = Manifest.load(tmp_path / "moved")
+    assert again.digest == small_manifest.digest
+    assert again.table.equals(small_manifest.table)
+    assert again.problems() == []  # the files are found under the new place
+
+
+def test_digest_sees_every_cell_and_the_order(small_manifest):
+    digests = {small_manifest.digest, small_manifest.take(small_manifest.ids[::-1]).digest}
+    for column in ("text", "material", "vision"):
+        changed = small_manifest.table.with_columns(
+            pl.when(pl.col("id") == "v0/0").then(pl.lit("x")).otherwise(pl.col(column)).alias(column)
+        )
+        digests.add(Manifest(changed, small_manifest.root).digest)
+    assert len(digests) == 5
+
+
+def test_every_problem_is_listed_at_once(tmp_path):
+    (tmp_path / "a.png").touch()
+    rows = [
+        {"id": "1", "vision": "a.png"}, {"id": "1", "vision": "a.png"}, {"id": None}, {"id": "4", "tactile": "../b.png"}, {"id": "5", "background": "gone.png"},
+    ]  # fmt: skip
+    with pytest.raises(ProblemsError) as caught:
+        Manifest.from_rows(rows, tmp_path).require_valid()
+    assert {(p.where, p.kind) for p in caught.value.problems} == {
+        ("row 2", "duplicate-id"), ("row 3", "null-id"), ("row 4", "outside-root"), ("row 5", "missing-file"),
+    }  # fmt: skip
+    with pytest.raises(ProblemsError, match="1 empty"):
+        Manifest.from_rows([], tmp_path).require_valid()
+
+
+def test_foreign_and_changed_files_are_refused(small_manifest, tmp_path):
+    path = tmp_path / "m.parquet"
+    with pytest.raises(PalpateError, match="must exist"):
+        Manifest.load(path)
+    path.write_text("no table")
+    with pytest.raises(PalpateError, match="Parquet"):
+        Manifest.load(path)
+    small_manifest.table.write_parquet(path)
+    with pytest.raises(PalpateError, match="foreign"):
+        Manifest.load(path)
+    small_manifest.table.head(3).write_parquet(
+        path, metadata={"palpate.format": "palpate-manifest/1", "palpate.digest": small_manifest.digest, "palpate.root": "."}
+    )
+    with pytest.raises(PalpateError, match="another program"):
+        Manifest.load(path)
+    with pytest.raises(PalpateError, match="'colour'"):
+        Manifest.from_rows([{"colour": "red"}], tmp_path)
+
+
+def test_parts_follow_the_split_and_foreign_ids_are_named(small_manifest):
+    split = Split.from_ids(train=["v1/0", "v0/0"], test=["v2/3"])
+    assert small_manifest.part(split, "train").ids == ["v0/0", "v1/0"]
+    with pytest.raises(PalpateError, match="first 'zz'"):
+        small_manifest.part(Split.from_ids(train=["zz"]), "train")
+    with pytest.raises(PalpateError, match="1 without"):
+        Manifest.from_rows([{"id": "1"}], ".").paths("vision")
+
+
+def test_joined_manifests_find_their_files(small_manifest, tmp_path):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "a.png").touch()
+    other = Manifest.from_rows([{"id": "o/1", "vision": "a.png"}], tmp_path / "other")
+    both = Manifest.join(small_manifest, other)
+    assert len(both) == len(small_manifest) + 1
+    assert both.problems() == []
+    assert both.table.tail(1)["tactile"][0] is None
+    with pytest.raises(PalpateError, match="must not share ids"):
+        Manifest.join(other, other)
