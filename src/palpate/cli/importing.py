@@ -51,7 +51,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     manifest = done.manifest
     facts = {
         "manifest": str(options.output / "manifest.parquet"), "digest": manifest.digest, "samples": len(manifest),
-        **{f"{name}s": manifest.table[name].drop_nulls().n_unique() for name in ("video", "touch", "material")},
+        **{many: manifest.table[one].drop_nulls().n_unique() for one, many in (("video", "videos"), ("touch", "touches"), ("material", "materials"))},
         "with_background": len(manifest) - manifest.table["background"].null_count(),
         "with_text": len(manifest) - manifest.table["text"].null_count(),
         "inconclusive": done.inconclusive, "skipped": len(done.skipped), "splits": {name: split.counts() for name, split in done.splits.items()},

@@ -10,10 +10,12 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import importlib.util
 import io
 import json
 import os
 import re
+import shutil
 import sys
 import time
 from collections.abc import Generator, Mapping, Sequence
@@ -26,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.cli import FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
-from palpate.core import PalpateError, Problem, ProblemsError, Progress, quiet
+from palpate.core import MissingExtraError, PalpateError, Problem, ProblemsError, Progress, quiet
 
 #: Lines of problems shown in the terminal; ``--json`` gives all.
 SHOWN_PROBLEMS = 40
@@ -147,6 +149,34 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         raise PalpateError(f"The options of palpate {name} must be as its help says", words, f"See: palpate {name} --help") from None
 
 
+def require_extra(purpose: str) -> None:
+    """Says which ``pip install`` is missing, before any work is done.
+
+    Raises:
+        MissingExtraError: if torch, diffusers, transformers or av is absent.
+    """
+    for package in ("torch", "diffusers", "transformers", "safetensors", "av"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(package, "all", purpose)
+
+
+@contextlib.contextmanager
+def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
+    """``.<name>.work`` beside an output folder: checkpoints and caches, found again by the same command, removed when it succeeds.
+
+    Raises:
+        PalpateError: if the output exists already, before any work is done.
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise PalpateError(f"{output} must be absent or an empty folder", "something there", "Choose another -o, or remove it")
+    work = output.absolute().parent / f".{output.name}.work"
+    if work.exists():
+        terminal.say(f"Going on from {work}")
+    work.mkdir(parents=True, exist_ok=True)
+    yield work
+    shutil.rmtree(work, ignore_errors=True)
+
+
 def run_verb(name: str, args: Sequence[str]) -> int:
     """Runs one verb with its arguments; see :func:`palpate.cli.main` for the exit statuses."""
     # Spinning OpenMP threads make two busy cores 3-9 times slower than one; must be set before torch loads.
@@ -183,4 +213,4 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         return OK
 
 
-__all__ = ["FAILED_CHECK", "Common", "OutPath", "Terminal", "run_verb"]
+__all__ = ["FAILED_CHECK", "Common", "OutPath", "Terminal", "require_extra", "run_verb", "working_folder"]

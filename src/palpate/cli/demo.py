@@ -1,0 +1,69 @@
+"""``palpate demo``: everything once, from photos to a page."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from palpate.cli.terminal import Common, Terminal, require_extra
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common):
+    """Run everything once: data, leak-free split, towers, generator, touches, scores, page.
+
+    Without --data it runs offline on the embedded synthetic world. Stopped half-way, the same command goes on from the last finished stage.
+    """
+
+    data: Path | None = None
+    """A Touch and Go tree (or anything `palpate import` reads) instead of the embedded world."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("runs/demo")
+    """Run folder."""
+    preset: Literal["mini", "tiny"] = "mini"
+    """`mini` takes minutes on two cores; `tiny` is for trying the plumbing."""
+    clip: str | None = None
+    """Hub id or folder of a pretrained CLIP, instead of a small one trained first."""
+    autoencoder: str | None = None
+    """Hub id or folder of a pretrained VQ model, instead of a small one trained first."""
+    group: Literal["auto", "video", "touch", "object"] = "auto"
+    """What the split keeps whole; `auto` takes the video, or the touch where videos are too few."""
+    background: bool = False
+    """Train the variant that also sees the no-contact image."""
+    seed: int = 0
+    """Of the split, the weights, the order of training and the noise."""
+    skip_bad: bool = False
+    """Leave out bad rows and files of --data and list them, instead of refusing."""
+    device: str = "auto"
+    """auto, cpu, cuda, mps."""
+
+
+def run(options: Options, terminal: Terminal) -> dict[str, Any]:
+    """Runs the pipeline and writes the page."""
+    require_extra("palpate demo")
+    from palpate.protocol.pipeline import PipelineOptions, run_pipeline
+    from palpate.protocol.summary import summarise
+    from palpate.report import summary_lines, write_report
+
+    out = options.data if options.data is None else options.data.resolve()
+    asked = PipelineOptions(
+        preset=options.preset, data=out, clip=options.clip, autoencoder=options.autoencoder, group=options.group, seed=options.seed,
+        skip_bad=options.skip_bad, background=options.background, device=options.device,
+    )  # fmt: skip
+    with terminal.progress() as progress:
+        outcome = run_pipeline(asked, options.out, say=terminal.say, progress=progress)
+    words = ["palpate", "demo", "--preset", options.preset, "--seed", str(options.seed)]
+    words += ["--data", str(options.data)] if options.data else []
+    words += [w for name in ("clip", "autoencoder") if (value := getattr(options, name)) for w in (f"--{name}", value)]
+    words += ["--group", options.group] if options.group != "auto" else []
+    words += ["--background"] if options.background else []
+    results = summarise(outcome, shlex.join(words))
+    page = write_report(results, options.out / "page.html").page
+    terminal.out.print()
+    for line in summary_lines(results):
+        terminal.out.print(line, markup=False)
+    terminal.out.print(f"Page: {page}", markup=False)
+    return {"page": str(page), "facts": list(results.facts), "digests": results.settings["digests"]}

@@ -1,0 +1,81 @@
+"""``palpate report``: results become a page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from palpate.cli.terminal import Common, OutPath, Terminal
+from palpate.core import Audit, PalpateError, Results, Score, read_json
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common):
+    """Write one self-contained page, with JSON and Markdown of the same results beside it."""
+
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Any of: the JSON of `palpate audit -o`, of `palpate score -o`, or of an earlier page."""
+    output: OutPath
+    """The page to write (.html)."""
+    title: str = "palpate report"
+    """Heading of the page."""
+
+
+def run(options: Options, terminal: Terminal) -> dict[str, Any]:
+    """Merges the results and writes the page."""
+    if not options.results:
+        raise PalpateError("A report needs results", "no file", "E.g. palpate audit train.txt test.txt -o audit.json")
+    from palpate.report import write_report
+
+    merged = Results(title=options.title)
+    for path in options.results:
+        merged = _join(merged, _read(path))
+    with terminal.progress() as progress:
+        files = write_report(merged, options.output, progress=progress)
+    paths = {"page": str(files.page), "json": str(files.json), "markdown": str(files.markdown)}
+    terminal.facts("Report", paths)
+    return paths
+
+
+def _read(path: Path) -> Results:
+    data = read_json(path, "results file")
+    kind = data.get("format") if isinstance(data, dict) else None
+    fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")} if isinstance(data, dict) else {}
+    try:
+        match kind:
+            case "palpate-audit/1":
+                return Results(title="", audits=[Audit.from_json(fields)])
+            case "palpate-scores/1":
+                return Results(title="", scores=[Score.from_json(s) for s in fields["scores"]])
+            case "palpate-results/1":
+                results = Results.from_json(fields)
+                return _absolute(results, path.parent)
+            case _:
+                raise PalpateError(
+                    f"{path} must hold results of palpate", f"format {kind!r}", "Pass the JSON of audit -o, score -o, or of a page"
+                )
+    except (KeyError, TypeError) as error:
+        raise PalpateError(
+            f"{path} must hold complete results", f"a missing or unknown field ({error})", "Write it again with palpate"
+        ) from None
+
+
+def _absolute(results: Results, base: Path) -> Results:
+    """Picture paths of an earlier page, counted from its own folder, made absolute."""
+    full = lambda name: name if name is None else str((base / name).resolve())  # noqa: E731
+    ref = lambda s: replace(s, vision=full(s.vision), tactile=full(s.tactile))  # noqa: E731
+    audits = [replace(a, worst=[replace(p, test=ref(p.test), train=ref(p.train)) for p in a.worst]) for a in results.audits]
+    gallery = [replace(g, sample=ref(g.sample), generated=full(g.generated), background=full(g.background)) for g in results.gallery]
+    return replace(results, audits=audits, gallery=gallery)
+
+
+def _join(a: Results, b: Results) -> Results:
+    """The two, one after the other; the first non-empty title stays."""
+    return Results(
+        title=a.title if a.title != "palpate report" or not b.title else b.title, facts=[*a.facts, *b.facts], audits=[*a.audits, *b.audits],
+        scores=[*a.scores, *b.scores], gallery=[*a.gallery, *b.gallery], settings={**a.settings, **b.settings}, notes=[*a.notes, *b.notes],
+        commands=[*a.commands, *b.commands],
+    )  # fmt: skip

@@ -1,0 +1,103 @@
+"""From a manifest, a split and towers to a saved-able pipeline: encode once, then train the denoiser (paper section 2).
+
+Only the train part of the split is read. Touches go through the frozen autoencoder and texts and photos through
+the frozen towers once, into caches keyed by digest; the training loop reads those.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from palpate import __version__
+from palpate.core import PalpateError, Progress, Split, digest_json, quiet
+from palpate.data.images import cached_images
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.denoiser import Source
+from palpate.diffusion.latents import LatentStats, encode_latents
+from palpate.diffusion.pipeline import Pipeline
+from palpate.diffusion.presets import DiffusionPreset
+from palpate.diffusion.training import train_denoiser
+from palpate.encoders.embed import embed, texts_of
+from palpate.encoders.towers import Towers, pick_device
+
+
+def train_pipeline(
+    manifest: Manifest,
+    split: Split,
+    towers: Towers,
+    autoencoder: Autoencoder,
+    preset: DiffusionPreset,
+    folder: Path,
+    *,
+    seed: int = 0,
+    steps: int | None = None,
+    source: Literal["text", "vision", "mixed"] | None = None,
+    background: bool = False,
+    cache: Path | None = None,
+    device: str = "auto",
+    progress: Progress = quiet,
+) -> Pipeline:
+    """Trains a generator on the train part of a split; run again to resume.
+
+    Args:
+        manifest: samples with touch and photo, and a text or a material.
+        split: its digest goes into the pipeline.
+        towers: their text embeddings condition the training, their vision embeddings the sampling.
+        autoencoder: frozen.
+        preset: geometry, schedule, length, sampler.
+        folder: for checkpoints and latents; nothing in it belongs to the pipeline.
+        seed: of weights, order, noise and condition dropout.
+        steps: instead of the preset's length.
+        source: instead of the preset's; ``vision`` is the baseline without text (GVST).
+        background: the variant w/ BG, which sees the latent of the no-contact image.
+        cache: folder for decoded pixels and embeddings.
+        device: see :func:`palpate.encoders.towers.pick_device`.
+        progress: told what is being done.
+
+    Raises:
+        PalpateError: if the train part is empty, or a sample lacks what is needed.
+    """
+    train = manifest.part(split, "train")
+    if not len(train):
+        raise PalpateError("The train part of the split must hold samples of this manifest", "none", "Make a split with: palpate split")
+    place = pick_device(device)
+    towers.to(device)
+    autoencoder.to(place)
+    _, text_source = texts_of(train)
+    conditions: dict[Source, np.ndarray] = {
+        "text": embed(train, towers, "text", cache=cache, progress=progress).features,
+        "vision": embed(train, towers, "vision", cache=cache, progress=progress).features,
+    }
+    latents = _latents(train, "tactile", autoencoder, preset, folder, cache, progress)
+    grounds = _latents(train, "background", autoencoder, preset, folder, cache, progress) if background else None
+    stats = LatentStats.of(latents, preset.latent_scale)
+    policy = preset.condition_for(towers.dim)
+    policy = policy if source is None else replace(policy, source=source)
+    loop = preset.loop_for(len(train), seed=seed)
+    loop = loop if steps is None else replace(loop, steps=steps)
+    denoiser = train_denoiser(
+        latents, conditions, stats=stats, unet=preset.unet, policy=policy, schedule=preset.schedule, loop=loop, folder=folder / "denoiser",
+        background=grounds, device=place, progress=progress,
+    )  # fmt: skip
+    record = {
+        "manifest": manifest.digest, "split": split.digest, "split_rule": dict(split.rule), "train_samples": len(train), "text_source": text_source,
+        "autoencoder": autoencoder.digest, "vision": towers.digest("vision"), "text": towers.digest("text"), "source": policy.source,
+        "background": background, "loop": asdict(loop), "unet": asdict(preset.unet), "seed": seed, "palpate": __version__,
+        "parameters": sum(p.numel() for p in denoiser.unet.parameters()),
+    }  # fmt: skip
+    # The pipeline carries the frozen pair alone: the touch tower scores, it does not generate.
+    return Pipeline(autoencoder, denoiser, stats, preset.schedule, preset.sampler, preset.size, Towers(towers.clip), preset.name, record)
+
+
+def _latents(
+    train: Manifest, column: str, autoencoder: Autoencoder, preset: DiffusionPreset, folder: Path, cache: Path | None, progress: Progress
+) -> np.ndarray:
+    """Latents of one image column, (n, c, h, w), from the cache in ``folder`` if it fits."""
+    images = cached_images(train, column, preset.size, cache, progress)
+    key = digest_json([train.digest, column, preset.size])
+    return encode_latents(autoencoder, images, train.ids, folder / f"latents-{column}", key=key, progress=progress)

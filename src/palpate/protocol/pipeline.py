@@ -1,0 +1,358 @@
+"""The main job as a graph of stages: photos in, a page's worth of results out.
+
+::
+
+    world -> data -> split -> pretraining world -> clip -> autoencoder -> towers -> generator -> generated -> scores
+
+Each stage reads the ones before it and is kept in the run folder under the digest of what it read
+(:class:`palpate.core.Run`), so a run that was killed goes on from its last finished stage, and a changed option
+redoes only what depends on it. ``world`` is skipped where data is given; ``pretraining``, ``clip`` and
+``autoencoder`` are skipped where pretrained models are given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate import __version__
+from palpate.core import (
+    Audit,
+    PalpateError,
+    Progress,
+    Run,
+    Score,
+    Split,
+    Stage,
+    digest_file,
+    digest_folder,
+    digest_lines,
+    quiet,
+    read_json,
+    write_json,
+)
+from palpate.data.images import cached_images
+from palpate.data.importing import import_dataset
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.autoencoder_training import train_autoencoder
+from palpate.diffusion.pipeline import Pipeline
+from palpate.diffusion.presets import preset_named as diffusion_preset
+from palpate.diffusion.recipe import train_pipeline
+from palpate.encoders.contrastive import train_clip, train_touch
+from palpate.encoders.presets import preset as encoder_preset
+from palpate.encoders.towers import Towers, load_clip
+from palpate.generate import Generated, generate
+from palpate.leakage import audit_split, describe, leak_free_split
+from palpate.protocol.presets import preset as pipeline_preset
+from palpate.protocol.scoring import score_generated
+from palpate.sim import WorldOptions, write_world
+
+
+@dataclass(frozen=True)
+class PipelineOptions:
+    """What to run.
+
+    Attributes:
+        preset: see :data:`palpate.protocol.presets.PRESETS`.
+        data: a data set on disk, or None for the embedded world.
+        clip: hub id or folder of a pretrained CLIP, or None to train a small one first.
+        autoencoder: hub id or folder of a pretrained VQ model, or None to train a small one first.
+        group: what the split keeps whole; ``auto`` falls back to touches where videos are too few.
+        seed: of the split, the weights, the order of training and the noise.
+        skip_bad: leave bad rows and images of ``data`` out and list them.
+        background: train the variant that sees the no-contact image.
+        device: ``auto``, ``cpu``, ``cuda`` ...
+        workers: processes that render the world.
+    """
+
+    preset: str = "mini"
+    data: Path | None = None
+    clip: str | None = None
+    autoencoder: str | None = None
+    group: str = "auto"
+    seed: int = 0
+    skip_bad: bool = False
+    background: bool = False
+    device: str = "auto"
+    workers: int = 2
+
+
+@dataclass(frozen=True)
+class PipelineOutcome:
+    """Everything that a finished run holds; see the stages' folders for the files.
+
+    Attributes:
+        manifest, split: the data and the leak-free split that was trained and scored on.
+        audits: of the data set's own splits, if it has any, and of ours.
+        generated: the touches made for the test part.
+        scores: see :func:`palpate.protocol.scoring.score_generated`.
+        stages: by name, with digests, facts and times.
+        options: what was asked for.
+    """
+
+    manifest: Manifest
+    split: Split
+    audits: list[Audit]
+    generated: Generated
+    scores: list[Score]
+    stages: Mapping[str, Stage]
+    options: PipelineOptions
+
+    def settings(self) -> dict[str, Any]:
+        """Options, digests, versions and times, for the page."""
+        packages = ("numpy", "torch", "diffusers", "transformers", "polars", "pillow")
+        return {
+            "options": {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.options).items()},
+            "digests": {"manifest": self.manifest.digest, "split": self.split.digest}
+            | {name: stage.facts["digest"] for name, stage in self.stages.items() if "digest" in stage.facts},
+            "split rule": dict(self.split.rule),
+            "stages": {
+                name: {k: v for k, v in stage.facts.items() if k not in ("digest", "audits")} for name, stage in self.stages.items()
+            },
+            "seconds": {name: round(stage.seconds, 1) for name, stage in self.stages.items()},
+            "versions": {"palpate": __version__, "python": platform.python_version()} | {p: metadata.version(p) for p in packages},
+            "machine": f"{platform.machine()}, {_cores()} cores",
+        }
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_pipeline(
+    options: PipelineOptions, out: Path, *, say: Callable[[str], None] = lambda line: None, progress: Progress = quiet
+) -> PipelineOutcome:
+    """Runs all stages, or those that are not there yet for the same inputs.
+
+    Args:
+        options: what to run.
+        out: run folder; stopping and running again with the same folder goes on.
+        say: called with one line a stage.
+        progress: told what is being done within a stage.
+
+    Raises:
+        PalpateError: on bad data or options; finished stages stay.
+    """
+    work = _Pipeline(options, Run(Path(out), say), progress)
+    manifest = work.data()
+    split, audits = work.split(manifest)
+    pretraining = None if options.clip and options.autoencoder else work.pretraining(manifest, split)
+    clip = options.clip or work.clip(pretraining)
+    autoencoder = options.autoencoder or work.autoencoder(pretraining, manifest, split)
+    towers = work.towers(manifest, split, clip)
+    model = work.generator(manifest, split, towers, autoencoder)
+    generated = work.generated(manifest, split, model)
+    scores = work.scores(manifest, split, generated, towers)
+    return PipelineOutcome(manifest, split, audits, generated, scores, work.run.stages, options)
+
+
+class _Pipeline:
+    """The stages; each method returns what later ones read."""
+
+    def __init__(self, options: PipelineOptions, run: Run, progress: Progress) -> None:
+        self.options, self.run, self.progress = options, run, progress
+        self.preset = pipeline_preset(options.preset)
+        self.encoder = encoder_preset(self.preset.encoder)
+        self.diffusion = diffusion_preset(self.preset.diffusion)
+        self.cache = run.folder / "cache"
+
+    def _digest(self, *names: str) -> dict[str, str]:
+        return {name: self.run.stages[name].digest for name in names if name in self.run.stages}
+
+    def _world(self, name: str, options: WorldOptions) -> Path:
+        def build(folder: Path) -> dict[str, Any]:
+            record = write_world(folder / "tree", options, workers=self.options.workers, progress=self.progress)
+            return {"digest": record.digest, "preset": self.options.preset}
+
+        return self.run.stage(name, {"options": options, "digest": options.digest}, build).folder / "tree"
+
+    def data(self) -> Manifest:
+        """The manifest of the given data, or of the embedded world."""
+        source = self.options.data if self.options.data is not None else self._world("world", self.preset.world)
+        if not source.exists():
+            raise PalpateError("The data must exist", f"nothing at {source}", "Check --data")
+        size = None if self.options.data is None else 4 * self.diffusion.size
+
+        def build(folder: Path) -> dict[str, Any]:
+            done = import_dataset(source, folder, skip_bad=self.options.skip_bad, size=size, progress=self.progress)
+            return {
+                "digest": done.manifest.digest, "dataset": done.facts.get("dataset", source.name), "samples": len(done.manifest),
+                "skipped": [str(p) for p in done.skipped], "inconclusive": done.inconclusive, "facts": dict(done.facts),
+            }  # fmt: skip
+
+        inputs = {"source": str(source.resolve()), "stamp": _stamp(source), "skip_bad": self.options.skip_bad, "size": size}
+        stage = self.run.stage("data", inputs | self._digest("world"), build)
+        return Manifest.load(stage.folder)
+
+    def split(self, manifest: Manifest) -> tuple[Split, list[Audit]]:
+        """The leak-free split, and the audits of it and of the data set's own."""
+        own = sorted((self.run.stages["data"].folder / "splits").glob("*.json"))
+
+        def build(folder: Path) -> dict[str, Any]:
+            plan = leak_free_split(manifest, train=self.preset.train, group=self.options.group, seed=self.options.seed)
+            plan.split.save(folder / "noleak.json")
+            audits = [audit_split(manifest, Split.load(path), name=path.stem) for path in own if Split.load(path).ids("test")]
+            audits.append(audit_split(manifest, plan.split, group=plan.group, name="NoLeak"))
+            if plan.group != "video" and not manifest.table["video"].null_count():
+                audits.append(audit_split(manifest, plan.split, group="video", name="NoLeak, seen by video"))
+            write_json(folder / "audits.json", [dataclasses.asdict(a) for a in audits])
+            return dict(describe(plan))
+
+        inputs = {"manifest": manifest.digest, "root": str(manifest.root), "train": self.preset.train, "group": self.options.group}
+        stage = self.run.stage("split", inputs | {"seed": self.options.seed, "own": [digest_file(p) for p in own]}, build)
+        return Split.load(stage.folder / "noleak.json"), [Audit.from_json(a) for a in read_json(stage.folder / "audits.json", "audits")]
+
+    def pretraining(self, manifest: Manifest, split: Split) -> Manifest:
+        """Another world's samples, joined with the train part: what the frozen models may see."""
+        tree = self._world("pretraining", self.preset.pretraining)
+
+        def build(folder: Path) -> dict[str, Any]:
+            done = import_dataset(tree, folder, progress=self.progress)
+            return {"digest": done.manifest.digest, "samples": len(done.manifest)}
+
+        stage = self.run.stage("pretraining-data", self._digest("pretraining"), build)
+        return Manifest.join(Manifest.load(stage.folder), manifest.part(split, "train"))
+
+    def clip(self, pretraining: Manifest | None) -> str:
+        """A small CLIP trained on photos and texts; returns its folder."""
+        assert pretraining is not None
+
+        def build(folder: Path) -> dict[str, Any]:
+            everything = Split.from_ids(train=pretraining.ids, rule={"name": "pretraining"}, manifest=pretraining.digest)
+            clip = train_clip(
+                pretraining, everything, self.encoder, folder / "training", seed=self.options.seed, cache=self.cache, device=self.options.device,
+                progress=self.progress,
+            )  # fmt: skip
+            clip.save(folder / "clip")
+            return {"digest": clip.digest("vision"), "text": clip.digest("text"), "samples": len(pretraining)}
+
+        inputs = {"preset": self.encoder, "train": pretraining.digest, "seed": self.options.seed}
+        return str(self.run.stage("clip", inputs | self._digest("pretraining-data", "split"), build).folder / "clip")
+
+    def autoencoder(self, pretraining: Manifest | None, manifest: Manifest, split: Split) -> str:
+        """A small VQ autoencoder of touches; returns its folder. Its reconstruction bounds every score of pictures."""
+        assert pretraining is not None
+        options = self.diffusion.autoencoder
+        if options is None:
+            raise PalpateError(
+                f"The preset {self.diffusion.name} needs a trained autoencoder", "none", "Pass --autoencoder HUB_ID_OR_FOLDER"
+            )
+        own = manifest.part(split, "train")
+
+        def build(folder: Path) -> dict[str, Any]:
+            images = cached_images(pretraining, "tactile", self.diffusion.size, self.cache, self.progress)
+            mine = cached_images(own, "tactile", self.diffusion.size, self.cache, self.progress)
+            images = np.concatenate([images, *[mine] * _repeats(len(images), len(mine), self.preset.repeat)])
+            key = digest_lines([pretraining.digest, own.digest])
+            model = train_autoencoder(images, options, folder / "training", seed=self.options.seed, key=key, progress=self.progress)
+            model.save(folder / "autoencoder")
+            held_out = cached_images(manifest.part(split, "test"), "tactile", self.diffusion.size, self.cache, self.progress)
+            error = np.square((model.decode(model.encode(held_out)).astype(np.float64) - held_out) / 255).mean((1, 2, 3))
+            return {
+                "digest": model.digest,
+                "images": len(images),
+                "test_reconstruction_psnr_db": round(float((-10 * np.log10(error)).mean()), 2),
+            }
+
+        inputs = {
+            "options": options,
+            "size": self.diffusion.size,
+            "train": pretraining.digest,
+            "own": own.digest,
+            "seed": self.options.seed,
+        }
+        stage = self.run.stage("autoencoder", inputs | {"repeat": self.preset.repeat} | self._digest("pretraining-data", "split"), build)
+        return str(stage.folder / "autoencoder")
+
+    def towers(self, manifest: Manifest, split: Split, clip: str) -> Towers:
+        """The frozen pair with a touch tower trained on the train part."""
+
+        def build(folder: Path) -> dict[str, Any]:
+            frozen = load_clip(clip, device=self.options.device)
+            towers = train_touch(
+                manifest, split, frozen, self.encoder, folder / "training", seed=self.options.seed, cache=self.cache, device=self.options.device,
+                progress=self.progress,
+            )  # fmt: skip
+            towers.save(folder / "towers")
+            return {"digest": towers.digest("touch"), "text_source": towers.card.get("text_source")}
+
+        inputs = {"preset": self.encoder, "clip": self._model_stamp("clip", clip), "seed": self.options.seed}
+        stage = self.run.stage("towers", inputs | self._digest("split", "data"), build)
+        return Towers.load(stage.folder / "towers")
+
+    def generator(self, manifest: Manifest, split: Split, towers: Towers, autoencoder: str) -> Pipeline:
+        """The trained pipeline."""
+
+        def build(folder: Path) -> dict[str, Any]:
+            pipeline = train_pipeline(
+                manifest, split, towers, Autoencoder.load(autoencoder), self.diffusion, folder / "training", seed=self.options.seed,
+                background=self.options.background, cache=self.cache, device=self.options.device, progress=self.progress,
+            )  # fmt: skip
+            pipeline.save(folder / "model")
+            loop = pipeline.training["loop"]
+            return {
+                "digest": pipeline.digest, "parameters": pipeline.training["parameters"], "steps": loop["steps"], "batch": loop["batch"],
+                "learning_rate": loop["lr"], "source": pipeline.training["source"], "sampler": dataclasses.asdict(pipeline.sampler),
+            }  # fmt: skip
+
+        inputs = {
+            "preset": self.diffusion,
+            "autoencoder": self._model_stamp("autoencoder", autoencoder),
+            "background": self.options.background,
+        }
+        stage = self.run.stage("generator", inputs | {"seed": self.options.seed} | self._digest("split", "data", "towers"), build)
+        return Pipeline.load(stage.folder / "model")
+
+    def generated(self, manifest: Manifest, split: Split, pipeline: Pipeline) -> Generated:
+        """A touch for each photo of the test part."""
+
+        def build(folder: Path) -> dict[str, Any]:
+            made = generate(
+                pipeline, manifest=manifest.part(split, "test"), out=folder / "touches", seed=self.options.seed, progress=self.progress
+            )
+            return {"images": len(made.ids)}
+
+        inputs = {"pipeline": pipeline.digest, "sampler": pipeline.sampler, "seed": self.options.seed}
+        return Generated.load(self.run.stage("generated", inputs | self._digest("split", "data"), build).folder / "touches")
+
+    def scores(self, manifest: Manifest, split: Split, generated: Generated, towers: Towers) -> list[Score]:
+        """The scores of the generated touches and of the controls."""
+
+        def build(folder: Path) -> dict[str, Any]:
+            scores = score_generated(
+                manifest, split, {"generated": generated}, towers, group=str(split.rule["group"]), seed=self.options.seed, cache=self.cache,
+                progress=self.progress,
+            )  # fmt: skip
+            write_json(folder / "scores.json", [s.to_json() for s in scores])
+            return {"scores": len(scores)}
+
+        inputs = {"encoder": towers.digest("touch"), "seed": self.options.seed}
+        stage = self.run.stage("scores", inputs | self._digest("split", "data", "generated", "towers"), build)
+        return [Score.from_json(s) for s in read_json(stage.folder / "scores.json", "scores")]
+
+    def _model_stamp(self, name: str, source: str) -> str:
+        """What names a frozen model: its stage's digest, the digest of its folder, or its hub id."""
+        if name in self.run.stages:
+            return self.run.stages[name].digest
+        return digest_folder(Path(source)) if Path(source).is_dir() else source
+
+
+def _repeats(others: int, mine: int, share: float) -> int:
+    """How often ``mine`` (already there once among ``others``) must be added to be ``share`` of the whole; at most 8 times."""
+    rest = max(0, others - mine)
+    return int(np.clip(np.ceil(share / (1 - share) * rest / max(1, mine)) - 1, 0, 8))
+
+
+def _stamp(source: Path) -> str:
+    """Names, sizes and modification times of the files below ``source``: changes when the data set does."""
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
+    return digest_lines(f"{p.relative_to(source)} {(s := p.stat()).st_size} {s.st_mtime_ns}" for p in files)

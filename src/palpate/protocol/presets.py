@@ -1,0 +1,55 @@
+"""Presets of the whole pipeline, one row each: worlds, encoders, generator, and what a run costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from palpate.core import PalpateError
+from palpate.sim import PRESETS as WORLDS
+from palpate.sim import WorldOptions
+
+
+@dataclass(frozen=True)
+class PipelinePreset:
+    """A complete run.
+
+    Attributes:
+        name: for ``--preset``.
+        world: the embedded data set, used where no data is given.
+        pretraining: another world, of other objects, on which the frozen towers and the autoencoder are trained.
+        encoder, diffusion: names of the presets of those rooms.
+        train: share of the train part.
+        repeat: the train part's touches are repeated until they are this share of the autoencoder's training set.
+        cost: measured on two CPU cores.
+    """
+
+    name: str
+    world: WorldOptions
+    pretraining: WorldOptions
+    encoder: str
+    diffusion: str
+    train: float = 0.75
+    repeat: float = 1 / 3
+    cost: str = ""
+
+
+_TINY = replace(WORLDS["tiny"], objects_per_material=4, touches_per_video=2, frames_per_touch=2)
+
+# fmt: off
+PRESETS = {p.name: p for p in (
+    #              name    world           pretraining            encoder diffusion
+    PipelinePreset("tiny", _TINY,          replace(_TINY, seed=1000), "tiny", "tiny", cost="for tests: under a minute"),
+    PipelinePreset("mini", WORLDS["demo"], WORLDS["pretrain"],    "mini", "mini", cost="the default"),
+)}
+# fmt: on
+
+
+def preset(name: str) -> PipelinePreset:
+    """A preset by name.
+
+    Raises:
+        PalpateError: if there is none of that name.
+    """
+    if name not in PRESETS:
+        raise PalpateError(f"A preset of the pipeline must be one of {', '.join(PRESETS)}", repr(name), "Choose one of these")
+    return PRESETS[name]

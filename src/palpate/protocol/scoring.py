@@ -1,0 +1,127 @@
+"""Scoring a folder of generated touches against the real test touches, with controls that keep the numbers honest.
+
+Subjects, all scored by the same code on the same samples:
+
+- ``generated``: the touches made from the test photos;
+- ``background only``: the sensor's no-contact image in the place of every touch. Pairwise metrics reward it (paper,
+  section 1); a metric of touch must not;
+- ``real, same material``: for each test touch a real train touch of its material: what a generator that knows
+  the material but not the place could reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet, rng_for
+from palpate.data.images import load_images, read_image
+from palpate.data.manifest import Manifest
+from palpate.encoders.embed import embed, embed_images
+from palpate.encoders.probe import material_accuracy
+from palpate.encoders.towers import Towers
+from palpate.generate import Generated
+from palpate.metrics import four_scores, psnr, ssim
+
+BACKGROUND, SAME_MATERIAL = "background only", "real, same material"
+
+
+def score_generated(
+    manifest: Manifest,
+    split: Split,
+    generated: Mapping[str, Generated],
+    towers: Towers,
+    *,
+    group: str = "video",
+    presets: Sequence[str] = ("grouped", "paper"),
+    controls: bool = True,
+    seed: int = 0,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> list[Score]:
+    """Scores one or several generators on the test part of a split.
+
+    Args:
+        manifest: samples with real touches.
+        split: its test part is scored, its train part feeds the material probe and a control.
+        generated: name -> folder; each must hold exactly the ids of the test part.
+        towers: their touch tower gives the features.
+        group: column whose values stay together in halves and intervals.
+        presets: of the TMMD family (see :data:`palpate.metrics.PRESETS`).
+        controls: score the controls as well.
+        seed: of random halves and of the choice of control touches.
+        cache: folder for embeddings.
+        progress: told what is being done.
+
+    Returns:
+        For each subject and preset the four metrics, SSIM and PSNR, and the material accuracy of a probe trained on real touches.
+
+    Raises:
+        PalpateError: if id sets differ, images are unreadable, or there is no touch tower.
+    """
+    test, train = manifest.part(split, "test"), manifest.part(split, "train")
+    for name, folder in generated.items():
+        require_same_ids(name, folder.ids, test.ids)
+    if not generated:
+        raise PalpateError("There must be generated touches to score", "none", "Pass --generated")
+    size = read_image(next(iter(generated.values())).paths[0]).size[0]
+    real = load_images(test.paths("tactile"), size, progress=progress)
+    features = embed(test, towers, "touch", groups=group, cache=cache, progress=progress)
+    train_features = embed(train, towers, "touch", groups=group, cache=cache, progress=progress)
+    pictures = {name: load_images([folder.path(i) for i in test.ids], size, progress=progress) for name, folder in generated.items()}
+    if controls:
+        pictures |= _controls(test, train, size, seed, progress)
+    scores: list[Score] = []
+    for name, images in pictures.items():
+        made = replace(features, features=embed_images(images, towers, "touch", progress=progress))
+        for preset in presets:
+            scores += four_scores(made, features, floor=features, preset=preset, subject=name, split=split.digest, seed=seed)
+        groups = features.groups
+        scores.append(ssim(images, real, ids=test.ids, groups=groups, subject=name, split=split.digest))
+        scores.append(psnr(images, real, ids=test.ids, groups=groups, subject=name, split=split.digest))
+        scores += _accuracy(train_features, made, name, split)
+    scores += _accuracy(train_features, features, "real", split)
+    return scores
+
+
+def require_same_ids(name: str, made: Sequence[str], wanted: Sequence[str]) -> None:
+    """Refuses to score another set of ids than the test part: metrics of different samples are not comparable.
+
+    Raises:
+        PalpateError: with the number of missing and surplus ids.
+    """
+    missing, surplus = sorted(set(wanted) - set(made)), sorted(set(made) - set(wanted))
+    if missing or surplus:
+        first = f"first missing {missing[0]!r}" if missing else f"first surplus {surplus[0]!r}"
+        raise PalpateError(
+            f"The touches of {name!r} must be those of the test part, by id",
+            f"{len(missing)} missing and {len(surplus)} surplus ids, {first}",
+            "Generate for this manifest and split: palpate generate --manifest M --split S",
+        )
+
+
+def _accuracy(train: FeatureSet, test: FeatureSet, subject: str, split: Split) -> list[Score]:
+    """Material accuracy of a probe that was fitted to real train touches; none where fewer than two materials are known."""
+    if train.labels is None or len(set(train.labels) - {""}) < 2:
+        return []
+    return [material_accuracy(train, test, subject=subject, split=split.digest)]
+
+
+def _controls(test: Manifest, train: Manifest, size: int, seed: int, progress: Progress) -> dict[str, np.ndarray]:
+    """The pictures of the control subjects that this data set allows."""
+    out: dict[str, np.ndarray] = {}
+    if not test.table["background"].null_count():
+        out[BACKGROUND] = load_images(test.paths("background"), size, progress=progress)
+    by_material: dict[str, list[str]] = {}
+    for material, path in zip(train.column("material"), train.column("tactile"), strict=True):
+        by_material.setdefault(material, []).append(path)
+    if all(m in by_material for m in test.column("material")):
+        pick = [
+            by_material[m][int(rng_for(seed, "control", i).integers(len(by_material[m])))]
+            for i, m in zip(test.ids, test.column("material"), strict=True)
+        ]
+        out[SAME_MATERIAL] = load_images([train.path(p) for p in pick], size, progress=progress)
+    return out
