@@ -10,6 +10,7 @@ from 1 in the order of frames, is called ``video#000k``.
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +22,9 @@ from palpate.core import PalpateError, Problem, ProblemsError, write_text
 from palpate.data.manifest import SCHEMA, Manifest
 
 INCONCLUSIVE = -1
-LINE = r"^(?<path>.*),\s*(?<label>[^,]*?)\s*$"
-PATH = r"^(?<video>[^/\\]+)/(?<stem>[^/\\]+)\.(?<suffix>[A-Za-z0-9]+)$"
+PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
+#: A good line; the video takes all commas before the slash.
+LINE = r"^(?P<video>[^/\\]+)/(?P<stem>[0-9]{1,18})\.(?P<suffix>[A-Za-z0-9]+)\s*,\s*(?P<label>[+-]?[0-9]{1,18})$"
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)|^\.[/\\]"
 FIX = "Mend the lines, or read the list with --skip-bad to leave them out"
@@ -69,9 +71,7 @@ def read_list(path: Path, *, skip_bad: bool = False, categories: Mapping[int, st
     return read_lists([path], root=path.parent, skip_bad=skip_bad, categories=categories)
 
 
-def read_lists(
-    paths: Sequence[Path], *, root: Path, skip_bad: bool = False, categories: Mapping[int, str] | None = None
-) -> FrameList:
+def read_lists(paths: Sequence[Path], *, root: Path, skip_bad: bool = False, categories: Mapping[int, str] | None = None) -> FrameList:
     """Reads several lists as one, so that frames which stand in two of them are found and touches are numbered together.
 
     Args:
@@ -142,7 +142,7 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
     problems: list[Problem] = []
     for number, (name, label) in enumerate(rows, 1):
         name = name if re.search(r"\.[A-Za-z][A-Za-z0-9]*$", name) else f"{name}.jpg"
-        match = re.match(PATH.replace("?<", "?P<"), name)
+        match = re.match(PATH, name)
         if match is None or not match["stem"].isdecimal() or re.search(CLIMBS, name) or "\n" in name:
             problems.append(Problem(f"row {number}", "bad-path", f"{name!r} is not video/frame.ext"))
         lines.append(f"{name},{int(label)}\n")
@@ -183,6 +183,39 @@ def read_categories(path: Path) -> dict[int, str]:
     return names
 
 
+@dataclass(frozen=True)
+class FrameTable:
+    """Words for frames, by (video, frame), and the lines that could not be read."""
+
+    values: dict[tuple[str, int], str]
+    skipped: list[Problem]
+
+
+def read_frame_table(path: Path) -> FrameTable:
+    """Reads ``video/frame.jpg,words`` lines (CSV, with an optional header ``frame,...``); words may hold commas, quoted or not.
+
+    Raises:
+        PalpateError: if the file is missing.
+    """
+    path = Path(path)
+    values: dict[tuple[str, int], str] = {}
+    skipped: list[Problem] = []
+    reader = csv.reader(_text(path).splitlines())
+    for fields in reader:
+        where = f"{path}:{reader.line_num}"
+        if not any(field.strip() for field in fields) or (reader.line_num == 1 and fields[0].strip().lower() == "frame"):
+            continue
+        match = re.match(PATH, fields[0].strip())
+        words = ",".join(fields[1:]).strip()
+        if match is None or not match["stem"].isdecimal() or re.search(CLIMBS, fields[0].strip()):
+            skipped.append(Problem(where, "bad-path", f"{fields[0]!r} is not video/frame.ext"))
+        elif not words:
+            skipped.append(Problem(where, "bad-line", f"{fields[0]!r} has no words"))
+        elif values.setdefault((match["video"], int(match["stem"])), words) != words:
+            skipped.append(Problem(where, "two-labels", f"{fields[0]!r} has other words on an earlier line"))
+    return FrameTable(values, skipped)
+
+
 def _text(path: Path) -> str:
     """The file as text; bytes that are no UTF-8 become U+FFFD, a byte-order mark is dropped."""
     try:
@@ -198,41 +231,36 @@ def _parse(path: Path) -> tuple[pl.DataFrame, list[Problem]]:
     lines = pl.DataFrame({"text": pl.Series(_text(path).split("\n"), dtype=pl.String)}).with_row_index("line", offset=1)
     lines = lines.with_columns(pl.col("text").str.strip_chars()).filter(pl.col("text") != "")
     table = lines.with_columns(pl.col("text").str.extract_groups(LINE).alias("parts")).unnest("parts")
-    table = table.with_columns(pl.col("path").str.strip_chars()).with_columns(pl.col("path").str.extract_groups(PATH).alias("names"))
-    table = table.unnest("names").with_columns(
+    table = table.with_columns(
         source=pl.lit(str(path)),
-        number=pl.col("label"),
-        label=pl.when(pl.col("label").str.contains(r"^[+-]?\d+$")).then("label").cast(pl.Int64, strict=False),
-        frame=pl.when(pl.col("stem").str.contains(r"^[0-9]+$")).then("stem").cast(pl.Int64, strict=False),
+        id=pl.format("{}/{}", "video", "stem"),
+        frame=pl.col("stem").cast(pl.Int64, strict=False),
+        label=pl.col("label").cast(pl.Int64, strict=False),
+        odd=pl.col("text").str.contains(CLIMBS) | pl.col("text").str.contains("\ufffd", literal=True),
     )
-    bad = (
-        pl.when(pl.col("text").str.contains("\ufffd", literal=True)).then(pl.lit("bad-encoding"))
-        .when(pl.col("path").is_null()).then(pl.lit("no-comma"))
-        .when(pl.col("path").str.contains(CLIMBS)).then(pl.lit("outside-root"))
-        .when(pl.col("stem").is_null()).then(pl.lit("bad-path"))
-        .when(pl.col("frame").is_null()).then(pl.lit("bad-frame"))
-        .when(pl.col("label").is_null()).then(pl.lit("bad-label"))
-    )  # fmt: skip
-    table = table.with_columns(bad=bad)
-    problems = [
-        Problem(f"{path}:{row['line']}", row["bad"], _reason(row)) for row in table.filter(pl.col("bad").is_not_null()).iter_rows(named=True)
-    ]
+    bad = table.filter(pl.col("odd") | pl.col("frame").is_null() | pl.col("label").is_null())
+    problems = [Problem(f"{path}:{line}", *_reason(text)) for line, text in bad.select("line", "text").iter_rows()]
     if not table.height:
         problems = [Problem(str(path), "empty-list", "the list has no lines")]
-    table = table.filter(pl.col("bad").is_null()).with_columns(id=pl.format("{}/{}", "video", "stem"))
+    table = table if not bad.height else table.filter(~pl.col("line").is_in(bad["line"].to_list()))
     return table.select("source", "line", "id", "video", "frame", "label", "suffix"), problems
 
 
-def _reason(row: Mapping[str, object]) -> str:
-    """A bad line in words."""
-    return {
-        "bad-encoding": f"the line {row['text']!r} is not UTF-8",
-        "no-comma": f"the line {row['text']!r} has no comma before a label",
-        "outside-root": f"the path {row['path']!r} leaves the data set",
-        "bad-path": f"the path {row['path']!r} is not video/frame.ext",
-        "bad-frame": f"the frame {row['stem']!r} is not an integer",
-        "bad-label": f"the label {row['number']!r} is not an integer",
-    }[str(row["bad"])]
+def _reason(line: str) -> tuple[str, str]:
+    """What is wrong with a line that is not well formed, as (kind, text)."""
+    path, comma, label = (part.strip() for part in line.rpartition(","))
+    match = re.match(PATH, path)
+    if "\ufffd" in line:
+        return "bad-encoding", f"the line {line!r} is not UTF-8"
+    if not comma:
+        return "no-comma", f"the line {line!r} has no comma before a label"
+    if re.search(CLIMBS, path):
+        return "outside-root", f"the path {path!r} leaves the data set"
+    if match is None:
+        return "bad-path", f"the path {path!r} is not video/frame.ext"
+    if re.fullmatch("[0-9]{1,18}", match["stem"]) is None:
+        return "bad-frame", f"the frame {match['stem']!r} is not an integer"
+    return "bad-label", f"the label {label!r} is not an integer"
 
 
 def _unknown_labels(rows: pl.DataFrame, categories: Mapping[int, str] | None) -> tuple[pl.DataFrame, list[Problem]]:

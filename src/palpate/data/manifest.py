@@ -150,7 +150,9 @@ class Manifest:
         table = pl.concat(tables)
         double = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
         if len(double):
-            raise PalpateError("Joined manifests must not share ids", f"{len(double)} shared, first {double[0]!r}", "Rename the videos of one of them")
+            raise PalpateError(
+                "Joined manifests must not share ids", f"{len(double)} shared, first {double[0]!r}", "Rename the videos of one of them"
+            )
         return cls(table, root, {"dataset": " + ".join(m.facts.get("dataset", "?") for m in manifests)})
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:

@@ -1,0 +1,244 @@
+"""Images: one way in (8-bit RGB, whole or refused) and one way out (8-bit PNG, fixed range).
+
+Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit grey ``v`` becomes
+``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of an animation the first picture counts.
+A batch for a network is the centre square, resized by Pillow's antialiased bicubic filter. No step depends on the
+content of other images: the range is never stretched.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from itertools import islice
+from pathlib import Path
+from threading import Event
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from palpate.core import PalpateError, Problem, ProblemsError, Progress, atomic_path, digest_json, quiet, short
+from palpate.data.manifest import Manifest
+
+Check = Literal["decode", "header", "none"]
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+#: What Pillow raises for files that are cut, empty, or no images.
+BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, struct.error, zlib.error, Image.DecompressionBombError)
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def read_image(path: Path) -> Image.Image:
+    """One image file as 8-bit RGB.
+
+    Raises:
+        PalpateError: if the file is missing, empty, truncated, or no image.
+    """
+    path = Path(path)
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return _rgb(ImageOps.exif_transpose(image))
+    except BROKEN as error:
+        raise PalpateError(f"The image {path} must be whole and readable", _reason(path, error), "Fetch the file again") from None
+
+
+def check_image(path: Path, how: Check = "decode") -> str | None:
+    """Why an image file is unusable, or None.
+
+    Args:
+        path: the file.
+        how: ``decode`` reads every byte (a JPEG at an eighth of its size, which finds truncation all the same),
+            ``header`` reads the first bytes only, ``none`` asks only whether the file exists.
+    """
+    path = Path(path)
+    if how == "none":
+        return None if path.is_file() else "no such file"
+    try:
+        with Image.open(path) as image:
+            if how == "decode":
+                image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
+                image.load()
+            return None
+    except BROKEN as error:
+        return _reason(path, error)
+
+
+def load_images(paths: Sequence[Path], size: int, *, progress: Progress = quiet) -> NDArray[np.uint8]:
+    """Images as one array; a path that stands twice is decoded once.
+
+    Args:
+        paths: (n,) files.
+        size: side of the squares, in pixels.
+        progress: told how many files are decoded.
+
+    Returns:
+        (n, size, size, 3), 0 to 255.
+
+    Raises:
+        ProblemsError: naming every unreadable file.
+    """
+    out = np.empty((len(paths), size, size, 3), np.uint8)
+    _fill(out, paths, progress)
+    return out
+
+
+def cached_images(manifest: Manifest, column: str, size: int, cache: Path | None = None, progress: Progress = quiet) -> NDArray[np.uint8]:
+    """One image column of a manifest as an array, decoded once and then mapped from a file.
+
+    Args:
+        manifest: the samples.
+        column: ``vision``, ``tactile`` or ``background``.
+        size: side of the squares, in pixels.
+        cache: folder for ``<column>-<size>-<digest>.npy``; None keeps the array in memory. The digest covers the paths,
+            file sizes, modification times, ``size`` and ``column``, so a changed file is decoded again.
+        progress: told how many files are decoded.
+
+    Returns:
+        (n, size, size, 3), 0 to 255, in row order; read-only if it is mapped.
+
+    Raises:
+        PalpateError: if a row has no such image.
+        ProblemsError: naming every missing or unreadable file.
+    """
+    paths = manifest.paths(column)
+    if cache is None:
+        return load_images(paths, size, progress=progress)
+    stamps = {path: _stamp(path) for path in dict.fromkeys(paths)}
+    key = digest_json([2, column, size, [[name, *stamps[p]] for name, p in zip(manifest.column(column), paths, strict=True)]])
+    file = Path(cache) / f"{column}-{size}-{short(key)}.npy"
+    shape = (len(paths), size, size, 3)
+    if (mapped := _mapped(file, shape)) is not None:
+        return mapped
+    with atomic_path(file) as part:
+        out = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
+        _fill(out, paths, progress)
+        out.flush()
+        del out
+    return np.load(file, mmap_mode="r", allow_pickle=False)
+
+
+def write_png(path: Path, array: NDArray[np.uint8]) -> None:
+    """Writes (h, w, 3) or (h, w) as an 8-bit PNG, atomically and without stretching its range.
+
+    Raises:
+        PalpateError: if the array is not of that type and shape.
+    """
+    if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
+        raise PalpateError(
+            f"An image to write to {path} must be uint8 of shape (h, w, 3) or (h, w)",
+            f"{array.dtype} of shape {array.shape}",
+            "Scale to 0..255, round and clip first",
+        )
+    with atomic_path(Path(path)) as part:
+        Image.fromarray(np.ascontiguousarray(array)).save(part, format="PNG")
+
+
+def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
+    """The centre square of an RGB image, resized: (size, size, 3), 0 to 255."""
+    width, height = image.size
+    side = min(width, height)
+    left, top = (width - side) // 2, (height - side) // 2
+    if width != height:
+        image = image.crop((left, top, left + side, top + side))
+    if side != size:
+        image = image.resize((size, size), Image.Resampling.BICUBIC)
+    return np.asarray(image)
+
+
+def in_threads(
+    function: Callable[[T], R], items: Iterable[T], threads: int | None = None, stop: Event | None = None
+) -> Iterator[tuple[T, R]]:
+    """Yields ``(item, function(item))`` as they finish; few are in flight, so that Ctrl-C and errors end it soon.
+
+    ``stop`` is set when the caller leaves early, for functions that run long and look at it.
+    """
+    threads = threads or min(16, os.cpu_count() or 1)
+    source = iter(items)
+    with ThreadPoolExecutor(threads) as pool:
+        running: dict[Future[R], T] = {pool.submit(function, item): item for item in islice(source, 4 * threads)}
+        try:
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    item = running.pop(future)
+                    yield item, future.result()
+                    for following in islice(source, 1):
+                        running[pool.submit(function, following)] = following
+        finally:
+            if stop is not None:
+                stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _fill(out: NDArray[np.uint8], paths: Sequence[Path], progress: Progress) -> None:
+    """Decodes every distinct path once and writes it to all its rows; raises all unreadable files at once."""
+    size = out.shape[1]
+    rows: dict[Path, list[int]] = {}
+    for k, path in enumerate(paths):
+        rows.setdefault(Path(path), []).append(k)
+
+    def decode(path: Path) -> Problem | None:
+        try:
+            out[rows[path]] = square(read_image(path), size)
+        except PalpateError as error:
+            return Problem(str(path), "bad-image", error.got)
+        return None
+
+    problems: list[Problem] = []
+    progress("decoding images", 0, len(rows))
+    for done, (_, problem) in enumerate(in_threads(decode, rows), 1):
+        problems += [problem] if problem else []
+        progress("decoding images", done, len(rows))
+    if problems:
+        raise ProblemsError(sorted(problems, key=lambda p: p.where), "Fetch these files again, or import with --skip-bad")
+
+
+def _mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
+    """The cached array if the file is there and has the right type and shape."""
+    try:
+        array = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+    return array if array.shape == shape and array.dtype == np.uint8 else None
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Size in bytes and modification time in nanoseconds; (-1, -1) if the file is missing, which decoding will report."""
+    try:
+        found = path.stat()
+    except OSError:
+        return (-1, -1)
+    return (found.st_size, found.st_mtime_ns)
+
+
+def _rgb(image: Image.Image) -> Image.Image:
+    """8-bit RGB by the rules in the head of this file."""
+    if image.mode == "RGB":
+        return image
+    if image.mode.startswith("I"):  # 16-bit grey; "I" is the same in 32-bit cells
+        values = np.clip(np.asarray(image).astype(np.int64), 0, 65535)
+        return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
+    if image.mode == "F":
+        raise ValueError("floating-point pixels, whose range is not defined")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        return Image.alpha_composite(Image.new("RGBA", image.size, "white"), image).convert("RGB")
+    return image.convert("RGB")
+
+
+def _reason(path: Path, error: BaseException) -> str:
+    """One plain sentence for what Pillow raised."""
+    if not path.exists():
+        return "no such file"
+    if path.is_dir():
+        return "a folder"
+    if path.stat().st_size == 0:
+        return "an empty file (0 bytes)"
+    if isinstance(error, Image.UnidentifiedImageError):
+        return "not an image"
+    return str(error).replace(str(path), path.name) or type(error).__name__

@@ -1,0 +1,181 @@
+"""Frames of a video file by their exact number.
+
+Frame ``k`` is the ``k``-th picture in order of presentation, as a full decode would count it. The timestamps of all
+packets are read first (a pass over the file without decoding); sorted, they are the index: ``pts[k]``. To reach frame
+``k`` the reader seeks to the last keyframe presented at or before ``pts[k]`` and decodes until exactly that timestamp;
+where decoding is already between that keyframe and ``k``, it goes on from there. Rates and durations are not used, so
+B-frames, variable rates and clips that do not start at zero are exact.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import MissingExtraError, PalpateError
+
+
+class VideoReader:
+    """A video file as a sequence of RGB pictures: ``len(reader)``, ``reader[k]``, ``reader.frames([3, 4, 90])``.
+
+    Not for use by several threads at once; open one reader a thread. Use as a context manager, or call :meth:`close`.
+
+    Args:
+        path: the file.
+
+    Raises:
+        MissingExtraError: if PyAV is not installed.
+        PalpateError: if the file is missing, no video, cut short, or without timestamps.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import av
+            from av.error import FFmpegError
+        except ImportError:
+            raise MissingExtraError("av", "video", "Reading video files") from None
+        self.path = Path(path)
+        self._errors: tuple[type[Exception], ...] = (FFmpegError, OSError)
+        if not self.path.is_file():
+            raise PalpateError("The video must exist", f"no file {self.path}", "Check the path")
+        try:
+            self._container: Any = av.open(str(self.path))
+        except self._errors as error:
+            got = "an empty file (0 bytes)" if self.path.stat().st_size == 0 else _said(error)
+            raise self._broken(f"{got}: it is cut short, or no video") from None
+        try:
+            if not self._container.streams.video:
+                raise self._broken("a file without pictures: it is cut short, or no video")
+            self._stream: Any = self._container.streams.video[0]
+            self._stream.thread_type = "AUTO"
+            self._pts, self._keys = self._index()
+        except BaseException:
+            self.close()
+            raise
+        self._decoded: Iterator[Any] | None = None
+        self._last: tuple[int, NDArray[np.uint8]] | None = None
+
+    def __len__(self) -> int:
+        """Number of pictures."""
+        return len(self._pts)
+
+    def __getitem__(self, k: int) -> NDArray[np.uint8]:
+        """Picture ``k`` (from 0) as (h, w, 3), 0 to 255.
+
+        Raises:
+            PalpateError: if ``k`` lies outside the video, or the file breaks off before it.
+        """
+        if not 0 <= k < len(self):
+            raise PalpateError(
+                f"A frame of {self.path} must lie between 0 and {len(self) - 1}", str(k), "Take the numbers from this video's own list"
+            )
+        if self._last is None or self._last[0] != k:
+            self._last = (k, self._reach(k))
+        return self._last[1]
+
+    def frames(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yields ``(k, (h, w, 3) picture)`` in the order given; rising numbers are decoded in a single pass.
+
+        Raises:
+            PalpateError: as for a single picture.
+        """
+        for k in indices:
+            yield k, self[k]
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._decoded = None
+        self._container.close()
+
+    def __enter__(self) -> VideoReader:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _index(self) -> tuple[list[int], list[tuple[int, int]]]:
+        """Sorted timestamps of the pictures, and (pts, dts) of the keyframes, sorted."""
+        times: list[int] = []
+        keys: list[tuple[int, int]] = []
+        packets = cut = 0
+        # Where the index of the container is readable it counts what is presented; the header's count may
+        # include pictures that an edit list removed.
+        entries = getattr(self._stream, "index_entries", None)
+        declared = len(entries) if entries else self._stream.frames
+        try:
+            for packet in self._container.demux(self._stream):
+                if packet.size == 0:
+                    continue
+                packets += 1
+                cut += packet.is_corrupt
+                if packet.is_discard:  # needed to decode what follows, never presented
+                    continue
+                if packet.pts is None:
+                    raise self._broken("pictures without timestamps", "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4")
+                times.append(packet.pts)
+                if packet.is_keyframe:
+                    keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
+        except self._errors as error:
+            raise self._broken(f"{packets} readable of {declared or 'an unknown number of'} frames ({_said(error)})") from None
+        if packets - cut < declared:
+            raise self._broken(f"{packets - cut} readable of {declared} declared frames: the file is cut short")
+        if not times:
+            raise self._broken("0 frames")
+        if len(set(times)) < len(times):
+            raise self._broken("two pictures with one timestamp", "Write it again: ffmpeg -i FILE -c copy NEW.mp4")
+        return sorted(times), sorted(keys)
+
+    def _reach(self, k: int) -> NDArray[np.uint8]:
+        """Decodes until picture ``k``."""
+        target = self._pts[k]
+        key = bisect_right(self._keys, target, key=lambda pair: pair[0]) - 1
+        ahead = self._decoded is not None and self._last is not None and self._last[0] < k
+        if ahead and self._last is not None and self._pts[self._last[0]] >= self._keys[max(key, 0)][0]:
+            found = self._until(target)
+            if found is not None:
+                return found
+        while key >= 0:
+            self._seek(self._keys[key][1])
+            found = self._until(target)
+            if found is not None:
+                return found
+            key -= 1  # the demuxer went to a later keyframe than asked for, or this one cannot be entered
+        self._seek(None)
+        found = self._until(target)
+        if found is None:
+            raise self._broken(f"frame {k} of {len(self)} cannot be decoded")
+        return found
+
+    def _seek(self, time: int | None) -> None:
+        try:
+            self._container.seek(self._pts[0] if time is None else time, stream=self._stream, backward=True)
+        except self._errors as error:
+            raise self._broken(_said(error)) from None
+        self._decoded = self._container.decode(self._stream)
+
+    def _until(self, target: int) -> NDArray[np.uint8] | None:
+        """The picture with timestamp ``target``, or None if decoding starts behind it or ends before it."""
+        assert self._decoded is not None
+        try:
+            for frame in self._decoded:
+                if frame.pts == target:
+                    return frame.to_ndarray(format="rgb24")
+                if frame.pts is not None and frame.pts > target:
+                    return None
+        except self._errors as error:
+            raise self._broken(f"a picture that cannot be decoded ({_said(error)})") from None
+        return None
+
+    def _broken(self, got: str, fix: str = "Fetch the file again") -> PalpateError:
+        return PalpateError(f"The video {self.path} must be whole and readable", got, fix)
+
+
+def _said(error: BaseException) -> str:
+    """FFmpeg's words without the file name, which the error names already."""
+    return str(getattr(error, "strerror", None) or error).split(";")[0]

@@ -1,0 +1,150 @@
+"""What a metric refuses, and how it says so: every input is looked at once, before any arithmetic.
+
+Features must be finite floating-point rows of one width; images must be ``(n, h, w, c)`` in [0, 1] or 8 bit.
+Integers are refused as features because the distance of wrapped integers is a number without meaning, and
+half precision is widened because ``exp`` of a small exponent rounds to 1 there (a perfect score for anything).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import PalpateError
+
+Normalize = Literal["check"] | bool
+Floats = NDArray[np.floating[Any]]
+
+#: Rows may differ from unit length by this much before ``normalize="check"`` refuses them.
+NORM_TOLERANCE = 1e-3
+
+
+def rows_text(bad: NDArray[np.bool_]) -> str:
+    """``"3 rows, first 0, 4, 7"`` for a boolean mask of rows."""
+    at = np.flatnonzero(bad)
+    first = ", ".join(str(int(i)) for i in at[:5])
+    return f"{at.size} row{'s' * (at.size != 1)} ({first}{', ...' * (at.size > 5)})"
+
+
+def as_array(name: str, x: Any) -> NDArray[Any]:
+    """``np.asarray``, with a user's error for ragged lists and for tensors that are on a device or track gradients."""
+    try:
+        return np.asarray(x)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise PalpateError(
+            f"{name} must turn into a NumPy array", str(error).splitlines()[0], "Pass an array, or tensor.detach().cpu()"
+        ) from None
+
+
+def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Floats:
+    """``x`` as a float32 or float64 array (n, d) that a kernel may be evaluated on.
+
+    Args:
+        name: what the error calls it.
+        x: anything ``np.asarray`` takes, (n, d).
+        normalize: ``"check"`` refuses rows whose L2 norm is not 1 within 1e-3; ``True`` divides by the norm; ``False`` takes rows as they are.
+        least: the fewest rows that the estimator can use.
+
+    Raises:
+        PalpateError: on integers, a wrong shape, too few rows, NaN or infinity, zero or un-normalised rows (their numbers are named).
+    """
+    x = as_array(name, x)
+    if x.dtype.kind != "f":
+        raise PalpateError(
+            f"{name} must be floating-point features", f"dtype {x.dtype}", "Pass the encoder's float output, not pixels or codes"
+        )
+    if x.ndim != 2 or x.shape[1] == 0:
+        raise PalpateError(f"{name} must have shape (n, d), one row a sample", f"shape {x.shape}", "Stack one feature vector a row")
+    if len(x) < least:
+        raise PalpateError(f"{name} must have at least {least} rows for this estimator", f"{len(x)}", "Pass more samples")
+    if x.dtype == np.float16:
+        warnings.warn(f"{name}: float16 features were widened to float32; their rounding stays", stacklevel=3)
+    x = x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)
+    if (bad := ~np.isfinite(x).all(axis=1)).any():
+        raise PalpateError(f"{name} must be finite", f"NaN or infinity in {rows_text(bad)}", "Check the images of those rows")
+    norms = np.sqrt(np.einsum("ij,ij->i", x, x, dtype=np.float64))
+    if normalize is not False and (bad := norms == 0).any():
+        raise PalpateError(f"{name} must have no zero vector", f"zeros in {rows_text(bad)}", "Check the images of those rows")
+    if normalize is True:
+        return (x / norms[:, None]).astype(x.dtype)
+    if normalize == "check" and (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
+        got = f"norm {norms[np.flatnonzero(bad)[0]]:.4g} in {rows_text(bad)}"
+        raise PalpateError(f"{name} must be L2-normalised", got, "Pass normalize=True to divide by the norm, or normalize=False to keep it")
+    if normalize not in ("check", False):
+        raise PalpateError('normalize must be "check", True or False', repr(normalize), "Leave it out for the default")
+    return x
+
+
+def checked_pair(x: Any, y: Any, *, normalize: Normalize, least: int, names: tuple[str, str] = ("x", "y")) -> tuple[Floats, Floats]:
+    """Both feature arrays, checked, of one width and promoted to one dtype."""
+    x, y = as_array(names[0], x), as_array(names[1], y)
+    if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
+        got = f"{x.shape[1]} and {y.shape[1]}"
+        raise PalpateError(f"{names[0]} and {names[1]} must have the same width", got, "Embed both with the same encoder")
+    a, b = (checked_features(name, v, normalize=normalize, least=least) for name, v in zip(names, (x, y), strict=True))
+    dtype = np.result_type(a, b)
+    return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
+
+
+def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] | None:
+    """Group names, one a row, as strings; None stays None.
+
+    Raises:
+        PalpateError: on a wrong length, or if some rows have a group and others none.
+    """
+    if values is None:
+        return None
+    names = list(values)
+    if len(names) != n:
+        raise PalpateError(f"{name} must have one entry a row ({n})", f"{len(names)}", f"Pass {name} in the order of the rows")
+    missing = np.array([v is None or v == "" for v in names], dtype=bool)
+    if missing.any():
+        raise PalpateError(f"{name} must be known for every row", f"none in {rows_text(missing)}", f"Fill {name}, or pass None for all")
+    return [str(v) for v in names]
+
+
+def checked_positive(**values: float) -> None:
+    """Refuses parameters that are not finite and positive."""
+    for name, value in values.items():
+        if not (np.isfinite(value) and value > 0):
+            raise PalpateError(f"{name} must be positive", f"{value!r}", f"Pass e.g. {name}=10")
+
+
+def checked_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Refuses a word that is not among ``choices``."""
+    if value not in choices:
+        raise PalpateError(f"{name} must be one of {', '.join(choices)}", repr(value), "Choose one of these")
+
+
+def checked_images(generated: Any, reference: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Two image stacks (n, h, w, c), c = 1 or 3, of one shape, each 8 bit or float in [0, 1].
+
+    Raises:
+        PalpateError: on other shapes, dtypes or ranges; image numbers are named.
+    """
+    pair = [as_array("The generated images", generated), as_array("The reference images", reference)]
+    for name, images in zip(("generated", "reference"), pair, strict=True):
+        if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
+            raise PalpateError(
+                f"The {name} images must have shape (n, h, w, 3), n >= 1", f"shape {images.shape}", "Stack them with channels last"
+            )
+        if images.dtype != np.uint8 and images.dtype.kind != "f":
+            raise PalpateError(f"The {name} images must be uint8, or floats in [0, 1]", f"dtype {images.dtype}", "Convert them")
+        if images.dtype.kind == "f":
+            for number, image in enumerate(images):
+                low, high = float(image.min()), float(image.max())
+                if not (low >= -1e-6 and high <= 1 + 1e-6):  # also false for NaN
+                    raise PalpateError(
+                        f"The {name} images must lie in [0, 1]", f"[{low:.4g}, {high:.4g}] in image {number}", "Scale them to [0, 1]"
+                    )
+    if pair[0].shape != pair[1].shape:
+        raise PalpateError(
+            "Generated and reference images must pair one to one in one size",
+            f"shapes {pair[0].shape} and {pair[1].shape}",
+            "Pass the same samples in the same order and size",
+        )
+    return pair[0], pair[1]

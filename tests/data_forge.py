@@ -1,0 +1,58 @@
+"""Small data sets in the true on-disk layouts, whose frames carry their own number."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+SIZE = 64
+
+
+def picture(k: int, size: int = SIZE) -> np.ndarray:
+    """Eight vertical bars: the bits of ``k``, least first. Survives any lossy codec."""
+    out = np.zeros((size, size, 3), np.uint8)
+    for bit in range(8):
+        if k >> bit & 1:
+            out[:, bit * size // 8 : (bit + 1) * size // 8] = 230
+    return out
+
+
+def number(array: np.ndarray) -> int:
+    """The number drawn by :func:`picture`."""
+    size = array.shape[1]
+    return sum(1 << bit for bit in range(8) if array[:, bit * size // 8 + 2 : (bit + 1) * size // 8 - 2].mean() > 115)
+
+
+def write_video(path: Path, count: int, *, start: int = 0, codec: str = "libx264", gop: int = 12, b_frames: int = 3, options=None) -> Path:
+    import av
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w", options={"movflags": "faststart"} if path.suffix == ".mp4" else {}) as out:
+        stream = out.add_stream(codec, rate=30)
+        stream.width = stream.height = SIZE
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.gop_size = gop
+        stream.codec_context.max_b_frames = b_frames
+        stream.options = options or {}
+        for k in range(count):
+            frame = av.VideoFrame.from_ndarray(picture(k), format="rgb24")
+            frame.pts = k + start
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    return path
+
+
+def write_image(path: Path, k: int) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(picture(k)).save(path, quality=92)
+    return path
+
+
+def write_frames(folder: Path, count: int) -> None:
+    for k in range(count):
+        write_image(folder / f"{k:010d}.jpg", k)
+
+
+def tree(folder: Path) -> set[str]:
+    """All files and folders below ``folder``."""
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*")} if folder.exists() else set()

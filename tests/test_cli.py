@@ -1,0 +1,117 @@
+"""The command line: statuses, JSON, one-line errors, and the facts of the official lists."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from palpate.cli import main
+
+
+@pytest.fixture
+def lists(tmp_path: Path) -> tuple[str, str]:
+    (tmp_path / "train.txt").write_text("a/0000000001.jpg,3\nb/0000000001.jpg,4")
+    (tmp_path / "test.txt").write_text("a/0000000005.jpg,3\nc/0000000001.jpg,4")
+    return str(tmp_path / "train.txt"), str(tmp_path / "test.txt")
+
+
+def call(capsys, *args):
+    status = main([str(a) for a in args])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def test_official_lists_give_the_published_facts(capsys, real_data):
+    place = real_data / "touch_and_go" / "lists"
+    status, out, _ = call(capsys, "audit", place / "train.txt", place / "test.txt", "--json", "--fail-over", "0.01")
+    facts = json.loads(out)
+    wanted = {
+        "test_samples": 29879, "groups_train": 120, "groups_test": 106, "groups_shared": 100, "test_samples_in_shared_groups": 29597,
+        "leaked_fraction": 0.99056, "gap_min": 31, "gap_median": 304, "gap_max": 2485, "identical_samples": 0,
+    }  # fmt: skip
+    assert {name: facts[name] for name in wanted} == wanted
+    assert (status, facts["failed"]) == (1, True)
+
+
+def test_fail_over_is_a_limit_not_a_switch(capsys, lists):
+    assert call(capsys, "audit", *lists)[0] == 0
+    assert call(capsys, "audit", *lists, "--fail-over", "0.49")[0] == 1
+    assert call(capsys, "audit", *lists, "--fail-over", "0.5")[0] == 0
+    assert call(capsys, "audit", *lists, "--fail-over", "2")[0] == 2
+
+
+def test_text_output_has_every_count(capsys, lists):
+    _, out, _ = call(capsys, "audit", *lists)
+    for line in ("leaked_fraction                0.5", "gap_min                        4", "groups_shared                  1"):
+        assert line in out
+
+
+@pytest.mark.parametrize("args, word", [
+    (["audti"], "Did you mean: palpate audit"),
+    (["audit", "one.txt"], "TRAIN and TEST list files"),
+    (["audit", "no.txt", "such.txt"], "no file no.txt"),
+    (["audit", "--colour", "red"], "Unrecognized"),
+    (["split", "nowhere", "-o", "s.json"], "manifest must exist"),
+    (["split", "nowhere", "-o", "s.json", "--train", "most"], "most"),
+    (["import", "nowhere", "-o", "out"], "nothing at nowhere"),
+    (["import", ".", "-o", "out", "--map", "vision"], "--map takes"),
+    (["demo", "--data", "nowhere"], "nowhere"),
+    (["report", "-o", "page.html"], "needs results"),
+    (["generate", "model", "-o", "out"], "--photos or --manifest"),
+    (["world", "-o", "w", "--size", "7"], "size"),
+])  # fmt: skip
+def test_a_users_mistake_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, args, word):
+    monkeypatch.chdir(tmp_path)
+    status, out, err = call(capsys, *args)
+    assert status == 2
+    lines = [line for line in err.splitlines() if line.startswith("palpate ")]
+    assert len(lines) == 1
+    assert word in lines[0]
+    assert "Traceback" not in err
+    assert out == ""
+
+
+def test_a_mistake_as_json(capsys, tmp_path):
+    status, out, _ = call(capsys, "audit", tmp_path / "a", tmp_path / "b", "--json")
+    assert status == 2
+    assert set(json.loads(out)) >= {"error", "must", "got", "fix"}
+
+
+def test_bad_lines_of_both_lists_are_told_at_once_or_skipped(capsys, lists):
+    for path in lists:
+        with open(path, "a") as file:
+            file.write("\nno comma here\n../../etc/passwd.jpg,3\nv/0000000007.jpg,stone\na/x.jpg,1\n")
+    status, out, err = call(capsys, "audit", *lists, "--json")
+    assert status == 2
+    problems = json.loads(out)["problems"]
+    assert len(problems) == 8
+    assert {Path(p["where"].rsplit(":", 1)[0]).name for p in problems} == {"train.txt", "test.txt"}
+    assert {p["where"].rsplit(":", 1)[1] for p in problems} == {"3", "4", "5", "6"}
+    status, out, err = call(capsys, "audit", *lists, "--json", "--skip-bad")
+    data = json.loads(out)
+    assert (status, data["test_samples"], len(data["skipped"])) == (0, 2, 8)
+    assert "Skipped 8" in err
+
+
+def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_path):
+    small_manifest.save(tmp_path / "m" / "manifest.parquet")
+    split = tmp_path / "s.json"
+    status, out, _ = call(capsys, "split", tmp_path / "m", "-o", split, "--train", "0.5", "--json")
+    facts = json.loads(out)
+    assert (status, facts["group"], facts["audit"]["leaked_fraction"]) == (0, "video", 0.0)
+    assert facts["largest_material_deviation"] == 0.0
+    status, out, _ = call(capsys, "audit", tmp_path / "m", "--split", split, "--json", "--fail-over", "0", "-o", tmp_path / "audit.json")
+    assert (status, json.loads(out)["groups_shared"]) == (0, 0)
+    status, out, _ = call(capsys, "report", tmp_path / "audit.json", "-o", tmp_path / "page.html", "--json", "-q")
+    assert status == 0
+    assert "NoLeak" in (tmp_path / "page.html").read_text()
+    again = call(capsys, "report", tmp_path / "page.json", "-o", tmp_path / "again.html", "-q")
+    assert again[0] == 0
+
+
+def test_report_refuses_foreign_json(capsys, tmp_path):
+    (tmp_path / "x.json").write_text('{"format": "other"}')
+    assert "must hold results of palpate" in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
+    (tmp_path / "x.json").write_text('{"format": "palpate-audit/1", "name": "x"}')
+    assert "missing or unknown field" in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
+    assert not (tmp_path / "p.html").exists()

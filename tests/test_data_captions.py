@@ -1,0 +1,59 @@
+"""Captions from labels: deterministic, about touch alone, and for known materials only."""
+
+import re
+
+import pytest
+
+from palpate.core import PalpateError
+from palpate.data.captions import ADJECTIVES, TEXT_FROM_TEMPLATE, caption
+from palpate.data.touch_and_go import CATEGORIES
+
+SEEN = [
+    "red",
+    "green",
+    "blue",
+    "white",
+    "black",
+    "brown",
+    "grey",
+    "gray",
+    "colour",
+    "color",
+    "bright",
+    "dark",
+    "light",
+    "shiny",
+    "glossy",
+    "transparent",
+    "yellow",
+    "orange",
+    "pink",
+]
+
+
+def test_every_material_has_touch_words_only():
+    assert set(ADJECTIVES) == set(CATEGORIES.values())
+    assert [CATEGORIES[k] for k in (0, 10, 15, 19)] == ["Concrete", "Rubber", "Rock", "Others"]
+    for material in ADJECTIVES:
+        assert 3 <= len(ADJECTIVES[material]) <= 6
+        for k in range(40):
+            text = caption(material, f"v/{k}")
+            words = re.findall(r"[a-z]+", text)
+            assert not set(words) & set(SEEN), text
+            assert sum(adjective in text for adjective in ADJECTIVES[material]) >= 3
+            assert material.lower() not in text
+            assert not re.search(r"\ba [aeiou]|\ban [^aeiou]", text), text
+
+
+def test_the_same_sample_has_the_same_words_and_others_vary():
+    assert caption("Rock", "v/1") == caption("rock ", "v/1")
+    assert len({caption("Rock", f"v/{k}") for k in range(50)}) > 20
+    assert len({caption("Rock", "v/1", seed=s) for s in range(50)}) > 20
+    assert "rock" in caption("Rock", "v/1", with_name=True)
+    assert "label" in TEXT_FROM_TEMPLATE
+
+
+def test_an_unknown_material_lists_the_known():
+    with pytest.raises(PalpateError, match=r"Concrete, .*Others") as caught:
+        caption("Cheese", "v/1")
+    assert "Cheese" in caught.value.got

@@ -1,0 +1,178 @@
+"""Frame lists: the format's corners, every kind of bad line at once, and the facts of the official lists."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from palpate.core import PalpateError, ProblemsError
+from palpate.data.listing import read_categories, read_frame_table, read_list, read_lists, touches, write_list
+
+
+def write(path, text):
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def slow_touches(videos, frames, labels):
+    """One by one, by looking for the row of the frame before."""
+    at = {(v, f): label for v, f, label in zip(videos, frames, labels, strict=True)}
+    names = {}
+    for video in set(videos):
+        count = 0
+        for v, f in sorted(k for k in at if k[0] == video):
+            count += at.get((v, f - 1)) != at[v, f]
+            names[v, f] = f"{v}#{count:04d}"
+    return [names[v, f] for v, f in zip(videos, frames, strict=True)]
+
+
+def test_bom_crlf_no_last_newline_commas_spaces_and_other_letters(tmp_path):
+    text = "\ufeffa, b/0000000007.jpg,3\r\n\r\nвидео 1/8.PNG, 12\r\n  v/9.jpeg,-1  \r\nv/10.jpg,0"
+    found = read_list(write(tmp_path / "l.txt", text))
+    assert found.manifest.ids == ["a, b/0000000007", "видео 1/8", "v/10"]
+    assert found.manifest.column("video") == ["a, b", "видео 1", "v"]
+    assert found.manifest.column("frame") == [7, 8, 10]
+    assert found.manifest.column("material") == ["3", "12", "0"]
+    assert found.manifest.column("vision") == [None] * 3
+    assert found.manifest.root == tmp_path
+    assert found.inconclusive == 1
+    assert found.rows["line"].to_list() == [1, 3, 5]
+    assert sorted(found.contact.rows()) == [("a, b", 7), ("v", 9), ("v", 10), ("видео 1", 8)]
+
+
+BAD = {
+    2: ("v/0000000002.jpg", "no-comma"),
+    3: ("v/0000000003.jpg,wood", "bad-label"),
+    4: ("0000000004.jpg,3", "bad-path"),
+    5: ("a/v/0000000005.jpg,3", "bad-path"),
+    6: ("v/frame6.jpg,3", "bad-frame"),
+    7: ("../0000000007.jpg,3", "outside-root"),
+    8: ("/v/0000000008.jpg,3", "outside-root"),
+    9: ("v/../../x/0000000009.jpg,3", "outside-root"),
+    10: ("v/1.jpg,3", "duplicate-row"),
+    11: ("w/0000000001.jpg,3", "two-labels"),
+    12: ("w/0000000001.jpg,4", "two-labels"),
+    13: ("v/0000000013.jpg,-2", "unknown-label"),
+    14: ("C:\\v\\0000000014.jpg,3", "outside-root"),
+    15: ("v/0000000015,3", "bad-path"),
+    16: ("v/0000000016.jpg,3.5", "bad-label"),
+    17: ("v/99999999999999999999999.jpg,3", "bad-frame"),
+    18: ("v/0000000018.jpg,", "bad-label"),
+}
+
+
+def test_every_bad_line_is_told_at_once_with_its_place(tmp_path):
+    path = write(tmp_path / "bad.txt", "\n".join(["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]))
+    with pytest.raises(ProblemsError) as caught:
+        read_list(path)
+    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{path}:{n}", kind) for n, (_, kind) in BAD.items()]
+
+
+def test_skip_bad_leaves_them_out_and_lists_them_and_trusts_neither_of_two_labels(tmp_path):
+    path = write(tmp_path / "bad.txt", "\n".join(["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]))
+    found = read_list(path, skip_bad=True)
+    assert found.manifest.ids == ["v/0000000001", "v/0000000019"]
+    assert [(p.where, p.kind) for p in found.skipped] == [(f"{path}:{n}", kind) for n, (_, kind) in BAD.items()]
+    assert f"4 at {path}:12" in found.skipped[9].text
+
+
+def test_empty_missing_folder_and_foreign_bytes(tmp_path):
+    with pytest.raises(ProblemsError) as caught:
+        read_list(write(tmp_path / "empty.txt", "\n \n"))
+    assert [(p.where, p.kind) for p in caught.value.problems] == [(str(tmp_path / "empty.txt"), "empty-list")]
+    with pytest.raises(ProblemsError) as caught:
+        read_list(write(tmp_path / "latin.txt", b"v/1.jpg,3\nv\xe9/2.jpg,3\n"))
+    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{tmp_path / 'latin.txt'}:2", "bad-encoding")]
+    with pytest.raises(PalpateError, match="no file"):
+        read_list(tmp_path / "none.txt")
+    with pytest.raises(PalpateError, match="folder"):
+        read_list(tmp_path)
+    only = read_list(write(tmp_path / "unclear.txt", "v/1.jpg,-1\n"))
+    assert (len(only.manifest), only.inconclusive, only.skipped) == (0, 1, [])
+
+
+def test_categories_beside_the_list_name_the_material_and_refuse_other_labels(tmp_path):
+    write(tmp_path / "category_reference.txt", "Inconclusive: -1 (no)\nWood: 3\nRuber: 10\n")
+    path = write(tmp_path / "l.txt", "v/1.jpg,3\nv/2.jpg,10\nv/3.jpg,11\nv/4.jpg,-1\n")
+    with pytest.raises(ProblemsError) as caught:
+        read_list(path)
+    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{path}:3", "unknown-label")]
+    assert read_list(path, skip_bad=True).manifest.column("material") == ["Wood", "Rubber"]
+    assert read_list(path, categories={3: "x", 10: "y", 11: "z"}).manifest.column("material") == ["x", "y", "z"]
+
+
+def test_joined_lists_find_a_frame_that_stands_in_both(tmp_path):
+    a, b = write(tmp_path / "a.txt", "v/1.jpg,3\nv/2.jpg,3"), write(tmp_path / "b.txt", "v/0002.jpg,3\nv/1.jpg,4\nv/3.jpg,3")
+    found = read_lists([a, b], root=tmp_path, skip_bad=True)
+    assert [(p.where, p.kind) for p in found.skipped] == [(f"{a}:1", "two-labels"), (f"{b}:1", "duplicate-row"), (f"{b}:2", "two-labels")]
+    assert found.manifest.column("touch") == ["v#0001", "v#0001"]
+
+
+def test_touches_by_hand_and_against_a_slow_count():
+    videos, frames, labels = list("bbbaabba"), [5, 4, 9, 1, 2, 6, 7, 4], [0, 0, 0, 1, 1, 2, 2, 1]
+    assert touches(videos, frames, labels) == ["b#0001", "b#0001", "b#0003", "a#0001", "a#0001", "b#0002", "b#0002", "a#0002"]
+    assert touches(videos, frames, None)[5] == "b#0001"
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    cells = rng.permutation([(v, f) for v in range(3) for f in range(200) if rng.random() < 0.8])
+    videos, frames = [f"v{v}" for v, _ in cells], [int(f) for _, f in cells]
+    labels = [int(f // 17) for f in frames]
+    assert touches(videos, frames, labels) == slow_touches(videos, frames, labels)
+    assert touches([], [], []) == []
+
+
+def test_write_list_can_be_read_back_and_refuses_what_could_not(tmp_path):
+    write_list(tmp_path / "l.txt", [("a.b/0000000001", 3), ("c/2.png", 4)])
+    assert (tmp_path / "l.txt").read_text() == "a.b/0000000001.jpg,3\nc/2.png,4\n"
+    assert read_list(tmp_path / "l.txt").manifest.ids == ["a.b/0000000001", "c/2"]
+    with pytest.raises(ProblemsError) as caught:
+        write_list(tmp_path / "m.txt", [("v/1", 3), ("photo", 3), ("v/x", 3)])
+    assert [p.where for p in caught.value.problems] == ["row 2", "row 3"]
+    assert not (tmp_path / "m.txt").exists()
+
+
+def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
+    text = "Inconclusive: -1 (Do not use)\nWood: 3 \nMetal:4\n'Synthetic  Fabric' : 8\n\"Ruber\": 10,\nOthers: 19"
+    found = read_categories(write(tmp_path / "c.txt", text))
+    assert found == {-1: "Inconclusive", 3: "Wood", 4: "Metal", 8: "Synthetic Fabric", 10: "Rubber", 19: "Others"}
+    with pytest.raises(ProblemsError) as caught:
+        read_categories(write(tmp_path / "d.txt", "Wood: 3\nStone\nIron: 3\n"))
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        (f"{tmp_path / 'd.txt'}:2", "bad-line"),
+        (f"{tmp_path / 'd.txt'}:3", "duplicate-id"),
+    ]
+    with pytest.raises(PalpateError, match="empty"):
+        read_categories(write(tmp_path / "e.txt", "\n"))
+
+
+def test_words_for_frames(tmp_path):
+    path = write(tmp_path / "captions.csv", 'frame,text\nv/0001.jpg,"hard, cold"\nv/2.jpg,soft, warm\nx,hard\nv/3.jpg,\nv/1.jpg,soft\n')
+    found = read_frame_table(path)
+    assert found.values == {("v", 1): "hard, cold", ("v", 2): "soft, warm"}
+    assert [(p.where, p.kind) for p in found.skipped] == [(f"{path}:4", "bad-path"), (f"{path}:5", "bad-line"), (f"{path}:6", "two-labels")]
+
+
+def test_listing_loads_neither_pillow_nor_av():
+    code = "import sys, palpate.data.listing; sys.exit(any(m in sys.modules for m in ('PIL', 'av', 'torch')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_facts_of_the_official_lists(real_data):
+    folder = real_data / "touch_and_go" / "lists"
+    train, test = read_list(folder / "train.txt"), read_list(folder / "test.txt")
+    start = time.perf_counter()
+    both = read_lists([folder / "train.txt", folder / "test.txt"], root=folder)
+    assert time.perf_counter() - start < 2  # some 0.25 s on an idle core
+    runs = [f.manifest.table["touch"].n_unique() for f in (train, test, both)]
+    assert [len(f.manifest) for f in (train, test, both)] == [91_982, 29_879, 121_861]
+    assert runs == [3_378, 1_113, 4_491]
+    by_touch = both.manifest.table.with_columns(source=both.rows["source"]).group_by("touch").n_unique()
+    assert by_touch["source"].max() == 1
+    assert by_touch["material"].max() == 1
+    assert train.manifest.table["video"].n_unique() == 120
+    assert both.manifest.table["video"].n_unique() == 126
+    assert both.manifest.table["material"].n_unique() == 19
+    lengths = both.manifest.table["touch"].value_counts()["count"]
+    assert (lengths.median(), lengths.max()) == (27, 86)

@@ -1,0 +1,327 @@
+"""Touch and Go: every layout, every kind of bad input told at once, resume, backgrounds, and the real clips."""
+
+import shutil
+
+import numpy as np
+import polars as pl
+import pytest
+from PIL import Image
+
+import palpate.data.recordings as recordings
+from data_forge import number, tree, write_frames, write_image, write_video
+from palpate.core import PalpateError, ProblemsError, Split
+from palpate.data.images import read_image
+from palpate.data.manifest import Manifest
+from palpate.data.touch_and_go import find_videos, import_touch_and_go
+
+av = pytest.importorskip("av", reason="PyAV is not installed")
+
+#: Touches of every forged recording of 40 frames: label 3 from 10 to 15, label 15 from 17 to 19.
+LINES = [f"{{}}/{k:010d}.jpg,3" for k in range(10, 16)] + [f"{{}}/{k:010d}.jpg,15" for k in range(17, 20)]
+
+
+def forge(root, *, raw=(), extracted=(), place="dataset", lines=None):
+    """A data set whose frames show their number; the sensor's show it too."""
+    for name in raw:
+        write_video(root / place / name / "video.mp4", 42)
+        write_video(root / place / name / "gelsight.mp4", 40)
+    for name in extracted:
+        write_frames(root / place / name / "video_frame", 40)
+        write_frames(root / place / name / "gelsight_frame", 40)
+    text = lines if lines is not None else [line.format(name) for name in (*raw, *extracted) for line in LINES]
+    (root / "label.txt").write_text("\n".join(text))
+    return root
+
+
+def shown(manifest, column):
+    return [number(np.asarray(read_image(manifest.path(p)))) for p in manifest.column(column)]
+
+
+@pytest.mark.parametrize("place", ["dataset", "final_dataset", "."])
+@pytest.mark.parametrize("layout", ["raw", "extracted", "mixed"])
+def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
+    names = {"raw": {"raw": ("a", "b")}, "extracted": {"extracted": ("a", "b")}, "mixed": {"raw": ("a",), "extracted": ("b",)}}
+    root = forge(tmp_path / "tag", place=place, **names[layout])
+    found = import_touch_and_go(root, tmp_path / "out")
+    manifest = found.manifest.require_valid()
+    frames = [*range(10, 16), *range(17, 20)] * 2
+    assert manifest.ids == [f"{v}/{k:010d}" for v, k in zip("a" * 9 + "b" * 9, frames, strict=True)]
+    assert manifest.column("frame") == frames
+    assert manifest.column("material") == (["Wood"] * 6 + ["Rock"] * 3) * 2
+    assert manifest.column("touch") == [f"{v}#000{t}" for v in "ab" for t in [1] * 6 + [2] * 3]
+    assert shown(manifest, "vision") == frames
+    assert shown(manifest, "tactile") == frames
+    # 4 before 10 is 6; 4 before 17 is 13, in a touch, so back to 9
+    assert shown(manifest, "background") == ([6] * 6 + [9] * 3) * 2
+    assert found.facts["layout"] == layout
+    assert found.facts["licence"] == "CC BY 4.0"
+    assert found.facts["text_source"] == "none"
+    assert manifest.column("text") == [None] * 18
+    roots = {"raw": tmp_path / "out", "extracted": root, "mixed": tmp_path / "out"}
+    assert manifest.root == roots[layout].resolve()
+    again = Manifest.load(tmp_path / "out")
+    assert again.digest == manifest.digest
+    assert again.require_valid().root == manifest.root
+    assert (tmp_path / "out" / "images").exists() == (layout != "extracted")
+
+
+def test_extracted_frames_go_before_the_raw_video(tmp_path):
+    root = forge(tmp_path, extracted=("a",))
+    (root / "dataset" / "a" / "video.mp4").write_bytes(b"")
+    assert find_videos(root)["a"].vision == root / "dataset" / "a" / "video_frame"
+    assert import_touch_and_go(root, tmp_path / "out").facts["layout"] == "extracted"
+
+
+def spoil(root):
+    """One of each kind of bad input; returns the problems that must be found, as (line, kind, word)."""
+    forge(root, raw=("good", "cut", "nomoov"), extracted=("ext",))
+    cut = root / "dataset" / "cut" / "gelsight.mp4"
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size * 2 // 3])
+    nomoov = root / "dataset" / "nomoov" / "video.mp4"
+    nomoov.write_bytes(nomoov.read_bytes()[:40])
+    (root / "dataset" / "ext" / "gelsight_frame" / "0000000011.jpg").unlink()
+    jpeg = root / "dataset" / "ext" / "video_frame" / "0000000012.jpg"
+    jpeg.write_bytes(jpeg.read_bytes()[:-300])
+    (root / "dataset" / "ext" / "gelsight_frame" / "0000000013.jpg").write_bytes(b"")
+    write_video(root / "dataset" / "oneside" / "video.mp4", 5)
+    (root / "label.txt").write_text(
+        "\n".join(
+            [
+                "good/0000000010.jpg,3",  # 1
+                "good/0000000041.jpg,3",  # 2: within the 42 of the photo, behind the 40 of the touch
+                "cut/0000000010.jpg,3",  # 3
+                "cut/0000000011.jpg,3",  # 4
+                "nomoov/0000000010.jpg,3",  # 5
+                "gone/0000000010.jpg,3",  # 6
+                "gone/0000000011.jpg,3",  # 7
+                "gone/0000000012.jpg,3",  # 8
+                "ext/0000000011.jpg,3",  # 9
+                "ext/0000000012.jpg,3",  # 10
+                "ext/0000000013.jpg,3",  # 11
+                "ext/0000000014.jpg,3",  # 12
+                "ext/0000000090.jpg,3",  # 13
+                "good/0000000012.jpg,77",  # 14
+                "good/0000000013.jpg,-1",  # 15
+                "oneside/0000000001.jpg,3",  # 16
+                "good,3",  # 17
+                "good/0000000039.jpg,3",  # 18: the last frame of the touch video
+                "good/0000000040.jpg,3",  # 19: the first behind it
+            ]
+        )
+    )
+    (root / "captions.csv").write_text("frame,text\ngood/0000000010.jpg,hard\nnonsense,hard\n")
+    return [
+        (root / "captions.csv", 3, "bad-path", "nonsense"),
+        (root / "label.txt", 2, "beyond-end", "40 frames"),
+        (root / "label.txt", 3, "bad-video", "gelsight.mp4"),
+        (root / "label.txt", 5, "bad-video", "video.mp4"),
+        (root / "label.txt", 6, "missing-video", "3 rows"),
+        (root / "label.txt", 9, "missing-file", "frame 11"),
+        (root / "label.txt", 10, "bad-image", "0000000012.jpg"),
+        (root / "label.txt", 11, "bad-image", "0000000013.jpg"),
+        (root / "label.txt", 13, "beyond-end", "90"),
+        (root / "label.txt", 14, "unknown-label", "77"),
+        (root / "label.txt", 16, "missing-video", "no tactile side"),
+        (root / "label.txt", 17, "bad-path", "good"),
+        (root / "label.txt", 19, "beyond-end", "frame 40"),
+    ]
+
+
+def test_everything_bad_is_told_at_once_and_nothing_is_left(tmp_path):
+    wanted = spoil(tmp_path / "tag")
+    with pytest.raises(ProblemsError) as caught:
+        import_touch_and_go(tmp_path / "tag", tmp_path / "out")
+    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{f}:{n}", kind) for f, n, kind, _ in wanted]
+    for problem, (_, _, _, word) in zip(caught.value.problems, wanted, strict=True):
+        assert word in problem.text
+    assert not (tmp_path / "out").exists()
+
+
+def test_skip_bad_imports_the_rest_and_lists_the_same(tmp_path):
+    wanted = spoil(tmp_path / "tag")
+    found = import_touch_and_go(tmp_path / "tag", tmp_path / "out", skip_bad=True)
+    assert [(p.where, p.kind) for p in found.skipped] == [(f"{f}:{n}", kind) for f, n, kind, _ in wanted]
+    assert found.manifest.ids == ["ext/0000000014", "good/0000000010", "good/0000000039"]
+    assert found.manifest.column("text") == [None, "hard", None]
+    assert found.inconclusive == 1
+    found.manifest.require_valid()
+
+
+def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatch):
+    root = forge(tmp_path / "tag", raw=("a", "b"))
+    original = recordings.VideoFrames.extract
+
+    def fail(self, wanted, created, stop):
+        original(self, {10, 11} if "b" in self.source.parts else wanted, created, stop)
+        if "b" in self.source.parts:
+            raise PalpateError("the video must be whole", "frame 12 of 40 cannot be decoded", "fetch it")
+
+    monkeypatch.setattr(recordings.VideoFrames, "extract", fail)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(ProblemsError) as caught:
+        import_touch_and_go(root, tmp_path / "out")
+    assert {(p.where, p.kind) for p in caught.value.problems} == {(f"{root / 'label.txt'}:10", "bad-video")}
+    assert tree(tmp_path / "out") == set()
+    found = import_touch_and_go(root, tmp_path / "out", skip_bad=True)
+    assert found.manifest.column("video") == ["a"] * 9 + ["b"] * 2
+    found.manifest.require_valid()
+
+
+def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
+    root = forge(tmp_path / "tag", raw=("a", "b", "c"))
+    whole = import_touch_and_go(root, tmp_path / "whole")
+
+    def stop(what, done, total, remark=""):
+        if what == "extracting frames" and done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_touch_and_go(root, tmp_path / "out", progress=stop)
+    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*.jpg")}
+    assert kept
+    assert not (tmp_path / "out" / "manifest.parquet").exists()
+    resumed = import_touch_and_go(root, tmp_path / "out")
+    assert all(p.stat().st_mtime_ns == t for p, t in kept.items())
+    assert resumed.manifest.digest == whole.manifest.digest
+    for path in (tmp_path / "whole").rglob("*.jpg"):
+        assert path.read_bytes() == (tmp_path / "out" / path.relative_to(tmp_path / "whole")).read_bytes()
+
+
+def test_cached_frames_of_other_settings_are_refused(tmp_path):
+    root = forge(tmp_path / "tag", raw=("a",))
+    found = import_touch_and_go(root, tmp_path / "out", size=32, image_format="png")
+    assert read_image(found.manifest.paths("tactile")[0]).size == (32, 32)
+    assert found.manifest.column("tactile")[0].endswith("0000000010.png")
+    before = tree(tmp_path / "out")
+    with pytest.raises(PalpateError, match="same settings"):
+        import_touch_and_go(root, tmp_path / "out")
+    write_video(root / "dataset" / "a" / "gelsight.mp4", 41)
+    with pytest.raises(PalpateError, match="a/tactile"):
+        import_touch_and_go(root, tmp_path / "out", size=32, image_format="png")
+    assert tree(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize("layout", ["raw", "extracted"])
+def test_background_is_a_typical_frame_where_the_recording_begins_with_a_touch_else_null(tmp_path, layout):
+    lines = [f"a/{k:010d}.jpg,3" for k in range(0, 8)] + [f"b/{k:010d}.jpg,3" for k in range(40)]
+    root = forge(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
+    found = import_touch_and_go(root, tmp_path / "out")
+    manifest = found.manifest.require_valid()
+    assert found.facts["backgrounds"] == "none 1, typical 1"
+    assert manifest.column("background")[8:] == [None] * 40
+    frames = [round(x) for x in np.linspace(12, 39, 15)]  # from 5 behind the touch's last frame to the end
+    median = np.median([[k >> b & 1 for b in range(8)] for k in frames], axis=0)
+    distance = [sum(abs((k >> b & 1) - median[b]) for b in range(8)) for k in frames]
+    nearest = {k for k, d in zip(frames, distance, strict=True) if d == min(distance)}
+    assert set(shown(Manifest(manifest.table[:8], manifest.root), "background")) <= nearest
+    assert len(nearest) < 5
+
+
+def test_a_mixed_import_can_be_moved_as_one_folder(tmp_path):
+    root = forge(tmp_path / "tag", raw=("a",), extracted=("b",))
+    found = import_touch_and_go(root, tmp_path / "out.partial")
+    (tmp_path / "out.partial").rename(tmp_path / "out")
+    shutil.rmtree(root)
+    again = Manifest.load(tmp_path / "out").require_valid()
+    assert again.digest == found.manifest.digest
+    assert shown(again, "tactile") == shown(again, "vision") == again.column("frame")
+
+
+def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):
+    lines = ["a/0000000020.jpg,3", "a/0000000016.jpg,-1", "a/0000000015.jpg,-1"]
+    root = forge(tmp_path / "tag", extracted=("a",), lines=lines)
+    found = import_touch_and_go(root, tmp_path / "o1")
+    assert shown(found.manifest, "background") == [14]
+    (root / "only.txt").write_text("a/0000000020.jpg,3")
+    found = import_touch_and_go(root, tmp_path / "o2", labels=root / "only.txt")
+    assert shown(found.manifest, "background") == [14]
+    assert found.inconclusive == 0
+
+
+def test_official_split_captions_and_objects(tmp_path):
+    root = forge(tmp_path / "tag", extracted=("a", "b"))
+    (root / "train.txt").write_text("\n".join(f"a/{k:010d}.jpg,3" for k in range(10, 16)) + "\nelsewhere/0000000001.jpg,3")
+    (root / "test.txt").write_text("b/17.jpg,15\nb/0000000018.jpg,15")
+    (root / "captions.csv").write_text("a/0000000010.jpg,hard, cold\n")
+    (root / "objects.csv").write_text("frame,object\nb/0000000019.jpg,wall\n")
+    found = import_touch_and_go(root, tmp_path / "out")
+    orig = found.splits["Orig"]
+    assert orig.ids("train") == [f"a/{k:010d}" for k in range(10, 16)]
+    assert orig.ids("test") == ["b/0000000017", "b/0000000018"]
+    assert orig.manifest == found.manifest.digest
+    assert Split.load(tmp_path / "out" / "splits" / "Orig.json").digest == orig.digest
+    rows = {r["id"]: r for r in found.manifest.table.iter_rows(named=True)}
+    assert rows["a/0000000010"]["text"] == "hard, cold"
+    assert rows["a/0000000011"]["text"] is None
+    assert rows["b/0000000019"]["object"] == "wall"
+    assert found.facts["text_source"] == "captions.csv"
+    (root / "label.txt").unlink()
+    (root / "train.txt").write_text("a/0000000010.jpg,3\nx,3\na/0000000011.jpg,-2")
+    with pytest.raises(ProblemsError) as caught:  # each once, although the lists are labels and split in one
+        import_touch_and_go(root, tmp_path / "out2")
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        (f"{root / 'train.txt'}:2", "bad-path"),
+        (f"{root / 'train.txt'}:3", "unknown-label"),
+    ]
+    (root / "train.txt").write_text("a/0000000010.jpg,3")
+    found = import_touch_and_go(root, tmp_path / "out2")
+    assert found.manifest.ids == ["a/0000000010", "b/17", "b/0000000018"]
+    assert found.splits["Orig"].counts() == {"train": 1, "test": 2}
+
+
+def test_max_per_touch_takes_evenly_spaced_frames(tmp_path):
+    lines = [f"a/{k:010d}.jpg,3" for k in range(10, 30)] + ["a/0000000035.jpg,3"]
+    root = forge(tmp_path / "tag", extracted=("a",), lines=lines)
+    take = lambda **kw: import_touch_and_go(root, tmp_path / "out", **kw).manifest.column("frame")  # noqa: E731
+    assert take(max_per_touch=1) == [20, 35]
+    assert take(max_per_touch=4) == [12, 17, 22, 27, 35]
+    assert take(max_per_touch=100) == [*range(10, 30), 35]
+    other = take(max_per_touch=4, seed=5)
+    assert other == take(max_per_touch=4, seed=5)
+    assert np.diff(other[:4]).tolist() == [5, 5, 5]
+    with pytest.raises(PalpateError, match="at least 1"):
+        take(max_per_touch=0)
+
+
+def test_missing_root_list_and_recordings_are_named(tmp_path):
+    with pytest.raises(PalpateError, match="no folder"):
+        import_touch_and_go(tmp_path / "none", tmp_path / "out")
+    with pytest.raises(PalpateError, match=r"dataset/, final_dataset/, the folder itself"):
+        import_touch_and_go(tmp_path, tmp_path / "out")
+    write_image(tmp_path / "dataset" / "a" / "video_frame" / "0.jpg", 1)
+    with pytest.raises(PalpateError, match=r"label\.txt"):
+        import_touch_and_go(tmp_path, tmp_path / "out")
+    (tmp_path / "label.txt").write_text("a/0.jpg,-1")
+    write_image(tmp_path / "dataset" / "a" / "gelsight_frame" / "0.jpg", 1)
+    with pytest.raises(PalpateError, match="at least one usable sample"):
+        import_touch_and_go(tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_link_out_of_the_data_set_is_told(tmp_path):
+    forge(tmp_path / "real", extracted=("a",))
+    root = tmp_path / "tag"
+    (root / "dataset").mkdir(parents=True)
+    shutil.copy(tmp_path / "real" / "label.txt", root)
+    (root / "dataset" / "a").symlink_to(tmp_path / "real" / "dataset" / "a")
+    with pytest.raises(ProblemsError) as caught:
+        import_touch_and_go(root, tmp_path / "out")
+    assert [p.kind for p in caught.value.problems] == ["outside-root"]
+
+
+@pytest.mark.slow
+def test_the_five_real_clips(real_data, tmp_path):
+    found = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path / "out")
+    table = found.manifest.require_valid().table
+    assert (table.height, table["touch"].n_unique(), table["video"].n_unique()) == (436, 17, 5)
+    counts = dict(table["material"].value_counts().iter_rows())
+    assert counts == {"Rock": 124, "Wood": 111, "Concrete": 88, "Brick": 58, "Grass": 55}
+    assert table["background"].null_count() == 0
+    assert found.facts["backgrounds"] == "frame 17"
+    # At the height of each touch the gel differs from its background more than at the touch's first frame.
+    for (_,), group in table.sort("frame").group_by("touch"):
+        gel = lambda p: np.asarray(Image.open(found.manifest.path(p)), np.float32)  # noqa: E731
+        rest = gel(group["background"][0])
+        change = [np.abs(gel(p) - rest).mean() for p in group["tactile"]]
+        assert max(change) > change[0], group["touch"][0]
+        assert (pl.Series(change) > 0).all()

@@ -1,0 +1,359 @@
+"""TMMD, I-, CI-, D-TMMD against loops over pairs, the jackknife against recomputation, and every undefined case."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from palpate.core import FeatureSet, PalpateError, Score, require_comparable
+from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, mmd2, tmmd
+from palpate.metrics.halves import half_of
+from test_metrics_mmd import loop_mmd, unit_rows
+
+
+def world(seed, classes=3, videos=4, frames=3, d=6, draw=None, prefix="", encoder="e" * 64):
+    """Features with class, video and frame effects; ``videos`` and ``frames`` may be cycled over classes."""
+    fixed, rng = np.random.default_rng(seed), np.random.default_rng([seed, 7 if draw is None else draw])
+    cycle = lambda v, k: v[k % len(v)] if isinstance(v, tuple) else v  # noqa: E731
+    rows, ids, labels, groups = [], [], [], []
+    for c in range(classes):
+        of_class = fixed.normal(size=d)
+        for v in range(cycle(videos, c)):
+            of_video = 0.5 * fixed.normal(size=d)
+            for f in range(cycle(frames, v)):
+                rows.append(2 + of_class + of_video + 0.3 * rng.normal(size=d))
+                ids.append(f"{prefix}c{c}v{v}/{f:03d}")
+                labels.append(f"m{c}")
+                groups.append(f"c{c}v{v}")
+    x = np.array(rows)
+    return FeatureSet(ids, x / np.linalg.norm(x, axis=1, keepdims=True), labels, groups, encoder)
+
+
+def change(s, **fields):
+    return FeatureSet(**{**{n: getattr(s, n) for n in ("ids", "features", "labels", "groups", "encoder")}, **fields})
+
+
+def keep(s, mask):
+    return s.take([i for i, k in zip(s.ids, mask, strict=True) if k])
+
+
+def without_groups(s):
+    return change(s, groups=None)
+
+
+def average_over_group_halvings(s, estimator):
+    """Eq. 3 by drawing every halving of the groups into equally many, with the double loop."""
+    names, groups = sorted(set(s.groups)), np.array(s.groups)
+    values = []
+    for half in itertools.combinations(names, len(names) // 2):
+        a = np.isin(groups, half)
+        values.append(loop_mmd(s.features[a], s.features[~a], estimator))
+    return np.mean(values)
+
+
+@given(seed=st.integers(0, 10**5), m=st.integers(2, 5), n=st.integers(2, 5), frames=st.sampled_from([1, 3, (1, 2, 4)]))
+@settings(max_examples=30, deadline=None)
+def test_tmmd_equals_the_double_loop(seed, m, n, frames):
+    g, r = world(seed, classes=1, videos=m, frames=frames), world(seed, classes=1, videos=n, frames=frames, draw=1)
+    if m + n > 4:  # two videos in both sets, all shared, is a case of its own
+        grouped = tmmd(g, r)
+        assert grouped.estimator == "grouped"
+        assert grouped.value == pytest.approx(loop_mmd(g.features, r.features, "grouped", g.groups, r.groups), abs=1e-9)
+    paper = tmmd(without_groups(g), without_groups(r))
+    assert (paper.estimator, paper.settings["preset"]) == ("unbiased", "paper")
+    assert paper.value == pytest.approx(loop_mmd(g.features, r.features, "unbiased"), abs=1e-9)
+    assert tmmd(g, r, preset="cmmd").value == pytest.approx(loop_mmd(g.features, r.features, "biased"), abs=1e-9)
+
+
+@pytest.mark.parametrize("estimator", ["unbiased", "biased"])
+@pytest.mark.parametrize(("videos", "frames"), [(4, 3), (6, 2)])
+def test_group_halves_are_the_average_over_all_halvings(estimator, videos, frames):
+    s = world(1, classes=1, videos=videos, frames=frames)
+    got = i_tmmd(s, estimator=estimator)
+    assert got.value == pytest.approx(average_over_group_halvings(s, estimator), abs=1e-9)
+    assert got.seed is None
+
+
+@given(seed=st.integers(0, 10**5), frames=st.sampled_from([(2, 3), (1, 4, 2), (5, 1, 1)]))
+@settings(max_examples=20, deadline=None)
+def test_the_excess_is_within_minus_between(seed, frames):
+    s = world(seed, classes=1, videos=5, frames=frames)
+    within, between = [], []
+    for i, j in itertools.permutations(range(len(s.ids)), 2):
+        k = np.exp(-((s.features[i] - s.features[j]) ** 2).sum() / 200)
+        (within if s.groups[i] == s.groups[j] else between).append(k)
+    score = i_tmmd(s)
+    assert score.details["E"] == pytest.approx(1000 * (np.mean(within) - np.mean(between)), abs=1e-9)
+    half = len(s.ids) / 2
+    assert score.value == pytest.approx(score.details["E"] * len(within) / (half * (half - 1)), abs=1e-9)
+
+
+@pytest.mark.parametrize("halves", ["random", "ordered"])
+@pytest.mark.parametrize("estimator", ["unbiased", "biased"])
+def test_i_ci_d_equal_the_double_loop(halves, estimator):
+    s = world(2, classes=3, videos=2, frames=(3, 4))
+    options = {"preset": "paper", "halves": halves, "estimator": estimator, "seed": 5}
+    plan = type("P", (), {"halves": halves, "seed": 5})
+    number = np.array([int(v[1:]) for v in s.labels])
+    half = half_of(s.ids, np.zeros_like(number), plan)
+    x = s.features
+    assert i_tmmd(s, **options).value == pytest.approx(loop_mmd(x[half == 0], x[half == 1], estimator), abs=1e-9)
+    half = half_of(s.ids, number, plan)
+    assert all(abs((half[number == c] == 0).sum() - (half[number == c] == 1).sum()) <= 1 for c in range(3))
+    own = [loop_mmd(x[(number == c) & (half == 0)], x[(number == c) & (half == 1)], estimator) for c in range(3)]
+    ci = ci_tmmd(s, **options)
+    assert ci.value == pytest.approx(np.mean(own), abs=1e-9)
+    assert [v["value"] for v in ci.details["per_class"].values()] == pytest.approx(own, abs=1e-9)
+    matrix = [[own[a] if a == b else loop_mmd(x[number == a], x[number == b], estimator) for b in range(3)] for a in range(3)]
+    d = d_tmmd(s, **options)
+    assert d.value == pytest.approx(np.mean([own[c] / sum(matrix[c]) for c in range(3)]), abs=1e-9)  # Eq. 7
+    np.testing.assert_allclose(d.details["matrix"], matrix, atol=1e-9)
+    off = [(sum(matrix[c]) - own[c]) / 2 for c in range(3)]
+    v = d.details["variants"]
+    assert v["mean/mean_of_ratios"] == pytest.approx(3 * d.value)
+    assert v["mean_off_diagonal/mean_of_ratios"] == pytest.approx(np.mean([own[c] / off[c] for c in range(3)]))
+    assert v["mean_off_diagonal/ratio_of_means"] == pytest.approx(np.mean(own) / np.mean(off))
+    assert d_tmmd(s, **options, denominator="mean_off_diagonal", aggregate="ratio_of_means").value == v["mean_off_diagonal/ratio_of_means"]
+
+
+def test_grouped_matrix_leaves_out_pairs_of_one_video():
+    s = world(3, classes=3, videos=2, frames=3)
+    groups = ["shared" if g in ("c0v0", "c1v0") else g for g in s.groups]  # one video shows two materials
+    s = change(s, groups=groups)
+    matrix = d_tmmd(s).details["matrix"]
+    a, b = np.array(s.labels) == "m0", np.array(s.labels) == "m1"
+    gs = np.array(groups)
+    assert matrix[0][1] == pytest.approx(loop_mmd(s.features[a], s.features[b], "grouped", gs[a], gs[b]), abs=1e-9)
+    assert matrix[0][0] == pytest.approx(average_over_group_halvings(keep(s, a), "unbiased"), abs=1e-9)
+
+
+def recomputed_interval(value, replicates, level=0.95):
+    g = len(replicates)
+    error = np.sqrt((g - 1) / g * ((replicates - np.mean(replicates)) ** 2).sum())
+    reach = stats.t.ppf(0.5 + level / 2, g - 1) * error
+    return value - reach, value + reach
+
+
+@pytest.mark.parametrize("preset", ["grouped", "paper"])
+@pytest.mark.parametrize("shared", [True, False])
+def test_tmmd_jackknife_equals_leaving_each_group_out(preset, shared):
+    g, r = world(4, classes=1, videos=5, frames=(2, 4, 3)), world(4, classes=1, videos=4, frames=(3, 2), draw=1)
+    if not shared:
+        r = change(r, groups=[f"real-{v}" for v in r.groups])
+    score = tmmd(g, r, preset=preset, level=0.9)
+    names = sorted({*g.groups, *r.groups})
+    replicates = [
+        tmmd(keep(g, np.array(g.groups) != v), keep(r, np.array(r.groups) != v), preset=preset).value
+        for v in names
+    ]  # fmt: skip
+    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(replicates), 0.9), abs=1e-9)
+    assert score.interval_method == f"leave-one-group-out jackknife, t, {len(names) - 1} df"
+
+
+@pytest.mark.parametrize("metric", [i_tmmd, ci_tmmd, d_tmmd])
+def test_free_jackknife_equals_leaving_each_group_out(metric):
+    s = world(5, classes=3, videos=(3, 4), frames=(2, 4, 3))
+    score = metric(s)
+    replicates = [metric(keep(s, np.array(s.groups) != v)).value for v in sorted(set(s.groups))]
+    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(replicates)), abs=1e-9)
+    assert "leave-one-group-out" in score.interval_method
+
+
+def test_jackknife_of_random_halves_keeps_the_halves():
+    s = world(6, classes=1, videos=6, frames=3)
+    score = i_tmmd(s, preset="paper", seed=3)
+    half, groups = half_of(s.ids, np.zeros(18, dtype=int), type("P", (), {"halves": "random", "seed": 3})), np.array(s.groups)
+    replicates = [mmd2(s.features[(half == 0) & (groups != v)], s.features[(half == 1) & (groups != v)]) for v in sorted(set(groups))]
+    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(replicates)), abs=1e-9)
+    assert "no signal" in score.note
+    assert score.seed == 3
+
+
+def test_without_groups_the_interval_leaves_out_samples_and_says_so():
+    g, r = without_groups(world(7, classes=1, videos=3)), without_groups(world(7, classes=1, videos=3, draw=1, prefix="r"))
+    score = tmmd(g, r)
+    everyone = [(s, i) for s in (g, r) for i in s.ids]
+    out = [tmmd(*(s.take([j for j in s.ids if not (t is s and j == i)]) for s in (g, r))).value for t, i in everyone]
+    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(out)), abs=1e-9)
+    assert "samples taken as independent" in score.interval_method
+    same_ids = tmmd(g, change(r, ids=g.ids))  # a generated touch and its reference are one unit
+    assert same_ids.details["units"] == 9
+
+
+def test_many_samples_are_left_out_in_blocks(monkeypatch):
+    g, r = without_groups(world(8, classes=1, videos=8, frames=10)), without_groups(world(8, classes=1, videos=8, frames=10, prefix="r"))
+    exact = tmmd(g, r)
+    monkeypatch.setattr("palpate.metrics.halves.BLOCKS", 40)
+    blocks = tmmd(g, r)
+    assert blocks.value == exact.value
+    assert "leave-one-random-block-out" in blocks.interval_method
+    width = lambda s: s.interval[1] - s.interval[0]  # noqa: E731
+    assert width(blocks) == pytest.approx(width(exact), rel=0.35)
+
+
+def test_two_groups_a_class_give_an_interval_over_classes():
+    s = world(9, classes=5, videos=2, frames=3)
+    score = ci_tmmd(s)
+    each = np.array([v["value"] for v in score.details["per_class"].values()])
+    assert "leave-one-class-out" in score.interval_method
+    reach = stats.t.ppf(0.975, 4) * each.std(ddof=1) / np.sqrt(5)
+    assert score.interval == pytest.approx((each.mean() - reach, each.mean() + reach), abs=1e-9)
+    assert d_tmmd(s).interval is not None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_literal_ratio_with_the_biased_form_is_at_most_one(seed):
+    score = d_tmmd(world(seed, classes=4), preset="cmmd")
+    assert 0 <= score.value <= 1
+
+
+def test_group_halves_see_what_random_halves_cannot():
+    s = world(10, classes=1, videos=12, frames=8)
+    by_video, random = i_tmmd(s), i_tmmd(s, preset="paper")
+    assert by_video.value > by_video.null[1]
+    assert by_video.details["z"] > 5
+    assert abs(random.details["z"]) < 4
+    assert random.details["E"] == pytest.approx(by_video.details["E"])
+
+
+def test_the_biased_null_is_centred_on_the_dispersion():
+    s = world(11, classes=2, videos=4, frames=6)
+    values = [ci_tmmd(s, preset="cmmd", seed=k).value for k in range(60)]
+    score = ci_tmmd(s, preset="cmmd")
+    assert np.mean(values) == pytest.approx(score.details["dispersion"], abs=3 * np.std(values) / np.sqrt(60))
+    assert np.mean([score.null[0] < v < score.null[1] for v in values]) > 0.85
+
+
+def test_scores_do_not_depend_on_row_order_or_block_size():
+    g, r = world(12), world(12, draw=1)
+    p = np.random.default_rng(0).permutation(len(g.ids))
+    shuffled = g.take([g.ids[i] for i in p])
+    for preset in PRESETS:
+        one, two = four_scores(g, r, preset=preset, floor=r), four_scores(shuffled, r, preset=preset, floor=r, block=5)
+        for a, b in zip(one, two, strict=True):
+            assert a.value == pytest.approx(b.value, abs=1e-9)
+            assert (a.interval, a.null) == (pytest.approx(b.interval, abs=1e-8), a.null and pytest.approx(b.null, abs=1e-8))
+
+
+@pytest.mark.parametrize("preset", [None, *PRESETS])
+def test_four_scores_equal_the_single_metrics_and_carry_their_settings(preset):
+    g, r = world(13, videos=(3, 4)), world(13, videos=(3, 4), draw=1)
+    scores = four_scores(g, r, preset=preset, split="s" * 64, floor=r, subject="mini")
+    assert [s.metric for s in scores] == ["TMMD", "I-TMMD", "CI-TMMD", "D-TMMD"]
+    singles = [tmmd(g, r, preset=preset), *(f(g, preset=preset) for f in (i_tmmd, ci_tmmd, d_tmmd))]
+    for score, single in zip(scores, singles, strict=True):
+        assert score.value == pytest.approx(single.value, abs=1e-9)
+        assert score.interval == pytest.approx(single.interval, abs=1e-9)
+        assert (score.encoder, score.split, score.subject, score.n) == ("e" * 64, "s" * 64, "mini", len(g.ids))
+        assert (score.bandwidth, score.scale, score.higher_is_better) == (10.0, 1000.0, False)
+        assert score.settings["preset"] == (preset or "grouped")
+        assert Score.from_json(json.loads(json.dumps(score.to_json(), allow_nan=False))).value == score.value
+    assert scores[0].m == len(r.ids)
+    assert scores[0].floor is None
+    assert scores[1].floor == pytest.approx(i_tmmd(r, preset=preset).value, abs=1e-9)
+    require_comparable([singles[1], i_tmmd(r, preset=preset)])
+    with pytest.raises(PalpateError, match="settings"):
+        require_comparable([i_tmmd(g, preset="paper"), i_tmmd(g, preset="paper", halves="ordered")])
+
+
+@pytest.mark.parametrize(("classes", "videos", "frames"), [(5, (2, 3), 6), (20, (1, 2), 8), (3, 1, 5), (1, 1, 6), (4, 3, 1), (1, 2, 2)])
+@pytest.mark.parametrize("preset", [None, "paper", "paper-tables"])
+def test_small_sets_give_a_score_or_a_note(classes, videos, frames, preset, recwarn):
+    g, r = world(14, classes, videos, frames), world(14, classes, videos, frames, draw=1)
+    for s in four_scores(g, r, preset=preset, floor=r):
+        text = json.dumps(s.to_json(), allow_nan=False)
+        assert "NaN" not in text
+        if s.value is None:
+            assert s.note.startswith("Undefined: ")
+            assert s.interval is None
+        elif s.interval is None:
+            assert "No interval" in s.note
+        else:
+            assert s.interval[0] <= s.value <= s.interval[1]
+            assert s.interval_method
+    assert not recwarn.list
+
+
+def test_classes_left_out_are_listed_with_reasons():
+    s = world(15, classes=6, videos=4, frames=3)
+    label, group = np.array(s.labels, dtype=object), np.array(s.groups, dtype=object)
+    label[label == "m0"] = None
+    few = [i for i, v in zip(s.ids, label, strict=True) if v == "m1"][:3]
+    group[label == "m2"] = "one"
+    single = label == "m3"
+    group[single] = [f"g{k}" for k in range(single.sum())]
+    s = FeatureSet(s.ids, s.features, list(label), list(group), s.encoder)
+    s = s.take([i for i, v in zip(s.ids, label, strict=True) if v != "m1" or i in few])
+    for score in (ci_tmmd(s), d_tmmd(s)):
+        assert score.details["classes"] == ["m4", "m5"]
+        assert score.details["excluded"] == {
+            "(no label)": "no label",
+            "m1": "fewer than 4 samples",
+            "m2": "all samples are of one group",
+            "m3": "no group has two samples",
+        }
+    assert ci_tmmd(s).value == pytest.approx(ci_tmmd(keep(s, np.isin(np.array(s.labels, dtype=str), ["m4", "m5"]))).value, abs=1e-9)
+    assert list(ci_tmmd(s, preset="paper").details["excluded"]) == ["(no label)", "m1"]
+
+
+def test_undefined_cases_say_why():
+    s = world(16, classes=2, videos=2, frames=3)
+    assert "no labels" in ci_tmmd(change(s, labels=None)).note
+    assert "no labels" in d_tmmd(change(s, labels=None)).note
+    assert "needs two classes" in d_tmmd(change(s, labels=["a"] * 12)).note
+    assert "one group" in i_tmmd(change(s, groups=["v"] * 12)).note
+    assert "no group has two samples" in i_tmmd(change(s, groups=s.ids)).note
+    assert "fewer than 4" in i_tmmd(s.take(s.ids[:3])).note
+    one = change(s, groups=["v"] * 12)
+    assert "two groups" in tmmd(one, one).note
+    assert "two samples" in tmmd(without_groups(s.take(s.ids[:1])), without_groups(s)).note
+
+
+def test_collapse_is_named():
+    s = world(17)
+    s = change(s, features=np.tile(unit_rows(0, 1, 6), (len(s.ids), 1)))
+    for score in (i_tmmd(s), ci_tmmd(s)):
+        assert score.value == 0
+        assert "collapse" in score.note
+    assert d_tmmd(s).value is None
+    assert "do not separate" in d_tmmd(s).note
+
+
+def test_unstable_classes_are_flagged():
+    s = without_groups(world(18, classes=1, videos=40, frames=1))
+    s = change(s, labels=[f"m{k % 4}" for k in range(40)])  # labels without meaning: no class differs from another
+    score = d_tmmd(s)
+    assert score.details["unstable"]
+    assert "unreliable" in score.note
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda g: tmmd(g, change(g, encoder="f" * 64)), ["one encoder", "eeeeeeeeeeee", "ffffffffffff"]),
+        (lambda g: four_scores(g, g, floor=change(g, encoder="f" * 64)), ["floor", "one encoder"]),
+        (lambda g: four_scores(g, g, floor=without_groups(g)), ["floor", "groups"]),
+        (lambda g: i_tmmd(without_groups(g), halves="group"), ['halves="group"']),
+        (lambda g: i_tmmd(without_groups(g), preset="grouped"), ["grouped"]),
+        (lambda g: tmmd(g, without_groups(g), estimator="grouped"), ["grouped"]),
+        (lambda g: i_tmmd(change(g, groups=[None, *g.groups[1:]])), ["groups", "1 row (0)"]),
+        (lambda g: i_tmmd(change(g, features=3 * g.features)), ["L2-normalised", "norm 3"]),
+        (lambda g: tmmd(g, change(g, features=g.features[:, :4], encoder=None), normalize=True), ["same width"]),
+        (lambda g: i_tmmd(g, preset="best"), ["preset", "paper-tables"]),
+        (lambda g: i_tmmd(g, halves="thirds"), ["halves", "ordered"]),
+        (lambda g: d_tmmd(g, denominator="none"), ["denominator"]),
+        (lambda g: d_tmmd(g, aggregate="none"), ["aggregate"]),
+        (lambda g: i_tmmd(g, level=95), ["level"]),
+        (lambda g: i_tmmd(g, min_samples=1), ["min_samples"]),
+        (lambda g: i_tmmd(g, sigma=-1.0), ["sigma"]),
+    ],
+)
+def test_refuses_bad_options(call, words):
+    with pytest.raises(PalpateError) as caught:
+        call(world(19))
+    for word in words:
+        assert word in str(caught.value)

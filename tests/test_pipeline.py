@@ -1,0 +1,138 @@
+"""The whole pipeline at its smallest: every verb by itself, the demo, and a demo that is killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from palpate.cli import main
+from palpate.core import Results
+
+pytestmark = pytest.mark.slow
+
+
+def demo(out: Path, *args: str, kill_at: str | None = None) -> tuple[int, list[str]]:
+    """Runs the tiny demo in a process of its own; with ``kill_at`` it gets SIGKILL as soon as that stage has begun."""
+    command = [sys.executable, "-m", "palpate", "demo", "--preset", "tiny", "--out", str(out), *args]
+    lines: list[str] = []
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            lines.append(line.strip())
+            if kill_at is not None and line.startswith(f"{kill_at}: ..."):
+                process.send_signal(signal.SIGKILL)
+    return process.returncode, lines
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "run"
+    status, lines = demo(out)
+    assert status == 0, "\n".join(lines)
+    return out
+
+
+def outcome(out: Path) -> tuple[object, dict[str, bytes]]:
+    """What a run is judged by: its scores and the bytes of its pictures."""
+    results = json.loads((out / "page.json").read_text())
+    pictures = {p.name: p.read_bytes() for p in (out / "generated").rglob("*.png")}
+    return results["scores"], pictures
+
+
+def test_the_demo_ends_in_a_page_with_everything_on_it(whole):
+    results = Results.load(whole / "page.json")
+    assert [a.name for a in results.audits] == ["Orig", "NoLeak"]
+    assert results.audits[0].leaked_fraction > 0
+    assert results.audits[1].leaked_fraction == 0
+    assert len(results.facts) == 3
+    assert any("synthetic" in note for note in results.notes)
+    assert {s.metric for s in results.scores} >= {"TMMD", "I-TMMD", "CI-TMMD", "D-TMMD", "SSIM", "PSNR"}
+    assert {s.subject for s in results.scores} >= {"generated", "background only", "real, same material"}
+    split, encoder = results.settings["digests"]["split"], results.settings["digests"]["towers"]
+    for score in results.scores:
+        assert score.split == split
+        assert score.metric in ("SSIM", "PSNR") or score.encoder == encoder
+    page = (whole / "page.html").read_text()
+    assert page.count("data:image/") >= 3 * len(results.gallery)
+
+
+def test_the_worlds_known_leak_is_what_the_audit_finds(whole):
+    leak = json.loads((whole / "world" / "tree" / "world.json").read_text())["leak"]
+    orig = Results.load(whole / "page.json").audits[0]
+    assert (orig.test_samples_in_shared_groups, orig.test_samples) == (leak["test_frames_in_shared_videos"], leak["test_frames"])
+
+
+@pytest.mark.parametrize("stage", ["autoencoder", "generated"])
+def test_a_killed_demo_goes_on_from_its_last_finished_stage(whole, tmp_path, stage):
+    out = tmp_path / "run"
+    status, lines = demo(out, kill_at=stage)
+    assert status == -signal.SIGKILL
+    assert not (out / stage).exists()
+    assert not (out / "page.html").exists()
+    finished = [line.split(":")[0] for line in lines if ": done in" in line]
+    assert "split" in finished
+    status, lines = demo(out)
+    assert status == 0, "\n".join(lines)
+    assert [line.split(":")[0] for line in lines if "already done" in line] == finished
+    assert outcome(out) == outcome(whole)
+
+
+def test_a_finished_demo_does_nothing_again_and_another_seed_does(whole):
+    status, lines = demo(whole)
+    assert status == 0
+    assert not [line for line in lines if ": done in" in line]
+    status, lines = demo(whole, "--seed", "1", kill_at="clip")
+    redone = {line.split(":")[0] for line in lines if ": ..." in line}
+    assert "split" in redone
+    assert "world" not in redone
+    demo(whole)  # as it was, for tests that come later
+
+
+def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for line in (
+        "world -o world --preset tiny --workers 1 --layout videos",
+        "import world -o tag",
+        "split tag -o s.json --train 0.5",
+        "audit tag --split s.json -o audit.json --fail-over 0",
+        "encoder tag --split s.json -o towers --preset tiny",
+        "train tag --split s.json --towers towers -o model --preset tiny --background",
+        "generate model --manifest tag --split s.json -o made",
+        "score tag --generated made --split s.json --towers towers -o scores.json --json",
+        "report audit.json scores.json -o page.html",
+    ):
+        assert main([*line.split(), "-q"]) == 0, (line, capsys.readouterr())
+    assert not list(tmp_path.glob(".*.work"))
+    results = Results.load(tmp_path / "page.json")
+    assert results.audits[0].leaked_fraction == 0
+    assert results.scores
+
+
+def test_photos_alone_are_enough_to_generate(whole, tmp_path):
+    photos = next((whole / "world" / "tree" / "dataset").iterdir()) / "video_frame"
+    model = whole / "generator" / "model"
+    (tmp_path / "photos").mkdir()
+    for path in sorted(photos.iterdir())[:3]:
+        (tmp_path / "photos" / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "photos" / "broken.jpg").write_bytes(path.read_bytes()[:200])
+    assert main(["generate", str(model), "--photos", str(tmp_path / "photos"), "-o", str(tmp_path / "a"), "-q"]) == 2
+    assert not (tmp_path / "a").exists()
+    assert main(["generate", str(model), "--photos", str(tmp_path / "photos"), "-o", str(tmp_path / "a"), "-q", "--skip-bad"]) == 0
+    assert len(list((tmp_path / "a" / "images").iterdir())) == 3
+
+
+def test_real_clips_go_through_to_the_page(real_data, tmp_path):
+    status, lines = demo(tmp_path / "run", "--data", str(real_data / "touch_and_go" / "clips"))
+    assert status == 0, "\n".join(lines)
+    results = Results.load(tmp_path / "run" / "page.json")
+    assert results.settings["stages"]["data"]["samples"] == 436
+    assert [a.group for a in results.audits] == ["touch", "video"]
+    assert [a.leaked_fraction for a in results.audits] == [0.0, 1.0]
+    assert any("0 of 5 materials occur in 2 or more videos" in note for note in results.notes)
+    assert not any("synthetic: palpate's" in note for note in results.notes)
