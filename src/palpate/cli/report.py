@@ -47,7 +47,7 @@ def _read(path: Path) -> Results:
     try:
         match kind:
             case "palpate-audit/1":
-                return Results(title="", audits=[Audit.from_json(fields)])
+                return _absolute(Results(title="", audits=[Audit.from_json(fields)]), path.parent)
             case "palpate-scores/1":
                 return Results(title="", scores=[Score.from_json(s) for s in fields["scores"]])
             case "palpate-results/1":

@@ -1,0 +1,177 @@
+"""The same results as Markdown: facts, tables, settings and commands; paths stand in for pictures.
+
+Tables are GitHub's pipe tables, padded so that they also read well in a terminal.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from palpate.core import Audit, Results, SampleRef
+from palpate.report.page import in_turns, material_of, where
+from palpate.report.tables import Cell, Heat, Table, heat_tables, score_tables
+from palpate.report.text import HINTS, HOW_TO_READ, count, number, percent, plain, purpose, summary_lines
+
+#: Rows of pictures listed in the Markdown; the JSON holds all.
+LISTED = 40
+_SPECIAL = str.maketrans({c: f"\\{c}" for c in "\\`*_[]|<>"})
+
+
+def esc(text: str) -> str:
+    """Text on one line in which no character means anything to Markdown."""
+    return " ".join(text.split()).translate(_SPECIAL)
+
+
+def code(text: str) -> str:
+    """Text in backticks that may itself hold backticks; a pipe is escaped for tables."""
+    text = " ".join(text.split())
+    fence = "`"
+    while fence in text:
+        fence += "`"
+    pad = " " if "`" in text else ""
+    return f"{fence}{pad}{text}{pad}{fence}".replace("|", "\\|")
+
+
+def pipe_table(head: Sequence[str], rows: Iterable[Sequence[str]], right: bool = True) -> list[str]:
+    """A padded pipe table; the first column is flush left, the others flush right unless ``right`` is false."""
+    body = [list(head), *(list(r) for r in rows)]
+    widths = [max(3, *(len(r[k]) for r in body)) for k in range(len(head))]
+    pad = lambda text, k: text.rjust(widths[k]) if right and k else text.ljust(widths[k])  # noqa: E731
+    lines = ["| " + " | ".join(pad(t, k) for k, t in enumerate(r)) + " |" for r in body]
+    rule = ["-" * (w - 1) + ":" if right and k else "-" * w for k, w in enumerate(widths)]
+    return [lines[0], "| " + " | ".join(rule) + " |", *lines[1:], ""]
+
+
+def _hint(section: str) -> list[str]:
+    said, command = HINTS[section]
+    return [f"{said} See {code(command)}.", ""]
+
+
+def _picture(path: str | None) -> str:
+    return code(path) if path else "–"
+
+
+def _cell(cell: Cell) -> str:
+    if cell.why:
+        return f"undefined: {esc(cell.why)}"
+    parts = [f"**{cell.value}**", cell.interval]
+    parts += [f"floor {cell.floor}"] if cell.floor else []
+    parts += [f"null {cell.null}"] if cell.null else []
+    parts += [cell.size] if cell.size else []
+    parts += [f"({cell.footnote})"] if cell.footnote else []
+    return " ".join(p for p in parts if p)
+
+
+def _scores(table: Table) -> list[str]:
+    head = ["", *(f"{esc(c.metric)} {'↑' if c.higher_is_better else '↓'}{', ' + c.size if c.size else ''}" for c in table.columns)]
+    rows = [
+        [esc(s), *("; ".join(_cell(c) for c in table.cells[s].get(col.metric, ())) or "–" for col in table.columns)] for s in table.subjects
+    ]
+    lines = [f"### {table.title}", "", *([table.question, ""] if table.question else []), *pipe_table(head, rows)]
+    made = [("All of these", table.shared), *((c.metric, c.made) for c in table.columns)]
+    lines += [f"- {esc(title)}: " + "; ".join(f"{esc(k)} {esc(v)}" for k, v in rows) for title, rows in made if rows]
+    lines += [f"- ({k}) {esc(note)}" for k, note in enumerate(table.notes, 1)]
+    return [*lines, ""]
+
+
+def _heat(heat: Heat) -> list[str]:
+    rows = [[esc(label), *values] for label, values in zip(heat.labels, heat.values, strict=True)]
+    return [f"### Matrix: {esc(heat.title)}", "", *pipe_table(["", *map(esc, heat.labels)], rows)]
+
+
+def _sample(sample: SampleRef) -> str:
+    return f"{esc(where(sample))}: {_picture(sample.vision)}, {_picture(sample.tactile)}"
+
+
+def _audit(audit: Audit) -> list[str]:
+    group = esc(audit.group)
+    rows = [
+        ["samples", count(audit.train_samples), count(audit.test_samples)],
+        [f"groups ({group})", count(audit.groups_train), count(audit.groups_test)],
+    ]
+    lines = [f"### {esc(audit.name)}: {esc(percent(audit.leaked_fraction))} leaked", "", *pipe_table(["", "train", "test"], rows)]
+    lines += [
+        f"- test samples in shared groups: {count(audit.test_samples_in_shared_groups)}",
+        f"- shared groups: {count(audit.groups_shared)}",
+        f"- identical samples in both parts: {count(audit.identical_samples)}",
+    ]
+    if audit.split:
+        lines.append(f"- split: {code(audit.split)}")
+    if audit.gap_median is not None:
+        lines.append(
+            f"- frames to the nearest train frame: least {count(audit.gap_min)}, median {number(audit.gap_median, 0)}, most {count(audit.gap_max)}"
+        )
+    lines += [f"- {esc(note)}" for note in audit.notes]
+    lines.append("")
+    if audit.gap_counts:
+        bins = zip(audit.gap_edges, audit.gap_edges[1:], audit.gap_counts, strict=False)
+        lines += pipe_table(["gap (frames)", "test samples"], [[f"{count(a)} to {count(b)}", count(n)] for a, b, n in bins])
+    if audit.worst:
+        lines += ["Nearest pairs:", ""]
+        lines += [
+            f"- {'gap ' + count(p.gap) + ' frames' if p.gap is not None else 'gap unknown'}; test {_sample(p.test)}; train {_sample(p.train)}"
+            for p in list(audit.worst)[:LISTED]
+        ]
+        lines.append("")
+    if audit.materials:
+        keys = ("material", "train", "test", "groups_train", "groups_test")
+        cells = [[esc(str(m.get("material") or "–")), *(count(m.get(k)) for k in keys[1:])] for m in audit.materials]
+        lines += pipe_table(["material", "train", "test", f"{group}s in train", f"{group}s in test"], cells)
+    return lines
+
+
+def _tree(value: Any, depth: int = 0) -> list[str]:
+    lines: list[str] = []
+    for key, inner in value.items():
+        indent = "  " * depth
+        if isinstance(inner, Mapping) and inner:
+            lines += [f"{indent}- {esc(str(key))}:", *_tree(inner, depth + 1)]
+        else:
+            text = inner if isinstance(inner, str) else json.dumps(inner, ensure_ascii=False)
+            lines.append(f"{indent}- {esc(str(key))}: {code(text) if text else '(empty)'}")
+    return lines
+
+
+def render_markdown(results: Results) -> str:
+    """The results as Markdown text.
+
+    Raises:
+        PalpateError: if scores may not stand in one table.
+    """
+    facts = list(results.facts) or summary_lines(results)
+    lines = [f"# {esc(results.title)}", "", esc(purpose(results)), "", *(f"- {esc(f)}" for f in facts), ""]
+    if results.notes:
+        lines += ["## Read this first", "", *(f"- {esc(n)}" for n in results.notes), ""]
+    lines += ["## Gallery", ""]
+    items = in_turns(results.gallery)[:LISTED]
+    if items:
+        rows = [
+            [esc(material_of(i.sample)), esc(where(i.sample)), _picture(i.sample.vision), _picture(i.sample.tactile), _picture(i.generated)]
+            for i in sorted(items, key=lambda i: material_of(i.sample).casefold())
+        ]
+        lines += pipe_table(["material", "sample", "photo", "real touch", "generated touch"], rows, right=False)
+        lines += [f"{count(len(items))} of {count(len(results.gallery))} rows.", ""]
+    else:
+        lines += _hint("gallery")
+    lines += ["## Scores", ""]
+    if results.scores:
+        lines += [" ".join(HOW_TO_READ), ""]
+        for table in score_tables(results.scores):
+            lines += _scores(table)
+        for heat in heat_tables(results.scores):
+            lines += _heat(heat)
+    else:
+        lines += _hint("scores")
+    lines += ["## Leakage audit", ""]
+    for audit in results.audits:
+        lines += _audit(audit)
+    lines += [] if results.audits else _hint("audits")
+    lines += ["## Settings and digests", "", *(_tree(plain(results.settings)) or _hint("settings")), ""]
+    lines += ["## Commands", ""]
+    if results.commands:
+        lines += ["```sh", *(c.replace("```", "` ` `") for c in results.commands), "```"]
+    else:
+        lines += _hint("commands")
+    return "\n".join(lines).rstrip() + "\n"

@@ -1,0 +1,223 @@
+"""Tables of scores: one a metric family, rows = subjects, columns = metrics.
+
+A column is what :func:`palpate.core.columns` makes, so scores of different settings raise instead of standing side by side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from palpate.core import Score, columns
+from palpate.report.plots import Axis, axis_of
+from palpate.report.text import decimals, defined, interval_text, number, plain, setting_of
+
+#: Family title, what it asks, and the pieces of a metric's name (lower case) that put it there; the first match wins.
+FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    (
+        "Touch features",
+        "Are generated and real touches alike to a touch encoder? I-, CI- and D-TMMD need no reference images.",
+        ("tmmd",),
+    ),
+    (
+        "Image distributions",
+        "Are the sets of images alike to a general image encoder?",
+        ("cmmd", "fid", "kid", "mmd", "density", "coverage"),
+    ),
+    ("Image by image", "Does each generated touch match its own real touch, pixel by pixel or patch by patch?", ("ssim", "psnr", "lpips", "l1", "mse")),
+    ("Recognition", "What can be read from the touch: its material, or the text and photo that belong to it?", ("acc", "top", "retriev", "probe", "@")),
+)  # fmt: skip
+OTHER = ("Other metrics", "")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One score as text.
+
+    Attributes:
+        score: the score itself.
+        value, interval, floor, null: numbers as text, '' where there is none.
+        size: ``"n = 240"`` or ``"n = 240, m = 1,200"``; '' where the whole column shares it.
+        footnote: number of the note below the table, or 0.
+        why: the note of an undefined score.
+    """
+
+    score: Score
+    value: str
+    interval: str
+    floor: str
+    null: str
+    size: str
+    footnote: int
+    why: str
+
+
+@dataclass(frozen=True)
+class Column:
+    """One metric: its direction, its axis, the sample sizes if all of its scores share them, and how the scores were made."""
+
+    metric: str
+    higher_is_better: bool
+    axis: Axis | None
+    size: str
+    made: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """One family. ``cells[subject][metric]`` lists the scores that stand there (several where seeds differ).
+
+    ``shared`` is how all columns were made alike; a column's ``made`` is what is its own.
+    """
+
+    title: str
+    question: str
+    columns: Sequence[Column]
+    subjects: Sequence[str]
+    cells: Mapping[str, Mapping[str, Sequence[Cell]]]
+    shared: Sequence[tuple[str, str]]
+    notes: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Heat:
+    """A square matrix of divergences, e.g. D-TMMD's between classes. ``shares`` are the colours' strengths in [0, 1]."""
+
+    title: str
+    labels: Sequence[str]
+    values: Sequence[Sequence[str]]
+    shares: Sequence[Sequence[float]] = field(default_factory=list)
+
+
+def family_of(metric: str) -> tuple[str, str]:
+    """Title and question of the family that a metric belongs to."""
+    name = metric.lower()
+    return next(((title, question) for title, question, pieces in FAMILIES if any(p in name for p in pieces)), OTHER)
+
+
+def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
+    """How the scores of one column were made, as (what, how): what all of them share, and the interval's method."""
+    first = column[0]
+    rows = [("estimator", first.estimator)]
+    if first.bandwidth is not None:
+        rows.append(("bandwidth σ", f"{first.bandwidth:g}"))
+    if first.scale != 1:
+        rows.append(("scale", f"× {first.scale:g}"))
+    levels = [(f"{100 * s.level:g}\u00a0%", s.interval_method) for s in column if s.interval is not None]
+    methods = dict.fromkeys(f"{level}, {method}" if method else level for level, method in levels)
+    rows.append(("interval", "; ".join(methods)))
+    seeds = dict.fromkeys(str(s.seed) for s in column if s.seed is not None)
+    rows.append(("seed", ", ".join(seeds)))
+    rows += [(str(k).replace("_", " "), v if isinstance(v, str) else str(plain(v))) for k, v in first.settings.items()]
+    rows += [("encoder", first.encoder or ""), ("split", first.split or "")]
+    return [(what, how) for what, how in rows if how]
+
+
+def _size(score: Score) -> str:
+    return ", ".join(f"{k} = {v:,}" for k, v in (("n", score.n or None), ("m", score.m)) if v is not None)
+
+
+def _cell(score: Score, digits: int, notes: list[str], size: str) -> Cell:
+    footnote = 0
+    if score.note and defined(score):
+        if score.note not in notes:
+            notes.append(score.note)
+        footnote = notes.index(score.note) + 1
+    return Cell(
+        score,
+        value=number(score.value, digits),
+        interval=interval_text(score, digits),
+        floor=number(score.floor, digits) if score.floor is not None else "",
+        null=f"{number(score.null[0], digits)} to {number(score.null[1], digits)}" if score.null else "",
+        size=size,
+        footnote=footnote,
+        why="" if defined(score) else score.note.removeprefix("Undefined: ") or "no reason recorded",
+    )
+
+
+#: What a named reading of the TMMD family means, in a few words, for the head of its table.
+READINGS = {
+    "paper": "the paper's formula to the letter, random halves",
+    "paper-tables": "the reading that fits the paper's printed tables",
+    "cmmd": "as CMMD's published code",
+    "grouped": "whole groups kept together",
+}
+
+
+def score_tables(scores: Sequence[Score]) -> list[Table]:
+    """The tables of all scores, families in fixed order, metrics and subjects in the order of first appearance.
+
+    Scores of another preset or of another split stand in tables of their own; within a table a column is checked.
+
+    Raises:
+        PalpateError: if two scores that share a column were not made alike.
+    """
+    order = [title for title, _, _ in FAMILIES] + [OTHER[0]]
+    parts: dict[tuple[int, str, str], list[Score]] = {}
+    for score in scores:
+        key = (order.index(family_of(score.metric)[0]), *setting_of(score))
+        parts.setdefault(key, []).append(score)
+    several = len({split for _, _, split in parts}) > 1
+    tables: list[Table] = []
+    for (place, preset, split), members in sorted(parts.items(), key=lambda item: item[0][0]):
+        title, question = family_of(members[0].metric)
+        if preset:
+            title += f", {preset}: {READINGS[preset]}" if preset in READINGS else f", {preset}"
+        if several and split:
+            title += f", split {split[:8]}"
+        first = not any(t.question == question for t in tables)
+        tables.append(_table(title, question if first or place == len(FAMILIES) else "", members))
+    return tables
+
+
+def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
+    notes: list[str] = []
+    cells: dict[str, dict[str, list[Cell]]] = {}
+    heads: list[Column] = []
+    for metric, column in columns(scores).items():
+        near = [v for s in column for v in (s.value, s.floor, *(s.interval or ())) if v is not None and math.isfinite(v)]
+        common = _size(column[0]) if len({_size(s) for s in column}) == 1 else ""
+        for score in column:
+            cell = _cell(score, decimals(near), notes, "" if common else _size(score))
+            cells.setdefault(score.subject, {}).setdefault(metric, []).append(cell)
+        heads.append(Column(metric, column[0].higher_is_better, axis_of(column), common, _made(column)))
+    subjects = list(dict.fromkeys(score.subject for score in scores))
+    shared = [row for row in heads[0].made if len(heads) > 1 and all(row in h.made for h in heads)]
+    heads = [replace(h, made=[row for row in h.made if row not in shared]) for h in heads]
+    return Table(title, question, heads, subjects, cells, shared, notes)
+
+
+def _square(matrix: Any) -> list[list[float | None]] | None:
+    """``matrix`` as rows of numbers (None = undefined), or None if it is not a square of them."""
+    rows = plain(matrix)
+    if not isinstance(rows, list) or not rows or any(not isinstance(r, list) or len(r) != len(rows) for r in rows):
+        return None
+    if any(v is not None and (isinstance(v, bool) or not isinstance(v, int | float)) for r in rows for v in r):
+        return None
+    return rows
+
+
+def heat_tables(scores: Sequence[Score]) -> list[Heat]:
+    """One heat table for each score whose details hold a square ``matrix`` (``classes`` or ``labels`` name its rows, else they are numbered)."""
+    tables: list[Heat] = []
+    for score in scores:
+        matrix = _square(score.details.get("matrix"))
+        if matrix is None:
+            continue
+        names = plain(score.details.get("classes", score.details.get("labels")))
+        labels = (
+            [str(n) for n in names] if isinstance(names, list) and len(names) == len(matrix) else [f"{k + 1}" for k in range(len(matrix))]
+        )
+        seen = [abs(v) for row in matrix for v in row if v is not None]
+        digits, top = min(3, decimals(seen)), max(seen, default=0.0) or 1.0
+        tables.append(
+            Heat(
+                ", ".join(filter(None, [score.metric, score.subject, str(score.settings.get("preset", ""))])),
+                labels,
+                [[number(v, digits) for v in row] for row in matrix],
+                [[round(max(0.0, v or 0.0) / top, 3) for v in row] for row in matrix],
+            )
+        )
+    return tables

@@ -1,0 +1,51 @@
+"""Objects: one drawn piece of a material, with the curve of the thing it covers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from palpate.core import rng_for
+from palpate.sim.materials import MATERIALS, Material, Surface, draw_surface
+from palpate.sim.options import VERSION, WorldOptions
+from palpate.sim.plan import ObjectRef
+from palpate.sim.tile import TILE_MM
+
+
+@dataclass(frozen=True)
+class Thing:
+    """An object that can be seen and touched.
+
+    Attributes:
+        ref: its name.
+        surface: relief, albedo, gloss, softness and words.
+        px: pixel size of the tile in mm.
+        curvature: 1 / radius in 1/mm along x of the touch, positive for a bulge; 0 for flat.
+    """
+
+    ref: ObjectRef
+    surface: Surface
+    px: float
+    curvature: float
+
+
+def make_object(options: WorldOptions, ref: ObjectRef) -> Thing:
+    """The object of that name; depends on the seed, the name and the tile size alone.
+
+    Raises:
+        PalpateError: if the material draws something invalid.
+    """
+    return _make(options.seed, ref, MATERIALS[ref.material], options.tile)
+
+
+@lru_cache(maxsize=6)
+def _make(seed: int, ref: ObjectRef, material: Material, tile: int) -> Thing:
+    rng: np.random.Generator = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
+    surface = draw_surface(ref.material, material, tile, rng)
+    flat = rng.random() < 0.6
+    bulge = 1.0 if rng.random() < 0.5 else -0.3
+    radius = math.exp(rng.uniform(math.log(25.0), math.log(90.0)))
+    return Thing(ref, surface, TILE_MM / tile, 0.0 if flat else bulge / radius)

@@ -1,0 +1,146 @@
+"""The press, the light, the sensor family, and frames rendered alone."""
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from palpate.core import PalpateError
+from palpate.sim import Video, WorldOptions, plan_world
+from palpate.sim.arrays import f32, to_bytes
+from palpate.sim.gel import make_sensor, marker_shift, press, shade, solve_approach
+from palpate.sim.plan import contact_frames, first_contact
+
+SMALL = WorldOptions(materials=("Wood", "Brick", "Gravel", "Leather"), objects_per_material=1, tile=128, size=32)
+
+
+def bisect(gap, load):
+    """Oracle: the approach by bisection."""
+    low, high = -50.0, 50.0
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if np.maximum(gap.astype(np.float64) + middle, 0).mean() < load else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize("load", [0.001, 0.1, 0.42, 3.0])
+@pytest.mark.parametrize("shape", [(7, 7), (64, 64)])
+def test_the_press_is_force_controlled(load, shape):
+    gap = f32(np.random.default_rng(0).normal(0, 0.3, shape))
+    d = solve_approach(gap, load)
+    assert d == pytest.approx(bisect(gap, load), abs=1e-6)
+    assert np.maximum(gap.astype(np.float64) + d, 0).mean() == pytest.approx(load, rel=1e-5)
+
+
+def test_the_press_by_hand():
+    # 0.5 lifted by d = 0.3 gives 0.8, the others stay apart: mean over four = 0.2.
+    assert solve_approach(f32([[0.5, -1.0], [-1.0, -2.0]]), 0.2) == pytest.approx(0.3)
+    assert solve_approach(np.zeros((4, 4), np.float32), 0.2) == pytest.approx(0.2)
+
+
+def test_a_touch_presses_with_its_load_and_the_gel_is_never_exceeded():
+    for plan in plan_world(SMALL):
+        video = Video(SMALL, plan)
+        for touch in range(SMALL.touches_per_video):
+            state = video.state(first_contact(SMALL, touch) + 1)
+            membrane, contact = video.membrane(state)
+            assert membrane.dtype == np.float32
+            assert contact.any()
+            assert membrane.min() >= 0.0
+            assert membrane.max() <= 1.6
+    stone = f32(np.where(np.hypot(*np.mgrid[-16:16, -16:16]) < 5, 0.5, -9.0))
+    shallow, deep = (press(make_sensor(SMALL, 0), stone, load)[0] for load in (0.01, 0.03))
+    assert shallow.max() < deep.max()
+
+
+def test_the_background_is_the_shading_without_contact():
+    video = Video(SMALL, 0)
+    flat = shade(video.sensor, np.zeros((32, 32), np.float32), video.gain)
+    np.testing.assert_array_equal(video.background(), to_bytes(flat))
+    free = np.stack([video.tactile(f) for f in range(5)]).astype(float)
+    assert np.abs(free.mean(0) - video.background()).mean() < 2.0  # free frames differ from it by noise alone
+    assert np.abs(free[0] - free[1]).mean() > 0.1
+    assert np.abs(video.tactile(6).astype(float) - video.background()).mean() > 3.0
+
+
+def test_the_frame_four_before_a_contact_is_free():
+    video = Video(SMALL, 0)
+    for touch in range(SMALL.touches_per_video):
+        first = first_contact(SMALL, touch)
+        assert not video.state(first - 4).contact
+        assert not video.state(first - 1).contact
+        assert all(video.state(f).contact for f in contact_frames(SMALL, touch))
+
+
+def test_shading_is_the_photometric_formula():
+    """A plane membrane of slope (a, b) without texture, against the formula written out in float64."""
+    sensor = dataclasses.replace(make_sensor(SMALL, 1), ink=None, texture=np.zeros((32, 32), np.float32))
+    row, column = np.mgrid[:32, :32]
+    a, b = 0.2, -0.1
+    image = shade(sensor, f32((a * column + b * row) * sensor.px), f32([1.1, 1.0, 0.9]))
+    normal = np.array([a, b, 1.0]) / np.sqrt(a * a + b * b + 1.0)
+    expected = np.zeros((32, 32, 3)) + sensor.ambient
+    for k in range(3):
+        expected += sensor.field[k][..., None] * max(0.0, float(normal @ sensor.light[k])) * sensor.colour[k]
+    expected = np.clip(expected * sensor.veil[..., None] * [1.1, 1.0, 0.9], 0, 1.2) ** sensor.gamma
+    np.testing.assert_allclose(image, expected, atol=2e-3)
+
+
+def test_a_unit_looks_the_same_at_every_size():
+    big, small = (make_sensor(dataclasses.replace(SMALL, size=size), 2) for size in (128, 64))
+    for name in ("veil", "ink", "dome", "texture"):
+        mean = getattr(big, name).reshape(64, 2, 64, 2).mean((1, 3))
+        np.testing.assert_allclose(getattr(small, name), mean, atol=1e-5)
+    assert small.gamma == big.gamma
+
+
+def test_digit_has_no_markers_and_one_family_many_units():
+    digit = make_sensor(dataclasses.replace(SMALL, look="digit"), 0)
+    assert digit.ink is None
+    assert make_sensor(SMALL, 0).ink.max() > 0.5
+    first, second, other_world = make_sensor(SMALL, 0), make_sensor(SMALL, 1), make_sensor(dataclasses.replace(SMALL, seed=7), 0)
+    for unit in (second, other_world):
+        assert not np.array_equal(first.veil, unit.veil)
+        assert np.abs(first.light - unit.light).max() < 0.4  # the lights of one product stay nearly in place
+
+
+def test_markers_follow_the_shear():
+    sensor = make_sensor(SMALL, 0)
+    dy, dx = marker_shift(sensor, np.full((32, 32), 0.5, np.float32), (0.7, -0.35))
+    assert float(dx[16, 16]) == pytest.approx(0.5 * 0.7 / sensor.px, rel=1e-4)
+    assert float(dy[16, 16]) == pytest.approx(-0.5 * 0.35 / sensor.px, rel=1e-4)
+
+
+@pytest.mark.parametrize("look", ["gelsight", "digit"])
+def test_a_frame_alone_equals_the_frame_in_its_video(look):
+    options = dataclasses.replace(SMALL, look=look)
+    whole = Video(options, 2)
+    frames = range(options.video_length)
+    vision, tactile = [whole.vision(f) for f in frames], [whole.tactile(f) for f in frames]
+    for f in (3, 7, 20, 31):
+        np.testing.assert_array_equal(Video(options, 2).vision(f), vision[f])
+        np.testing.assert_array_equal(Video(options, 2).tactile(f), tactile[f])
+    assert vision[0].dtype == np.uint8
+    assert vision[0].shape == tactile[0].shape == (32, 32, 3)
+
+
+def test_neighbouring_frames_are_alike_and_materials_are_not():
+    video, other = Video(SMALL, 0), Video(SMALL, 1)
+    difference = lambda a, b: np.abs(a.astype(float) - b).mean()  # noqa: E731
+    assert difference(video.vision(5), video.vision(6)) < difference(video.vision(5), other.vision(5))
+
+
+def test_a_frame_or_video_that_is_not_there_is_refused():
+    with pytest.raises(PalpateError, match="0 to 31"):
+        Video(SMALL, 0).vision(32)
+    with pytest.raises(PalpateError, match="0 to 3"):
+        Video(SMALL, 4)
+
+
+def test_images_survive_jpeg():
+    image = Video(SMALL, 0).tactile(6)
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=95, subsampling=0)
+    assert np.abs(np.asarray(Image.open(file)).astype(float) - image).mean() < 4

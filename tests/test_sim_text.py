@@ -1,0 +1,96 @@
+"""Captions: only the words of the piece, good grammar, never colour or light."""
+
+import re
+
+import pytest
+
+from palpate.sim import MATERIALS, Video, WorldOptions, plan_world
+from palpate.sim.text import NAMED, UNNAMED, article, listed, phrase
+
+LIGHT = {
+    "red",
+    "orange",
+    "yellow",
+    "green",
+    "blue",
+    "purple",
+    "violet",
+    "pink",
+    "brown",
+    "black",
+    "white",
+    "grey",
+    "gray",
+    "golden",
+    "silver",
+    "beige",
+    "coloured",
+    "colored",
+    "colour",
+    "color",
+    "bright",
+    "dark",
+    "pale",
+    "light",
+    "shiny",
+    "glossy",
+    "matt",
+    "matte",
+    "shaded",
+    "glazed",
+    "transparent",
+    "clear",
+}
+FIXED = {w for t in (*NAMED, *UNNAMED) for w in re.findall(r"[a-z]+", re.sub(r"\{.*?\}", "", t))} | {"a", "an", "and"}
+
+
+def words(text):
+    return re.findall(r"[a-z]+", text.lower())
+
+
+def test_captions_use_the_words_of_the_piece_and_the_template_alone():
+    options = WorldOptions(tile=64, size=16, objects_per_material=3, mixed=0.5)
+    named = total = 0
+    for plan in plan_world(options):
+        video = Video(options, plan)
+        for touch in range(options.touches_per_video):
+            text, surface = video.text(touch), video.thing(touch).surface
+            allowed = FIXED | set(words(" ".join(surface.words))) | set(words(surface.noun))
+            assert set(words(text)) <= allowed, text
+            assert sum(w in text.lower() for w in surface.words) >= 2
+            assert not set(words(text)) & LIGHT, text
+            assert text[0].isupper()
+            assert text.endswith(".")
+            assert not re.search(r"\b[Aa] [aeio]|\b[Aa] un(?!i)|\b[Aa]n [^aeiou]|\ba [a-z, ]*\ba\b", text), text
+            named += surface.noun.removeprefix("a ") in text
+            total += 1
+    assert 0.35 < named / total < 0.65
+
+
+def test_no_material_has_words_of_colour_or_light():
+    from palpate.core import rng_for
+    from palpate.sim import Tile
+
+    for name, material in MATERIALS.items():
+        for k in range(25):
+            rng = rng_for(1, "words", name, k)
+            assert not set(words(" ".join(material.draw(Tile(64, rng), rng).words))) & LIGHT
+
+
+@pytest.mark.parametrize(("word", "expected"), [("unusual", "an"), ("uniform", "a"), ("even", "an"), ("hard", "a"), ("Elastic", "an")])
+def test_articles(word, expected):
+    assert article(word) == expected
+
+
+def test_phrases():
+    assert phrase(("rugged", "rough"), "tree bark") == "rugged, rough tree bark"
+    assert phrase(("unusual", "porous"), "a sponge") == "an unusual, porous sponge"
+    assert listed(("a",)) == "a"
+    assert listed(("a", "b", "c")) == "a, b and c"
+
+
+def test_the_share_of_named_captions_is_obeyed():
+    for named, templates in ((0.0, UNNAMED), (1.0, NAMED)):
+        options = WorldOptions(materials=("Wood",), objects_per_material=4, tile=64, size=16, named=named)
+        texts = [Video(options, k).text(t) for k in range(4) for t in range(4)]
+        assert all(("wood" in text.lower()) is (templates is NAMED) for text in texts)
