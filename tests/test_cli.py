@@ -46,7 +46,7 @@ def test_text_output_has_every_count(capsys, lists):
         assert line in out
 
 
-@pytest.mark.parametrize("args, word", [
+@pytest.mark.parametrize(("args", "word"), [
     (["audti"], "Did you mean: palpate audit"),
     (["audit", "one.txt"], "TRAIN and TEST list files"),
     (["audit", "no.txt", "such.txt"], "no file no.txt"),

@@ -1,13 +1,32 @@
 """Core: errors, digests, files, splits, scores, results, stages."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
 
 from palpate.core import (
-    Audit, FeatureSet, GalleryItem, LeakPair, PalpateError, Problem, ProblemsError, Results, Run, SampleRef, Score, Split,
-    atomic_folder, atomic_path, columns, digest_json, inside, rng_for, seed_for,
+    Audit,
+    FeatureSet,
+    GalleryItem,
+    LeakPair,
+    MissingExtraError,
+    PalpateError,
+    Problem,
+    ProblemsError,
+    Results,
+    Run,
+    SampleRef,
+    Score,
+    Split,
+    atomic_folder,
+    atomic_path,
+    columns,
+    digest_json,
+    inside,
+    rng_for,
+    seed_for,
 )  # fmt: skip
 
 
@@ -20,6 +39,12 @@ def test_an_error_is_one_line_of_must_got_fix():
         {"where": "a:1", "kind": "bad-line", "text": "x"},
         {"where": "a:2", "kind": "bad-line", "text": "y"},
     ]
+
+
+def test_errors_survive_pickling_as_worker_processes_need():
+    for error in (PalpateError("m", "g", "f"), ProblemsError([Problem("a:1", "k", "t")], "f"), MissingExtraError("av", "video", "x")):
+        again = pickle.loads(pickle.dumps(error))
+        assert (type(again), str(again), again.to_json()) == (type(error), str(error), error.to_json())
 
 
 def test_seeds_depend_on_names_alone_and_are_stable_across_versions():
@@ -36,13 +61,15 @@ def test_digests_are_canonical():
 
 
 def test_atomic_writing_leaves_nothing_half(tmp_path):
-    def fail_in(context, write):
-        with pytest.raises(RuntimeError), context as part:
+    def write_and_fail(context, write):
+        with context as part:
             write(part)
             raise RuntimeError
 
-    fail_in(atomic_path(tmp_path / "a.txt"), lambda part: part.write_text("half"))
-    fail_in(atomic_folder(tmp_path / "b"), lambda part: (part / "x").write_text("half"))
+    with pytest.raises(RuntimeError):
+        write_and_fail(atomic_path(tmp_path / "a.txt"), lambda part: part.write_text("half"))
+    with pytest.raises(RuntimeError):
+        write_and_fail(atomic_folder(tmp_path / "b"), lambda part: (part / "x").write_text("half"))
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").touch()

@@ -55,16 +55,19 @@ def test_audit_and_split_load_no_torch(tmp_path):
 
 
 @pytest.mark.skipif(not LINT.exists(), reason="import-linter is not installed")
-@pytest.mark.parametrize("room, line", [
+@pytest.mark.parametrize(("room", "line"), [
     ("metrics", "import palpate.data.manifest"), ("core", "import polars"), ("leakage", "import palpate.sim"), ("sim", "import palpate.leakage"),
     ("report", "import palpate.metrics"), ("data", "import palpate.encoders.loop"), ("leakage", "import torch"),
 ])  # fmt: skip
 def test_a_planted_import_against_the_house_is_found(tmp_path, room, line):
     shutil.copytree(TOP / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(TOP / "pyproject.toml", tmp_path)
-    run = lambda: subprocess.run(
-        [LINT], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path / "src"), "PATH": ""}, capture_output=True, text=True, check=False
-    )  # noqa: E731
+
+    def run():
+        return subprocess.run(
+            [LINT], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path / "src"), "PATH": ""}, capture_output=True, text=True, check=False
+        )
+
     clean = run()
     assert clean.returncode == 0, clean.stdout + clean.stderr
     (tmp_path / "src" / "palpate" / room / "planted.py").write_text(f'"""Planted."""\n\n{line}\n')

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 
 class PalpateError(Exception):
@@ -23,6 +24,10 @@ class PalpateError(Exception):
     def __init__(self, must: str, got: str, fix: str) -> None:
         self.must, self.got, self.fix = must, got, fix
         super().__init__(f"{must.rstrip('.')}. Got {got.rstrip('.')}. {fix.rstrip('.')}.")
+
+    def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
+        # By default an exception is rebuilt from its message alone, which this constructor does not take.
+        return type(self), (self.must, self.got, self.fix)
 
     def to_json(self) -> dict[str, object]:
         """The error as a JSON object: ``error, must, got, fix``."""
@@ -58,6 +63,9 @@ class ProblemsError(PalpateError):
         )
         super().__init__("Every row and file of the input must be readable and consistent", got, fix)
 
+    def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
+        return type(self), (self.problems, self.fix)
+
     def to_json(self) -> dict[str, object]:
         """The error as a JSON object, with the list ``problems``."""
         return super().to_json() | {"problems": [asdict(p) for p in self.problems]}
@@ -67,8 +75,12 @@ class MissingExtraError(PalpateError):
     """An optional dependency is not installed; says which ``pip install`` mends it."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
+        self._given = (package, extra, purpose)
         super().__init__(
             f"{purpose} needs the package {package}",
             "no such package in this environment",
             f"Run: pip install 'palpate[{extra}]'",
         )
+
+    def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
+        return type(self), self._given

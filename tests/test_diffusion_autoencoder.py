@@ -1,0 +1,207 @@
+"""The VQ autoencoder: its semantics against a hand-made one, its training, its files, the latent cache."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from diffusers import VQModel
+
+from palpate.core import PalpateError
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.autoencoder_training import (
+    AutoencoderOptions,
+    _ssim,
+    build_autoencoder,
+    k_means,
+    measure_reconstruction,
+    train_autoencoder,
+)
+from palpate.diffusion.latents import LatentStats, encode_latents
+from palpate.diffusion.pixels import digest_tensors, to_bytes, to_unit
+
+SMALL = AutoencoderOptions(patch=4, widths=(16,), groups=4, codes=32, steps_free=60, steps_quantised=20, batch=8, crop=8, lr=5e-3)
+
+
+def pictures(n: int, size: int = 16, seed: int = 0) -> np.ndarray:
+    """Smooth colour ramps: easy to compress, all different."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:size, :size] / size
+    waves = np.stack([x, y, x * y, np.ones_like(x)], -1)
+    return np.clip(waves @ rng.uniform(-120, 120, (n, 1, 4, 3)) + 128, 0, 255).astype(np.uint8)
+
+
+def random_model(seed: int = 0) -> Autoencoder:
+    torch.manual_seed(seed)
+    return build_autoencoder(SMALL).eval()
+
+
+def test_pixels_go_there_and_back():
+    images = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), dtype=np.uint8)
+    unit = to_unit(images)
+    assert unit.shape == (3, 3, 8, 8)
+    assert unit[1, 2, 3, 4] == pytest.approx(images[1, 3, 4, 2] / 127.5 - 1)
+    assert np.array_equal(to_bytes(unit), images)
+    assert to_bytes(torch.full((1, 3, 1, 1), 5.0)).max() == 255
+    with pytest.raises(PalpateError, match="bytes of shape"):
+        to_unit(images.astype(np.float32))
+
+
+def test_digest_sees_names_shapes_and_values():
+    one = {"a": torch.arange(6.0)}
+    assert digest_tensors(one) == digest_tensors({"a": torch.arange(6.0)})
+    others = [{"b": one["a"]}, {"a": one["a"].reshape(2, 3)}, {"a": one["a"].double()}, {"a": one["a"] + 1e-6}]
+    assert len({digest_tensors(v) for v in [one, *others]}) == 5
+
+
+def test_encode_is_before_quantisation_and_decode_quantises():
+    model = random_model()
+    images = pictures(3)
+    z = model.encode(images)
+    assert z.shape == (3, 3, 4, 4)
+    # By hand: unshuffle patches, run the VQModel's own parts.
+    unit = torch.from_numpy(images).permute(0, 3, 1, 2) / 127.5 - 1
+    patches = unit.reshape(3, 3, 4, 4, 4, 4).permute(0, 1, 3, 5, 2, 4).reshape(3, 48, 4, 4)
+    with torch.no_grad():
+        by_hand = model.vq.quant_conv(model.vq.encoder(patches))
+    assert torch.allclose(z, by_hand, atol=1e-6)
+    # Quantise by brute force: decoding latents equals decoding their nearest codes.
+    codes = model.vq.quantize.embedding.weight.detach()
+    flat = z.permute(0, 2, 3, 1).reshape(-1, 3)
+    nearest = ((flat[:, None] - codes[None]) ** 2).sum(-1).argmin(1)
+    assert torch.equal(model.codes(z).flatten(), nearest)
+    snapped = codes[nearest].reshape(3, 4, 4, 3).permute(0, 3, 1, 2)
+    # z + (q - z) of the straight-through form is q up to rounding.
+    assert np.abs(model.decode(z).astype(int) - model.decode(snapped)).max() <= 1
+    with torch.no_grad():
+        free = to_bytes(model.image(z, quantise=False)[0])
+    assert not np.array_equal(model.decode(z), free)
+
+
+def test_batches_agree():
+    model = random_model()
+    images = pictures(7)
+    assert torch.allclose(model.encode(images, batch=2), model.encode(images, batch=7), atol=1e-6)
+    assert model.encode(images[:0]).shape == (0, 3, 4, 4)
+    assert model.decode(torch.zeros(0, 3, 4, 4)).shape == (0, 16, 16, 3)
+
+
+def test_odd_sizes_are_refused():
+    with pytest.raises(PalpateError, match="multiples of 4"):
+        random_model().encode(np.zeros((1, 18, 16, 3), np.uint8))
+
+
+def test_saved_model_is_the_same_and_tampering_is_noticed(tmp_path):
+    model = random_model()
+    model.save(tmp_path / "ae")
+    again = Autoencoder.load(tmp_path / "ae")
+    assert again.digest == model.digest
+    assert again.patch == 4
+    images = pictures(2)
+    assert torch.equal(again.encode(images), model.encode(images))
+    assert not any(p.requires_grad for p in again.parameters())
+    card = json.loads((tmp_path / "ae" / "palpate.json").read_text())
+    card["digest"] = "0" * 64
+    (tmp_path / "ae" / "palpate.json").write_text(json.dumps(card))
+    with pytest.raises(PalpateError, match="must match"):
+        Autoencoder.load(tmp_path / "ae")
+
+
+def test_a_plain_vqmodel_folder_loads_with_patch_1(tmp_path):
+    torch.manual_seed(0)
+    blocks = {"down_block_types": ("DownEncoderBlock2D",) * 3, "up_block_types": ("UpDecoderBlock2D",) * 3}
+    vq = VQModel(block_out_channels=(8, 8, 16), norm_num_groups=4, num_vq_embeddings=16, latent_channels=3, **blocks)
+    vq.save_pretrained(tmp_path / "vq")
+    model = Autoencoder.load(tmp_path / "vq")
+    assert (model.patch, model.factor, model.channels) == (1, 4, 3)
+    images = pictures(2)
+    with torch.no_grad():
+        wanted = vq.eval().encode(to_unit(images)).latents
+    assert torch.allclose(model.encode(images), wanted, atol=1e-6)
+
+
+def test_folders_that_are_none_are_refused(tmp_path):
+    with pytest.raises(PalpateError, match="diffusers VQModel"):
+        Autoencoder.load(tmp_path)
+
+
+def test_k_means_finds_separate_heaps_and_leaves_no_centre_unused():
+    rng = np.random.default_rng(0)
+    middles = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
+    points = np.concatenate([m + 0.1 * rng.standard_normal((50, 3)) for m in middles])
+    centres = k_means(points, 4, np.random.default_rng(1))
+    distance = np.linalg.norm(middles[:, None] - centres[None], axis=2)
+    assert distance.min(axis=1).max() < 0.2
+    many = k_means(points, 60, np.random.default_rng(1))
+    used = np.linalg.norm(points[:, None] - many[None], axis=2).argmin(1)
+    assert len(np.unique(used)) >= 58
+
+
+def test_training_learns_uses_its_codes_and_resumes(tmp_path):
+    train, test = pictures(64), pictures(16, seed=1)
+    model = train_autoencoder(train, SMALL, tmp_path / "a", held_out=test)
+    result = measure_reconstruction(model, test)
+    assert model.card["held_out"]["psnr"] == pytest.approx(result.psnr)
+    untrained = measure_reconstruction(random_model(), test)
+    assert result.psnr > untrained.psnr + 4
+    assert result.perplexity > 8 > untrained.perplexity
+    assert result.codes == 32
+
+    def stop(what, done, total, remark=""):
+        if what == "codebook" and done == 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_autoencoder(train, SMALL, tmp_path / "b", progress=stop)
+    assert train_autoencoder(train, SMALL, tmp_path / "b").digest == model.digest
+
+
+def test_scores_of_a_perfect_copy_and_by_scikit_image():
+    from skimage.metrics import structural_similarity
+
+    rng = np.random.default_rng(0)
+    a, b = rng.random((2, 24, 24, 3)), rng.random((2, 24, 24, 3))
+    mixed = 0.7 * a + 0.3 * b
+    ours = _ssim(*(torch.from_numpy(v).permute(0, 3, 1, 2) for v in (a, mixed)))
+    for k in range(2):
+        _, full = structural_similarity(
+            a[k], mixed[k], data_range=1, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
+        )
+        assert float(ours[k]) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
+
+
+def test_latent_statistics_by_hand():
+    z = torch.randn(300, 2, 3, 3) * torch.tensor([2.0, 0.5]).reshape(1, 2, 1, 1) + 1
+    stats = LatentStats.of(z)
+    assert stats.mean == pytest.approx(z.double().mean((0, 2, 3)).tolist(), abs=1e-9)
+    assert stats.std == pytest.approx(z.double().std((0, 2, 3), correction=0).tolist(), abs=1e-9)
+    normal = stats.normalise(z)
+    assert torch.allclose(normal.std((0, 2, 3)), torch.ones(2), atol=1e-3)
+    assert torch.allclose(stats.restore(normal), z, atol=1e-5)
+    paper = LatentStats.of(z, "one")
+    assert paper.std == stats.std
+    assert torch.equal(paper.normalise(z), z)
+
+
+def test_latents_are_encoded_once(tmp_path):
+    model = random_model()
+    images = pictures(5)
+    ids = list("abcde")
+    calls = []
+
+    class Rows:
+        def __getitem__(self, rows):
+            calls.append(rows)
+            return images[rows]
+
+    z = encode_latents(model, Rows(), ids, tmp_path, key="k", batch=2)
+    assert torch.allclose(torch.from_numpy(np.array(z)), model.encode(images), atol=1e-6)
+    n = len(calls)
+    again = encode_latents(model, Rows(), ids, tmp_path, key="k", batch=2)
+    assert len(calls) == n
+    assert np.array_equal(z, again)
+    encode_latents(model, Rows(), ids, tmp_path, key="other", batch=2)
+    assert len(calls) > n
+    n = len(calls)
+    encode_latents(model, Rows(), list("abcdX"), tmp_path, key="other", batch=2)
+    assert len(calls) > n

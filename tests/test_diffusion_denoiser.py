@@ -1,0 +1,248 @@
+"""Condition tokens, Eq. 1, condition dropout, and the geometry of the paper's U-Net."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from palpate.core import PalpateError
+from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, UNetOptions, build_unet
+from palpate.diffusion.latents import LatentStats
+from palpate.diffusion.presets import MINI, PAPER, PRESETS, preset_named
+from palpate.diffusion.training import DiffusionLoss, Schedule, train_denoiser
+from palpate.encoders.loop import LoopOptions
+
+UNET = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
+POLICY = ConditionPolicy(width=12)
+PLAIN = LatentStats((0.0,) * 3, (1.0,) * 3, "one")
+LOOP = LoopOptions(steps=12, batch=4, lr=1e-3, warmup=2, ema=0.9)
+
+
+def denoiser(policy: ConditionPolicy = POLICY, *, background: bool = False, means=None) -> Denoiser:
+    torch.manual_seed(0)
+    return Denoiser(build_unet(UNET, channels=3, size=8, width=policy.width, background=background), policy, means).eval()
+
+
+def test_the_papers_unet_has_the_parameters_of_latent_diffusion():
+    with torch.device("meta"):
+        net = build_unet(PAPER.unet, channels=3, size=64, width=768, background=False)
+        wide = build_unet(PAPER.unet, channels=3, size=64, width=768, background=True)
+    count = sum(p.numel() for p in net.parameters())
+    assert round(count / 1e6, 1) == 406.3
+    # w/ BG adds three input channels to the first 3 x 3 convolution and nothing else.
+    assert sum(p.numel() for p in wide.parameters()) - count == 3 * 192 * 9
+    # Attention at 1/2, 1/4 and 1/8 with heads of 32 channels.
+    heads = [b.attentions[0].transformer_blocks[0].attn1.heads for b in net.down_blocks if hasattr(b, "attentions")]
+    assert heads == [384 // 32, 576 // 32, 960 // 32]
+
+
+def test_the_papers_preset_says_what_the_paper_says():
+    assert (PAPER.schedule.steps, PAPER.schedule.beta_start, PAPER.schedule.beta_end) == (1000, 0.0015, 0.0195)
+    assert PAPER.schedule.prediction == "epsilon"
+    assert PAPER.schedule.min_snr is None
+    assert (PAPER.sampler.method, PAPER.sampler.steps, PAPER.sampler.guidance) == ("ddim", 200, 7.5)
+    assert PAPER.loop.lr == pytest.approx(6.4e-5)
+    assert PAPER.loop_for(13_900).steps == -(-30 * 13_900 // 32)
+    assert PAPER.condition == ConditionPolicy(width=768, dropout=0.1, gap="none", noise=0.0, null="zeros", source="text")
+    assert PAPER.latent_scale == "one"
+    assert preset_named("mini") is MINI
+    with pytest.raises(PalpateError, match="tiny, mini, paper"):
+        preset_named("huge")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_builds(name):
+    preset = PRESETS[name]
+    with torch.device("meta"):
+        net = build_unet(preset.unet, channels=3, size=preset.size // 4, width=preset.condition.width, background=False)
+        out = net(torch.zeros(1, 3, 16, 16), torch.zeros(1, dtype=torch.long), torch.zeros(1, 1, preset.condition.width)).sample
+    assert out.shape == (1, 3, 16, 16)
+
+
+def test_schedule_is_diffusers_scaled_linear():
+    from diffusers import DDIMScheduler
+
+    theirs = DDIMScheduler(beta_start=0.0015, beta_end=0.0195, beta_schedule="scaled_linear").alphas_cumprod
+    assert torch.allclose(Schedule().alphas().float(), theirs, rtol=2e-5)
+    assert Schedule().alphas()[0].item() == pytest.approx(1 - 0.0015)
+
+
+def test_tokens_are_normalised_scaled_repeated_and_shifted():
+    c = torch.randn(5, 12)
+    plain = denoiser(replace(POLICY, tokens=3)).tokens(c, "text")
+    wanted = c / c.norm(dim=1, keepdim=True) * 12**0.5
+    assert plain.shape == (5, 3, 12)
+    assert torch.allclose(plain[:, 2], wanted, atol=1e-6)
+    m = torch.randn(12)
+    shifted = denoiser(replace(POLICY, gap="mean-shift"), means={"text": m})
+    moved = c - m
+    assert torch.allclose(shifted.tokens(c, "text")[:, 0], moved / moved.norm(dim=1, keepdim=True) * 12**0.5, atol=1e-5)
+    with pytest.raises(PalpateError, match="mean of vision"):
+        shifted.tokens(c, "vision")
+    with pytest.raises(PalpateError, match=r"\(n, 12\)"):
+        shifted.tokens(torch.randn(5, 11), "text")
+
+
+def test_null_token_is_zeros_or_learned():
+    assert not denoiser().null_tokens(2).any()
+    learned = denoiser(replace(POLICY, null="learned", tokens=2))
+    assert learned.null_tokens(3).shape == (3, 2, 12)
+    assert learned.null_tokens(3).any()
+
+
+def test_condition_and_background_reach_the_output():
+    model = denoiser(background=True)
+    x, t = torch.randn(2, 3, 8, 8), torch.tensor([10, 500])
+    a, b = model.tokens(torch.randn(2, 12), "text"), model.tokens(torch.randn(2, 12), "text")
+    ground = torch.randn(2, 3, 8, 8)
+    with torch.no_grad():
+        assert not torch.allclose(model(x, t, a, ground), model(x, t, b, ground))
+        assert not torch.allclose(model(x, t, a, ground), model(x, t, a, torch.zeros_like(ground)))
+    with pytest.raises(PalpateError, match="background image"):
+        model(x, t, a)
+
+
+class Recorder(Denoiser):
+    """Answers zero and keeps what it was asked."""
+
+    def forward(self, x, t, tokens, background=None):
+        self.seen = (x.clone(), t.clone(), tokens.clone(), background)
+        return torch.zeros_like(x)
+
+
+def recorder(policy: ConditionPolicy) -> Recorder:
+    torch.manual_seed(0)
+    return Recorder(build_unet(UNET, channels=3, size=8, width=policy.width, background=False), policy)
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
+def test_loss_is_equation_1(prediction):
+    z = torch.randn(40, 3, 8, 8)
+    tokens = torch.randn(40, 1, 12)
+    schedule = Schedule(prediction=prediction)
+    loss = DiffusionLoss(z, {"text": tokens}, None, PLAIN, schedule)
+    model = recorder(replace(POLICY, dropout=0.0))
+    rows = torch.arange(40)
+    value, logs = loss(model, rows, torch.Generator().manual_seed(5), 0)
+    x, t, seen, _ = model.seen
+    assert torch.equal(seen, tokens)
+    # The network sees sqrt(a) z + sqrt(1 - a) eps: recover eps, and with answer 0 the loss is the mean square of the target.
+    a = torch.tensor(np.cumprod(1 - np.linspace(0.0015**0.5, 0.0195**0.5, 1000) ** 2))[t].reshape(-1, 1, 1, 1)
+    eps = (x - a.sqrt() * z) / (1 - a).sqrt()
+    assert abs(float(eps.mean())) < 0.05
+    assert float(eps.std()) == pytest.approx(1, abs=0.05)
+    target = eps if prediction == "epsilon" else a.sqrt() * eps - (1 - a).sqrt() * z
+    assert float(value) == pytest.approx(float(target.square().mean()), rel=1e-4)
+    assert logs["mse"] == pytest.approx(float(value), rel=1e-6)
+
+
+def test_time_is_uniform_over_all_steps():
+    loss = DiffusionLoss(torch.zeros(4000, 3, 2, 2), {"text": torch.zeros(4000, 1, 12)}, None, PLAIN, Schedule(steps=10))
+    model = recorder(POLICY)
+    loss(model, torch.arange(4000), torch.Generator().manual_seed(0), 0)
+    counts = torch.bincount(model.seen[1], minlength=10)
+    assert len(counts) == 10
+    assert counts.min() > 320
+    assert counts.max() < 480
+
+
+def test_min_snr_weight():
+    alphas = Schedule(min_snr=5.0).alphas()
+    t = torch.tensor([0, 200, 999])
+    snr = (alphas / (1 - alphas))[t]
+    for prediction, extra in (("epsilon", 0), ("v_prediction", 1)):
+        loss = DiffusionLoss(torch.zeros(1, 3, 2, 2), {}, None, PLAIN, Schedule(prediction=prediction, min_snr=5.0))
+        assert loss._weight(t).tolist() == pytest.approx((snr.clamp(max=5) / (snr + extra)).tolist(), rel=1e-5)
+
+
+def test_dropout_replaces_a_tenth_of_the_conditions_by_null():
+    tokens = torch.ones(3000, 2, 12)
+    loss = DiffusionLoss(torch.zeros(3000, 3, 2, 2), {"text": tokens}, None, PLAIN, Schedule())
+    model = recorder(replace(POLICY, tokens=2))
+    loss(model, torch.arange(3000), torch.Generator().manual_seed(0), 0)
+    dropped = (model.seen[2] == 0).all(-1)
+    assert torch.equal(dropped[:, 0], dropped[:, 1])
+    assert 0.08 < dropped[:, 0].float().mean() < 0.12
+
+
+def test_noise_moves_tokens_but_keeps_their_length():
+    tokens = torch.nn.functional.normalize(torch.randn(200, 1, 12), dim=2) * 12**0.5
+    loss = DiffusionLoss(torch.zeros(200, 3, 2, 2), {"text": tokens}, None, PLAIN, Schedule())
+    model = recorder(replace(POLICY, dropout=0.0, noise=0.5))
+    loss(model, torch.arange(200), torch.Generator().manual_seed(0), 0)
+    seen = model.seen[2]
+    assert torch.allclose(seen.norm(dim=2), torch.full((200, 1), 12**0.5), atol=1e-4)
+    cosine = torch.nn.functional.cosine_similarity(seen[:, 0], tokens[:, 0])
+    assert 0.8 < cosine.mean() < 0.97
+
+
+def test_mixed_source_draws_from_both():
+    tables = {"text": torch.zeros(2000, 1, 12), "vision": torch.ones(2000, 1, 12)}
+    loss = DiffusionLoss(torch.zeros(2000, 3, 2, 2), tables, None, PLAIN, Schedule())
+    model = recorder(replace(POLICY, dropout=0.0, source="mixed"))
+    loss(model, torch.arange(2000), torch.Generator().manual_seed(0), 0)
+    share = model.seen[2][:, 0, 0].mean()
+    assert 0.46 < share < 0.54
+
+
+def data(n: int = 24):
+    torch.manual_seed(1)
+    return torch.randn(n, 3, 8, 8), {"text": torch.randn(n, 12), "vision": torch.randn(n, 12)}
+
+
+def train(folder, **changes):
+    z, conditions = data()
+    settings = {"stats": LatentStats.of(z), "unet": UNET, "policy": POLICY, "schedule": Schedule(), "loop": LOOP, "folder": folder}
+    return train_denoiser(z, conditions, **settings | changes)
+
+
+def test_training_resumes_to_the_same_weights(tmp_path):
+    whole = train(tmp_path / "a")
+
+    def stop(what, done, total, remark=""):
+        if done == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "b", progress=stop)
+    again = train(tmp_path / "b")
+    for (name, a), b in zip(whole.state_dict().items(), again.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    # Another schedule is another run: the old checkpoint is not used.
+    other = train(tmp_path / "b", schedule=Schedule(prediction="v_prediction"))
+    assert not all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True))
+
+
+def test_training_does_not_touch_global_randomness(tmp_path):
+    z, conditions = data()
+    torch.manual_seed(3)
+    before = torch.get_rng_state()
+    train_denoiser(z, conditions, stats=PLAIN, unet=UNET, policy=POLICY, schedule=Schedule(), loop=LOOP, folder=tmp_path)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_saved_denoiser_is_the_same(tmp_path):
+    policy = replace(POLICY, gap="mean-shift", null="learned", source="vision")
+    model = train(tmp_path / "run", policy=policy)
+    model.save(tmp_path / "unet")
+    again = Denoiser.load(tmp_path / "unet", policy)
+    for (name, a), b in zip(model.state_dict().items(), again.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    # Only vision conditioned the training, but the text mean is known too, so text can drive it.
+    assert torch.isfinite(again.means).all()
+
+
+def test_mistakes_are_told(tmp_path):
+    z, conditions = data()
+    with pytest.raises(PalpateError, match="needs embeddings of text, vision"):
+        train_denoiser(
+            z, {"text": conditions["text"]}, stats=PLAIN, unet=UNET, policy=replace(POLICY, source="mixed"), schedule=Schedule(), loop=LOOP,
+            folder=tmp_path,
+        )  # fmt: skip
+    with pytest.raises(PalpateError, match="one row a sample"):
+        train_denoiser(
+            z[:-1], conditions, stats=PLAIN, unet=UNET, policy=POLICY, schedule=Schedule(), loop=LOOP, folder=tmp_path
+        )  # fmt: skip
+    with pytest.raises(PalpateError, match=r"\[0, 1\)"):
+        ConditionPolicy(width=3, dropout=1.0)

@@ -1,0 +1,163 @@
+"""The sampler against closed forms, and that a sample depends on its seed and id alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from palpate.core import PalpateError
+from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, UNetOptions, build_unet
+from palpate.diffusion.sampling import SamplerOptions, build_scheduler, sample, sample_latents, starting_noise
+from palpate.diffusion.training import Schedule
+
+SHAPE = (3, 4, 4)
+TOKENS = torch.zeros(1, 1, 1)
+MEAN, SPREAD = 1.7, 0.4
+
+
+def exact(schedule: Schedule, mean, spread: float):
+    """The exact predictor for data N(mean, spread^2): E[eps | z_t], or E[v | z_t]."""
+    alphas = schedule.alphas().float()
+
+    def predict(z, t, tokens, background):
+        a = alphas[t].reshape(-1, 1, 1, 1)
+        m = mean(tokens) if callable(mean) else mean
+        eps = (z - a.sqrt() * m) * (1 - a).sqrt() / (a * spread**2 + 1 - a)
+        if schedule.prediction == "epsilon":
+            return eps
+        return (eps - (1 - a).sqrt() * z) / a.sqrt()
+
+    return predict
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
+@pytest.mark.parametrize(("method", "steps", "tolerance"), [("ddim", 200, 0.02), ("ddim", 1000, 0.01), ("dpm", 20, 0.02)])
+def test_gaussian_data_come_out_with_their_mean_and_spread(method, steps, tolerance, prediction):
+    schedule = Schedule(prediction=prediction)
+    ids = [f"s{k}" for k in range(128)]
+    z = sample(
+        exact(schedule, MEAN, SPREAD), TOKENS.expand(128, 1, 1), TOKENS, ids,
+        shape=SHAPE, schedule=schedule, options=SamplerOptions(method, steps, guidance=1.0, batch=64), seed=0,
+    )  # fmt: skip
+    noise = starting_noise(ids, SHAPE, 0)
+    # The probability flow of a Gaussian is z^0 = mean + spread * z^T (up to the signal left at T), sample by sample.
+    assert float(z.mean()) == pytest.approx(MEAN + SPREAD * float(noise.mean()), abs=tolerance)
+    assert float(z.std()) == pytest.approx(SPREAD * float(noise.std()), rel=3 * tolerance)
+    assert torch.allclose(z, MEAN + SPREAD * noise, atol=0.1)
+
+
+def test_guidance_extrapolates_from_the_unconditional_prediction():
+    """Equal spreads, means 0 (null) and m: the guided prediction is that of the mean s m."""
+    schedule = Schedule()
+    predict = exact(schedule, lambda tokens: tokens.reshape(-1, 1, 1, 1), 0.5)
+    ids = [f"s{k}" for k in range(32)]
+    for s in (0.0, 1.0, 3.0):
+        z = sample(
+            predict, torch.full((32, 1, 1), 0.8), TOKENS, ids,
+            shape=SHAPE, schedule=schedule, options=SamplerOptions("ddim", 200, guidance=s, batch=16), seed=1,
+        )  # fmt: skip
+        expected = s * 0.8 + 0.5 * float(starting_noise(ids, SHAPE, 1).mean())
+        assert float(z.mean()) == pytest.approx(expected, abs=0.03)
+
+
+def test_ddim_step_by_hand():
+    """One deterministic DDIM step: z_{t-1} = sqrt(a') x0 + sqrt(1 - a') eps."""
+    schedule = Schedule()
+    scheduler = build_scheduler(schedule, "ddim")
+    scheduler.set_timesteps(10)
+    times = scheduler.timesteps.tolist()
+    assert times[0] == 999
+    a = schedule.alphas()
+    z, eps = torch.randn(2, 3, 4, 4), torch.randn(2, 3, 4, 4)
+    x0 = (z - (1 - a[999]).sqrt() * eps) / a[999].sqrt()
+    wanted = a[899].sqrt() * x0 + (1 - a[899]).sqrt() * eps
+    assert times[1] == 899
+    assert torch.allclose(scheduler.step(eps, 999, z).prev_sample.double(), wanted.double(), rtol=1e-3, atol=1e-3)
+
+
+def test_noise_belongs_to_seed_and_id():
+    a = starting_noise(["x", "y"], SHAPE, 0)
+    assert torch.equal(starting_noise(["y"], SHAPE, 0)[0], a[1])
+    assert not torch.equal(a[0], a[1])
+    assert not torch.equal(starting_noise(["x"], SHAPE, 1)[0], a[0])
+    many = starting_noise([str(k) for k in range(500)], SHAPE, 0)
+    assert abs(float(many.mean())) < 0.02
+    assert float(many.std()) == pytest.approx(1, abs=0.02)
+
+
+def network(policy: ConditionPolicy | None = None) -> Denoiser:
+    torch.manual_seed(0)
+    policy = policy or ConditionPolicy(width=12)
+    options = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
+    return Denoiser(build_unet(options, channels=3, size=8, width=12, background=False), policy).eval()
+
+
+def draw(model: Denoiser, conditions, ids, **changes) -> torch.Tensor:
+    options = replace(SamplerOptions("dpm", 4, guidance=3.0, batch=4), **changes)
+    return sample_latents(model, model.tokens(conditions, "vision"), ids, size=8, schedule=Schedule(), options=options, seed=0)
+
+
+def test_a_sample_does_not_depend_on_its_neighbours():
+    model = network()
+    torch.manual_seed(1)
+    c = torch.randn(7, 12)
+    ids = [f"id {k}" for k in range(7)]
+    whole = draw(model, c, ids)
+    order = [4, 1, 6, 0]
+    # At one batch size, other neighbours and places change no bit.
+    assert torch.equal(draw(model, c[order], [ids[k] for k in order]), whole[order])
+    assert torch.equal(draw(model, c[3:4], ids[3:4])[0], whole[3])
+    # Another batch size may pick other kernels: equal up to rounding.
+    for batch in (1, 3, 7, 16):
+        assert torch.allclose(draw(model, c, ids, batch=batch), whole, rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
+
+
+def test_guidance_changes_the_output():
+    model = network()
+    c = torch.randn(2, 12)
+    outputs = [draw(model, c, ["a", "b"], guidance=s) for s in (0.0, 1.0, 2.0, 7.5)]
+    for k, one in enumerate(outputs):
+        for other in outputs[k + 1 :]:
+            assert not torch.allclose(one, other, atol=1e-4)
+    # Without guidance the unconditional pass is not made, yet the formula holds.
+    both = draw(model, c, ["a", "b"], guidance=1.0 + 1e-9)
+    assert torch.allclose(both, outputs[1], atol=1e-4)
+
+
+def test_guidance_needs_condition_dropout():
+    model = network(ConditionPolicy(width=12, dropout=0.0))
+    with pytest.raises(PalpateError, match="condition dropout"):
+        draw(model, torch.randn(1, 12), ["a"], guidance=2.0)
+    assert draw(model, torch.randn(1, 12), ["a"], guidance=1.0).shape == (1, 3, 8, 8)
+
+
+def test_rescaling_keeps_the_spread_of_the_conditional_prediction():
+    seen = []
+
+    def predict(z, t, tokens, background):
+        out = z * torch.where(tokens == 0, 0.5, 1.0).reshape(-1, 1, 1, 1)
+        seen.append(out)
+        return out
+
+    from palpate.diffusion.sampling import _guided
+
+    z, t = torch.randn(2, 3, 4, 4), torch.tensor([5, 5])
+    out = _guided(predict, z, t, torch.ones(2, 1, 1), torch.zeros(2, 1, 1), None, SamplerOptions(guidance=4.0, rescale=1.0))
+    assert torch.allclose(out.std((1, 2, 3)), z.std((1, 2, 3)), rtol=1e-5)
+    assert torch.allclose(out / out.std(), z / z.std(), atol=1e-5)
+
+
+def test_mistakes_are_told():
+    model = network()
+    with pytest.raises(PalpateError, match="one condition"):
+        draw(model, torch.randn(2, 12), ["a"])
+    with pytest.raises(PalpateError, match="1 to 1000 steps"):
+        draw(model, torch.randn(1, 12), ["a"], steps=0)
+    with pytest.raises(PalpateError, match="w/ BG"):
+        sample_latents(
+            model, model.tokens(torch.randn(1, 12), "text"), ["a"], size=8, schedule=Schedule(), options=SamplerOptions(), seed=0,
+            background=torch.zeros(1, 3, 8, 8),
+        )  # fmt: skip
+    assert draw(model, torch.randn(0, 12), []).shape == (0, 3, 8, 8)
+    assert np.isfinite(draw(model, torch.randn(1, 12), ["a"]).numpy()).all()
