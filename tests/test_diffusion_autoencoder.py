@@ -1,6 +1,7 @@
 """The VQ autoencoder: its semantics against a hand-made one, its training, its files, the latent cache."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,6 +119,37 @@ def test_a_plain_vqmodel_folder_loads_with_patch_1(tmp_path):
     with torch.no_grad():
         wanted = vq.eval().encode(to_unit(images)).latents
     assert torch.allclose(model.encode(images), wanted, atol=1e-6)
+
+
+def test_an_old_bin_loads_as_weights_only(tmp_path):
+    model = random_model()
+    model.save(tmp_path / "vq")
+    (tmp_path / "vq" / "diffusion_pytorch_model.safetensors").unlink()
+    torch.save(model.vq.state_dict(), tmp_path / "vq" / "diffusion_pytorch_model.bin")
+    assert Autoencoder.load(tmp_path / "vq").digest == model.digest
+    marker = tmp_path / "ran"
+    torch.save({"x": Evil(str(marker))}, tmp_path / "vq" / "diffusion_pytorch_model.bin")
+    with pytest.raises(PalpateError, match="diffusers VQModel"):
+        Autoencoder.load(tmp_path / "vq")
+    assert not marker.exists()
+
+
+class Evil:
+    """Would make a file when unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (self.path, "w")
+
+
+def test_other_options_in_the_same_folder_train_anew(tmp_path):
+    train = pictures(32)
+    short = replace(SMALL, steps_free=5, steps_quantised=5)
+    train_autoencoder(train, replace(short, lr=1e-3), tmp_path / "a")
+    second = train_autoencoder(train, short, tmp_path / "a")
+    assert second.digest == train_autoencoder(train, short, tmp_path / "b").digest
 
 
 def test_folders_that_are_none_are_refused(tmp_path):

@@ -1,1 +1,1 @@
-"""encoders"""
+"""The towers (vision, text, touch): loading, contrastive training, embedding with a cache, probes. Imports torch."""

@@ -2,7 +2,8 @@
 
 The rows and the noise of step k depend on (seed, k) alone, so a run that is stopped and started again
 takes the same steps as one that was not. A checkpoint is safetensors (weights, moving average, both Adam
-moments) with the step in its metadata; no pickle is written or read.
+moments) with the step and the log in its metadata, so that one rename replaces all of it; no pickle is written
+or read. ``log.jsonl`` is a copy for people.
 
 The moving average of the weights is ``a <- d a + (1 - d) w`` with ``d = min(ema, (1 + k) / (10 + k))``, the
 warm-up that latent diffusion uses (reference: Rombach et al., CVPR 2022, public code).
@@ -16,10 +17,11 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -44,6 +46,10 @@ class LoopOptions:
         ema: decay of the moving average that becomes the result, or None for the last weights.
         seed: of the order of rows and of the noise.
         checkpoint_seconds: time between checkpoints.
+        betas: AdamW's decay rates of the two moments.
+
+    Raises:
+        PalpateError: if a number lies outside its range or ``decay`` is unknown.
     """
 
     steps: int
@@ -56,6 +62,23 @@ class LoopOptions:
     ema: float | None = None
     seed: int = 0
     checkpoint_seconds: float = 60.0
+    betas: tuple[float, float] = (0.9, 0.999)
+
+    def __post_init__(self) -> None:
+        wrong = {
+            "steps must be at least 0": self.steps < 0,
+            "batch must be at least 1": self.batch < 1,
+            "lr must be positive and finite": not 0 < self.lr < math.inf,
+            "warmup must be at least 0": self.warmup < 0,
+            "decay must be cosine or constant": self.decay not in ("cosine", "constant"),
+            "weight_decay must be at least 0": not self.weight_decay >= 0,
+            "clip must be positive, or None": self.clip is not None and not self.clip > 0,
+            "ema must lie in [0, 1), or be None": self.ema is not None and not 0 <= self.ema < 1,
+        }
+        for must, bad in wrong.items():
+            if bad:
+                name = must.split()[0]
+                raise PalpateError(f"Training option {must}", repr(getattr(self, name)), f"Change the option {name}")
 
 
 def rows_at(step: int, batch: int, n: int, seed: int) -> np.ndarray:
@@ -94,7 +117,8 @@ def fit(
         loss: see :data:`LossFunction`; the generator lives on the CPU.
         n: number of training rows.
         options: see :class:`LoopOptions`.
-        folder: receives the checkpoint and ``log.jsonl`` (one line a logged step).
+        folder: receives the checkpoint and ``log.jsonl`` (one line a logged step). A checkpoint of other rows, other
+            options or other shapes is not used, and is replaced by the first one of this run.
         what: name for the progress bar.
         key: digest of the data and settings outside ``options``; a checkpoint with another key is not used.
         progress: called after each step with the smoothed loss as remark.
@@ -103,22 +127,24 @@ def fit(
         The log: dictionaries with ``step``, ``loss``, ``lr``, ``seconds`` and what ``loss`` returned.
 
     Raises:
-        PalpateError: without rows, or if the loss stops being finite.
+        PalpateError: without rows or parameters to train, or if the loss or its gradient stops being finite.
     """
     if n < 1:
         raise PalpateError(f"{what} needs at least one sample", "none", "Check the split: is its train part empty?")
     folder.mkdir(parents=True, exist_ok=True)
     params = {name: p for name, p in module.named_parameters() if p.requires_grad}
+    if not params:
+        raise PalpateError(f"{what} needs parameters that require gradients", "none", "Do not freeze the whole model")
     groups = [
         {"params": [p for p in params.values() if p.ndim >= 2], "weight_decay": options.weight_decay},
         {"params": [p for p in params.values() if p.ndim < 2], "weight_decay": 0.0},
     ]
-    optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=options.lr)
+    optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=options.lr, betas=options.betas)
     average = {name: p.detach().clone() for name, p in params.items()} if options.ema is not None else {}
     # How often a checkpoint is written changes nothing in the result, so it is not part of the key.
-    key = digest_json([key, n, {k: v for k, v in asdict(options).items() if k != "checkpoint_seconds"}])
-    start = _restore(folder, key, module, optimiser, params, average)
-    log = _read_log(folder, start)
+    shapes = {name: list(p.shape) for name, p in params.items()}
+    key = digest_json([key, n, shapes, {k: v for k, v in asdict(options).items() if k != "checkpoint_seconds"}])
+    start, log = _restore(folder, key, module, optimiser, params, average)
     module.train()
     smooth, saved = None, time.monotonic()
     whole = applied = start  # steps wholly done, and steps whose update has begun: equal between two steps
@@ -135,17 +161,21 @@ def fit(
                 raise PalpateError(f"The loss of {what} must stay finite", f"{number} at step {step}", "Lower the learning rate")
             optimiser.zero_grad(set_to_none=True)
             value.backward()
-            if options.clip is not None:
-                torch.nn.utils.clip_grad_norm_(list(params.values()), options.clip)
+            # A limit of infinity only measures. Weights must never meet such a gradient: a checkpoint would keep the harm.
+            norm = float(torch.nn.utils.clip_grad_norm_(list(params.values()), math.inf if options.clip is None else options.clip))
+            if not math.isfinite(norm):
+                raise PalpateError(f"The gradient of {what} must stay finite", f"norm {norm} at step {step}", "Lower the learning rate")
             applied = step + 1
             optimiser.step()
             if options.ema is not None:
                 d = min(options.ema, (1 + step) / (10 + step))
-                torch._foreach_lerp_(list(average.values()), [p.detach() for p in params.values()], 1 - d)
-            whole = step + 1
-            smooth = number if smooth is None else 0.95 * smooth + 0.05 * number
+                with torch.no_grad():
+                    for name, value in average.items():
+                        value.lerp_(params[name], 1 - d)
             if step % 10 == 0 or step == options.steps - 1:
                 log.append({"step": step, "loss": number, "lr": learning_rate(step, options), "seconds": time.monotonic() - began, **logs})
+            whole = step + 1
+            smooth = number if smooth is None else 0.95 * smooth + 0.05 * number
             progress(what, step + 1, options.steps, f"loss {smooth:.4f}")
             if time.monotonic() - saved > options.checkpoint_seconds:
                 _checkpoint(folder, key, step + 1, optimiser, module, params, average, log)
@@ -182,7 +212,7 @@ def _checkpoint(
     # Tied weights share storage, which safetensors refuses: each entry gets its own.
     tensors = {k: v.detach().to("cpu", copy=True).contiguous() for k, v in tensors.items()}
     with atomic_path(folder / "checkpoint.safetensors") as part:
-        save_file(tensors, part, metadata={"key": key, "step": str(step)})
+        save_file(tensors, part, metadata={"key": key, "step": str(step), "log": json.dumps(log)})
     with atomic_path(folder / "log.jsonl") as part:
         part.write_text("".join(json.dumps(line) + "\n" for line in log), encoding="utf-8")
 
@@ -194,15 +224,15 @@ def _restore(
     optimiser: torch.optim.Optimizer,
     params: dict[str, nn.Parameter],
     average: dict[str, Tensor],
-) -> int:
-    """Loads a checkpoint of this run, if there is one; returns the step to go on from."""
+) -> tuple[int, list[dict[str, float]]]:
+    """Loads a checkpoint of this run, if there is one; returns the step to go on from, and the log up to there."""
     path = folder / "checkpoint.safetensors"
     if not path.is_file():
-        return 0
-    with safe_open(path, framework="pt") as file:
+        return 0, []
+    with _opened(path) as file:
         meta = file.metadata() or {}
         if meta.get("key") != key:
-            return 0
+            return 0, []
         step = int(meta["step"])
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no iterator of its own
     module.load_state_dict({k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")})
@@ -215,12 +245,12 @@ def _restore(
                 "exp_avg": tensors[f"exp_avg.{name}"].to(p.device),
                 "exp_avg_sq": tensors[f"exp_avg_sq.{name}"].to(p.device),
             }
-    return step
+    return step, json.loads(meta["log"])
 
 
-def _read_log(folder: Path, start: int) -> list[dict[str, float]]:
-    path = folder / "log.jsonl"
-    if start == 0 or not path.is_file():
-        return []
-    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return [line for line in lines if line["step"] < start]
+def _opened(path: Path) -> Any:
+    """A checkpoint file, open for reading."""
+    try:
+        return safe_open(path, framework="pt")
+    except SafetensorError as error:
+        raise PalpateError(f"The checkpoint {path} must be a whole safetensors file", str(error), "Delete it to start anew") from None

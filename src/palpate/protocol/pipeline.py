@@ -148,7 +148,7 @@ def run_pipeline(
     pretraining = None if options.clip and options.autoencoder else work.pretraining(manifest, split)
     clip = options.clip or work.clip(pretraining)
     autoencoder = options.autoencoder or work.autoencoder(pretraining, manifest, split)
-    towers = work.towers(manifest, split, clip)
+    towers = work.towers(manifest, split, clip, pretraining)
     model = work.generator(manifest, split, towers, autoencoder)
     generated = work.generated(manifest, split, model)
     scores = work.scores(manifest, split, generated, towers)
@@ -273,20 +273,35 @@ class _Pipeline:
         stage = self.run.stage("autoencoder", inputs | {"repeat": self.preset.repeat} | self._digest("pretraining-data", "split"), build)
         return str(stage.folder / "autoencoder")
 
-    def towers(self, manifest: Manifest, split: Split, clip: str) -> Towers:
-        """The frozen pair with a touch tower trained on the train part."""
+    def towers(self, manifest: Manifest, split: Split, clip: str, pretraining: Manifest | None) -> Towers:
+        """The frozen pair with a touch tower: trained on the pretraining samples, if there are any, then on the train part."""
 
         def build(folder: Path) -> dict[str, Any]:
             frozen = load_clip(clip, device=self.options.device)
-            towers = train_touch(
-                manifest, split, frozen, self.encoder, folder / "training", seed=self.options.seed, cache=self.cache, device=self.options.device,
-                progress=self.progress,
-            )  # fmt: skip
+            common: dict[str, Any] = {
+                "seed": self.options.seed,
+                "cache": self.cache,
+                "device": self.options.device,
+                "progress": self.progress,
+            }
+            before, after = self.preset.touch_epochs
+            if pretraining is None:
+                towers = train_touch(manifest, split, frozen, self.encoder, folder / "training", **common)
+            else:
+                everything = Split.from_ids(train=pretraining.ids, rule={"name": "pretraining"}, manifest=pretraining.digest)
+                start = train_touch(pretraining, everything, frozen, self.encoder, folder / "pretraining", epochs=before, **common)
+                towers = train_touch(manifest, split, frozen, self.encoder, folder / "training", epochs=after, start=start, **common)
             towers.save(folder / "towers")
             return {"digest": towers.digest("touch"), "text_source": towers.card.get("text_source")}
 
-        inputs = {"preset": self.encoder, "clip": self._model_stamp("clip", clip), "seed": self.options.seed}
-        stage = self.run.stage("towers", inputs | self._digest("split", "data"), build)
+        inputs = {
+            "preset": self.encoder,
+            "clip": self._model_stamp("clip", clip),
+            "seed": self.options.seed,
+            "epochs": self.preset.touch_epochs,
+        }
+        names = ("split", "data") + (("pretraining-data",) if pretraining is not None else ())
+        stage = self.run.stage("towers", inputs | self._digest(*names), build)
         return Towers.load(stage.folder / "towers")
 
     def generator(self, manifest: Manifest, split: Split, towers: Towers, autoencoder: str) -> Pipeline:

@@ -1,0 +1,263 @@
+"""Training of a small VQ autoencoder, in stages that leave no code unused.
+
+1. *Free*: encoder and decoder without quantisation, with Gaussian noise on the latents (relative to their
+   spread), so that the decoder is smooth around each latent.
+2. *Codebook*: k-means of encoder outputs (Lloyd's iterations; an empty cell moves to the point farthest from
+   its centre) becomes the codebook, so that every code starts in use.
+3. *Quantised*: everything together with straight-through gradients (van den Oord et al. 2017).
+
+Loss: ``l1 * L1 + l2 * L2 + edge * L2 of the first differences`` (+ the codebook loss of VQModel in stage 3). Squares
+where the texture is: where a pattern is not yet known, an absolute error is least for none at all. Stage 1 sees
+random crops: the network is convolutional, and crops give it more steps a second. Stage 3 sees whole images, because
+group normalisation takes its statistics over the image: trained on crops alone, whole images come out too dark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from diffusers.models.autoencoders.vq_model import VQModel
+from scipy.spatial import KDTree
+from torch import Tensor, nn
+
+from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for, seed_for
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.pixels import to_unit
+from palpate.encoders.loop import LoopOptions, fit
+
+
+@dataclass(frozen=True)
+class AutoencoderOptions:
+    """Shape and training of a VQ autoencoder.
+
+    Attributes:
+        patch: side of the patches of the stem (1: none).
+        widths: channels of each resolution level; each level after the first halves the size.
+        layers: residual blocks a level.
+        codes: entries of the codebook.
+        channels: latent channels.
+        groups: of the group normalisation.
+        attention: whether the middle block attends.
+        steps_free, steps_quantised: optimiser steps of the two stages.
+        batch, lr: of both stages; the last starts at half the rate.
+        crop: side of the random crops of stage 1 in pixels (0: whole images).
+        noise: standard deviation of the noise of stage 1, as a share of the latents'.
+        l1, l2, edge, codebook: weights in the loss.
+    """
+
+    patch: int = 4
+    widths: tuple[int, ...] = (64,)
+    layers: int = 1
+    codes: int = 4096
+    channels: int = 3
+    groups: int = 16
+    attention: bool = False
+    steps_free: int = 1700
+    steps_quantised: int = 200
+    batch: int = 8
+    lr: float = 2e-3
+    crop: int = 32
+    noise: float = 0.02
+    l1: float = 0.25
+    l2: float = 10.0
+    edge: float = 10.0
+    codebook: float = 0.25
+
+
+def build_autoencoder(options: AutoencoderOptions) -> Autoencoder:
+    """An untrained autoencoder; its weights come from torch's global generator."""
+    levels = len(options.widths)
+    vq = VQModel(
+        in_channels=3 * options.patch**2,
+        out_channels=3 * options.patch**2,
+        down_block_types=("DownEncoderBlock2D",) * levels,
+        up_block_types=("UpDecoderBlock2D",) * levels,
+        block_out_channels=options.widths,
+        layers_per_block=options.layers,
+        latent_channels=options.channels,
+        num_vq_embeddings=options.codes,
+        norm_num_groups=options.groups,
+        mid_block_add_attention=options.attention,
+    )
+    return Autoencoder(vq, options.patch)
+
+
+def train_autoencoder(
+    images: np.ndarray,
+    options: AutoencoderOptions,
+    folder: Path,
+    *,
+    held_out: np.ndarray | None = None,
+    seed: int = 0,
+    key: str = "",
+    device: str | torch.device = "cpu",
+    progress: Progress = quiet,
+) -> Autoencoder:
+    """Trains an autoencoder; resumes if ``folder`` holds a part of the same run.
+
+    Args:
+        images: bytes (n, h, w, 3), an array or a memory map: the train part alone.
+        options: see :class:`AutoencoderOptions`.
+        folder: for checkpoints.
+        held_out: bytes (m, h, w, 3) of other videos; the card then says how well they are reconstructed.
+        seed: of weights, order, crops and noise.
+        key: digest of the images.
+        device: where to train.
+        progress: called after each step.
+
+    Returns:
+        The frozen autoencoder, on ``device``; its card holds the options and the seed.
+    """
+    side = options.crop or images.shape[1]
+    factor = options.patch * 2 ** (len(options.widths) - 1)
+    if side % factor or side > min(images.shape[1:3]):
+        raise PalpateError(
+            f"Crops must be multiples of {factor} and fit into the images", f"{side} for {images.shape[1:3]}", "Choose another crop"
+        )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed_for(seed, "autoencoder"))
+        model = build_autoencoder(options).to(device)
+    key = digest_json([key, asdict(options), seed])
+    free = LoopOptions(steps=options.steps_free, batch=options.batch, lr=options.lr, weight_decay=1e-4, seed=seed)
+    fit(model, _Loss(images, options, quantise=False), len(images), free, folder / "free", what="autoencoder", key=key, progress=progress)
+    _set_codebook(model, images, options, seed)
+    last = replace(free, steps=options.steps_quantised, lr=options.lr / 2)
+    fit(model, _Loss(images, options, quantise=True), len(images), last, folder / "quantised", what="codebook", key=key, progress=progress)
+    model.card = {"options": asdict(options), "seed": seed, "images": len(images), "key": key}
+    if held_out is not None and len(held_out):
+        model.card["held_out"] = asdict(measure_reconstruction(model, held_out))
+    return model.eval().requires_grad_(requires_grad=False)
+
+
+class _Loss:
+    """The loss of one step; see the head of this file."""
+
+    def __init__(self, images: np.ndarray, options: AutoencoderOptions, *, quantise: bool) -> None:
+        self.images, self.options, self.quantise = images, options, quantise
+
+    def __call__(self, module: nn.Module, rows: Tensor, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        assert isinstance(module, Autoencoder)
+        options, device = self.options, next(module.parameters()).device
+        x = _crops(to_unit(self.images[rows.numpy()]), 0 if self.quantise else options.crop, generator).to(device)
+        z = module.latents(x)
+        if not self.quantise and options.noise:
+            z = z + options.noise * z.detach().std() * torch.randn(z.shape, generator=generator).to(device)
+        y, codebook = module.image(z, quantise=self.quantise)
+        error = y - x
+        edges = torch.diff(error, dim=3).square().mean() + torch.diff(error, dim=2).square().mean()
+        square = error.square().mean()
+        loss = options.l1 * error.abs().mean() + options.l2 * square + options.edge * edges
+        if self.quantise:
+            loss = loss + options.codebook * codebook
+        return loss, {"psnr": float(10 * torch.log10(4 / square.detach()))}
+
+
+def _crops(x: Tensor, side: int, generator: torch.Generator) -> Tensor:
+    """A random square of ``side`` pixels from each image."""
+    if not side or side == min(x.shape[2:]):
+        return x
+    n, _, height, width = x.shape
+    top = torch.randint(0, height - side + 1, (n,), generator=generator).tolist()
+    left = torch.randint(0, width - side + 1, (n,), generator=generator).tolist()
+    return torch.stack([x[k, :, t : t + side, c : c + side] for k, (t, c) in enumerate(zip(top, left, strict=True))])
+
+
+def _set_codebook(model: Autoencoder, images: np.ndarray, options: AutoencoderOptions, seed: int) -> None:
+    """Makes the centres of encoder outputs the codebook."""
+    rng = rng_for(seed, "codebook")
+    side = images.shape[1] // model.factor
+    count = max(8, -(-options.codes * 32 // side**2))
+    chosen = np.sort(rng.choice(len(images), size=min(len(images), count), replace=False))
+    points = model.encode(images[chosen]).permute(0, 2, 3, 1).reshape(-1, model.channels).double().numpy()
+    centres = torch.from_numpy(k_means(points, options.codes, rng))
+    model.vq.quantize.embedding.weight.data.copy_(centres)
+
+
+def k_means(points: np.ndarray, k: int, rng: np.random.Generator, iterations: int = 12) -> np.ndarray:
+    """Lloyd's k-means in few dimensions.
+
+    Args:
+        points: (n, d).
+        k: centres; more than n gives points twice, with a little noise.
+        rng: draws the first centres.
+        iterations: of assignment and mean.
+
+    Returns:
+        (k, d).
+    """
+    centres = points[rng.choice(len(points), size=k, replace=len(points) < k)].copy()
+    centres += 1e-4 * points.std() * rng.standard_normal(centres.shape)
+    for _ in range(iterations):
+        distance, nearest = KDTree(centres).query(points)
+        counts = np.bincount(nearest, minlength=k)
+        sums = np.stack([np.bincount(nearest, weights=points[:, j], minlength=k) for j in range(points.shape[1])], axis=1)
+        used = counts > 0
+        centres[used] = sums[used] / counts[used, None]
+        empty = np.flatnonzero(~used)
+        farthest = np.argsort(-np.asarray(distance))[: len(empty)]
+        centres[empty[: len(farthest)]] = points[farthest]
+    return centres
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """How well an autoencoder reconstructs images that it was not trained on.
+
+    Attributes:
+        n: images.
+        psnr: mean over images of 10 log10(1 / MSE), values in [0, 1].
+        psnr_free: the same without quantisation.
+        ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range 1).
+        perplexity: exp of the entropy of the codes used; at most the number of codes.
+        dead: codes never used on these images.
+        codes: entries of the codebook.
+    """
+
+    n: int
+    psnr: float
+    psnr_free: float
+    ssim: float
+    perplexity: float
+    dead: int
+    codes: int
+
+
+@torch.no_grad()
+def measure_reconstruction(autoencoder: Autoencoder, images: np.ndarray, batch: int = 64) -> Reconstruction:
+    """Scores reconstructions of bytes (n, h, w, 3), a batch at a time."""
+    device = next(autoencoder.parameters()).device
+    codes = int(autoencoder.vq.config["num_vq_embeddings"])
+    counts = np.zeros(codes, dtype=np.int64)
+    rows: dict[str, list[Tensor]] = {"psnr": [], "psnr_free": [], "ssim": []}
+    for k in range(0, len(images), batch):
+        x = to_unit(images[k : k + batch]).to(device)
+        z = autoencoder.latents(x)
+        y, free = autoencoder.image(z)[0].clamp(-1, 1), autoencoder.image(z, quantise=False)[0].clamp(-1, 1)
+        rows["psnr"].append(10 * torch.log10(4 / (y - x).square().mean((1, 2, 3)).clamp_min(1e-12)))
+        rows["psnr_free"].append(10 * torch.log10(4 / (free - x).square().mean((1, 2, 3)).clamp_min(1e-12)))
+        rows["ssim"].append(_ssim((x + 1) / 2, (y + 1) / 2))
+        counts += np.bincount(autoencoder.codes(z).flatten().cpu().numpy(), minlength=codes)
+    share = counts[counts > 0] / counts.sum()
+    mean = {name: float(torch.cat(values).double().mean()) for name, values in rows.items()}
+    return Reconstruction(
+        len(images), **mean, perplexity=float(np.exp(-(share * np.log(share)).sum())), dead=int((counts == 0).sum()), codes=codes
+    )
+
+
+def _ssim(x: Tensor, y: Tensor) -> Tensor:
+    """SSIM of each image of (n, 3, h, w) in [0, 1], mean over channels and the positions where the window fits."""
+    offset = torch.arange(11, dtype=x.dtype, device=x.device) - 5
+    window = torch.exp(-offset.square() / (2 * 1.5**2))
+    window = window / window.sum()
+
+    def blur(z: Tensor) -> Tensor:
+        z = nn.functional.conv2d(z.flatten(0, 1).unsqueeze(1), window.reshape(1, 1, 1, -1))
+        return nn.functional.conv2d(z, window.reshape(1, 1, -1, 1)).unflatten(0, (x.shape[0], x.shape[1])).squeeze(2)
+
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    return ((2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean((1, 2, 3))

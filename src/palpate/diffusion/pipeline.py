@@ -1,0 +1,238 @@
+"""The saved pipeline: everything needed to turn a photo into a touch, in one folder that needs nothing else.
+
+::
+
+    unet/          the denoiser, diffusers' format, and condition.safetensors (modality means, learned null)
+    autoencoder/   the VQModel, diffusers' format, and its palpate.json
+    towers/        the vision tower (and text tower) whose embeddings the denoiser knows
+    scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
+    palpate.json   preset, condition policy, schedule, sampler, latent statistics, background flag, training record, digest
+
+The *digest* names weights, condition policy, schedule and latent statistics: what the pictures depend on beside
+seed, sampler settings and input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from palpate import __version__
+from palpate.core import PalpateError, Progress, atomic_folder, digest_json, quiet, read_json, write_json
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Source
+from palpate.diffusion.latents import LatentStats
+from palpate.diffusion.pixels import digest_tensors, to_unit
+from palpate.diffusion.sampling import SamplerOptions, build_scheduler, sample_latents
+from palpate.diffusion.training import Schedule
+from palpate.encoders.towers import Towers
+
+FORMAT = "palpate-pipeline/1"
+#: Photos embedded at once, always: an embedding does not depend on its neighbours.
+EMBED = 32
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A generator of touches.
+
+    Attributes:
+        autoencoder, denoiser: frozen, on one device.
+        stats: of the training latents.
+        schedule: that the denoiser was trained with.
+        sampler: the default sampling settings.
+        size: side of the touches in pixels.
+        towers: give the vision embeddings of photos; None for a pipeline driven by embeddings alone.
+        preset: name of the preset.
+        training: JSON record: digests of manifest, split and encoder, steps, seed, source of the conditions, versions.
+    """
+
+    autoencoder: Autoencoder
+    denoiser: Denoiser
+    stats: LatentStats
+    schedule: Schedule
+    sampler: SamplerOptions
+    size: int
+    towers: Towers | None = None
+    preset: str = ""
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all that the pictures depend on beside seed, sampler and input."""
+        parts = [asdict(self.stats), asdict(self.schedule), asdict(self.denoiser.policy), self.size, self.autoencoder.digest]
+        return digest_json(
+            [FORMAT, *parts, digest_tensors(self.denoiser.state_dict()), self.towers.digest("vision") if self.towers else None]
+        )
+
+    @property
+    def background(self) -> bool:
+        """Whether each touch needs an image of the sensor touching nothing."""
+        return self.denoiser.background
+
+    @property
+    def vision_size(self) -> int:
+        """Side in pixels at which photos are best given; they are resized to the tower's input anyway."""
+        return self._towers().preprocess("vision").resize
+
+    def _towers(self) -> Towers:
+        if self.towers is None:
+            raise PalpateError("Photos need the pipeline's vision tower", "a pipeline without towers", "Save it with its towers")
+        return self.towers
+
+    def sampler_with(self, *, guidance: float | None = None, steps: int | None = None, batch: int | None = None) -> SamplerOptions:
+        """The default sampler with some settings replaced."""
+        given = {"guidance": guidance, "steps": steps, "batch": batch}
+        return replace(self.sampler, **{k: v for k, v in given.items() if v is not None})
+
+    def embed(self, vision: np.ndarray) -> Tensor:
+        """Photos, bytes (n, h, w, 3), -> L2-normalised vision embeddings (n, d), on the CPU."""
+        towers, parts = self._towers(), list[Tensor]()
+        transform = towers.preprocess("vision")
+        with torch.no_grad():
+            for start in range(0, len(vision), EMBED):
+                stop = min(start + EMBED, len(vision))
+                # The last batch repeats its last row: every batch runs the same kernels.
+                pixels = transform.fit(vision[[min(k, stop - 1) for k in range(start, start + EMBED)]])
+                unit = to_unit(pixels).add(1.0).div(2.0).to(towers.device)
+                embedded = towers.encode("vision", transform.normalise(transform.crop(unit)))
+                parts.append(embedded[: stop - start].cpu())
+        return torch.cat(parts) if parts else torch.empty(0, towers.dim)
+
+    def touch(
+        self,
+        vision: np.ndarray,
+        ids: Sequence[str],
+        *,
+        seed: int,
+        guidance: float | None = None,
+        steps: int | None = None,
+        background: np.ndarray | None = None,
+        progress: Progress = quiet,
+    ) -> np.ndarray:
+        """The touches that photos promise.
+
+        Args:
+            vision: bytes (n, h, w, 3).
+            ids: n sample ids; with ``seed`` they decide the noise.
+            seed: of the noise.
+            guidance: s; default: the sampler's.
+            steps: of the solver; default: the sampler's.
+            background: bytes (n, size, size, 3), for a pipeline w/ BG.
+            progress: called with the number of touches done.
+
+        Returns:
+            Bytes (n, size, size, 3).
+
+        Raises:
+            PalpateError: if lengths differ, a background is missing, or guidance is asked of a model without dropout.
+        """
+        sampler = self.sampler_with(guidance=guidance, steps=steps)
+        return self.touch_from_embeddings(self.embed(vision), ids, seed=seed, sampler=sampler, background=background, progress=progress)
+
+    def touch_from_embeddings(
+        self,
+        conditions: Tensor | np.ndarray,
+        ids: Sequence[str],
+        *,
+        seed: int,
+        source: Source = "vision",
+        sampler: SamplerOptions | None = None,
+        background: np.ndarray | None = None,
+        progress: Progress = quiet,
+    ) -> np.ndarray:
+        """Like :meth:`touch`, from embeddings (n, d) of either source."""
+        options = sampler or self.sampler
+        ground = None
+        if background is not None:
+            if background.shape[1:3] != (self.size, self.size):
+                got = f"{background.shape[1]} x {background.shape[2]}"
+                raise PalpateError(f"Background images must be {self.size} pixels square", got, "Resize them")
+            ground = self.stats.normalise(self.autoencoder.encode(background))
+        tokens = self.denoiser.tokens(torch.as_tensor(conditions), source)
+        latents = sample_latents(
+            self.denoiser,
+            tokens,
+            ids,
+            size=self.size // self.autoencoder.factor,
+            schedule=self.schedule,
+            options=options,
+            seed=seed,
+            background=ground,
+            progress=progress,
+        )
+        return self.autoencoder.decode(self.stats.restore(latents))
+
+    def to(self, device: str | torch.device) -> Pipeline:
+        """Moves all parts to a device, in place; returns the pipeline."""
+        self.autoencoder.to(device)
+        self.denoiser.to(device)
+        if self.towers is not None:
+            self.towers.to(str(device))
+        return self
+
+    def save(self, folder: Path) -> None:
+        """Writes the pipeline; the folder appears whole or not at all.
+
+        Raises:
+            PalpateError: if the folder exists and is not empty.
+        """
+        with atomic_folder(Path(folder)) as part:
+            self.denoiser.save(part / "unet")
+            self.autoencoder.save(part / "autoencoder")
+            if self.towers is not None:
+                self.towers.save(part / "towers")
+            build_scheduler(self.schedule, self.sampler.method).save_pretrained(part / "scheduler")
+            write_json(part / "palpate.json", self.to_json())
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of ``palpate.json``."""
+        return {
+            "format": FORMAT,
+            "digest": self.digest,
+            "preset": self.preset,
+            "size": self.size,
+            "background": self.background,
+            "condition": asdict(self.denoiser.policy),
+            "schedule": asdict(self.schedule),
+            "sampler": asdict(self.sampler),
+            "latents": asdict(self.stats) | {"factor": self.autoencoder.factor},
+            "autoencoder": self.autoencoder.digest,
+            "towers": self.towers.digest("vision") if self.towers else None,
+            "training": dict(self.training),
+            "palpate": __version__,
+        }
+
+    @classmethod
+    def load(cls, folder: Path) -> Pipeline:
+        """Reads a saved pipeline and checks its digest.
+
+        Raises:
+            PalpateError: if the folder is no pipeline, is of another format, or holds other weights than it says.
+        """
+        folder = Path(folder)
+        about = read_json(folder / "palpate.json", "pipeline")
+        if not isinstance(about, dict) or about.get("format") != FORMAT:
+            raise PalpateError(f"{folder} must be a pipeline ({FORMAT})", "another kind of folder", "Make one with: palpate train")
+        stats = about["latents"]
+        pipeline = cls(
+            autoencoder=Autoencoder.load(folder / "autoencoder"),
+            denoiser=Denoiser.load(folder / "unet", ConditionPolicy(**about["condition"])),
+            stats=LatentStats(tuple(stats["mean"]), tuple(stats["std"]), stats["scale"]),
+            schedule=Schedule(**about["schedule"]),
+            sampler=SamplerOptions(**about["sampler"]),
+            size=int(about["size"]),
+            towers=Towers.load(folder / "towers") if about["towers"] else None,
+            preset=about["preset"],
+            training=about["training"],
+        )
+        if pipeline.digest != about["digest"]:
+            raise PalpateError(f"The weights in {folder} must match its palpate.json", "other weights", "Copy the whole folder again")
+        return pipeline

@@ -1,0 +1,312 @@
+"""Checkpoint + photos or a manifest -> a folder of touches with an index, by id.
+
+::
+
+    OUT/images/<name>.png    one touch an id; the name is made from the id and cannot leave the folder
+    OUT/index.json           {"format", "complete", "settings", "digest", "images": {id: name}, "skipped": [...]}
+
+Each PNG carries its id, the digest of the settings and of its photo as text, so a folder that was left half done is
+continued: pictures of the same settings and photo are kept, and the result has the same bytes as one made at a
+stretch. ``settings`` holds the pipeline's digest, seed, sampler and image size; a folder made with others is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, PngImagePlugin
+from torch import Tensor
+
+from palpate.core import (
+    PalpateError,
+    Problem,
+    ProblemsError,
+    Progress,
+    atomic_path,
+    digest_file,
+    digest_json,
+    inside,
+    quiet,
+    read_json,
+    short,
+    write_json,
+)  # fmt: skip
+from palpate.data.images import SUFFIXES, load_images, read_image, square
+from palpate.data.manifest import Manifest
+from palpate.diffusion.pipeline import EMBED, Pipeline
+from palpate.diffusion.sampling import SamplerOptions
+
+FORMAT = "palpate-generated/1"
+
+
+@dataclass(frozen=True)
+class Generated:
+    """A folder of generated touches.
+
+    Attributes:
+        folder: holds ``index.json`` and ``images``.
+        files: id -> file name below ``images``.
+        settings: what the pictures were made with.
+        skipped: inputs that could not be used.
+        made: how many pictures this call made (0 when loaded).
+    """
+
+    folder: Path
+    files: Mapping[str, str]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    skipped: Sequence[Problem] = ()
+    made: int = 0
+
+    @property
+    def ids(self) -> list[str]:
+        """The ids, in the order of the index."""
+        return list(self.files)
+
+    @property
+    def paths(self) -> list[Path]:
+        """One image an id, in the order of :attr:`ids`."""
+        return [self.folder / "images" / name for name in self.files.values()]
+
+    def path(self, sample_id: str) -> Path:
+        """The image of one id.
+
+        Raises:
+            PalpateError: if there is none.
+        """
+        if sample_id not in self.files:
+            raise PalpateError("Every id asked for must have been generated", repr(sample_id), "Generate it into the same folder")
+        return self.folder / "images" / self.files[sample_id]
+
+    @classmethod
+    def load(cls, folder: Path) -> Generated:
+        """Reads a finished folder.
+
+        Raises:
+            PalpateError: if it has no index, was left half done, or names a file outside the folder or missing.
+        """
+        folder = Path(folder)
+        index = _read_index(folder)
+        if not index["complete"]:
+            raise PalpateError(f"{folder} must be finished", "a folder that was left half done", "Run the same command again: it continues")
+        bad = [n for n in index["images"].values() if (p := inside(folder / "images", n)) is None or not p.is_file()]
+        if bad:
+            raise PalpateError(
+                f"Every image of {folder / 'index.json'} must lie in images/", f"{len(bad)} that do not, first {bad[0]!r}", "Generate again"
+            )
+        return cls(folder, index["images"], index["settings"], [Problem(**p) for p in index["skipped"]])
+
+
+@dataclass(frozen=True)
+class _Input:
+    """One touch to make."""
+
+    sample: str
+    vision: Path
+    background: Path | None
+
+    def digest(self) -> str:
+        return digest_json([digest_file(p) if p else None for p in (self.vision, self.background)])
+
+
+def generate(
+    pipeline: Pipeline,
+    *,
+    out: Path,
+    manifest: Manifest | None = None,
+    photos: Path | Sequence[Path] | Mapping[str, Path] | None = None,
+    ids: Sequence[str] | None = None,
+    seed: int = 0,
+    guidance: float | None = None,
+    steps: int | None = None,
+    batch: int | None = None,
+    skip_bad: bool = False,
+    progress: Progress = quiet,
+) -> Generated:
+    """Makes one touch for each photo; running it again continues a half-done folder.
+
+    Args:
+        pipeline: the generator, with its towers.
+        out: folder to fill.
+        manifest: samples whose column ``vision`` (and ``background``, for a pipeline w/ BG) is used.
+        photos: instead: a folder, files, or id -> file; ids are then paths below the folder, or file names.
+        ids: which of them; default all.
+        seed: of the noise of each sample.
+        guidance: s; default: the sampler's of the pipeline.
+        steps: of the solver; default: the sampler's.
+        batch: pictures at once, which they do not depend on; default: the sampler's.
+        skip_bad: list unreadable photos in the index instead of refusing.
+        progress: told about embedding and generating.
+
+    Returns:
+        All pictures in the folder, with the unreadable inputs.
+
+    Raises:
+        PalpateError: on wrong arguments, or if the folder was made with other settings.
+        ProblemsError: naming every unreadable photo, before any picture is made, unless ``skip_bad``.
+    """
+    inputs = _inputs(pipeline, manifest, photos, ids)
+    sampler = pipeline.sampler_with(guidance=guidance, steps=steps, batch=batch)
+    settings = _settings(pipeline, sampler, seed)
+    digest = digest_json(settings)
+    out = Path(out)
+    index = _open_index(out, settings, digest)
+    stamps, bad = _stamps(inputs)
+    todo = [i for i in inputs if i.sample in stamps and not _is_made(out, i.sample, digest, stamps[i.sample])]
+    conditions, broken = _embed(pipeline, todo, progress)
+    bad |= broken
+    if bad and not skip_bad:
+        raise ProblemsError(list(bad.values()), "Mend or remove these photos, or pass --skip-bad")
+    todo = [i for i in todo if i.sample in conditions]
+    index["complete"] = False
+    write_json(out / "index.json", index)
+    for start in range(0, len(todo), sampler.batch):
+        chunk = todo[start : start + sampler.batch]
+        ground = load_images([i.background for i in chunk if i.background], pipeline.size) if pipeline.background else None
+        rows = torch.stack([conditions[i.sample] for i in chunk])
+        touches = pipeline.touch_from_embeddings(rows, [i.sample for i in chunk], seed=seed, sampler=sampler, background=ground)
+        for item, touch in zip(chunk, touches, strict=True):
+            _write(out, item.sample, touch, digest, stamps[item.sample])
+        progress("generating touches", start + len(chunk), len(todo))
+    images = index["images"] | {i.sample: file_name(i.sample) for i in inputs if i.sample not in bad}
+    problems = list(bad.values())
+    index |= {"complete": True, "images": images, "skipped": [asdict(p) for p in problems]}
+    write_json(out / "index.json", index)
+    return Generated(out, images, settings, problems, len(todo))
+
+
+def file_name(sample_id: str) -> str:
+    """A file name that is unique to the id, on any file system: its harmless characters and a part of its SHA-256."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", sample_id).strip("_")[:80]
+    return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}.png"
+
+
+def _settings(pipeline: Pipeline, sampler: SamplerOptions, seed: int) -> dict[str, Any]:
+    """All that a picture depends on beside its photo; the batch is no part of it."""
+    chosen = {k: v for k, v in asdict(sampler).items() if k != "batch"}
+    return {"pipeline": pipeline.digest, "preset": pipeline.preset, "seed": seed, "size": pipeline.size, "sampler": chosen}
+
+
+def _inputs(
+    pipeline: Pipeline,
+    manifest: Manifest | None,
+    photos: Path | Sequence[Path] | Mapping[str, Path] | None,
+    ids: Sequence[str] | None,
+) -> list[_Input]:
+    if (manifest is None) == (photos is None):
+        raise PalpateError("Touches are generated for a manifest or for photos", "both" if photos else "neither", "Pass one of the two")
+    if manifest is not None:
+        chosen = manifest if ids is None else manifest.take(ids)
+        grounds = chosen.paths("background") if pipeline.background else [None] * len(chosen)
+        found = [_Input(*row) for row in zip(chosen.ids, chosen.paths("vision"), grounds, strict=True)]
+    else:
+        if pipeline.background:
+            raise PalpateError("A generator w/ BG needs a background image a sample", "photos alone", "Use a manifest with backgrounds")
+        table = photo_ids(photos or {})
+        if ids is not None and (missing := [i for i in ids if i not in table]):
+            raise PalpateError("Every id must be among the photos", f"{len(missing)} that are not, first {missing[0]!r}", "Check the names")
+        found = [_Input(i, table[i], None) for i in (table if ids is None else ids)]
+    if not found:
+        raise PalpateError("There must be at least one photo", "none", "Check the folder, the split or the ids")
+    if len({i.sample for i in found}) < len(found):
+        raise PalpateError("Ids must be unique", "an id that stands twice", "Name each id once")
+    return found
+
+
+def photo_ids(photos: Path | Sequence[Path] | Mapping[str, Path]) -> dict[str, Path]:
+    """Ids of photos: paths below a folder (sorted), or file names of a list.
+
+    Raises:
+        PalpateError: if a folder is missing or two files have one name.
+    """
+    if isinstance(photos, Mapping):
+        return {i: Path(p) for i, p in photos.items()}
+    if isinstance(photos, Path):
+        if photos.is_file():
+            return {photos.name: photos}
+        if not photos.is_dir():
+            raise PalpateError("The photos must be a folder or files", f"no such path {photos}", "Check the path")
+        files = sorted(p for p in photos.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+        return {p.relative_to(photos).as_posix(): p for p in files}
+    table: dict[str, Path] = {}
+    for path in map(Path, photos):
+        if path.name in table:
+            raise PalpateError("Photos in a list must differ in name", f"{path.name!r} twice", "Pass their common folder instead")
+        table[path.name] = path
+    return table
+
+
+def _read_index(folder: Path) -> dict[str, Any]:
+    index = read_json(folder / "index.json", "index of generated touches")
+    if not isinstance(index, dict) or index.get("format") != FORMAT:
+        raise PalpateError(f"{folder} must hold generated touches ({FORMAT})", "another kind of folder", "Make one with: palpate generate")
+    return index
+
+
+def _open_index(out: Path, settings: Mapping[str, Any], digest: str) -> dict[str, Any]:
+    """The index in ``out`` if it has these settings, else a new one for an empty folder."""
+    if (out / "index.json").is_file():
+        index = _read_index(out)
+        if index["digest"] != digest:
+            differ = [k for k, v in settings.items() if index["settings"].get(k) != v]
+            got = f"another {', another '.join(differ)} there"
+            raise PalpateError(f"{out} must hold touches of the same settings or nothing", got, "Choose another folder")
+        return index
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise PalpateError(f"{out} must be empty or hold generated touches", "other files", "Choose another folder")
+    return {"format": FORMAT, "complete": False, "settings": dict(settings), "digest": digest, "images": {}, "skipped": []}
+
+
+def _stamps(inputs: Sequence[_Input]) -> tuple[dict[str, str], dict[str, Problem]]:
+    """By id: the digest of the files of each input, and what is wrong with those whose files cannot be opened."""
+    stamps: dict[str, str] = {}
+    bad: dict[str, Problem] = {}
+    for item in inputs:
+        try:
+            stamps[item.sample] = item.digest()
+        except OSError as error:
+            bad[item.sample] = Problem(str(error.filename or item.vision), "missing-file", error.strerror or "cannot be opened")
+    return stamps, bad
+
+
+def _is_made(out: Path, sample_id: str, digest: str, stamp: str) -> bool:
+    try:
+        with Image.open(out / "images" / file_name(sample_id)) as image:
+            return [image.info.get(f"palpate.{k}") for k in ("id", "settings", "input")] == [sample_id, digest, stamp]
+    except OSError:
+        return False
+
+
+def _write(out: Path, sample_id: str, touch: np.ndarray, digest: str, stamp: str) -> None:
+    text = PngImagePlugin.PngInfo()
+    for name, value in (("id", sample_id), ("settings", digest), ("input", stamp)):
+        text.add_itxt(f"palpate.{name}", value)
+    with atomic_path(out / "images" / file_name(sample_id)) as part:
+        Image.fromarray(touch).save(part, format="PNG", pnginfo=text)
+
+
+def _embed(pipeline: Pipeline, inputs: Sequence[_Input], progress: Progress) -> tuple[dict[str, Tensor], dict[str, Problem]]:
+    """By id: the vision embedding of each input whose files decode, and what is wrong with the others."""
+    found: dict[str, Tensor] = {}
+    bad: dict[str, Problem] = {}
+    for start in range(0, len(inputs), EMBED):
+        pixels: dict[str, np.ndarray] = {}
+        for item in inputs[start : start + EMBED]:
+            file = item.vision
+            try:
+                photo = square(read_image(file), pipeline.vision_size)
+                if (file := item.background) is not None:
+                    read_image(file)
+                pixels[item.sample] = photo
+            except PalpateError as error:
+                bad[item.sample] = Problem(str(file), "bad-image", error.got)
+        if pixels:
+            found |= dict(zip(pixels, pipeline.embed(np.stack(list(pixels.values()))), strict=True))
+        progress("embedding photos", len(found) + len(bad), len(inputs))
+    return found, bad
