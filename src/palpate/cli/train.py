@@ -50,7 +50,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.diffusion.autoencoder_training import train_autoencoder
     from palpate.diffusion.presets import preset_named
     from palpate.diffusion.recipe import train_pipeline
-    from palpate.encoders.towers import Towers
+    from palpate.encoders.towers import Towers, pick_device
 
     if options.steps is not None and options.steps < 1:
         raise PalpateError("--steps must be at least 1", str(options.steps), "Leave it out for the preset's length")
@@ -62,11 +62,13 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         elif chosen.autoencoder is None:
             raise PalpateError(f"The preset {chosen.name} needs a trained autoencoder", "none", "Pass --autoencoder HUB_ID_OR_FOLDER")
         else:
-            train = manifest.part(split, "train")
+            train, test = manifest.part(split, "train"), manifest.part(split, "val", "test")
             images = cached_images(train, "tactile", chosen.size, work / "cache", progress)
+            held_out = cached_images(test, "tactile", chosen.size, work / "cache", progress) if len(test) else None
             autoencoder = train_autoencoder(
-                images, chosen.autoencoder, work / "autoencoder", seed=options.seed, key=train.digest, progress=progress
-            )
+                images, chosen.autoencoder, work / "autoencoder", held_out=held_out, seed=options.seed, key=train.digest,
+                device=pick_device(options.device), progress=progress,
+            )  # fmt: skip
         pipeline = train_pipeline(
             manifest, split, towers, autoencoder, chosen, work, seed=options.seed, steps=options.steps, source=options.source,
             background=options.background, cache=work / "cache", device=options.device, progress=progress,

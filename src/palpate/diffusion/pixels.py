@@ -21,7 +21,7 @@ def to_unit(images: np.ndarray | Tensor) -> Tensor:
     Raises:
         PalpateError: for another shape or type.
     """
-    tensor = images if isinstance(images, Tensor) else torch.from_numpy(np.ascontiguousarray(images))
+    tensor = images if isinstance(images, Tensor) else torch.from_numpy(np.require(images, requirements=["C", "W"]))
     if tensor.dtype != torch.uint8 or tensor.ndim != 4 or tensor.shape[3] != 3:
         raise PalpateError(
             "Images must be bytes of shape (n, height, width, 3)", f"{tensor.dtype} of shape {tuple(tensor.shape)}", "Decode them to RGB"

@@ -76,6 +76,7 @@ def material_accuracy(
     train: FeatureSet,
     test: FeatureSet,
     *,
+    probe: Probe | None = None,
     l2: float | None = None,
     balanced: bool = False,
     seed: int = 0,
@@ -87,6 +88,7 @@ def material_accuracy(
     Args:
         train: features with labels and groups.
         test: features of the same encoder.
+        probe: one that was fitted to ``train`` before, to score several sets with; None fits one.
         l2: see :func:`fit_probe`.
         balanced: see :func:`fit_probe`; also averages the accuracy over classes.
         seed: see :func:`fit_probe`.
@@ -102,7 +104,7 @@ def material_accuracy(
     """
     if train.encoder != test.encoder:
         raise PalpateError("Both sides of a probe must come from one encoder", f"{train.encoder} and {test.encoder}", "Embed them again")
-    probe = fit_probe(train, l2=l2, balanced=balanced, seed=seed)
+    probe = probe or fit_probe(train, l2=l2, balanced=balanced, seed=seed)
     x, labels, groups = _labelled(test, "test")
     hit = np.array([a == b for a, b in zip(probe.predict(x), labels, strict=True)], dtype=float)
     counts = Counter(labels)

@@ -49,7 +49,7 @@ from palpate.diffusion.presets import preset_named as diffusion_preset
 from palpate.diffusion.recipe import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_touch
 from palpate.encoders.presets import preset as encoder_preset
-from palpate.encoders.towers import Towers, load_clip
+from palpate.encoders.towers import Towers, load_clip, pick_device
 from palpate.generate import Generated, generate
 from palpate.leakage import audit_split, describe, leak_free_split
 from palpate.protocol.presets import preset as pipeline_preset
@@ -253,15 +253,13 @@ class _Pipeline:
             mine = cached_images(own, "tactile", self.diffusion.size, self.cache, self.progress)
             images = np.concatenate([images, *[mine] * _repeats(len(images), len(mine), self.preset.repeat)])
             key = digest_lines([pretraining.digest, own.digest])
-            model = train_autoencoder(images, options, folder / "training", seed=self.options.seed, key=key, progress=self.progress)
-            model.save(folder / "autoencoder")
             held_out = cached_images(manifest.part(split, "test"), "tactile", self.diffusion.size, self.cache, self.progress)
-            error = np.square((model.decode(model.encode(held_out)).astype(np.float64) - held_out) / 255).mean((1, 2, 3))
-            return {
-                "digest": model.digest,
-                "images": len(images),
-                "test_reconstruction_psnr_db": round(float((-10 * np.log10(error)).mean()), 2),
-            }
+            model = train_autoencoder(
+                images, options, folder / "training", held_out=held_out, seed=self.options.seed, key=key, device=pick_device(self.options.device),
+                progress=self.progress,
+            )  # fmt: skip
+            model.save(folder / "autoencoder")
+            return {"digest": model.digest, "images": len(images), "on test touches": model.card["held_out"]}
 
         inputs = {
             "options": options,

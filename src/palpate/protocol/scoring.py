@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet, rng_for
+from palpate.core import PalpateError, Progress, Score, Split, quiet, rng_for
 from palpate.data.images import load_images, read_image
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images
-from palpate.encoders.probe import material_accuracy
+from palpate.encoders.probe import fit_probe, material_accuracy
 from palpate.encoders.towers import Towers
 from palpate.generate import Generated
 from palpate.metrics import four_scores, psnr, ssim
@@ -74,6 +74,9 @@ def score_generated(
     pictures = {name: load_images([folder.path(i) for i in test.ids], size, progress=progress) for name, folder in generated.items()}
     if controls:
         pictures |= _controls(test, train, size, seed, progress)
+    known = train_features.labels is not None and len(set(train_features.labels) - {""}) > 1
+    probe = fit_probe(train_features) if known else None
+    accuracy = lambda of, name: [material_accuracy(train_features, of, probe=probe, subject=name, split=split.digest)] if probe else []  # noqa: E731
     scores: list[Score] = []
     for name, images in pictures.items():
         made = replace(features, features=embed_images(images, towers, "touch", progress=progress))
@@ -82,8 +85,9 @@ def score_generated(
         groups = features.groups
         scores.append(ssim(images, real, ids=test.ids, groups=groups, subject=name, split=split.digest))
         scores.append(psnr(images, real, ids=test.ids, groups=groups, subject=name, split=split.digest))
-        scores += _accuracy(train_features, made, name, split)
-    scores += _accuracy(train_features, features, "real", split)
+        if name != SAME_MATERIAL:  # these are train touches, which the probe was fitted to
+            scores += accuracy(made, name)
+    scores += accuracy(features, "real")
     return scores
 
 
@@ -101,13 +105,6 @@ def require_same_ids(name: str, made: Sequence[str], wanted: Sequence[str]) -> N
             f"{len(missing)} missing and {len(surplus)} surplus ids, {first}",
             "Generate for this manifest and split: palpate generate --manifest M --split S",
         )
-
-
-def _accuracy(train: FeatureSet, test: FeatureSet, subject: str, split: Split) -> list[Score]:
-    """Material accuracy of a probe that was fitted to real train touches; none where fewer than two materials are known."""
-    if train.labels is None or len(set(train.labels) - {""}) < 2:
-        return []
-    return [material_accuracy(train, test, subject=subject, split=split.digest)]
 
 
 def _controls(test: Manifest, train: Manifest, size: int, seed: int, progress: Progress) -> dict[str, np.ndarray]:
