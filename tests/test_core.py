@@ -170,3 +170,12 @@ def test_a_killed_stage_keeps_its_partial_folder_for_the_same_inputs_only(tmp_pa
         for path in (tmp_path / "a").iterdir():
             path.unlink()
         (tmp_path / "a").rmdir()
+
+
+def test_a_refused_input_leaves_no_partial_folder(tmp_path):
+    def refuse(folder):
+        raise PalpateError("a", "b", "c")
+
+    with pytest.raises(PalpateError):
+        Run(tmp_path).stage("a", {}, refuse)
+    assert list(tmp_path.iterdir()) == []

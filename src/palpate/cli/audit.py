@@ -87,9 +87,8 @@ def show(audit: Audit, terminal: Terminal) -> None:
     for note in audit.notes:
         terminal.say(f"Note: {note}")
     if audit.leaked_fraction > 0 or audit.identical_samples:
-        terminal.out.print(
+        terminal.print(
             f"This split leaks: {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with train. Make one that does not: palpate split",
-            markup=False,
         )
     else:
-        terminal.out.print(f"No test sample shares a {audit.group} with train.", markup=False)
+        terminal.print(f"No test sample shares a {audit.group} with train.")

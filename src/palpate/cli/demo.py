@@ -62,8 +62,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     words += ["--background"] if options.background else []
     results = summarise(outcome, shlex.join(words))
     page = write_report(results, options.out / "page.html").page
-    terminal.out.print()
+    terminal.print("")
     for line in summary_lines(results):
-        terminal.out.print(line, markup=False)
-    terminal.out.print(f"Page: {page}", markup=False)
+        terminal.print(line)
+    terminal.print(f"Page: {page}")
     return {"page": str(page), "facts": list(results.facts), "digests": results.settings["digests"]}

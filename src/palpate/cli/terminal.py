@@ -57,7 +57,11 @@ class Terminal:
 
     def say(self, line: str) -> None:
         """A remark on standard error."""
-        self.err.print(line, markup=False)
+        self.err.print(line, markup=False, soft_wrap=True)
+
+    def print(self, line: str) -> None:
+        """A line of the result, on standard output."""
+        self.out.print(line, markup=False, soft_wrap=True)
 
     def skipped(self, problems: Sequence[Problem]) -> None:
         """Lists what ``--skip-bad`` left out."""

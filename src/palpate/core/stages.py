@@ -88,7 +88,12 @@ class Run:
                 write_json(begun, {"digest": digest, "inputs": json.loads(canonical_json(inputs))})
             self.say(f"{name}: ...")
             start = time.monotonic()
-            facts = dict(build(part) or {})
+            try:
+                facts = dict(build(part) or {})
+            except PalpateError:  # a refused input leaves nothing behind, unless there is work to go on from
+                if [p.name for p in part.iterdir()] == [begun.name]:
+                    shutil.rmtree(part)
+                raise
             seconds = time.monotonic() - start
             write_json(part / "stage.json", {**read_json(begun, "stage record"), "facts": facts, "seconds": round(seconds, 2)})
             begun.unlink()
