@@ -156,7 +156,7 @@ def test_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_file):
     tags = [tag for tag, _ in reached]
     assert tags[:6] == ["A"] * 6
     assert "SUMMARY" in tags
-    assert ["DIV", "Table: Touch features"] in reached
+    assert any(tag == "DIV" and label.startswith("Table: Touch features") for tag, label in reached)
 
 
 def test_printed_page_opens_what_is_folded(chromium, page_file):
