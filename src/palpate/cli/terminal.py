@@ -177,7 +177,12 @@ def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
     if work.exists():
         terminal.say(f"Going on from {work}")
     work.mkdir(parents=True, exist_ok=True)
-    yield work
+    try:
+        yield work
+    except PalpateError:
+        if not any(p.is_file() for p in work.rglob("*")):  # refused before any work was done
+            shutil.rmtree(work)
+        raise
     shutil.rmtree(work, ignore_errors=True)
 
 
