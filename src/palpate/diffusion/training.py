@@ -104,9 +104,9 @@ def train_denoiser(
         model = Denoiser(net, policy, means).to(device)
     with torch.no_grad():
         tokens: dict[Source, Tensor] = {s: model.tokens(tables[s], s).to("cpu") for s in policy.sources}
-    data = {f"tokens.{s}": value for s, value in tokens.items()} | {"latents": torch.as_tensor(np.asarray(latents))}
+    data = {f"tokens.{s}": value for s, value in tokens.items()} | {"latents": torch.tensor(np.asarray(latents))}
     if background is not None:
-        data["background"] = torch.as_tensor(np.asarray(background))
+        data["background"] = torch.tensor(np.asarray(background))
     key = digest_json([key, asdict(stats), asdict(unet), asdict(policy), asdict(schedule), digest_tensors(data)])
     loss = DiffusionLoss(latents, tokens, background, stats, schedule)
     fit(model, loss, n, loop, folder, what="generator", key=key, progress=progress)
