@@ -12,6 +12,10 @@ from PIL import Image
 from palpate.data.manifest import Manifest
 
 TOP = Path(__file__).resolve().parents[1]
+CHROMIUM = Path(os.environ.get("PALPATE_CHROMIUM", "/usr/bin/chromium"))
+ARGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
+]  # fmt: skip
 
 
 def shared_data() -> Path | None:
@@ -49,3 +53,15 @@ def small_manifest(tmp_path: Path) -> Manifest:
                     {"id": f"v{v}/{frame}", "video": f"v{v}", "frame": frame, "touch": f"v{v}#{touch}", "material": material, **paths}
                 )
     return Manifest.from_rows(rows, tmp_path / "root")
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """Debian's chromium, driven by playwright; tests that need it skip where it is absent."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if not CHROMIUM.is_file():
+        pytest.skip(f"no chromium at {CHROMIUM}; install it or set PALPATE_CHROMIUM")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=ARGS)
+        yield browser
+        browser.close()

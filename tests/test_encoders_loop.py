@@ -2,6 +2,10 @@
 
 import json
 import math
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -290,3 +294,33 @@ def test_log_file_is_the_log(tmp_path):
     assert [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()] == log
     assert [line["step"] for line in log] == [0, 10, STEPS - 1]
     assert all(line["step_again"] == line["step"] for line in log)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from test_encoders_loop import N, Net, loss, options
+from palpate.encoders.loop import fit
+
+def until(module, rows, generator, step):
+    if step == int(sys.argv[2]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return loss(module, rows, generator, step)
+
+fit(Net(), until, N, options(checkpoint_seconds=0), Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.slow
+def test_a_run_that_gets_sigkill_in_mid_training_ends_as_one_that_did_not(tmp_path):
+    whole = Net()
+    fit(whole, loss, N, options(checkpoint_seconds=0), tmp_path / "whole")
+    for step in (6, 11):
+        command = [sys.executable, "-c", KILLED, str(tmp_path / "killed"), str(step)]
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        with safe_open(tmp_path / "killed" / "checkpoint.safetensors", framework="pt") as file:
+            assert file.metadata()["step"] == str(step)
+    again = Net()
+    fit(again, loss, N, options(checkpoint_seconds=0), tmp_path / "killed")
+    assert all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), again.state_dict().values(), strict=True))

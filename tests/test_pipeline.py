@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from palpate.cli import main
 from palpate.core import Results
@@ -81,6 +82,75 @@ def test_a_killed_demo_goes_on_from_its_last_finished_stage(whole, tmp_path, sta
     assert status == 0, "\n".join(lines)
     assert [line.split(":")[0] for line in lines if "already done" in line] == finished
     assert outcome(out) == outcome(whole)
+
+
+STAGES = ("world", "data", "split", "pretraining", "pretraining-data", "clip", "autoencoder", "towers", "generator", "generated", "scores")
+
+
+def test_a_demo_killed_between_a_stages_last_file_and_its_mark_heals(whole, tmp_path):
+    out = tmp_path / "run"
+    assert demo(out)[0] == 0
+    for name in STAGES:  # the state of each stage just before it is marked as finished
+        mark = out / name / "stage.json"
+        record = json.loads(mark.read_text())
+        (out / name / "inputs.json").write_text(json.dumps({"digest": record["digest"], "inputs": record["inputs"]}))
+        mark.unlink()
+        (out / name).rename(out / f"{name}.partial")
+    # The data were read in place from the world's folder, which bears its name again before they are.
+    status, lines = demo(out)
+    assert status == 0, "\n".join(lines)
+    assert not list(out.glob("*.partial"))
+    assert outcome(out) == outcome(whole)
+
+
+def test_pictures_that_change_in_place_redo_everything_that_saw_them(whole, tmp_path):
+    data, out = tmp_path / "data", tmp_path / "run"
+    assert main(["world", "-o", str(data), "--preset", "tiny", "--seed", "5", "-q"]) == 0
+    assert demo(out, "--data", str(data))[0] == 0
+    for path in data.rglob("*.jpg"):
+        with Image.open(path) as image:
+            turned = image.rotate(180)
+        turned.save(path)
+    status, lines = demo(out, "--data", str(data))
+    assert status == 0, "\n".join(lines)
+    reused = {line.split(":")[0] for line in lines if "already done" in line}
+    assert reused <= {"split", "pretraining", "pretraining-data"}
+
+
+def test_a_users_copy_of_the_pretraining_world_is_welcome(tmp_path):
+    assert main(["world", "-o", str(tmp_path / "w"), "--preset", "tiny", "--seed", "1000", "--objects-per-material", "4", "-q"]) == 0
+    status, lines = demo(tmp_path / "run", "--data", str(tmp_path / "w"))
+    assert status == 0, "\n".join(lines)
+
+
+def test_towers_and_generators_of_another_split_are_told(whole, tmp_path):
+    place = whole / "data"
+    assert main(["split", str(place), "-o", str(tmp_path / "s.json"), "--seed", "9", "--train", "0.5", "-q"]) == 0
+    model, towers, made = whole / "generator" / "model", whole / "towers" / "towers", tmp_path / "made"
+    assert main(["generate", str(model), "--manifest", str(place), "--split", str(tmp_path / "s.json"), "-o", str(made), "-q"]) == 0
+    args = ["--generated", str(made), "--split", str(tmp_path / "s.json"), "--towers", str(towers), "-o", str(tmp_path / "x.json"), "-q"]
+    assert main(["score", str(place), *args]) == 0
+    notes = {s["metric"]: s["note"] for s in json.loads((tmp_path / "x.json").read_text())["scores"] if s["subject"] == "made"}
+    assert "touch tower was trained on another split" in notes["TMMD"]
+    assert "generator was not trained on this split" in notes["SSIM"]
+    assert not any("another split" in s.note for s in Results.load(whole / "page.json").scores)
+
+
+@pytest.mark.browser
+def test_the_demos_own_page_opens_cleanly_in_a_browser(whole, chromium):
+    for width in (1280, 360):
+        page = chromium.new_page(viewport={"width": width, "height": 900})
+        said, asked = [], []
+        page.on("console", lambda message, said=said: said.append(message.text))
+        page.on("request", lambda request, asked=asked: asked.append(request.url))
+        page.goto((whole / "page.html").as_uri())
+        assert said == []
+        assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+        broken = "[...document.images].filter(i => !i.complete || !i.naturalWidth).length"
+        assert page.evaluate(broken) == 0
+        assert page.evaluate("document.images.length") > 20
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.close()
 
 
 def test_a_finished_demo_does_nothing_again_and_another_seed_does(whole):

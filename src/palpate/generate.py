@@ -190,7 +190,14 @@ def file_name(sample_id: str) -> str:
 def _settings(pipeline: Pipeline, sampler: SamplerOptions, seed: int) -> dict[str, Any]:
     """All that a picture depends on beside its photo; the batch is no part of it."""
     chosen = {k: v for k, v in asdict(sampler).items() if k != "batch"}
-    return {"pipeline": pipeline.digest, "preset": pipeline.preset, "seed": seed, "size": pipeline.size, "sampler": chosen}
+    return {
+        "pipeline": pipeline.digest,
+        "split": pipeline.training.get("split"),
+        "preset": pipeline.preset,
+        "seed": seed,
+        "size": pipeline.size,
+        "sampler": chosen,
+    }
 
 
 def _inputs(

@@ -10,7 +10,7 @@ import sys
 from dataclasses import dataclass
 
 #: Exit statuses.
-OK, FAILED_CHECK, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+OK, FAILED_CHECK, USER_ERROR, BUG, INTERRUPTED = 0, 1, 2, 70, 130
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ def main(argv: list[str] | None = None) -> int:
     """Runs the command line.
 
     Returns:
-        0 done; 1 a check failed (``audit --fail-over``); 2 a user's mistake, told in one line; 130 stopped by Ctrl-C.
+        0 done; 1 a check failed (``audit --fail-over``); 2 a user's mistake, told in one line; 70 a bug of ours;
+        130 stopped by Ctrl-C.
     """
     args = sys.argv[1:] if argv is None else argv
     if not args or args[0] in ("-h", "--help", "help"):

@@ -29,13 +29,15 @@ class Options(Common):
     """How many of the nearest pairs to keep."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write the audit as JSON, for `palpate report`."""
-    skip_bad: Annotated[bool, tyro.conf.arg(help="Leave out bad lines and list them, instead of refusing.")] = False
+    skip_bad: Annotated[bool, tyro.conf.arg(help="With list files: leave out bad lines and list them, instead of refusing.")] = False
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Runs the audit and prints it."""
     if options.fail_over is not None and not 0 <= options.fail_over <= 1:
         raise PalpateError("--fail-over must lie in [0, 1]", str(options.fail_over), "Pass a fraction, e.g. --fail-over 0.01")
+    if options.worst < 0:
+        raise PalpateError("--worst must be at least 0", str(options.worst), "Pass how many pairs to keep, e.g. --worst 12")
     audit, skipped = _audit(options)
     data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "skipped": skipped}
     if options.output:
@@ -67,7 +69,7 @@ def _audit(options: Options) -> tuple[Audit, list[str]]:
         )
         return found, []
     if options.split is None and len(options.paths) == 2:
-        return audit_lists(options.paths[0], options.paths[1], group=options.group, skip_bad=options.skip_bad)
+        return audit_lists(options.paths[0], options.paths[1], group=options.group, worst=options.worst, skip_bad=options.skip_bad)
     raise PalpateError(
         "An audit takes TRAIN and TEST list files, or one manifest with --split",
         f"{len(options.paths)} path(s) {'with' if options.split else 'without'} --split",

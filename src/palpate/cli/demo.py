@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, Terminal, require_extra
+from palpate.core import PalpateError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +54,13 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         preset=options.preset, data=out, clip=options.clip, autoencoder=options.autoencoder, group=options.group, seed=options.seed,
         skip_bad=options.skip_bad, background=options.background, device=options.device,
     )  # fmt: skip
-    with terminal.progress() as progress:
-        outcome = run_pipeline(asked, options.out, say=terminal.say, progress=progress)
+    try:
+        with terminal.progress() as progress:
+            outcome = run_pipeline(asked, options.out, say=terminal.say, progress=progress)
+    except PalpateError:
+        if options.out.is_dir() and not any(options.out.iterdir()):  # refused before any work was done
+            options.out.rmdir()
+        raise
     words = ["palpate", "demo", "--preset", options.preset, "--seed", str(options.seed)]
     words += ["--data", str(options.data)] if options.data else []
     words += [w for name in ("clip", "autoencoder") if (value := getattr(options, name)) for w in (f"--{name}", value)]

@@ -36,7 +36,7 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Trains, embeds the parts, and tells how well a linear probe names the material."""
     require_extra("palpate encoder")
-    from palpate.core import Split
+    from palpate.core import PalpateError, Split
     from palpate.data.manifest import Manifest
     from palpate.encoders.contrastive import train_clip, train_touch
     from palpate.encoders.embed import embed
@@ -44,6 +44,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.encoders.probe import material_accuracy
     from palpate.encoders.towers import load_clip
 
+    if options.epochs is not None and not 0 < options.epochs < float("inf"):
+        raise PalpateError("--epochs must be a positive number", str(options.epochs), "Leave it out for the preset's length")
     manifest, split, chosen = Manifest.load(options.manifest), Split.load(options.split), preset(options.preset)
     with working_folder(options.output, terminal) as work, terminal.progress() as progress:
         cache = work / "cache"

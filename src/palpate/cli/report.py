@@ -57,7 +57,7 @@ def _read(path: Path) -> Results:
                 raise PalpateError(
                     f"{path} must hold results of palpate", f"format {kind!r}", "Pass the JSON of audit -o, score -o, or of a page"
                 )
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise PalpateError(
             f"{path} must hold complete results", f"a missing or unknown field ({error})", "Write it again with palpate"
         ) from None

@@ -45,6 +45,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.generate import Generated
     from palpate.protocol.scoring import score_generated
 
+    if not options.presets:
+        raise PalpateError("--presets must name at least one preset", "none", "E.g. --presets grouped paper")
     split = Split.load(options.split)
     group = str(split.rule.get("group", "video")) if options.group == "auto" else options.group
     names = [p.name if p.name != "touches" else p.resolve().parent.name for p in options.generated]

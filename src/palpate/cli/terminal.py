@@ -18,6 +18,7 @@ import re
 import shutil
 import sys
 import time
+import traceback
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from palpate.cli import FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
+from palpate.cli import BUG, FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
 from palpate.core import MissingExtraError, PalpateError, Problem, ProblemsError, Progress, quiet
 
 #: Lines of problems shown in the terminal; ``--json`` gives all.
@@ -197,6 +198,14 @@ def _set_threads() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
+def _file_error(error: OSError) -> PalpateError:
+    """A file or folder that cannot be read or written, as must / got / fix."""
+    place = error.filename or "the files of this command"
+    return PalpateError(
+        f"{place} must be readable and writable as asked", error.strerror or str(error), "Check the path, its rights and the free space"
+    )
+
+
 def run_verb(name: str, args: Sequence[str]) -> int:
     """Runs one verb with its arguments; see :func:`palpate.cli.main` for the exit statuses."""
     _set_threads()
@@ -217,7 +226,11 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         if as_json:
             sys.stdout.write(json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
         return int(status)
-    except PalpateError as error:
+    except BrokenPipeError:  # the reader of a pipe went away: not an error of ours
+        sys.stderr.close()
+        return OK
+    except (PalpateError, OSError) as caught:
+        error = caught if isinstance(caught, PalpateError) else _file_error(caught)
         sys.stderr.write(f"palpate {name}: {error}\n")
         if isinstance(error, ProblemsError):
             _list_problems(error.problems, lambda line: sys.stderr.write(f"{line}\n"))
@@ -227,9 +240,10 @@ def run_verb(name: str, args: Sequence[str]) -> int:
     except KeyboardInterrupt:
         sys.stderr.write(f"\npalpate {name}: stopped. Run the same command again to go on from what is done.\n")
         return INTERRUPTED
-    except BrokenPipeError:  # the reader of a pipe went away: not an error of ours
-        sys.stderr.close()
-        return OK
+    except Exception:  # our own mistake: the traceback helps to report it, and the status differs from a failed check
+        traceback.print_exc()
+        sys.stderr.write(f"palpate {name}: this is a bug in palpate; please report the lines above.\n")
+        return BUG
 
 
 __all__ = ["FAILED_CHECK", "Common", "OutPath", "Terminal", "require_extra", "run_verb", "working_folder"]

@@ -44,7 +44,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Trains the autoencoder, if none is given, then the denoiser, and saves the pipeline."""
     require_extra("palpate train")
     from palpate.core import Split
-    from palpate.data.images import cached_images
+    from palpate.data.images import cached_images, image_stamp
     from palpate.data.manifest import Manifest
     from palpate.diffusion.autoencoder import Autoencoder
     from palpate.diffusion.autoencoder_training import train_autoencoder
@@ -66,7 +66,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             images = cached_images(train, "tactile", chosen.size, work / "cache", progress)
             held_out = cached_images(test, "tactile", chosen.size, work / "cache", progress) if len(test) else None
             autoencoder = train_autoencoder(
-                images, chosen.autoencoder, work / "autoencoder", held_out=held_out, seed=options.seed, key=train.digest,
+                images, chosen.autoencoder, work / "autoencoder", held_out=held_out, seed=options.seed, key=image_stamp(train, "tactile"),
                 device=pick_device(options.device), progress=progress,
             )  # fmt: skip
         pipeline = train_pipeline(

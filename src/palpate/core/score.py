@@ -72,6 +72,8 @@ class Score:
         """The inverse of :meth:`to_json`."""
         pairs = {k: tuple(data[k]) if data.get(k) is not None else None for k in ("interval", "null")}
         fields: dict[str, Any] = {**data, **pairs}
+        if not isinstance(fields.get("value"), int | float | None):
+            raise TypeError(f"the value of a score must be a number, got {fields['value']!r}")
         return cls(**fields)
 
 

@@ -89,7 +89,14 @@ class Split:
         data = read_json(path, "split file")
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise PalpateError(f"{path} must be a split file ({FORMAT})", "another kind of file", "Write one with: palpate split")
-        split = cls.from_ids(rule=data.get("rule"), manifest=data.get("manifest"), **data["parts"])
+        parts: dict[str, list[str]] = data["parts"] if isinstance(data.get("parts"), dict) else {"": []}
+        rule: Any = data.get("rule")
+        whole = set(parts) <= set(PARTS) and isinstance(rule, dict)
+        if not whole or not all(isinstance(ids, list) and all(isinstance(i, str) for i in ids) for ids in parts.values()):
+            raise PalpateError(
+                f"{path} must hold a rule and lists of ids by part", "an incomplete split file", "Write it again with: palpate split"
+            )
+        split = cls.from_ids(rule=rule, manifest=data.get("manifest"), **parts)
         if split.digest != data.get("digest"):
             raise PalpateError(
                 f"The digest in {path} must match its content", "a split that was edited by hand", "Write it again with: palpate split"

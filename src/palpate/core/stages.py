@@ -16,11 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from palpate import __version__
 from palpate.core.digest import canonical_json, digest_json
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 
-#: Part of every stage's digest: raise it when a stage would write other bytes from the same inputs.
+#: Part of every stage's digest, as is the version of palpate: other code may write other bytes from the same inputs.
 FORMAT = "palpate-stage/1"
 
 
@@ -68,7 +69,7 @@ class Run:
         Raises:
             PalpateError: if the run folder cannot be used.
         """
-        digest = digest_json([FORMAT, name, inputs])
+        digest = digest_json([FORMAT, __version__, name, inputs])
         final, part = self.folder / name, self.folder / f"{name}.partial"
         mark = final / "stage.json"
         if mark.is_file() and (done := read_json(mark, "stage record")).get("digest") == digest:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import PalpateError, atomic_path
+from palpate.core import PalpateError, atomic_path, inside
 from palpate.data.images import SUFFIXES, read_image
 from palpate.data.video import VideoReader
 
@@ -46,25 +46,31 @@ class Frames(Protocol):
 
 
 class FolderFrames:
-    """Frames in a folder, named by their number (``0000000033.jpg``); other files are ignored."""
+    """Frames in a folder, named by their number (``0000000033.jpg``); other files are ignored.
+
+    ``leaving`` holds the frames that are links to files outside ``root``; they do not count as there.
+    """
 
     raw = False
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, root: Path) -> None:
         self.source = folder
+        self.leaving: set[int] = set()
         self._names: dict[int, str] = {}
         with os.scandir(folder) as entries:
             for entry in entries:
                 stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122 (a data set has hundreds of thousands of these)
                 if stem.isdecimal() and suffix.lower() in SUFFIXES:
                     self._names[int(stem)] = entry.name
+                    if entry.is_symlink() and inside(root, os.path.relpath(entry.path, root)) is None:
+                        self.leaving.add(int(stem))
 
     def __len__(self) -> int:
         return max(self._names, default=-1) + 1
 
     def has(self, k: int) -> bool:
-        """Whether there is a file for frame ``k``."""
-        return k in self._names
+        """Whether there is a file for frame ``k`` inside the root."""
+        return k in self._names and k not in self.leaving
 
     def path(self, k: int) -> Path:
         """The file of frame ``k``."""

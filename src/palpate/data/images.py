@@ -109,9 +109,7 @@ def cached_images(manifest: Manifest, column: str, size: int, cache: Path | None
     paths = manifest.paths(column)
     if cache is None:
         return load_images(paths, size, progress=progress)
-    stamps = {path: _stamp(path) for path in dict.fromkeys(paths)}
-    key = digest_json([2, column, size, [[name, *stamps[p]] for name, p in zip(manifest.column(column), paths, strict=True)]])
-    file = Path(cache) / f"{column}-{size}-{short(key)}.npy"
+    file = Path(cache) / f"{column}-{size}-{short(digest_json([2, size, image_stamp(manifest, column)]))}.npy"
     shape = (len(paths), size, size, 3)
     if (mapped := _mapped(file, shape)) is not None:
         return mapped
@@ -121,6 +119,19 @@ def cached_images(manifest: Manifest, column: str, size: int, cache: Path | None
         out.flush()
         del out
     return np.load(file, mmap_mode="r", allow_pickle=False)
+
+
+def image_stamp(manifest: Manifest, column: str) -> str:
+    """Digest of the paths, file sizes and modification times of one image column: changes when a file does.
+
+    For keys of caches and checkpoints, which must not outlive the pictures they were made from.
+
+    Raises:
+        PalpateError: if a row has no such image.
+    """
+    paths = manifest.paths(column)
+    stamps = {path: _stamp(path) for path in dict.fromkeys(paths)}
+    return digest_json([column, [[name, *stamps[p]] for name, p in zip(manifest.column(column), paths, strict=True)]])
 
 
 def write_png(path: Path, array: NDArray[np.uint8]) -> None:

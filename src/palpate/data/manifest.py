@@ -40,6 +40,8 @@ SCHEMA: dict[str, type[pl.DataType]] = {
 }  # fmt: skip
 IMAGE_COLUMNS = ("vision", "tactile", "background")
 FORMAT = "palpate-manifest/1"
+#: Absolute paths, drive letters, and ``..`` as a component.
+CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 
 
 @dataclass(frozen=True)
@@ -133,6 +135,11 @@ class Manifest:
         """
         self.take(split.ids(*parts))  # names ids that are missing
         return Manifest(self.table.filter(pl.col("id").is_in(split.ids(*parts))), self.root, self.facts)
+
+    def prefixed(self, prefix: str) -> Manifest:
+        """The same samples with ``prefix`` before their ids, videos and touches."""
+        named = self.table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in ("id", "video", "touch"))
+        return Manifest(named, self.root, self.facts)
 
     @classmethod
     def join(cls, *manifests: Manifest) -> Manifest:
@@ -232,6 +239,12 @@ class Manifest:
             )
         facts = {k.removeprefix("palpate.fact."): v for k, v in meta.items() if k.startswith("palpate.fact.")}
         manifest = cls(table, Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"])), facts)
+        for name in IMAGE_COLUMNS:
+            climbing = table.filter(pl.col(name).str.contains(CLIMBS))[name]
+            if len(climbing):
+                raise PalpateError(
+                    f"Paths in {path} must stay inside the root", f"the {name} path {climbing[0]!r}", "Remove the row, or import again"
+                )
         if manifest.digest != meta["palpate.digest"]:
             raise PalpateError(f"The digest in {path} must match its rows", "rows that were changed by another program", fix)
         return manifest

@@ -151,7 +151,7 @@ class Recordings:
             if source.is_dir():
                 if inside(self.root, os.path.relpath(source, self.root)) is None:
                     return "outside-root", f"{source} is a link that leaves the data set; import from the folder that really holds it"
-                sides[side] = FolderFrames(source)
+                sides[side] = FolderFrames(source, self.root)
                 continue
             try:
                 sides[side] = VideoFrames(source, self.out / "images" / name / side, self.image_format, self.size)
@@ -169,8 +169,11 @@ class Recordings:
             return False
         missing = [side for side, frames in sides.items() if not frames.has(row.frame)]
         for side in missing:
-            text = f"no picture of frame {row.frame} in {sides[side].source}"
-            self.problems.append(Problem(row.where, "missing-file", text))
+            source = sides[side]
+            if isinstance(source, FolderFrames) and row.frame in source.leaving:
+                self.problems.append(Problem(row.where, "outside-root", f"{source.path(row.frame)} is a link that leaves the data set"))
+            else:
+                self.problems.append(Problem(row.where, "missing-file", f"no picture of frame {row.frame} in {source.source}"))
         return not missing
 
     def choose_backgrounds(self, rows: Sequence[Row], starts: Mapping[str, int]) -> None:

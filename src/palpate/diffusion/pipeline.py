@@ -30,7 +30,7 @@ from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Source
 from palpate.diffusion.latents import LatentStats
 from palpate.diffusion.pixels import digest_tensors, to_unit
-from palpate.diffusion.sampling import SamplerOptions, build_scheduler, sample_latents
+from palpate.diffusion.sampling import SamplerOptions, build_scheduler, require_sampling, sample_latents
 from palpate.diffusion.training import Schedule
 from palpate.encoders.towers import Towers
 
@@ -88,9 +88,15 @@ class Pipeline:
         return self.towers
 
     def sampler_with(self, *, guidance: float | None = None, steps: int | None = None, batch: int | None = None) -> SamplerOptions:
-        """The default sampler with some settings replaced."""
+        """The default sampler with some settings replaced.
+
+        Raises:
+            PalpateError: on settings that this pipeline cannot sample with.
+        """
         given = {"guidance": guidance, "steps": steps, "batch": batch}
-        return replace(self.sampler, **{k: v for k, v in given.items() if v is not None})
+        sampler = replace(self.sampler, **{k: v for k, v in given.items() if v is not None})
+        require_sampling(sampler, self.schedule, self.denoiser)
+        return sampler
 
     def embed(self, vision: np.ndarray) -> Tensor:
         """Photos, bytes (n, h, w, 3), -> L2-normalised vision embeddings (n, d), on the CPU."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, quiet
-from palpate.data.images import cached_images
+from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.denoiser import Source
@@ -99,5 +99,5 @@ def _latents(
 ) -> np.ndarray:
     """Latents of one image column, (n, c, h, w), from the cache in ``folder`` if it fits."""
     images = cached_images(train, column, preset.size, cache, progress)
-    key = digest_json([train.digest, column, preset.size])
+    key = digest_json([train.digest, image_stamp(train, column), preset.size])
     return encode_latents(autoencoder, images, train.ids, folder / f"latents-{column}", key=key, progress=progress)

@@ -11,6 +11,7 @@ is filled up), so that an image depends on (seed, id) and not on what else is ge
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, cast
@@ -47,6 +48,27 @@ class SamplerOptions:
     guidance: float = 7.5
     batch: int = 16
     rescale: float = 0.0
+
+
+def require_sampling(options: SamplerOptions, schedule: Schedule, denoiser: Denoiser | None = None) -> None:
+    """Refuses settings that cannot be sampled with, before any work is done.
+
+    Raises:
+        PalpateError: on steps, batch or guidance out of range, or guidance for a denoiser that never saw the unconditional token.
+    """
+    if options.steps < 1 or options.batch < 1 or options.steps > schedule.steps:
+        got = f"steps {options.steps}, batch {options.batch}"
+        raise PalpateError(
+            f"Sampling needs 1 to {schedule.steps} steps and a batch of at least 1", got, "Choose e.g. 50 steps and batch 16"
+        )
+    if not math.isfinite(options.guidance):
+        raise PalpateError("Guidance must be a finite number", str(options.guidance), "Choose e.g. 2; 1 is none")
+    if denoiser is not None and options.guidance != 1 and not denoiser.policy.dropout:
+        raise PalpateError(
+            "Guidance needs a generator trained with condition dropout",
+            f"guidance {options.guidance:g} and dropout 0 in the checkpoint",
+            "Pass guidance 1, or train with dropout 0.1",
+        )
 
 
 def build_scheduler(schedule: Schedule, method: Literal["ddim", "dpm"]) -> DDIMScheduler | DPMSolverMultistepScheduler:
@@ -118,11 +140,7 @@ def sample(
     """
     if len(tokens) != len(ids) or (background is not None and len(background) != len(ids)):
         raise PalpateError("Every id needs one condition", f"{len(ids)} ids, {len(tokens)} conditions", "Pass one row an id")
-    if options.steps < 1 or options.batch < 1 or options.steps > schedule.steps:
-        got = f"steps {options.steps}, batch {options.batch}"
-        raise PalpateError(
-            f"Sampling needs 1 to {schedule.steps} steps and a batch of at least 1", got, "Choose e.g. 50 steps and batch 16"
-        )
+    require_sampling(options, schedule)
     parts: list[Tensor] = []
     for start in range(0, len(ids), options.batch):
         stop = min(start + options.batch, len(ids))
@@ -182,12 +200,7 @@ def sample_latents(
     Raises:
         PalpateError: if guidance is asked of a denoiser that never saw the unconditional token, or a background is missing.
     """
-    if options.guidance != 1 and not denoiser.policy.dropout:
-        raise PalpateError(
-            "Guidance needs a generator trained with condition dropout",
-            f"guidance {options.guidance:g} and dropout 0 in the checkpoint",
-            "Pass guidance 1, or train with dropout 0.1",
-        )
+    require_sampling(options, schedule, denoiser)
     if denoiser.background != (background is not None):
         got = "no background" if denoiser.background else "a background for a generator without"
         raise PalpateError("A generator w/ BG takes a background image a sample, others take none", got, "Use the matching pipeline")

@@ -33,7 +33,7 @@ from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet
-from palpate.data.images import cached_images
+from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.loop import LoopOptions, fit
@@ -201,7 +201,16 @@ def train_touch(
         "targets": mode, "weights": list(weights), "vision": clip.digest("vision"), "text": clip.digest("text"),
         "start": start.digest("touch") if start else None,
     }  # fmt: skip
-    log = fit(model, loss, len(train), options, folder, what="training the touch tower", key=digest_json(facts), progress=progress)
+    log = fit(
+        model,
+        loss,
+        len(train),
+        options,
+        folder,
+        what="training the touch tower",
+        key=digest_json([facts, _stamps(train)]),
+        progress=progress,
+    )
     touch = model.touch.eval().requires_grad_(False)
     card = _card(facts, options, log, place) | {"clip": clip.name, "clip_card": clip.card, "start_card": start.card if start else None}
     return Towers(clip, touch, preprocess, card)
@@ -292,7 +301,16 @@ def train_clip(
         return info_nce(vision, text, scale, soft), {"scale": float(scale.detach())}
 
     facts = _facts(preset, train, split, texts, text_source, options, seed) | {"targets": mode}
-    log = fit(clip.model, loss, len(train), options, folder, what="training vision and text", key=digest_json(facts), progress=progress)
+    log = fit(
+        clip.model,
+        loss,
+        len(train),
+        options,
+        folder,
+        what="training vision and text",
+        key=digest_json([facts, _stamps(train)]),
+        progress=progress,
+    )
     clip.model.eval().requires_grad_(False)
     clip.card = _card(facts, options, log, place)
     return clip
@@ -303,6 +321,11 @@ def _train_part(manifest: Manifest, split: Split) -> Manifest:
     if not len(train):
         raise PalpateError("The train part of the split must hold samples of this manifest", "none", "Make a split with: palpate split")
     return train
+
+
+def _stamps(train: Manifest) -> list[str]:
+    """What must not have changed on disk for a checkpoint to be continued."""
+    return [image_stamp(train, column) for column in ("vision", "tactile") if not train.table[column].null_count()]
 
 
 def _numbers(texts: Sequence[str]) -> Tensor:

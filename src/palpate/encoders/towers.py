@@ -251,7 +251,7 @@ class Towers:
         folder = Path(folder)
         card = read_json(folder / "palpate.json", "card of the towers")
         if not isinstance(card, Mapping) or card.get("format") != FORMAT:
-            raise PalpateError(f"{folder} must hold towers ({FORMAT})", "another kind of folder", "Train with: palpate train towers")
+            raise PalpateError(f"{folder} must hold towers ({FORMAT})", "another kind of folder", "Train with: palpate encoder")
         towers = cls(load_clip(folder / "clip"), card=dict(card["card"]))
         if "touch" in card["digests"]:
             towers.touch = _load_touch(folder / "touch")
@@ -270,7 +270,7 @@ class Towers:
         if tower != "touch":
             raise PalpateError(f"A tower must be one of {', '.join(TOWERS)}", repr(tower), "Choose one of these")
         if self.touch is None or self.touch_preprocess is None:
-            raise PalpateError("These towers must include a touch tower", "vision and text only", "Train one with: palpate train towers")
+            raise PalpateError("These towers must include a touch tower", "vision and text only", "Train one with: palpate encoder")
         return self.touch, self.touch_preprocess
 
 

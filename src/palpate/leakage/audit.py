@@ -41,6 +41,10 @@ def audit_split(manifest: Manifest, split: Split, *, group: str = "video", name:
     """
     result = audit_parts(manifest.part(split, "train"), manifest.part(split, "test"), group=group, name=name, worst=worst)
     notes = list(result.notes)
+    if split.manifest is not None and split.manifest != manifest.digest:
+        notes.append("The split was made for another manifest (the digests differ).")
+    if unused := len(manifest) - len(split.parts):
+        notes.append(f"{unused} of {len(manifest)} samples of the manifest are in no part of the split.")
     if (val := manifest.part(split, "val")).table.height:
         shared = set(val.column(group)) & set(manifest.part(split, "train", "test").column(group)) - {None}
         if shared:
@@ -164,7 +168,7 @@ def _materials(train: pl.DataFrame, test: pl.DataFrame, group: str) -> list[Mapp
     return rows
 
 
-def audit_lists(train: Path, test: Path, *, group: str = "video", skip_bad: bool = False) -> tuple[Audit, list[str]]:
+def audit_lists(train: Path, test: Path, *, group: str = "video", worst: int = 12, skip_bad: bool = False) -> tuple[Audit, list[str]]:
     """Audits two bare list files (``video/frame.jpg,label`` a line); no pictures are needed.
 
     Returns:
@@ -182,5 +186,5 @@ def audit_lists(train: Path, test: Path, *, group: str = "video", skip_bad: bool
             problems += error.problems
     if problems:
         raise ProblemsError(problems, "Mend the lines, or pass --skip-bad to go on without them")
-    result = audit_parts(lists[0].manifest, lists[1].manifest, group=group, name=f"{train.name} / {test.name}")
+    result = audit_parts(lists[0].manifest, lists[1].manifest, group=group, name=f"{train.name} / {test.name}", worst=worst)
     return result, [str(p) for found in lists for p in found.skipped]

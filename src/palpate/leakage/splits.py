@@ -1,11 +1,11 @@
 """Leak-free splits: whole groups go to one part, and every material keeps its share.
 
 With n_gm the samples of material m in group g and r_p the wanted share of part p, the assignment a(g)
-is chosen to minimise, in this order,
+is chosen to minimise a weighted sum of, heaviest first,
 
-1. materials that could be in every part (they occur in enough groups) but are missing from one,
-2. the largest deviation ``max_{m, p} | sum_{g: a(g)=p} n_gm / n_m - r_p |``,
-3. the mean squared deviation of the materials and of the whole,
+1. materials that could be in every part (they occur in enough groups) but are missing from one (weight 100),
+2. the largest deviation ``max_{m, p} | sum_{g: a(g)=p} n_gm / n_m - r_p |`` of such a material, and that of the whole (1 each),
+3. the mean squared deviation of all materials and of the whole (0.1),
 
 by a seeded greedy construction (largest groups first) followed by moves and swaps until none improves.
 """
@@ -65,6 +65,11 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, str]:
         )
     if known[0] == "touch":
         return "touch", "The manifest knows no videos: the touch is kept whole."
+    if table[known[0]].n_unique() < parts and "touch" in known:
+        return (
+            "touch",
+            f"There are fewer than {parts} {known[0]}s: whole touches are kept together instead, and train and test share a {known[0]}.",
+        )
     videos = table.filter(pl.col("material").is_not_null()).group_by("material").agg(pl.col(known[0]).n_unique().alias("n"))
     if not videos.height:
         return known[0], ""

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -48,6 +49,7 @@ from palpate.diffusion.pipeline import Pipeline
 from palpate.diffusion.presets import preset_named as diffusion_preset
 from palpate.diffusion.recipe import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_touch
+from palpate.encoders.embed import texts_of
 from palpate.encoders.presets import preset as encoder_preset
 from palpate.encoders.towers import Towers, load_clip, pick_device
 from palpate.generate import Generated, generate
@@ -184,6 +186,7 @@ class _Pipeline:
 
         def build(folder: Path) -> dict[str, Any]:
             done = import_dataset(source, folder, skip_bad=self.options.skip_bad, size=size, progress=self.progress)
+            texts_of(done.manifest)  # a sample with neither text nor a known material is refused now, not minutes later
             return {
                 "digest": done.manifest.digest, "dataset": done.facts.get("dataset", source.name), "samples": len(done.manifest),
                 "skipped": [str(p) for p in done.skipped], "inconclusive": done.inconclusive, "facts": dict(done.facts),
@@ -220,7 +223,8 @@ class _Pipeline:
             return {"digest": done.manifest.digest, "samples": len(done.manifest)}
 
         stage = self.run.stage("pretraining-data", self._digest("pretraining"), build)
-        return Manifest.join(Manifest.load(stage.folder), manifest.part(split, "train"))
+        # Prefixed, so that a user's own copy of this world does not collide with it.
+        return Manifest.join(Manifest.load(stage.folder).prefixed("pretraining/"), manifest.part(split, "train"))
 
     def clip(self, pretraining: Manifest | None) -> str:
         """A small CLIP trained on photos and texts; returns its folder."""
@@ -232,11 +236,11 @@ class _Pipeline:
                 pretraining, everything, self.encoder, folder / "training", seed=self.options.seed, cache=self.cache, device=self.options.device,
                 progress=self.progress,
             )  # fmt: skip
-            clip.save(folder / "clip")
+            clip.save(_fresh(folder / "clip"))
             return {"digest": clip.digest("vision"), "text": clip.digest("text"), "samples": len(pretraining)}
 
         inputs = {"preset": self.encoder, "train": pretraining.digest, "seed": self.options.seed}
-        return str(self.run.stage("clip", inputs | self._digest("pretraining-data", "split"), build).folder / "clip")
+        return str(self.run.stage("clip", inputs | self._digest("pretraining-data", "split", "data"), build).folder / "clip")
 
     def autoencoder(self, pretraining: Manifest | None, manifest: Manifest, split: Split) -> str:
         """A small VQ autoencoder of touches; returns its folder. Its reconstruction bounds every score of pictures."""
@@ -258,7 +262,7 @@ class _Pipeline:
                 images, options, folder / "training", held_out=held_out, seed=self.options.seed, key=key, device=pick_device(self.options.device),
                 progress=self.progress,
             )  # fmt: skip
-            model.save(folder / "autoencoder")
+            model.save(_fresh(folder / "autoencoder"))
             return {"digest": model.digest, "images": len(images), "on test touches": model.card["held_out"]}
 
         inputs = {
@@ -268,7 +272,9 @@ class _Pipeline:
             "own": own.digest,
             "seed": self.options.seed,
         }
-        stage = self.run.stage("autoencoder", inputs | {"repeat": self.preset.repeat} | self._digest("pretraining-data", "split"), build)
+        stage = self.run.stage(
+            "autoencoder", inputs | {"repeat": self.preset.repeat} | self._digest("pretraining-data", "split", "data"), build
+        )
         return str(stage.folder / "autoencoder")
 
     def towers(self, manifest: Manifest, split: Split, clip: str, pretraining: Manifest | None) -> Towers:
@@ -289,7 +295,7 @@ class _Pipeline:
                 everything = Split.from_ids(train=pretraining.ids, rule={"name": "pretraining"}, manifest=pretraining.digest)
                 start = train_touch(pretraining, everything, frozen, self.encoder, folder / "pretraining", epochs=before, **common)
                 towers = train_touch(manifest, split, frozen, self.encoder, folder / "training", epochs=after, start=start, **common)
-            towers.save(folder / "towers")
+            towers.save(_fresh(folder / "towers"))
             return {"digest": towers.digest("touch"), "text_source": towers.card.get("text_source")}
 
         inputs = {
@@ -310,7 +316,7 @@ class _Pipeline:
                 manifest, split, towers, Autoencoder.load(autoencoder), self.diffusion, folder / "training", seed=self.options.seed,
                 background=self.options.background, cache=self.cache, device=self.options.device, progress=self.progress,
             )  # fmt: skip
-            pipeline.save(folder / "model")
+            pipeline.save(_fresh(folder / "model"))
             loop = pipeline.training["loop"]
             return {
                 "digest": pipeline.digest, "parameters": pipeline.training["parameters"], "steps": loop["steps"], "batch": loop["batch"],
@@ -357,6 +363,12 @@ class _Pipeline:
         if name in self.run.stages:
             return self.run.stages[name].digest
         return digest_folder(Path(source)) if Path(source).is_dir() else source
+
+
+def _fresh(folder: Path) -> Path:
+    """The folder, without what a call that was killed between saving and finishing its stage left in it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    return folder
 
 
 def _repeats(others: int, mine: int, share: float) -> int:

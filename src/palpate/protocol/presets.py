@@ -31,7 +31,7 @@ class PipelinePreset:
     diffusion: str
     train: float = 0.75
     repeat: float = 1 / 3
-    touch_epochs: tuple[float, float] = (6, 8)
+    touch_epochs: tuple[float, float] = (5, 6)
     cost: str = ""
 
 

@@ -88,7 +88,23 @@ def score_generated(
         if name != SAME_MATERIAL:  # these are train touches, which the probe was fitted to
             scores += accuracy(made, name)
     scores += accuracy(features, "real")
-    return scores
+    return [replace(s, note=". ".join(filter(None, [s.note, *_doubts(s, split, generated, towers)]))) for s in scores]
+
+
+def _doubts(score: Score, split: Split, generated: Mapping[str, Generated], towers: Towers) -> list[str]:
+    """Reasons not to trust a score: an encoder or a generator that may have seen test samples (paper, section 5)."""
+    found: list[str] = []
+    trained = towers.card.get("split")
+    if score.encoder and trained != split.digest:
+        said = "no record of its split" if trained is None else "trained on another split"
+        found.append(
+            f"The touch tower comes with {said}" if trained is None else f"The touch tower was {said}: it may have seen test touches"
+        )
+    if score.subject in generated:
+        trained = generated[score.subject].settings.get("split")
+        if trained != split.digest:
+            found.append("The generator was not trained on this split: it may have seen test samples")
+    return found
 
 
 def require_same_ids(name: str, made: Sequence[str], wanted: Sequence[str]) -> None:

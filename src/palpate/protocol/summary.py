@@ -21,8 +21,8 @@ SYNTHETIC = (
     "to be compared with those of real data."
 )
 SMALL_MODELS = (
-    "Frozen towers and autoencoder are small ones, trained in this run on another synthetic world and the train part; they stand where pretrained "
-    "CLIP and VQ-GAN stand in the paper (--clip and --autoencoder take those)."
+    "Small and trained in this run, on another synthetic world and the train part: {}. They stand where pretrained models stand in the paper; "
+    "--clip and --autoencoder take those."
 )
 LABEL_TEXT = (
     "This data set has no texts: training used template texts made from the material, so text carries no more than the label, and class-aware scores "
@@ -41,7 +41,7 @@ def summarise(outcome: PipelineOutcome, command: str) -> Results:
     name = str(facts["data"].facts["dataset"])
     return Results(
         title=f"From photo to touch on {name}",
-        facts=headline(outcome.audits, outcome.scores, outcome.manifest, outcome.generated),
+        facts=headline(outcome),
         audits=outcome.audits,
         scores=outcome.scores,
         gallery=gallery(outcome.manifest, outcome.generated, outcome.options.seed),
@@ -51,9 +51,11 @@ def summarise(outcome: PipelineOutcome, command: str) -> Results:
     )
 
 
-def headline(audits: Sequence[Audit], scores: Sequence[Score], manifest: Manifest, generated: Generated) -> list[str]:
+def headline(outcome: PipelineOutcome) -> list[str]:
     """Three sentences: the leak, the distance to real touches, what the touches still tell."""
-    return [_leak_fact(audits), _distance_fact(scores, len(generated.ids)), _material_fact(scores, manifest)]
+    source = "photos and no-contact images" if outcome.options.background else "photos alone"
+    distance = _distance_fact(outcome.scores, len(outcome.generated.ids), source)
+    return [_leak_fact(outcome.audits), distance, _material_fact(outcome.scores, outcome.manifest)]
 
 
 def _leak_fact(audits: Sequence[Audit]) -> str:
@@ -81,12 +83,10 @@ def _with_interval(score: Score | None, digits: int) -> str:
     return f"{score.value:.{digits}f}{around}"
 
 
-def _distance_fact(scores: Sequence[Score], n: int) -> str:
+def _distance_fact(scores: Sequence[Score], n: int, source: str) -> str:
     made, blank = (_find(scores, "TMMD", subject, "paper") for subject in ("generated", BACKGROUND))
     versus = f", the empty gel {_with_interval(blank, 2)}" if blank is not None else ""
-    return (
-        f"Distance: {n} touches generated from photos alone have TMMD {_with_interval(made, 2)} to the real ones{versus} (lower is better)."
-    )
+    return f"Distance: {n} touches generated from {source} have TMMD {_with_interval(made, 2)} to the real ones{versus} (lower is better)."
 
 
 def _material_fact(scores: Sequence[Score], manifest: Manifest) -> str:
@@ -119,8 +119,11 @@ def _notes(outcome: PipelineOutcome) -> list[str]:
     notes: list[str] = []
     if outcome.options.data is None:
         notes.append(SYNTHETIC)
-    if not (outcome.options.clip and outcome.options.autoencoder):
-        notes.append(SMALL_MODELS)
+    small = ["the frozen vision and text towers"] * (not outcome.options.clip) + ["the frozen autoencoder"] * (
+        not outcome.options.autoencoder
+    )
+    if small:
+        notes.append(SMALL_MODELS.format(" and ".join(small)))
     rule: Mapping[str, object] = outcome.split.rule
     if rule.get("reason"):
         notes.append(str(rule["reason"]))
