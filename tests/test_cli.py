@@ -71,6 +71,37 @@ def test_a_users_mistake_is_one_line_and_status_2(capsys, tmp_path, monkeypatch,
     assert out == ""
 
 
+def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(capsys, lists, small_manifest, tmp_path):
+    small_manifest.save(tmp_path / "m" / "manifest.parquet")
+    (tmp_path / "half.json").write_text('{"format": "palpate-split/1", "rule": {}, "digest": "x"}')
+    (tmp_path / "odd.json").write_text('{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}')
+    (tmp_path / "scores.json").write_text('{"format": "palpate-scores/1", "scores": [{"metric": "m", "subject": "s", "value": "high"}]}')
+    for args, word in (
+        (["audit", *lists, "-o", tmp_path / "m"], "must be readable and writable"),
+        (["audit", *lists, "-o", lists[0] + "/x.json"], "must be readable and writable"),
+        (["split", tmp_path / "m", "-o", tmp_path / "m"], "must be readable and writable"),
+        (["audit", tmp_path / "m", "--split", tmp_path / "half.json"], "an incomplete split file"),
+        (["audit", tmp_path / "m", "--split", tmp_path / "odd.json"], "an incomplete split file"),
+        (["report", tmp_path / "scores.json", "-o", tmp_path / "p.html"], "must hold complete results"),
+        (["audit", *lists, "--worst", "-1"], "--worst must be at least 0"),
+        (["encoder", tmp_path / "m", "--split", tmp_path / "half.json", "-o", tmp_path / "t", "--epochs", "nan"], "--epochs must be"),
+    ):
+        status, _, err = call(capsys, *args)
+        assert (status, word in err, "Traceback" in err) == (2, True, False), (args, err)
+
+
+def test_a_bug_of_ours_has_a_status_of_its_own(capsys, lists, monkeypatch):
+    monkeypatch.setattr("palpate.cli.audit.show", lambda *_: 1 / 0)
+    status, _, err = call(capsys, "audit", *lists)
+    assert status == 70
+    assert "this is a bug in palpate" in err
+
+
+def test_worst_counts_pairs_of_lists_as_well(capsys, lists):
+    assert len(json.loads(call(capsys, "audit", *lists, "--json", "--worst", "0")[1])["worst"]) == 0
+    assert len(json.loads(call(capsys, "audit", *lists, "--json")[1])["worst"]) == 1
+
+
 def test_a_mistake_as_json(capsys, tmp_path):
     status, out, _ = call(capsys, "audit", tmp_path / "a", tmp_path / "b", "--json")
     assert status == 2

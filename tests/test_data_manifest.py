@@ -59,6 +59,14 @@ def test_foreign_and_changed_files_are_refused(small_manifest, tmp_path):
         Manifest.from_rows([{"colour": "red"}], tmp_path)
 
 
+def test_a_manifest_whose_paths_climb_out_is_not_loaded(tmp_path):
+    (tmp_path / "secret.png").touch()
+    for path in ("../secret.png", "a/../../secret.png", str(tmp_path / "secret.png"), "C:/x.png"):
+        Manifest.from_rows([{"id": "1", "vision": path}], tmp_path / "root").save(tmp_path / "root" / "manifest.parquet")
+        with pytest.raises(PalpateError, match="inside the root"):
+            Manifest.load(tmp_path / "root")
+
+
 def test_parts_follow_the_split_and_foreign_ids_are_named(small_manifest):
     split = Split.from_ids(train=["v1/0", "v0/0"], test=["v2/3"])
     assert small_manifest.part(split, "train").ids == ["v0/0", "v1/0"]

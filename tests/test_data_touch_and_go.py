@@ -309,6 +309,21 @@ def test_a_link_out_of_the_data_set_is_told(tmp_path):
     assert [p.kind for p in caught.value.problems] == ["outside-root"]
 
 
+def test_one_frame_that_links_out_of_the_data_set_is_told_or_skipped(tmp_path):
+    forge(tmp_path, extracted=("a",))
+    frames = tmp_path / "dataset" / "a" / "gelsight_frame"
+    listed = (tmp_path / "label.txt").read_text().split(",")[0].split("/")[1]
+    (tmp_path.parent / f"{tmp_path.name}-outside.jpg").write_bytes((frames / listed).read_bytes())
+    (frames / listed).unlink()
+    (frames / listed).symlink_to(tmp_path.parent / f"{tmp_path.name}-outside.jpg")
+    with pytest.raises(ProblemsError) as caught:
+        import_touch_and_go(tmp_path, tmp_path / "out")
+    assert [p.kind for p in caught.value.problems] == ["outside-root"]
+    done = import_touch_and_go(tmp_path, tmp_path / "out", skip_bad=True)
+    assert [p.kind for p in done.skipped] == ["outside-root"]
+    assert done.manifest.problems() == []
+
+
 @pytest.mark.slow
 def test_the_five_real_clips(real_data, tmp_path):
     found = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path / "out")

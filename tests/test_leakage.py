@@ -120,6 +120,20 @@ def test_too_few_videos_fall_back_to_touches_and_say_so():
     assert audit_split(m, plan.split, group="video").leaked_fraction == 1.0
 
 
+def test_one_video_falls_back_to_touches_even_without_materials():
+    m = Manifest.from_rows([{"id": f"v/{f}", "video": "v", "frame": f, "touch": f"v#{f // 10}"} for f in range(40)], ".")
+    plan = leak_free_split(m)
+    assert plan.group == "touch"
+    assert "fewer than 2 videos" in plan.reason
+
+
+def test_a_split_of_another_or_larger_manifest_is_told():
+    m = manifest_of([("a", 1, "Wood"), ("b", 1, "Wood"), ("c", 1, "Wood")])
+    audit = audit_split(m, Split.from_ids(train=["a/1"], test=["b/1"], manifest="0" * 64))
+    assert any("another manifest" in note for note in audit.notes)
+    assert any("1 of 3 samples" in note for note in audit.notes)
+
+
 def test_splits_that_cannot_be_made_say_why():
     m = manifest_of([("a", 1, "Wood"), ("a", 2, "Wood")])
     with pytest.raises(PalpateError, match="at least as many groups"):
