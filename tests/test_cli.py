@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from palpate.cli import main
+from palpate.core import Split
 
 
 @pytest.fixture
@@ -75,11 +76,13 @@ def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(capsys, l
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
     (tmp_path / "half.json").write_text('{"format": "palpate-split/1", "rule": {}, "digest": "x"}')
     (tmp_path / "odd.json").write_text('{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}')
-    (tmp_path / "scores.json").write_text('{"format": "palpate-scores/1", "scores": [{"metric": "m", "subject": "s", "value": "high"}]}')
+    (tmp_path / "scores.json").write_text(
+        '{"format": "palpate-results/1", "title": "t", "scores": [{"metric": "m", "subject": "s", "value": "high"}]}'
+    )
     for args, word in (
-        (["audit", *lists, "-o", tmp_path / "m"], "must be readable and writable"),
-        (["audit", *lists, "-o", lists[0] + "/x.json"], "must be readable and writable"),
-        (["split", tmp_path / "m", "-o", tmp_path / "m"], "must be readable and writable"),
+        (["audit", *lists, "-o", tmp_path / "m"], f"{tmp_path / 'm'} must be writable"),
+        (["audit", *lists, "-o", lists[0] + "/x.json"], "must be"),
+        (["split", tmp_path / "m", "-o", tmp_path / "m"], "must not replace an input"),
         (["audit", tmp_path / "m", "--split", tmp_path / "half.json"], "an incomplete split file"),
         (["audit", tmp_path / "m", "--split", tmp_path / "odd.json"], "an incomplete split file"),
         (["report", tmp_path / "scores.json", "-o", tmp_path / "p.html"], "must hold complete results"),
@@ -88,6 +91,42 @@ def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(capsys, l
     ):
         status, _, err = call(capsys, *args)
         assert (status, word in err, "Traceback" in err) == (2, True, False), (args, err)
+
+
+def test_no_output_replaces_an_input_or_a_foreign_file(capsys, lists, small_manifest, tmp_path):
+    small_manifest.save(tmp_path / "m" / "manifest.parquet")
+    assert call(capsys, "audit", *lists, "-o", tmp_path / "a.json")[0] == 0
+    (tmp_path / "notes.html").write_text("my notes")
+    kept = {
+        p: p.read_bytes() for p in (*map(Path, lists), tmp_path / "m" / "manifest.parquet", tmp_path / "a.json", tmp_path / "notes.html")
+    }
+    for args in (
+        ["audit", *lists, "-o", lists[0]],
+        ["split", tmp_path / "m", "-o", tmp_path / "m" / "manifest.parquet"],
+        ["report", tmp_path / "a.json", "-o", tmp_path / "a.html"],
+        ["report", tmp_path / "a.json", "-o", tmp_path / "notes.html"],
+        ["import", lists[0], "-o", tmp_path],
+    ):
+        assert call(capsys, *args)[0] == 2, args
+    assert {p: p.read_bytes() for p in kept} == kept
+    for _ in range(2):  # its own earlier output may be replaced
+        assert call(capsys, "report", tmp_path / "a.json", "-o", tmp_path / "page.html", "-q")[0] == 0
+        assert call(capsys, "audit", *lists, "-o", tmp_path / "a.json")[0] == 0
+        assert call(capsys, "split", tmp_path / "m", "-o", tmp_path / "s.json")[0] == 0
+
+
+def test_a_page_whose_audit_is_of_another_split_says_so(capsys, lists, tmp_path):
+    score = {"metric": "TMMD", "subject": "x", "value": 1.0, "split": "b" * 64}
+    (tmp_path / "r.json").write_text(json.dumps({"format": "palpate-results/1", "title": "t", "scores": [score]}))
+    assert call(capsys, "audit", *lists, "-o", tmp_path / "a.json")[0] == 0
+    assert call(capsys, "report", tmp_path / "a.json", tmp_path / "r.json", "-o", tmp_path / "p.html", "-q")[0] == 0
+    assert "No audit on this page is of the split" in (tmp_path / "p.html").read_text()
+
+
+def test_piped_text_keeps_digests_whole(capsys, small_manifest, tmp_path):
+    small_manifest.save(tmp_path / "m" / "manifest.parquet")
+    _, out, _ = call(capsys, "split", tmp_path / "m", "-o", tmp_path / "s.json")
+    assert Split.load(tmp_path / "s.json").digest in out
 
 
 def test_a_bug_of_ours_has_a_status_of_its_own(capsys, lists, monkeypatch):

@@ -182,6 +182,9 @@ def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
     results = Results.load(tmp_path / "page.json")
     assert results.audits[0].leaked_fraction == 0
     assert results.scores
+    assert results.gallery
+    assert results.settings["digests"]["split"] == results.audits[0].split
+    assert any(command.startswith("palpate score tag") for command in results.commands)
 
 
 def test_photos_alone_are_enough_to_generate(whole, tmp_path):
@@ -202,6 +205,7 @@ def test_real_clips_go_through_to_the_page(real_data, tmp_path):
     assert status == 0, "\n".join(lines)
     results = Results.load(tmp_path / "run" / "page.json")
     assert results.settings["stages"]["data"]["samples"] == 436
+    assert [a.name for a in results.audits] == ["NoLeak by touch", "NoLeak by touch, seen by video"]
     assert [a.group for a in results.audits] == ["touch", "video"]
     assert [a.leaked_fraction for a in results.audits] == [0.0, 1.0]
     assert any("0 of 5 materials occur in 2 or more videos" in note for note in results.notes)

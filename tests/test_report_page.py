@@ -271,14 +271,14 @@ def test_json_holds_what_json_cannot(tmp_path):
     assert json.loads(files.json.read_text())["settings"] == {"rate": None, "path": tmp_path.as_posix(), "array": [0, 1, 2], "one": 0.5}
 
 
-def test_base_moves_relative_paths_and_keeps_absolute_ones(tmp_path):
+def test_all_picture_paths_are_counted_from_the_page(tmp_path):
     name = picture(tmp_path / "data" / "a.png")
     absolute = str(tmp_path / "data" / "a.png")
     results = Results("t", gallery=[GalleryItem(SampleRef("a", vision=name, tactile=absolute), name)])
     files = write_report(results, tmp_path / "out" / "page.html", base=tmp_path / "data")
     assert len(Tree(files.page.read_text()).all("img")) == 3
     item = Results.load(files.json).gallery[0]
-    assert (item.sample.vision, item.sample.tactile, item.generated) == ("../data/a.png", absolute, "../data/a.png")
+    assert (item.sample.vision, item.sample.tactile, item.generated) == ("../data/a.png", "../data/a.png", "../data/a.png")
     assert write_report(Results.load(files.json), files.page).page.read_text() == files.page.read_text()
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import FAILED_CHECK, Common, Terminal
+from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output
 from palpate.core import Audit, PalpateError, Split, write_json
 
 
@@ -38,6 +38,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         raise PalpateError("--fail-over must lie in [0, 1]", str(options.fail_over), "Pass a fraction, e.g. --fail-over 0.01")
     if options.worst < 0:
         raise PalpateError("--worst must be at least 0", str(options.worst), "Pass how many pairs to keep, e.g. --worst 12")
+    if options.output:
+        guard_output(options.output, [*options.paths, *([options.split] if options.split else [])])
     audit, skipped = _audit(options)
     data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "skipped": skipped}
     if options.output:

@@ -54,6 +54,15 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         preset=options.preset, data=out, clip=options.clip, autoencoder=options.autoencoder, group=options.group, seed=options.seed,
         skip_bad=options.skip_bad, background=options.background, device=options.device,
     )  # fmt: skip
+    if (
+        options.out.is_dir()
+        and any(options.out.iterdir())
+        and not any(options.out.glob("*.partial"))
+        and not any(options.out.glob("*/stage.json"))
+    ):
+        raise PalpateError(
+            f"{options.out} must be new, empty, or a run folder of the demo", "a folder with other files", "Choose another --out"
+        )
     try:
         with terminal.progress() as progress:
             outcome = run_pipeline(asked, options.out, say=terminal.say, progress=progress)
@@ -66,6 +75,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     words += [w for name in ("clip", "autoencoder") if (value := getattr(options, name)) for w in (f"--{name}", value)]
     words += ["--group", options.group] if options.group != "auto" else []
     words += ["--background"] if options.background else []
+    words += ["--skip-bad"] if options.skip_bad else []
+    words += ["--out", str(options.out)]
     results = summarise(outcome, shlex.join(words))
     page = write_report(results, options.out / "page.html").page
     terminal.print("")

@@ -11,6 +11,9 @@ import tyro
 from palpate.cli.terminal import Common, OutPath, Terminal
 from palpate.core import PalpateError
 
+#: All that an import writes.
+IMPORT_FILES = {"manifest.parquet", "splits", "images"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
@@ -43,12 +46,20 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     pairs = [item.split("=", 1) for item in options.map]
     if wrong := [item for item, pair in zip(options.map, pairs, strict=True) if len(pair) != 2]:
         raise PalpateError("--map takes COLUMN=NAME", repr(wrong[0]), "E.g. --map vision=rgb_path tactile=gel_path")
+    strange = {p.name for p in options.output.iterdir()} - IMPORT_FILES if options.output.is_dir() else set[str]()
+    if strange:
+        raise PalpateError(
+            f"{options.output} must be new, empty, or an earlier import", f"a folder with {sorted(strange)[0]}", "Choose another -o"
+        )
     with terminal.progress() as progress:
         done = import_dataset(
             options.source, options.output, format=options.format, columns=dict(pairs) or None, root=options.root, size=options.size,
             max_per_touch=options.max_per_touch, check=options.check, skip_bad=options.skip_bad, progress=progress,
         )  # fmt: skip
     manifest = done.manifest
+    for path in (options.output / "splits").glob("*.json"):  # of an earlier import of something else
+        if path.stem not in done.splits:
+            path.unlink()
     facts = {
         "manifest": str(options.output / "manifest.parquet"), "digest": manifest.digest, "samples": len(manifest),
         **{many: manifest.table[one].drop_nulls().n_unique() for one, many in (("video", "videos"), ("touch", "touches"), ("material", "materials"))},

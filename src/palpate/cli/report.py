@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal
-from palpate.core import Audit, PalpateError, Results, Score, read_json
+from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
+from palpate.core import Audit, PalpateError, Results, read_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +30,14 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         raise PalpateError("A report needs results", "no file", "E.g. palpate audit train.txt test.txt -o audit.json")
     from palpate.report import write_report
 
+    if options.output.suffix == ".html":
+        guard_output(options.output, options.results, (b"palpate",))
+        guard_output(options.output.with_suffix(".json"), options.results)
+        guard_output(options.output.with_suffix(".md"), options.results, (options.title.encode(), b"palpate"))
     merged = Results(title=options.title)
     for path in options.results:
         merged = _join(merged, _read(path))
+    merged = replace(merged, notes=[*merged.notes, *_mismatch(merged)])
     with terminal.progress() as progress:
         files = write_report(merged, options.output, progress=progress)
     paths = {"page": str(files.page), "json": str(files.json), "markdown": str(files.markdown)}
@@ -48,8 +53,6 @@ def _read(path: Path) -> Results:
         match kind:
             case "palpate-audit/1":
                 return _absolute(Results(title="", audits=[Audit.from_json(fields)]), path.parent)
-            case "palpate-scores/1":
-                return Results(title="", scores=[Score.from_json(s) for s in fields["scores"]])
             case "palpate-results/1":
                 results = Results.from_json(fields)
                 return _absolute(results, path.parent)
@@ -61,6 +64,17 @@ def _read(path: Path) -> Results:
         raise PalpateError(
             f"{path} must hold complete results", f"a missing or unknown field ({error})", "Write it again with palpate"
         ) from None
+
+
+def _mismatch(results: Results) -> list[str]:
+    """Says so if no audit on the page is of the split that the scores are on."""
+    audited, scored = ({x.split for x in of if x.split} for of in (results.audits, results.scores))
+    if results.audits and scored - audited:
+        named = ", ".join(s[:8] for s in sorted(scored - audited))
+        return [
+            f"No audit on this page is of the split that these scores are on ({named}): what the audits say of leaks does not speak of them."
+        ]
+    return []
 
 
 def _absolute(results: Results, base: Path) -> Results:

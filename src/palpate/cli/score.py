@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, Terminal, require_extra
-from palpate.core import Score, write_json
+from palpate.cli.terminal import Common, Terminal, guard_output, require_extra
+from palpate.core import Results, Score
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +25,7 @@ class Options(Common):
     towers: Path
     """Folder of `palpate encoder`; its touch tower gives the features."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Write the scores as JSON, for `palpate report`."""
+    """Write scores, gallery and settings as JSON, for `palpate report`."""
     presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ("grouped", "paper")
     """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole videos together."""
     group: Literal["auto", "video", "touch", "object"] = "auto"
@@ -44,6 +44,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.encoders.towers import Towers
     from palpate.generate import Generated
     from palpate.protocol.scoring import score_generated
+    from palpate.protocol.summary import gallery
 
     if not options.presets:
         raise PalpateError("--presets must name at least one preset", "none", "E.g. --presets grouped paper")
@@ -53,16 +54,24 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if len(set(names)) < len(names):
         raise PalpateError("Folders of generated touches must differ in name", ", ".join(names), "Rename one: the name stands in the table")
     folders = {name: Generated.load(path) for name, path in zip(names, options.generated, strict=True)}
+    if options.output:
+        guard_output(options.output, [options.manifest, options.split])
+    manifest, towers = Manifest.load(options.manifest), Towers.load(options.towers)
     with terminal.progress() as progress:
         scores = score_generated(
-            Manifest.load(options.manifest), split, folders, Towers.load(options.towers), group=group, presets=options.presets,
+            manifest, split, folders, towers, group=group, presets=options.presets,
             controls=options.controls, seed=options.seed, progress=progress,
         )  # fmt: skip
-    data = {"format": "palpate-scores/1", "scores": [s.to_json() for s in scores]}
+    digests = {"manifest": manifest.digest, "split": split.digest, "touch tower": towers.digest("touch")}
+    results = Results(
+        title=f"Scores of {', '.join(names)}", scores=scores, gallery=gallery(manifest, folders[names[0]], options.seed),
+        settings={"digests": digests, "split rule": dict(split.rule), "generated": {name: dict(f.settings) for name, f in folders.items()}},
+        commands=[terminal.command],
+    )  # fmt: skip
     if options.output:
-        write_json(options.output, data)
+        results.save(options.output)
     show(scores, terminal)
-    return data
+    return results.to_json()
 
 
 def show(scores: list[Score], terminal: Terminal) -> None:

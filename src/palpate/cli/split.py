@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.audit import show
-from palpate.cli.terminal import Common, OutPath, Terminal
+from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +36,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.data.manifest import Manifest
     from palpate.leakage import audit_split, describe, leak_free_split
 
+    guard_output(options.output, [options.manifest], (b'"format": "palpate-split/',))
     manifest = Manifest.load(options.manifest)
     plan = leak_free_split(manifest, train=options.train, val=options.val, group=options.group, seed=options.seed)
     audit = audit_split(manifest, plan.split, group=plan.group, name=options.output.name)

@@ -15,6 +15,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import sys
 import time
@@ -50,10 +51,12 @@ class Common:
 class Terminal:
     """Where a verb writes: results on standard output, progress and remarks on standard error."""
 
-    def __init__(self, options: Common) -> None:
+    def __init__(self, options: Common, command: str = "") -> None:
+        self.command = command
         self.json = options.as_json
         self.silent = options.quiet
-        self.out = Console(highlight=False, quiet=self.json)
+        # Piped text is not wrapped: digests and paths must stay whole.
+        self.out = Console(highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400)
         self.err = Console(stderr=True, highlight=False, quiet=self.silent)
 
     def say(self, line: str) -> None:
@@ -150,7 +153,10 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         if stop.code in (0, None):
             raise
         words = re.sub(r"[\u2500-\u257f]+|─+", " ", said.getvalue())
-        words = re.split(r"For full helptext", " ".join(words.split()))[0].strip() or "arguments that cannot be parsed"
+        words = (
+            re.split(r"For full helptext|Argument helptext|Full error|If your arguments", " ".join(words.split()))[0].strip()
+            or "arguments that cannot be parsed"
+        )
         raise PalpateError(f"The options of palpate {name} must be as its help says", words, f"See: palpate {name} --help") from None
 
 
@@ -187,6 +193,28 @@ def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
     shutil.rmtree(work, ignore_errors=True)
 
 
+def guard_output(output: Path, inputs: Sequence[Path] = (), marks: Sequence[bytes] = (b'"format": "palpate-',)) -> None:
+    """Refuses an output file that would replace an input, or anything that palpate did not write.
+
+    Args:
+        output: the file to write.
+        inputs: what the command reads.
+        marks: an existing file must hold one of these in its first 4 KB to be replaced.
+
+    Raises:
+        PalpateError: saying which.
+    """
+    if any(output.exists() and path.exists() and output.samefile(path) for path in inputs):
+        raise PalpateError("An output must not replace an input of the same command", str(output), "Choose another -o")
+    if output.is_file():
+        with open(output, "rb") as file:
+            head = file.read(4096)
+        if head and not any(mark in head for mark in marks):
+            raise PalpateError(
+                f"{output} must be new, or a file of the kind that this command writes", "another file", "Choose another -o, or remove it"
+            )
+
+
 def _set_threads() -> None:
     """Thread counts for small models, unless the user has set them; must come before NumPy and torch load.
 
@@ -220,7 +248,7 @@ def run_verb(name: str, args: Sequence[str]) -> int:
             )
         module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
         options = parse(name, module.Options, args)
-        terminal = Terminal(options)
+        terminal = Terminal(options, shlex.join(["palpate", name, *args]))
         answer = module.run(options, terminal)
         result, status = answer if isinstance(answer, tuple) else (answer, OK)
         if as_json:
@@ -246,4 +274,4 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         return BUG
 
 
-__all__ = ["FAILED_CHECK", "Common", "OutPath", "Terminal", "require_extra", "run_verb", "working_folder"]
+__all__ = ["FAILED_CHECK", "Common", "OutPath", "Terminal", "guard_output", "require_extra", "run_verb", "working_folder"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -18,8 +19,13 @@ from palpate.core.errors import PalpateError
 def atomic_path(path: Path) -> Generator[Path]:
     """A temporary sibling of ``path`` to write to; renamed to ``path`` on success, removed on failure."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
+    except OSError as error:  # told with the user's path, not with that of the temporary file
+        raise PalpateError(f"{path} must be writable", error.strerror or str(error), "Choose another path, or check its rights") from None
     os.close(handle)
     part = Path(name)
     part.chmod(0o644)

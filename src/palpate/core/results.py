@@ -43,7 +43,7 @@ class Audit:
         leaked_fraction: test samples in shared groups / test samples.
         gap_min, gap_median, gap_max: distance to the nearest train frame of the same video, over test samples that have one; else None.
         gap_edges, gap_counts: histogram of those distances; ``len(edges) == len(counts) + 1``.
-        identical_samples: test samples whose id (video and frame) is in train as well.
+        identical_samples: test samples whose id, or whose video and frame, are in train as well.
         worst: pairs with the smallest gaps, at most one a group first.
         materials: rows ``{"material", "train", "test", "groups_train", "groups_test"}``.
         notes: sentences for people (fallbacks, exclusions).

@@ -72,7 +72,7 @@ def import_pairs(
     problems: list[Problem] = []
     if source.is_dir():
         if columns:
-            raise PalpateError("Columns can be renamed in a table only", f"the folder {source}", "Leave --columns out")
+            raise PalpateError("Columns can be renamed in a table only", f"the folder {source}", "Leave --map out")
         base, layout = source, "folders"
         rows = _folder_rows(source, problems)
     elif source.is_file():
@@ -111,7 +111,7 @@ def _table_rows(path: Path, columns: dict[str, str], problems: list[Problem]) ->
         raise PalpateError(
             f"{path} must have the columns {', '.join(must)}",
             f"no {', '.join(absent)} among {', '.join(sorted(there))}",
-            "Rename it, or map it: --columns vision=YOUR_COLUMN",
+            "Rename it, or map it: --map vision=YOUR_COLUMN",
         )
     rows: list[Found] = []
     for where, given in found:

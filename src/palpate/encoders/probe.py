@@ -284,7 +284,8 @@ def _score(
         left = (top.sum() - top) / (bottom.sum() - bottom)
         g = len(names)
         half = float(student.ppf(0.975, g - 1) * np.sqrt((g - 1) / g * ((left - left.mean()) ** 2).sum()))
-        interval = (max(0.0, mean - half), min(1.0, mean + half))
+        # Where leaving out any group changes nothing, the jackknife has nothing to say.
+        interval = (max(0.0, mean - half), min(1.0, mean + half)) if half > 0 else None
     return Score(
         metric, subject, mean, interval, interval_method=f"leave-one-group-out jackknife, t, {len(names) - 1} df" if interval else "",
         estimator=estimator, n=len(value), seed=seed, encoder=encoder, split=split,

@@ -84,7 +84,7 @@ def audit_parts(train: Manifest, test: Manifest, *, group: str = "video", name: 
     return Audit(
         name=name, group=group, train_samples=a.height, test_samples=b.height, groups_train=len(groups_a), groups_test=len(groups_b),
         groups_shared=len(shared), test_samples_in_shared_groups=in_shared, leaked_fraction=round(in_shared / b.height, 5),
-        identical_samples=int(b["id"].is_in(a["id"].implode()).sum()),
+        identical_samples=int((b["id"].is_in(a["id"].implode()).to_numpy() | (gaps == 0)).sum()),
         gap_min=int(found.min()) if found.size else None,
         gap_median=_plain(np.median(found)) if found.size else None,
         gap_max=last if found.size else None,

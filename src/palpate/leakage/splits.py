@@ -61,7 +61,7 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, str]:
         raise PalpateError(
             "A leak-free split needs the video, object or touch of every sample",
             "nulls in each of these columns",
-            "Fill one of them in the manifest",
+            "Import a table that has one: palpate import table.csv --map video=YOUR_COLUMN",
         )
     if known[0] == "touch":
         return "touch", "The manifest knows no videos: the touch is kept whole."

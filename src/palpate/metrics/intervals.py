@@ -49,6 +49,8 @@ def mean_interval(values: Array, groups: Sequence[str] | None, level: float) -> 
         return None, ""
     drift = np.bincount(names, weights=values - values.mean())
     error = float(np.sqrt(g / (g - 1) * (drift**2).sum())) / len(values)
+    if error == 0:  # no variation between groups is no evidence of certainty
+        return None, ""
     method = "cluster-robust over groups" if groups is not None else "per image, taken as independent"
     return t_interval(float(values.mean()), error, g - 1, level), f"{method}, t, {g - 1} df ({g} {what}s)"
 

@@ -97,6 +97,8 @@ def _mean_score(metric: str, values: Array, ids: Sequence[str] | None, groups: S
     kept = values[finite]
     identical = int((~finite).sum())
     interval, method = mean_interval(kept, None if groups is None else [g for g, k in zip(groups, finite, strict=True) if k], level)
+    if interval is not None and metric == "SSIM":  # the t interval knows no bounds, SSIM does
+        interval = (max(-1.0, interval[0]), min(1.0, interval[1]))
     worst = np.argsort(values, kind="stable")[:5]
     details: dict[str, Any] = {
         "sd": float(kept.std(ddof=1)) if len(kept) > 1 else None,
@@ -110,7 +112,7 @@ def _mean_score(metric: str, values: Array, ids: Sequence[str] | None, groups: S
     if not len(kept):
         note = f"Undefined: all {len(values)} pairs are identical, so the value is infinite"
     elif interval is None:
-        note = ". ".join(filter(None, [note, "No interval: one image or one group"]))
+        note = ". ".join(filter(None, [note, "No interval: one image or one group, or no variation between them"]))
     value = float(kept.mean()) if len(kept) else None
     return Score(
         metric, value=value, interval=interval, level=level, interval_method=method, estimator="per-image mean", n=len(values),

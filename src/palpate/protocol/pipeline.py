@@ -204,9 +204,11 @@ class _Pipeline:
             plan = leak_free_split(manifest, train=self.preset.train, group=self.options.group, seed=self.options.seed)
             plan.split.save(folder / "noleak.json")
             audits = [audit_split(manifest, Split.load(path), name=path.stem) for path in own if Split.load(path).ids("test")]
-            audits.append(audit_split(manifest, plan.split, group=plan.group, name="NoLeak"))
+            audits.append(
+                audit_split(manifest, plan.split, group=plan.group, name="NoLeak" if plan.group == "video" else f"NoLeak by {plan.group}")
+            )
             if plan.group != "video" and not manifest.table["video"].null_count():
-                audits.append(audit_split(manifest, plan.split, group="video", name="NoLeak, seen by video"))
+                audits.append(audit_split(manifest, plan.split, group="video", name=f"NoLeak by {plan.group}, seen by video"))
             write_json(folder / "audits.json", [dataclasses.asdict(a) for a in audits])
             return dict(describe(plan))
 

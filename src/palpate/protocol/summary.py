@@ -59,10 +59,10 @@ def headline(outcome: PipelineOutcome) -> list[str]:
 
 
 def _leak_fact(audits: Sequence[Audit]) -> str:
-    ours = next(a for a in audits if a.name == "NoLeak")
+    ours = next(a for a in audits if a.name.startswith("NoLeak"))
     clean = f"NoLeak (whole {ours.group}{'s' if ours.group != 'touch' else 'es'} kept together) leaks {ours.leaked_fraction:.1%}"
     own = next((a for a in audits if not a.name.startswith("NoLeak")), None)
-    seen = next((a for a in audits if a.name == "NoLeak, seen by video"), None)
+    seen = next((a for a in audits if a.name.endswith("seen by video")), None)
     if own is not None:
         gap = f", a median of {own.gap_median:g} frames from the nearest train frame" if own.gap_median is not None else ""
         return f"Leak: {own.leaked_fraction:.1%} of the test samples of the data set's own split share a video with train{gap}; {clean}."
@@ -84,18 +84,19 @@ def _with_interval(score: Score | None, digits: int) -> str:
 
 
 def _distance_fact(scores: Sequence[Score], n: int, source: str) -> str:
-    made, blank = (_find(scores, "TMMD", subject, "paper") for subject in ("generated", BACKGROUND))
+    made, blank = (_find(scores, "TMMD", subject, "grouped") for subject in ("generated", BACKGROUND))
     versus = f", the empty gel {_with_interval(blank, 2)}" if blank is not None else ""
-    return f"Distance: {n} touches generated from {source} have TMMD {_with_interval(made, 2)} to the real ones{versus} (lower is better)."
+    return f"Distance: {n} touches generated from {source} have TMMD (grouped) {_with_interval(made, 2)} to the real ones{versus} (lower is better)."
 
 
 def _material_fact(scores: Sequence[Score], manifest: Manifest) -> str:
-    made, real = (_find(scores, "material accuracy", subject) for subject in ("generated", "real"))
+    made, real, blank = (_find(scores, "material accuracy", subject) for subject in ("generated", "real", BACKGROUND))
     if made is None or real is None:
         return f"Material: {manifest.table['material'].drop_nulls().n_unique()} materials, too few for a probe."
     chance = made.details.get("chance")
-    beside = f"; chance {chance:.1%}" if isinstance(chance, float) else ""
     value = lambda s: "undefined" if s.value is None else f"{s.value:.1%}"  # noqa: E731
+    beside = f", of the empty gel {value(blank)}" if blank is not None else ""
+    beside += f"; chance is {chance:.1%}" if isinstance(chance, float) else ""
     return f"Material: a probe fitted to real train touches is right on {value(real)} of the real test touches and {value(made)} of the generated ones{beside}."
 
 

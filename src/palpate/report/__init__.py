@@ -25,14 +25,12 @@ class ReportFiles:
 
 
 def _moved(results: Results, base: Path, folder: Path) -> Results:
-    """The results with relative picture paths counted from ``folder`` instead of ``base``."""
-    if base.resolve() == folder.resolve():
-        return results
+    """The results with all picture paths counted from ``folder``: they stay right when the run folder moves, and name nobody's disk."""
 
     def path(name: str | None) -> str | None:
-        if name is None or Path(name).is_absolute():
-            return name
-        return Path(os.path.relpath(base.resolve() / name, folder.resolve())).as_posix()
+        if name is None:
+            return None
+        return Path(os.path.relpath(base.resolve() / name, folder.resolve())).as_posix()  # an absolute name replaces the base
 
     def sample(ref: SampleRef) -> SampleRef:
         return dataclasses.replace(ref, vision=path(ref.vision), tactile=path(ref.tactile))

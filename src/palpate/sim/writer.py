@@ -18,6 +18,8 @@ import dataclasses
 import multiprocessing
 import os
 import shutil
+import signal
+import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -120,7 +122,7 @@ def _render(options: WorldOptions, plans: Sequence[VideoPlan], part: Path, worke
     context = multiprocessing.get_context("spawn")  # a forked copy of a process with threads may hang
     with ProcessPoolExecutor(workers, context, _start_worker, (dict(MATERIALS),)) as pool:
         try:
-            for name, error in pool.map(partial(_guarded, job), plans, chunksize=max(1, min(4, len(plans) // (2 * workers)))):
+            for name, error in _started(pool, partial(_guarded, job), plans, chunk=max(1, min(4, len(plans) // (2 * workers)))):
                 if error is not None:
                     raise PalpateError(*error)
                 yield name
@@ -132,6 +134,17 @@ def _render(options: WorldOptions, plans: Sequence[VideoPlan], part: Path, worke
             ) from None
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _started(pool: ProcessPoolExecutor, job: Any, plans: Sequence[VideoPlan], chunk: int) -> Iterator[Any]:
+    """``pool.map``, whose processes start deaf to Ctrl-C: a terminal sends it to all of them, and each would print a traceback."""
+    if threading.current_thread() is not threading.main_thread():  # only there can signals be set
+        return pool.map(job, plans, chunksize=chunk)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        return pool.map(job, plans, chunksize=chunk)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _start_worker(materials: dict[str, Material]) -> None:
