@@ -53,6 +53,7 @@ def test_the_demo_ends_in_a_page_with_everything_on_it(whole):
     assert results.audits[1].leaked_fraction == 0
     assert len(results.facts) == 3
     assert any("synthetic" in note for note in results.notes)
+    assert results.title == "From photo to touch on palpate's procedural world"
     assert {s.metric for s in results.scores} >= {"TMMD", "I-TMMD", "CI-TMMD", "D-TMMD", "SSIM", "PSNR"}
     assert {s.subject for s in results.scores} >= {"generated", "background only", "real, same material"}
     split, encoder = results.settings["digests"]["split"], results.settings["digests"]["towers"]

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.core import PalpateError, Progress, Split, quiet, read_json
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
 from palpate.data.images import Check
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
@@ -135,12 +135,18 @@ def import_touch_and_go(
         rows = work.extract(rows, progress)
         raise_if(work.problems, skip_bad)
         require_some(len(rows), root, work.problems)
-        facts = {
-            "dataset": NAME, "licence": LICENCE, "citation": CITATION, "url": URL,
-            "text_source": "captions.csv" if texts else "none",
-        }  # fmt: skip
+        facts = _facts(root) | {"text_source": "captions.csv" if texts else "none"}
         manifest = work.manifest(rows, facts, SENSOR, {"text": texts, "object": objects})
         return Imported(manifest, work.problems, _splits(manifest, official), listed.inconclusive).save(out, created)
+
+
+def _facts(root: Path) -> dict[str, str]:
+    """Name and licence of the data; palpate's own world comes in this layout, and must never pass for the real set."""
+    mark = root / "world.json"
+    about = read_json(mark, "world record") if mark.is_file() else {}
+    if isinstance(about, dict) and str(about.get("format", "")).startswith("palpate-world/"):
+        return {"dataset": "palpate's procedural world", "synthetic": "yes", "digest": str(about.get("digest", ""))}
+    return {"dataset": NAME, "licence": LICENCE, "citation": CITATION, "url": URL}
 
 
 def _require_videos(root: Path) -> dict[str, VideoFiles]:

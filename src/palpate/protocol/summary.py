@@ -118,7 +118,7 @@ def gallery(manifest: Manifest, generated: Generated, seed: int) -> list[Gallery
 
 def _notes(outcome: PipelineOutcome) -> list[str]:
     notes: list[str] = []
-    if outcome.options.data is None:
+    if outcome.manifest.facts.get("synthetic"):
         notes.append(SYNTHETIC)
     small = ["the frozen vision and text towers"] * (not outcome.options.clip) + ["the frozen autoencoder"] * (
         not outcome.options.autoencoder
