@@ -45,7 +45,7 @@ _MINI_BEFORE = replace(WORLDS["pretrain"], materials=_TEN, objects_per_material=
 PRESETS = {p.name: p for p in (
     #              name    world   pretraining                encoder diffusion
     PipelinePreset("tiny", _TINY,  replace(_TINY, seed=1000), "tiny", "tiny", train=0.75, cost="for tests: under a minute"),
-    PipelinePreset("mini", _MINI,  _MINI_BEFORE,              "mini", "mini", train=0.85, cost="the default"),
+    PipelinePreset("mini", _MINI,  _MINI_BEFORE,              "mini", "mini", train=0.85, cost="about 8 minutes on two x86-64 cores, one of them busy most of the time"),
 )}
 # fmt: on
 
