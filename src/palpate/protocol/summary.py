@@ -133,12 +133,7 @@ def _notes(outcome: PipelineOutcome) -> list[str]:
     if outcome.manifest.table["text"].null_count():
         notes.append(LABEL_TEXT)
     blank = _find(outcome.scores, "material accuracy", BACKGROUND)
-    if (
-        blank is not None
-        and blank.value is not None
-        and blank.interval is not None
-        and blank.interval[0] > 2 * float(blank.details.get("chance") or 1)
-    ):
+    if blank is not None and blank.value is not None and blank.value > 2 * float(blank.details.get("chance") or 1):
         notes.append(
             f"The empty gel alone names the material in {blank.value:.0%} of the test samples, far above chance: each video has its own gel look, and the probe "
             "has learnt that. Material accuracy under this split measures the video, not the touch."
