@@ -51,7 +51,7 @@ def test_foreign_and_changed_files_are_refused(small_manifest, tmp_path):
     with pytest.raises(PalpateError, match="foreign"):
         Manifest.load(path)
     small_manifest.table.head(3).write_parquet(
-        path, metadata={"palpate.format": "palpate-manifest/1", "palpate.digest": small_manifest.digest, "palpate.root": "."}
+        path, metadata={"palpate.format": "palpate-manifest/2", "palpate.digest": small_manifest.digest, "palpate.root": "."}
     )
     with pytest.raises(PalpateError, match="another program"):
         Manifest.load(path)

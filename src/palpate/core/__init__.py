@@ -5,13 +5,13 @@ from palpate.core.errors import MissingExtraError, PalpateError, Problem, Proble
 from palpate.core.files import atomic_folder, atomic_path, inside, read_json, write_json, write_text
 from palpate.core.progress import Progress, quiet, track
 from palpate.core.random import rng_for, seed_for
-from palpate.core.results import Audit, GalleryItem, LeakPair, Results, SampleRef
+from palpate.core.results import CAUSES, MATRIX_ROWS, Audit, GalleryItem, Impact, ImpactRow, LeakPair, Results, SampleRef, Signal
 from palpate.core.score import FeatureSet, Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
 from palpate.core.stages import Run, Stage
 
 __all__ = [
-    "PARTS", "Audit", "FeatureSet", "GalleryItem", "LeakPair", "MissingExtraError", "PalpateError", "Problem", "ProblemsError", "Progress",
-    "Results", "Run", "SampleRef", "Score", "Split", "Stage", "atomic_folder", "atomic_path", "columns", "digest_file", "digest_folder", "digest_json",
+    "CAUSES", "MATRIX_ROWS", "PARTS", "Audit", "FeatureSet", "GalleryItem", "Impact", "ImpactRow", "LeakPair", "MissingExtraError", "PalpateError", "Problem", "ProblemsError", "Progress",
+    "Results", "Run", "SampleRef", "Score", "Signal", "Split", "Stage", "atomic_folder", "atomic_path", "columns", "digest_file", "digest_folder", "digest_json",
     "digest_lines", "inside", "quiet", "read_json", "require_comparable", "rng_for", "seed_for", "short", "track", "write_json", "write_text",
 ]  # fmt: skip

@@ -11,6 +11,9 @@ from typing import Any
 from palpate.core.files import read_json, write_json
 from palpate.core.score import Score
 
+#: Rows of the group-by-part matrix that an audit keeps.
+MATRIX_ROWS = 60
+
 
 @dataclass(frozen=True)
 class SampleRef:
@@ -26,11 +29,112 @@ class SampleRef:
 
 @dataclass(frozen=True)
 class LeakPair:
-    """A test sample beside the train sample that is nearest to it in the same group. ``gap`` is in frames."""
+    """A test sample beside the train sample that it leaks from.
+
+    Attributes:
+        gap: distance in frames, if both lie in one video; else None.
+        score: strength of the signal in [0, 1]; None where only the gap is known.
+        cause: for pictures that look alike, why (one of ``CAUSES``).
+    """
 
     test: SampleRef
     train: SampleRef
     gap: int | None
+    score: float | None = None
+    cause: str = ""
+
+
+#: Why two pictures look alike. Only ``content`` is a leak.
+CAUSES = ("content", "nothing touched", "sensor drift")
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One kind of leak, over all test samples: what was looked at, and what was found.
+
+    Attributes:
+        kind: ``identical sample``, ``identical bytes``, ``shared video`` (or ``object``, ``session`` ...), ``time gap``,
+            ``near-duplicate vision`` or ``near-duplicate touch``.
+        checked: test samples that could be looked at (a null or unreadable one cannot).
+        flagged: test samples that leak by this signal.
+        threshold: the score from which a sample is flagged.
+        false_positives: the rate at which unrelated samples would be flagged, which the threshold was calibrated to; None where
+            the signal is exact.
+        edges, unrelated, found: histograms of scores over the same bins, of unrelated pairs and of test samples against train
+            (counts; ``len(edges) == len(found) + 1``); empty where nothing was calibrated.
+        causes: test samples at or over the threshold by cause (``CAUSES``); empty where the signal has one cause.
+        worst: the strongest pairs.
+        notes: sentences for people.
+    """
+
+    kind: str
+    checked: int
+    flagged: int
+    threshold: float
+    false_positives: float | None = None
+    edges: Sequence[float] = ()
+    unrelated: Sequence[int] = ()
+    found: Sequence[int] = ()
+    causes: Mapping[str, int] = field(default_factory=dict)
+    worst: Sequence[LeakPair] = ()
+    notes: Sequence[str] = ()
+
+    @property
+    def fraction(self) -> float:
+        """Flagged share of the samples that could be looked at; 0 if there are none."""
+        return self.flagged / self.checked if self.checked else 0.0
+
+
+@dataclass(frozen=True)
+class ImpactRow:
+    """What leaking costs, for one kind of feature and one classifier: material accuracy, in [0, 1].
+
+    Attributes:
+        features: e.g. ``touch pixels`` or an encoder's name.
+        classifier: ``1-NN`` or ``linear probe``.
+        given, clean: accuracy on the test part of the given split and of the leak-free one.
+        cost: ``given - clean``.
+        given_interval, clean_interval, cost_interval: 95 % by leaving out whole groups; None with fewer than two.
+        chance: 1 / materials.
+    """
+
+    features: str
+    classifier: str
+    given: float
+    clean: float
+    cost: float
+    given_interval: tuple[float, float] | None
+    clean_interval: tuple[float, float] | None
+    cost_interval: tuple[float, float] | None
+    chance: float
+
+
+@dataclass(frozen=True)
+class Impact:
+    """What a split's leak does to scores: the same classifiers under the given split and under leak-free ones.
+
+    Attributes:
+        rows: one for each kind of features and classifier.
+        headline: one sentence with the number that a user can put in a paper.
+        group: the column kept whole by the leak-free splits and left out for the intervals.
+        clean_splits: digests of the leak-free splits that ``clean`` averages over.
+        settings: seeds, sizes, penalties and digests of features.
+        notes: sentences for people.
+    """
+
+    rows: Sequence[ImpactRow]
+    headline: str
+    group: str
+    clean_splits: Sequence[str]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Impact:
+        """The inverse of ``dataclasses.asdict``."""
+        pair = lambda v: None if v is None else (v[0], v[1])  # noqa: E731
+        rows = [ImpactRow(**{**r, **{k: pair(r[k]) for k in ("given_interval", "clean_interval", "cost_interval")}}) for r in data["rows"]]
+        return cls(**{**data, "rows": rows})
 
 
 @dataclass(frozen=True)
@@ -47,6 +151,13 @@ class Audit:
         worst: pairs with the smallest gaps, at most one a group first.
         materials: rows ``{"material", "train", "test", "groups_train", "groups_test"}``.
         notes: sentences for people (fallbacks, exclusions).
+        against: what the test part was compared with: ``train``, or ``pretraining`` where a third list was given.
+        signals: every kind of leak that was looked for, strongest evidence first.
+        leaking_samples: test samples that any signal flags.
+        matrix: rows ``{"group", "train", "val", "test", "leaking"}`` (counts of samples), shared groups with most test samples first; at
+            most ``MATRIX_ROWS``, ``groups_in_all`` tells how many there are.
+        impact: what the leak does to scores, if it was asked for.
+        commands: command lines that say what to do next.
     """
 
     name: str
@@ -68,13 +179,32 @@ class Audit:
     materials: Sequence[Mapping[str, Any]] = ()
     notes: Sequence[str] = ()
     split: str | None = None
+    against: str = "train"
+    signals: Sequence[Signal] = ()
+    leaking_samples: int = 0
+    matrix: Sequence[Mapping[str, Any]] = ()
+    groups_in_all: int = 0
+    impact: Impact | None = None
+    commands: Sequence[str] = ()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Audit:
         """The inverse of ``dataclasses.asdict``."""
-        worst = [LeakPair(SampleRef(**w["test"]), SampleRef(**w["train"]), w["gap"]) for w in data.get("worst", ())]
-        fields: dict[str, Any] = {**data, "worst": worst}
+        signals = [_signal(s) for s in data.get("signals", ())]
+        impact = Impact.from_json(data["impact"]) if data.get("impact") else None
+        fields: dict[str, Any] = {**data, "worst": _pairs(data.get("worst", ())), "signals": signals or (), "impact": impact}
+        for name in ("matrix", "commands"):  # an empty list reads as the default does
+            fields[name] = fields.get(name) or ()
         return cls(**fields)
+
+
+def _signal(data: Mapping[str, Any]) -> Signal:
+    fields: dict[str, Any] = {**data, "worst": _pairs(data.get("worst", ()))}
+    return Signal(**fields)
+
+
+def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[LeakPair]:
+    return [LeakPair(SampleRef(**r["test"]), SampleRef(**r["train"]), r["gap"], r.get("score"), r.get("cause", "")) for r in rows]
 
 
 @dataclass(frozen=True)

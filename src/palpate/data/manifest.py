@@ -8,6 +8,7 @@ column         type     meaning (null where the data set has none; never invente
 ``frame``      int      position in both videos of the recording
 ``touch``      string   the run of consecutive in-contact frames it belongs to, unique across videos
 ``object``     string   the thing touched
+``session``    string   recordings made in one sitting, of which neighbours may share the object
 ``material``   string   class name
 ``text``       string   what the touch feels like, in words
 ``vision``     string   path of the photo, relative to the root
@@ -35,11 +36,11 @@ import polars as pl
 from palpate.core import PalpateError, Problem, ProblemsError, SampleRef, Split, atomic_path, digest_lines, inside
 
 SCHEMA: dict[str, type[pl.DataType]] = {
-    "id": pl.String, "video": pl.String, "frame": pl.Int64, "touch": pl.String, "object": pl.String, "material": pl.String,
-    "text": pl.String, "vision": pl.String, "tactile": pl.String, "background": pl.String, "sensor": pl.String, "domain": pl.String,
+    "id": pl.String, "video": pl.String, "frame": pl.Int64, "touch": pl.String, "object": pl.String, "session": pl.String,
+    "material": pl.String, "text": pl.String, "vision": pl.String, "tactile": pl.String, "background": pl.String, "sensor": pl.String, "domain": pl.String,
 }  # fmt: skip
 IMAGE_COLUMNS = ("vision", "tactile", "background")
-FORMAT = "palpate-manifest/1"
+FORMAT = "palpate-manifest/2"
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 
@@ -137,8 +138,8 @@ class Manifest:
         return Manifest(self.table.filter(pl.col("id").is_in(split.ids(*parts))), self.root, self.facts)
 
     def prefixed(self, prefix: str) -> Manifest:
-        """The same samples with ``prefix`` before their ids, videos and touches."""
-        named = self.table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in ("id", "video", "touch"))
+        """The same samples with ``prefix`` before their ids, videos, touches and sessions."""
+        named = self.table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in ("id", "video", "touch", "session"))
         return Manifest(named, self.root, self.facts)
 
     @classmethod

@@ -21,7 +21,7 @@ from palpate.core import Audit, LeakPair, PalpateError, Problem, ProblemsError, 
 from palpate.data.listing import FrameList, read_list
 from palpate.data.manifest import Manifest
 
-GROUPS = ("video", "touch", "object", "domain", "sensor")
+GROUPS = ("video", "touch", "object", "session", "domain", "sensor")
 #: Right-open bins of the gap histogram, in frames; 30 frames are one second of Touch and Go.
 GAP_EDGES = (0, 1, 3, 10, 30, 60, 90, 150, 300, 600, 900, 1800, 3600)
 
