@@ -6,7 +6,7 @@ import pytest
 
 from palpate.core import PalpateError
 from palpate.data.captions import ADJECTIVES, TEXT_FROM_TEMPLATE, caption
-from palpate.data.touch_and_go import CATEGORIES
+from palpate.data.formats.touch_and_go import CATEGORIES
 
 SEEN = [
     "red",

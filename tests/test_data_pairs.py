@@ -1,15 +1,18 @@
 """Pairs: tables of four kinds and folders, with every bad row told at once; and formats found by look."""
 
 import json
+from functools import partial
 
 import polars as pl
 import pytest
 
 from data_forge import tree, write_frames, write_image
 from palpate.core import PalpateError, ProblemsError
-from palpate.data.importing import FORMATS, import_dataset
+from palpate.data.formats import FORMATS
+from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
-from palpate.data.pairs import import_pairs
+
+import_pairs = partial(import_dataset, format="pairs")
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from PIL import Image
 import palpate.data.recordings as recordings
 from data_forge import number, tree, write_frames, write_image, write_video
 from palpate.core import PalpateError, ProblemsError, Split
+from palpate.data.formats.touch_and_go import find_videos, import_touch_and_go
 from palpate.data.images import read_image
 from palpate.data.manifest import Manifest
-from palpate.data.touch_and_go import find_videos, import_touch_and_go
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
 

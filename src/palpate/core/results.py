@@ -132,9 +132,9 @@ class Impact:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Impact:
         """The inverse of ``dataclasses.asdict``."""
-        pair = lambda v: None if v is None else (v[0], v[1])  # noqa: E731
-        rows = [ImpactRow(**{**r, **{k: pair(r[k]) for k in ("given_interval", "clean_interval", "cost_interval")}}) for r in data["rows"]]
-        return cls(**{**data, "rows": rows})
+        rows = [_impact_row(row) for row in data["rows"]]
+        splits, settings, notes = data["clean_splits"], data.get("settings", {}), data.get("notes", ())
+        return cls(rows, data["headline"], data["group"], splits, settings, notes)
 
 
 @dataclass(frozen=True)
@@ -196,6 +196,11 @@ class Audit:
         for name in ("matrix", "commands"):  # an empty list reads as the default does
             fields[name] = fields.get(name) or ()
         return cls(**fields)
+
+
+def _impact_row(data: Mapping[str, Any]) -> ImpactRow:
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+    return ImpactRow(**fields)
 
 
 def _signal(data: Mapping[str, Any]) -> Signal:

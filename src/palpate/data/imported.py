@@ -23,12 +23,14 @@ class Imported:
         skipped: everything that was left out because it is bad.
         splits: the data set's own splits by name (``"Orig"``), over ids of the manifest.
         inconclusive: rows left out because their label says that the material is unclear.
+        suspicious: what was imported but looks wrong.
     """
 
     manifest: Manifest
     skipped: list[Problem] = field(default_factory=list)
     splits: Mapping[str, Split] = field(default_factory=dict)
     inconclusive: int = 0
+    suspicious: list[Problem] = field(default_factory=list)
 
     @property
     def facts(self) -> Mapping[str, str]:

@@ -1,44 +1,18 @@
-"""Importing by name or by look: a data-set format is one file with ``detect`` and an importer, and one row in ``FORMATS``."""
+"""Data sets by name or by look: import one, look one over, write a split in its own form."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, quiet
-from palpate.data import pairs, touch_and_go
+from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.data.formats import FORMATS, Format, Validation
+from palpate.data.formats.base import import_scanned, validation
 from palpate.data.images import Check
 from palpate.data.imported import Imported
-
-
-@dataclass(frozen=True)
-class Format:
-    """One data-set format.
-
-    Attributes:
-        detect: whether a source looks like it; must be quick and must not raise.
-        run: ``run(source, out, *, skip_bad, check, progress, ...) -> Imported``; further keywords are its own options.
-        looks_for: what ``detect`` wants to see, for the error message.
-    """
-
-    detect: Callable[[Path], bool]
-    run: Callable[..., Imported]
-    looks_for: str
-
-    @property
-    def options(self) -> list[str]:
-        """The keywords of ``run``."""
-        return [p.name for p in inspect.signature(self.run).parameters.values() if p.kind is p.KEYWORD_ONLY]
-
-
-#: Tried from first to last.
-FORMATS: dict[str, Format] = {
-    "touch-and-go": Format(touch_and_go.detect, touch_and_go.import_touch_and_go, touch_and_go.LOOKED_FOR),
-    "pairs": Format(pairs.detect, pairs.import_pairs, pairs.LOOKED_FOR),
-}
+from palpate.data.listing import write_table
+from palpate.data.manifest import Manifest
 
 
 def import_dataset(
@@ -68,23 +42,83 @@ def import_dataset(
         PalpateError: if the source is missing or looks like no known format, or an option does not belong to the format.
         ProblemsError: with every bad row and file at once; nothing is left behind.
     """
-    source = Path(source)
-    if format != "auto" and format not in FORMATS:
-        raise PalpateError(f"The format must be auto or one of {', '.join(FORMATS)}", repr(format), "Choose one of these")
-    if not source.exists():
+    name, found = _format(Path(source), format)
+    given = _given(name, found, options)
+    if found.run is not None:
+        if size is not None and "size" in found.options:
+            given["size"] = size
+        return found.run(Path(source), Path(out), skip_bad=skip_bad, check=check, progress=progress, **given)
+    facts = {**found.facts.of_manifest(), "format": name}
+    scan = found.scan(Path(source), progress=progress, **given)
+    return import_scanned(scan, Path(source), Path(out), facts, skip_bad=skip_bad, check=check, progress=progress)
+
+
+def validate_dataset(
+    source: Path,
+    *,
+    format: str = "auto",  # noqa: A002
+    check: Check = "decode",
+    progress: Progress = quiet,
+    **options: Any,
+) -> Validation:
+    """Looks a data set over without writing anything: what is missing, invalid or suspicious.
+
+    Args:
+        source: folder or table.
+        format: as in :func:`import_dataset`.
+        check: how images are checked.
+        progress: told what is being done.
+        options: the format's own options; None means its default.
+
+    Raises:
+        PalpateError: as :func:`import_dataset`.
+    """
+    name, found = _format(Path(source), format)
+    given = _given(name, found, options)
+    if "check" in inspect.signature(found.scan).parameters:
+        given["check"] = check
+    return validation(name, found, found.scan(Path(source), progress=progress, **given), check=check, progress=progress)
+
+
+def write_lists(manifest: Manifest, split: Split, out: Path) -> list[Path]:
+    """Writes a split in the form of the data set that the manifest came from; a CSV of the manifest's rows a part, where it has none.
+
+    Returns:
+        The files written.
+
+    Raises:
+        PalpateError: if the split's ids are not in the manifest, or a sample lacks what the lists need.
+    """
+    found = FORMATS.get(str(manifest.facts.get("format", "")))
+    if found is not None and found.write_lists is not None:
+        return found.write_lists(manifest, split, Path(out))
+    return [write_table(Path(out) / f"{part}.csv", manifest.part(split, part)) for part in split.counts()]
+
+
+def _format(source: Path, name: str) -> tuple[str, Format]:
+    """The named or recognised format.
+
+    Raises:
+        PalpateError: if there is no source, no such format, or none that fits.
+    """
+    if name != "auto" and name not in FORMATS:
+        raise PalpateError(f"The format must be auto or one of {', '.join(FORMATS)}", repr(name), "Choose one of these")
+    if not source.exists() and (name == "auto" or not FORMATS[name].remote):
         raise PalpateError("The source of an import must exist", f"nothing at {source}", "Check the path")
-    name = format if format != "auto" else next((n for n, f in FORMATS.items() if f.detect(source)), None)
-    if name is None:
+    if name == "auto":
+        name = next((n for n, f in FORMATS.items() if f.detect(source)), "")
+    if not name:
         wanted = "; ".join(f"{n}: {f.looks_for}" for n, f in FORMATS.items())
         raise PalpateError(f"{source} must look like a known data set. Looked for {wanted}", _contents(source), "Name the format: --format")
+    return name, FORMATS[name]
+
+
+def _given(name: str, found: Format, options: dict[str, Any]) -> dict[str, Any]:
+    """The options that were given, if they all belong to the format."""
     given = {key: value for key, value in options.items() if value is not None}
-    if strange := sorted(set(given) - set(FORMATS[name].options)):
-        raise PalpateError(
-            f"The format {name} takes the options {', '.join(FORMATS[name].options)}", ", ".join(strange), "Leave the others out"
-        )
-    if size is not None and "size" in FORMATS[name].options:
-        given["size"] = size
-    return FORMATS[name].run(source, Path(out), skip_bad=skip_bad, check=check, progress=progress, **given)
+    if strange := sorted(set(given) - set(found.options)):
+        raise PalpateError(f"The format {name} takes the options {', '.join(found.options)}", ", ".join(strange), "Leave the others out")
+    return given
 
 
 def _contents(source: Path) -> str:

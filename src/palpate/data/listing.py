@@ -151,6 +151,13 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
     write_text(Path(path), "".join(lines))
 
 
+def write_table(path: Path, manifest: Manifest) -> Path:
+    """Writes a manifest's rows as CSV, without its empty columns, atomically; paths stay relative to its root."""
+    table = manifest.table.select(name for name in SCHEMA if manifest.table[name].null_count() < len(manifest))
+    write_text(Path(path), table.write_csv())
+    return Path(path)
+
+
 def read_categories(path: Path) -> dict[int, str]:
     """Reads a category table, ``Name: id`` a line, with uneven spaces, optional quotes and optional remarks in brackets.
 

@@ -14,17 +14,16 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Progress, inside, quiet
-from palpate.data.images import SUFFIXES, Check, check_image, in_threads
-from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest
+from palpate.core import PalpateError, Problem, Progress, quiet
+from palpate.data.formats.base import Facts, Found, Scan
+from palpate.data.images import SUFFIXES
+from palpate.data.manifest import SCHEMA
 
 VISION = ("vision", "rgb", "image", "images")
 TACTILE = ("tactile", "touch", "gelsight", "digit")
@@ -33,7 +32,16 @@ NEEDED = ("vision", "tactile")
 LOOKED_FOR = (
     f"a table ({', '.join(TABLES)}) with the columns vision and tactile, or a folder with {'|'.join(VISION)}/ and {'|'.join(TACTILE)}/"
 )
-Found = tuple[str, dict[str, Any]]
+FACTS = Facts(
+    "pairs of one's own",
+    "unknown",
+    "unknown",
+    "unknown",
+    "unknown",
+    None,
+    "as many as the table has rows",
+    "the column video, if there is one",
+)
 
 
 def detect(source: Path) -> bool:
@@ -43,30 +51,17 @@ def detect(source: Path) -> bool:
     return source.is_dir() and all(any((source / name).is_dir() for name in names) for names in (VISION, TACTILE))
 
 
-def import_pairs(
-    source: Path,
-    out: Path,
-    *,
-    root: Path | None = None,
-    columns: Mapping[str, str] | None = None,
-    skip_bad: bool = False,
-    check: Check = "decode",
-    progress: Progress = quiet,
-) -> Imported:
-    """Reads pairs and writes ``out/manifest.parquet``; images stay where they are.
+def scan(source: Path, *, root: Path | None = None, columns: Mapping[str, str] | None = None, progress: Progress = quiet) -> Scan:
+    """Reads the rows of a table, or pairs up the files of two folders.
 
     Args:
         source: a table or a folder.
-        out: folder to write to.
         root: folder that the table's paths are relative to.
         columns: manifest column -> column of the table, where the names differ (``{"video": "clip"}``).
-        skip_bad: leave bad rows out and list them, instead of raising.
-        check: how images are checked.
-        progress: told how many images are checked.
+        progress: unused; reading a table is quick.
 
     Raises:
         PalpateError: if the source is missing or of another form, or lacks a needed column.
-        ProblemsError: with every bad row and file at once; nothing is written.
     """
     source = Path(source)
     problems: list[Problem] = []
@@ -80,15 +75,9 @@ def import_pairs(
         rows = _table_rows(source, dict(columns or {}), problems)
     else:
         raise PalpateError("The source of an import must exist", f"nothing at {source}", "Check the path")
-    rows = _unique(_checked_paths(rows, base, problems), problems)
-    rows = _checked_images(rows, base, check, problems, progress)
-    problems.sort(key=_place)
-    raise_if(problems, skip_bad)
-    require_some(len(rows), source, problems)
     words = any(row.get("text") for _, row in rows)
     facts = {"dataset": source.stem, "layout": layout, "text_source": f"column {(columns or {}).get('text', 'text')}" if words else "none"}
-    with removing_on_error(out) as created:
-        return Imported(Manifest.from_rows((row for _, row in rows), base.resolve(), facts), problems).save(out, created)
+    return Scan(rows, base, problems, facts=facts)
 
 
 def _table_rows(path: Path, columns: dict[str, str], problems: list[Problem]) -> list[Found]:
@@ -221,71 +210,3 @@ def _stems(base: Path, folder: Path, problems: list[Problem]) -> dict[str, Path]
 
 def _relative(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix()
-
-
-def _checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) -> list[Found]:
-    """Rows whose paths stay inside the root and exist, written relative to it."""
-    known: dict[str, tuple[str, str] | None] = {}
-    root = base.resolve()
-    good: list[Found] = []
-    for where, row in rows:
-        fine = True
-        for name in IMAGE_COLUMNS:
-            given = row.get(name)
-            if given is None:
-                continue
-            if given not in known:
-                path = inside(base, given)
-                known[given] = (
-                    ("outside-root", f"the path {given!r} leaves the root {base}") if path is None
-                    else None if path.is_file() else ("missing-file", f"no file {given!r} in {base}")
-                )  # fmt: skip
-            if (found := known[given]) is not None:
-                problems.append(Problem(where, found[0], f"{name}: {found[1]}"))
-                fine = False
-            elif given.startswith(("/", "./")) or "//" in given or "/../" in given or Path(given).is_absolute():
-                row[name] = (root / given).resolve().relative_to(root).as_posix()
-        if fine:
-            good.append((where, row))
-    return good
-
-
-def _unique(rows: Sequence[Found], problems: list[Problem]) -> list[Found]:
-    """Rows with their ids, each standing once; the first keeps it."""
-    seen: dict[str, str] = {}
-    good: list[Found] = []
-    for where, row in rows:
-        if row.get("id") is None:
-            named = row.get("video") is not None and row.get("frame") is not None
-            row["id"] = f"{row['video']}/{row['frame']}" if named else str(Path(row["tactile"]).with_suffix("").as_posix())
-        if (before := seen.setdefault(row["id"], where)) != where:
-            problems.append(Problem(where, "duplicate-id", f"the id {row['id']!r} stands at {before} already"))
-        else:
-            good.append((where, row))
-    return good
-
-
-def _checked_images(rows: Sequence[Found], base: Path, how: Check, problems: list[Problem], progress: Progress) -> list[Found]:
-    """Rows whose images are whole; a file in use by many rows is checked once and told once, with its first row."""
-    if how == "none":
-        return list(rows)
-    first: dict[str, str] = {}
-    uses: Counter[str] = Counter()
-    for where, row in rows:
-        for name in IMAGE_COLUMNS:
-            if row.get(name) is not None:
-                first.setdefault(row[name], where)
-                uses[row[name]] += 1
-    bad: set[str] = set()
-    for done, (name, reason) in enumerate(in_threads(lambda n: check_image(base / n, how), first), 1):
-        if reason:
-            bad.add(name)
-            rest = f" (used by {uses[name]} rows)" if uses[name] > 1 else ""
-            problems.append(Problem(first[name], "bad-image", f"{name}: {reason}{rest}"))
-        progress("checking images", done, len(first))
-    return [(where, row) for where, row in rows if not any(row.get(name) in bad for name in IMAGE_COLUMNS)]
-
-
-def _place(problem: Problem) -> tuple[str, int, str]:
-    name, _, line = problem.where.rpartition(":")
-    return (name, int(line), problem.kind) if line.isdecimal() else (problem.where, 0, problem.kind)

@@ -21,22 +21,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from palpate.core import PalpateError, Progress, Split, quiet, read_json
+from palpate.core import PalpateError, Problem, Progress, Split, quiet, read_json
+from palpate.data.formats.base import Facts, Scan
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
 from palpate.data.images import Check
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
-from palpate.data.listing import FrameList, FrameTable, read_categories, read_frame_table, read_lists
+from palpate.data.listing import INCONCLUSIVE, FrameList, FrameTable, read_categories, read_frame_table, read_lists, write_list
 from palpate.data.manifest import Manifest
 from palpate.data.recordings import Recordings, VideoFiles, first_frames, rows_of, thin
 
-NAME = "Touch and Go"
-CITATION = (
+FACTS = Facts(
+    "Touch and Go",
     "F. Yang, C. Ma, J. Zhang, J. Zhu, W. Yuan, A. Owens: Touch and Go: Learning from Human-Collected Vision and Touch. "
-    "NeurIPS Datasets and Benchmarks, 2022"
+    "NeurIPS Datasets and Benchmarks, 2022",
+    "CC BY 4.0",
+    "https://touch-and-go.github.io",
+    "GelSight'17",
+    (640, 480),
+    "121,861 frames of 126 videos in the official lists; label.txt names about twice as many",
+    "video",
+    {"touch, 50 images (T3)": ((0.51808, 0.50300, 0.51457), (0.13893, 0.11343, 0.13497))},
 )
-LICENCE = "CC BY 4.0"
-URL = "https://touch-and-go.github.io"
-SENSOR = "GelSight'17"
 CATEGORIES: dict[int, str] = dict(
     enumerate((
         "Concrete", "Plastic", "Glass", "Wood", "Metal", "Brick", "Tile", "Leather", "Synthetic Fabric", "Natural Fabric",
@@ -136,8 +141,62 @@ def import_touch_and_go(
         raise_if(work.problems, skip_bad)
         require_some(len(rows), root, work.problems)
         facts = _facts(root) | {"text_source": "captions.csv" if texts else "none"}
-        manifest = work.manifest(rows, facts, SENSOR, {"text": texts, "object": objects})
+        manifest = work.manifest(rows, facts, FACTS.sensor, {"text": texts, "object": objects})
         return Imported(manifest, work.problems, _splits(manifest, official), listed.inconclusive).save(out, created)
+
+
+def scan(root: Path, *, labels: Sequence[Path] | Path | None = None, check: Check = "decode", progress: Progress = quiet) -> Scan:
+    """Looks a data set over without decoding or writing anything: lists, recordings, frames and, where extracted, pictures.
+
+    Rows carry no paths, as frames of raw videos have none yet.
+
+    Raises:
+        PalpateError: if the root, the list or the recordings are missing.
+    """
+    root = Path(root)
+    videos = _require_videos(root)
+    lists = _require_lists(root, labels)
+    table = root / "category_reference.txt"
+    categories = {k: v for k, v in (read_categories(table) if table.is_file() else CATEGORIES).items() if k >= 0}
+    listed = read_lists(lists, root=root, skip_bad=True, categories=categories)
+    official = listed if lists == [root / name for name in OFFICIAL.values()] else _official(root)
+    rows = rows_of(listed)
+    work = Recordings(root, root, videos, _contacts(root, listed, official), "jpg", None, [])
+    work.problems += listed.skipped + (official.skipped if official and official is not listed else [])
+    starts = first_frames(rows)
+    rows = work.open(rows, progress)
+    work.choose_backgrounds(rows, starts)
+    rows = work.check(rows, check, progress)
+    found = [(r.where, {"id": r.id, "video": r.video, "frame": r.frame, "touch": r.touch, "material": r.material}) for r in rows]
+    unlisted = sorted(set(videos) - set(listed.contact["video"]))
+    odd = [Problem(str(root), "unlisted-video", f"the recording {name!r} is in no list") for name in unlisted]
+    bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
+    odd += [Problem(r, "no-background", "no frame of its recording shows the gel untouched") for r in bare]
+    return Scan(found, root, work.problems, odd, _facts(root), inconclusive=listed.inconclusive)
+
+
+def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
+    """Writes ``<part>.txt`` with a ``video/0000000033.jpg,3`` line a sample, as the official lists are.
+
+    A material that is no known class keeps its number if it is one (bare lists without a category table).
+
+    Raises:
+        PalpateError: if a sample has no video or frame, or a material that is no class.
+    """
+    ids = {name: k for k, name in CATEGORIES.items()}
+    files: list[Path] = []
+    for part in split.counts():
+        rows: list[tuple[str, int]] = []
+        for row in manifest.part(split, part).table.select("id", "video", "frame", "material").iter_rows(named=True):
+            name = row["material"]
+            label = INCONCLUSIVE if name is None else ids.get(name, int(name) if str(name).isdecimal() else None)
+            if row["video"] is None or row["frame"] is None or label is None:
+                got = f"{row['id']!r} with video {row['video']!r}, frame {row['frame']!r} and material {name!r}"
+                raise PalpateError("A frame list needs the video, frame and class of every sample", got, "Write the split file alone")
+            rows.append((f"{row['video']}/{row['frame']:010d}.jpg", label))
+        files.append(Path(folder) / f"{part}.txt")
+        write_list(files[-1], rows)
+    return files
 
 
 def _facts(root: Path) -> dict[str, str]:
@@ -145,8 +204,13 @@ def _facts(root: Path) -> dict[str, str]:
     mark = root / "world.json"
     about = read_json(mark, "world record") if mark.is_file() else {}
     if isinstance(about, dict) and str(about.get("format", "")).startswith("palpate-world/"):
-        return {"dataset": "palpate's procedural world", "synthetic": "yes", "digest": str(about.get("digest", ""))}
-    return {"dataset": NAME, "licence": LICENCE, "citation": CITATION, "url": URL}
+        return {
+            "dataset": "palpate's procedural world",
+            "format": "touch-and-go",
+            "synthetic": "yes",
+            "digest": str(about.get("digest", "")),
+        }
+    return {**FACTS.of_manifest(), "format": "touch-and-go"}
 
 
 def _require_videos(root: Path) -> dict[str, VideoFiles]:
@@ -157,7 +221,7 @@ def _require_videos(root: Path) -> dict[str, VideoFiles]:
         raise PalpateError(
             f"{root} must hold recordings: folders with video.mp4 and gelsight.mp4, or video_frame/ and gelsight_frame/",
             "none under " + ", ".join("the folder itself" if p == "." else f"{p}/" for p in PLACES),
-            f"Download the videos from {URL}",
+            f"Download the videos from {FACTS.url}",
         )
     return videos
 
