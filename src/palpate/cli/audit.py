@@ -3,96 +3,308 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output
-from palpate.core import Audit, PalpateError, Split, write_json
+from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output, require_extra
+from palpate.core import Audit, Impact, PalpateError, Problem, ProblemsError, Progress, Results, Split, write_json
+
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
+    from palpate.leakage.audit import Inspection, Pictures
+
+#: Modality -> image column of a manifest.
+MODALITIES = {"vision": "vision", "touch": "tactile"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Tell whether a train/test split leaks: two bare list files, or a manifest with a split file."""
+    """Tell whether a train/test split leaks: shared videos, near frames, equal files, and pictures that nearly repeat in vision or touch."""
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """TRAIN and TEST list files (`video/frame.jpg,label` a line), or one manifest."""
+    """TRAIN and TEST (each a list of `video/frame.jpg,label` lines, a table, a manifest or a folder), or one manifest with --split."""
     split: Path | None = None
     """Split file, with a manifest."""
-    group: Literal["video", "touch", "object", "domain", "sensor"] = "video"
-    """What must not be shared between train and test."""
+    pretrain: Path | None = None
+    """What an encoder was pretrained on: a further list, table, manifest or folder that the test part is compared with."""
+    group: Literal["auto", "video", "touch", "object", "session", "domain", "sensor"] = "auto"
+    """What must not be shared between train and test. `auto` takes the video, or what is known instead of it."""
+    near: int = 30
+    """A gap of up to this many frames within a video is a leak of its own."""
+    images: bool = True
+    """Look at tables alone: compare neither files nor pictures. Bare lists have no pictures anyway."""
+    false_positives: float = 0.001
+    """Rate at which unrelated pictures may pass for near-duplicates; the threshold is calibrated to it on the data."""
+    encoder: Path | None = None
+    """Folder of trained towers whose embeddings replace the built-in picture features."""
+    impact: bool = False
+    """Also measure what leaking costs: material accuracy under this split and under a leak-free one."""
     fail_over: float | None = None
-    """Exit with status 1 if more than this fraction of the test samples leaks."""
+    """Exit with status 1 if more than this fraction of the test samples leaks by any signal."""
     worst: int = 12
-    """How many of the nearest pairs to keep."""
+    """How many of the strongest pairs to keep for each signal."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write the audit as JSON, for `palpate report`."""
-    skip_bad: Annotated[bool, tyro.conf.arg(help="With list files: leave out bad lines and list them, instead of refusing.")] = False
+    page: Path | None = None
+    """Write the audit as one self-contained page (.html)."""
+    table: Path | None = None
+    """Write every signal of every test sample as a table (.parquet or .csv)."""
+    cache: Path | None = None
+    """Folder that keeps decoded picture features, so that another audit of the same pictures is quick."""
+    root: Path | None = None
+    """Where the paths of tables start (default: the folder of the table)."""
+    processes: int | None = None
+    """Processes that decode pictures (default: one a core)."""
+    skip_bad: Annotated[bool, tyro.conf.arg(help="Leave out bad rows and list them, instead of refusing.")] = False
+
+
+@dataclass(frozen=True)
+class _Sides:
+    """What is compared: one manifest with a split, or two; what was skipped in reading them."""
+
+    skipped: list[Problem]
+    train: Manifest
+    test: Manifest
+    whole: Manifest | None = None
+    split: Split | None = None
+    pretrain: Manifest | None = None
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
-    """Runs the audit and prints it."""
-    if options.fail_over is not None and not 0 <= options.fail_over <= 1:
-        raise PalpateError("--fail-over must lie in [0, 1]", str(options.fail_over), "Pass a fraction, e.g. --fail-over 0.01")
-    if options.worst < 0:
-        raise PalpateError("--worst must be at least 0", str(options.worst), "Pass how many pairs to keep, e.g. --worst 12")
-    if options.output:
-        guard_output(options.output, [*options.paths, *([options.split] if options.split else [])])
-    audit, skipped = _audit(options)
-    data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "skipped": skipped}
-    if options.output:
-        write_json(options.output, data)
-    failed = options.fail_over is not None and audit.leaked_fraction > options.fail_over
-    show(audit, terminal)
+    """Runs the audit, prints it, and writes what was asked for."""
+    _check(options)
+    with terminal.progress() as progress:
+        sides = _read(options, progress)
+        cache = _cache(options)
+        found = _audit(options, sides, cache, progress)
+        others: list[Audit] = []
+        if sides.pretrain is not None:
+            others.append(_against_pretraining(options, sides.pretrain, sides.test, cache, progress))
+        audit = found.audit
+        if options.impact and sides.whole is not None and sides.split is not None:
+            audit = replace(audit, impact=_impact(options, sides.whole, sides.split, audit.group, cache, progress))
+        audit = replace(audit, commands=_next(options, audit))
+    skipped = [str(p) for p in sides.skipped]
+    data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "others": [dataclasses.asdict(a) for a in others], "skipped": skipped}
+    _write(options, [audit, *others], found, data, terminal)
+    if options.cache is None and cache is not None:
+        shutil.rmtree(cache, ignore_errors=True)
+    leaked = max(audit.leaked_fraction, *(a.leaking_samples / a.test_samples for a in (audit, *others)))
+    failed = options.fail_over is not None and leaked > options.fail_over
+    for one in (audit, *others):
+        show(one, terminal)
     if skipped:
         terminal.say(f"Skipped {len(skipped)}:")
         for line in skipped[:40]:
             terminal.say(f"  {line}")
+    for line in audit.commands:
+        terminal.say(f"Next: {line}")
     if failed:
-        terminal.say(f"FAIL: leaked fraction {audit.leaked_fraction} is over {options.fail_over}")
+        terminal.say(f"FAIL: leaked fraction {round(leaked, 5)} is over {options.fail_over}")
     return data | {"failed": failed}, FAILED_CHECK if failed else 0
 
 
-def _audit(options: Options) -> tuple[Audit, list[str]]:
-    from palpate.leakage import audit_lists, audit_split
+def _check(options: Options) -> None:
+    """Refuses options out of range and outputs in the way, before any work.
 
-    if options.split is not None and len(options.paths) == 1:
-        from palpate.data.manifest import Manifest
+    Raises:
+        PalpateError: saying which.
+    """
+    if options.fail_over is not None and not 0 <= options.fail_over <= 1:
+        raise PalpateError("--fail-over must lie in [0, 1]", str(options.fail_over), "Pass a fraction, e.g. --fail-over 0.01")
+    if not 0 < options.false_positives < 0.5:
+        raise PalpateError("--false-positives must lie in (0, 0.5)", str(options.false_positives), "Pass e.g. --false-positives 0.001")
+    for name, value, low in (("--worst", options.worst, 0), ("--near", options.near, 0), ("--processes", options.processes or 1, 1)):
+        if value < low:
+            raise PalpateError(f"{name} must be at least {low}", str(value), f"Pass e.g. {name} 12")
+    if options.table is not None and options.table.suffix.lower() not in (".parquet", ".csv"):
+        raise PalpateError("--table must end in .parquet or .csv", options.table.name, "Pass e.g. --table signals.parquet")
+    if options.impact and options.split is None:
+        raise PalpateError("--impact needs a manifest with --split", "lists or no split", "Import the data set first: palpate import")
+    if options.encoder is not None:
+        require_extra("palpate audit --encoder")
+    inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
+    for output, marks in (
+        (options.output, (b'"format": "palpate-',)), (options.page, (b"palpate",)), (options.table, (b"PAR1", b"id,video,frame,material,leaking")),
+    ):  # fmt: skip
+        if output is not None:
+            guard_output(output, inputs, marks)
 
-        split = Split.load(options.split)
-        found = audit_split(
-            Manifest.load(options.paths[0]),
-            split,
-            group=options.group,
-            name=str(split.rule.get("name", options.split.name)),
-            worst=options.worst,
+
+def _read(options: Options, progress: Progress) -> _Sides:
+    """Reads all inputs; what is wrong in several of them is told together.
+
+    Raises:
+        PalpateError: on a number of paths that makes no audit.
+        ProblemsError: with every bad row, unless ``--skip-bad``.
+    """
+    from palpate.data.reading import read_samples
+
+    if len(options.paths) != (1 if options.split is not None else 2):
+        raise PalpateError(
+            "An audit takes TRAIN and TEST, or one manifest with --split",
+            f"{len(options.paths)} path(s) {'with' if options.split else 'without'} --split",
+            "E.g. palpate audit train.txt test.txt",
         )
-        return found, []
-    if options.split is None and len(options.paths) == 2:
-        return audit_lists(options.paths[0], options.paths[1], group=options.group, worst=options.worst, skip_bad=options.skip_bad)
-    raise PalpateError(
-        "An audit takes TRAIN and TEST list files, or one manifest with --split",
-        f"{len(options.paths)} path(s) {'with' if options.split else 'without'} --split",
-        "E.g. palpate audit train.txt test.txt",
-    )
+    problems: list[Problem] = []
+    skipped: list[Problem] = []
+    read: list[Manifest] = []
+    for path in (*options.paths, *([options.pretrain] if options.pretrain else [])):
+        try:
+            samples, bad = read_samples(path, skip_bad=options.skip_bad, root=options.root, progress=progress)
+        except ProblemsError as error:  # told together with those of the other inputs
+            problems += error.problems
+        else:
+            read.append(samples)
+            skipped += bad
+    if problems:
+        raise ProblemsError(problems, "Mend the lines, or pass --skip-bad to go on without them")
+    pretrain = read.pop() if options.pretrain else None
+    if options.split is None:
+        return _Sides(skipped, read[0], read[1], pretrain=pretrain)
+    split = Split.load(options.split)
+    return _Sides(skipped, read[0].part(split, "train"), read[0].part(split, "test"), read[0], split, pretrain)
+
+
+def _audit(options: Options, sides: _Sides, cache: Path | None, progress: Progress) -> Inspection:
+    from palpate.leakage.audit import inspect_parts, inspect_split
+
+    common: dict[str, Any] = {
+        "group": options.group, "worst": options.worst, "near": options.near, "progress": progress,
+        "pictures": _pictures(options, sides.train, sides.test, cache, progress),
+    }  # fmt: skip
+    if sides.whole is not None and sides.split is not None and options.split is not None:
+        return inspect_split(sides.whole, sides.split, name=str(sides.split.rule.get("name", options.split.name)), **common)
+    return inspect_parts(sides.train, sides.test, name=f"{options.paths[0].name} / {options.paths[1].name}", **common)
+
+
+def _against_pretraining(options: Options, pretrain: Manifest, test: Manifest, cache: Path | None, progress: Progress) -> Audit:
+    """The test part against what an encoder has seen."""
+    from palpate.leakage.audit import inspect_parts
+
+    name = f"{options.pretrain.name if options.pretrain else 'pretraining'} / test"
+    pictures = _pictures(options, pretrain, test, cache, progress)
+    return inspect_parts(
+        pretrain, test, name=name, against="pretraining", group=options.group, worst=options.worst, near=options.near, pictures=pictures,
+        progress=progress,
+    ).audit  # fmt: skip
+
+
+def _pictures(options: Options, train: Manifest, test: Manifest, cache: Path | None, progress: Progress) -> Pictures | None:
+    """How pictures are compared; None if there are none on both sides, or none are wanted."""
+    from palpate.leakage.audit import Pictures
+
+    there = [m for m, c in MODALITIES.items() if all(s.table[c].null_count() < len(s) for s in (train, test))]
+    if not options.images or not there:
+        return None
+    features: dict[str, Any] = {}
+    name = ""
+    if options.encoder is not None:
+        from palpate.encoders.embed import embed
+        from palpate.encoders.towers import Towers
+
+        towers = Towers.load(options.encoder)
+        for modality in there:
+            pair = [embed(side, towers, modality, cache=cache, progress=progress).features for side in (train, test)]
+            features[modality] = (pair[0], pair[1])
+        name = f"towers {options.encoder.name}"
+    return Pictures(there, options.false_positives, features, name, cache, options.processes)
+
+
+def _impact(options: Options, manifest: Manifest, split: Split, group: str, cache: Path | None, progress: Progress) -> Impact:
+    """What leaking costs, on raw pictures or on the towers' embeddings."""
+    from palpate.protocol.impact import impact
+
+    features: Any = "pixels"
+    if options.encoder is not None:
+        from palpate.encoders.embed import embed
+        from palpate.encoders.towers import Towers
+
+        towers = Towers.load(options.encoder)
+        there = [m for m, c in MODALITIES.items() if manifest.table[c].null_count() == 0]
+        features = {f"{m} tower": embed(manifest, towers, m, cache=cache, progress=progress) for m in there}
+    return impact(manifest, split, group=group, features=features, cache=cache, progress=progress)
+
+
+def _cache(options: Options) -> Path | None:
+    """The folder for picture features: the one named, else one beside the output that goes when the audit is done."""
+    if options.cache is not None:
+        return options.cache
+    output = options.output or options.page or options.table
+    return output.absolute().parent / f".{output.name}.work" if output else None
+
+
+def _next(options: Options, audit: Audit) -> list[str]:
+    """Command lines that say what to do about what was found."""
+    leaks = audit.leaking_samples or audit.leaked_fraction
+    by = audit.group if audit.group in ("video", "object", "session", "touch") else "video"
+    near = any(s.flagged for s in audit.signals if s.kind.startswith("near-duplicate"))
+    lines: list[str] = []
+    if leaks:
+        source = str(options.paths[0]) if options.split else " ".join(map(str, options.paths))
+        lines.append(f"palpate split {source} --by {by}{' --near both' if near else ''} -o noleak.json")
+        if options.split:
+            lines.append(f"palpate audit {source} --split noleak.json")
+    if options.split and not options.impact and leaks:
+        lines.append(f"palpate audit {options.paths[0]} --split {options.split} --impact")
+    if not options.split and not audit.signals[-1].kind.startswith("near-duplicate"):
+        lines.append("palpate import DATA_SET -o data/ && palpate audit data/ --split data/splits/Orig.json   # pictures too")
+    return lines
+
+
+def _write(options: Options, audits: Sequence[Audit], found: Inspection, data: dict[str, Any], terminal: Terminal) -> None:
+    """The JSON, the page and the table, as asked."""
+    if options.output:
+        write_json(options.output, data)
+    if options.table:
+        from palpate.core import atomic_path
+
+        with atomic_path(options.table) as part:
+            (found.table.write_csv if options.table.suffix.lower() == ".csv" else found.table.write_parquet)(part)
+    if options.page:
+        from palpate.report import write_report
+
+        results = Results(title=f"Audit of {audits[0].name}", audits=audits, commands=[terminal.command, *audits[0].commands])
+        with terminal.progress() as progress:
+            write_report(results, options.page, progress=progress)
 
 
 COUNTS = (
     "train_samples", "test_samples", "groups_train", "groups_test", "groups_shared", "test_samples_in_shared_groups",
-    "leaked_fraction", "gap_min", "gap_median", "gap_max", "identical_samples",
+    "leaked_fraction", "leaking_samples", "gap_min", "gap_median", "gap_max", "identical_samples",
 )  # fmt: skip
 
 
 def show(audit: Audit, terminal: Terminal) -> None:
     """Prints the counts of an audit and what they mean."""
     terminal.facts(f"Audit of {audit.name} (group: {audit.group})", {name: getattr(audit, name) for name in COUNTS})
-    for note in audit.notes:
+    facts: dict[str, Any] = {}
+    for s in audit.signals:
+        at = f", threshold {s.threshold:.3f} at a false-positive rate of {s.false_positives:g}" if s.false_positives is not None else ""
+        causes = "; " + ", ".join(f"{cause} {n}" for cause, n in s.causes.items()) if s.causes else ""
+        facts[s.kind] = f"{s.flagged} of {s.checked} test samples ({s.fraction:.2%}){at}{causes}"
+    if facts:
+        terminal.facts("Signals", facts)
+    for note in (*audit.notes, *(f"{s.kind}: {note}" for s in audit.signals for note in s.notes)):
         terminal.say(f"Note: {note}")
-    if audit.leaked_fraction > 0 or audit.identical_samples:
+    if audit.impact is not None:
+        terminal.print(audit.impact.headline)
+        for note in audit.impact.notes:
+            terminal.say(f"Note: {note}")
+    other = "train" if audit.against == "train" else "the pretraining data"
+    if audit.leaked_fraction > 0 or audit.leaking_samples:
+        share = audit.leaking_samples / audit.test_samples
+        more = "" if audit.leaking_samples == audit.test_samples_in_shared_groups else f" {share:.3%} leak by one signal or another."
         terminal.print(
-            f"This split leaks: {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with train. Make one that does not: palpate split",
+            f"This split leaks: {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with {other}.{more}"
+            + (" Make one that does not: palpate split" if audit.against == "train" else "")
         )
+    elif audit.group == "none":
+        terminal.print(f"No test sample was found again in {other}.")
     else:
-        terminal.print(f"No test sample shares a {audit.group} with train.")
+        terminal.print(f"No test sample shares a {audit.group} with {other}, and no other signal flags one.")

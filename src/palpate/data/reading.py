@@ -1,0 +1,78 @@
+"""Samples from whatever names them: a manifest, a frame list, a table, or a folder of a known data set; nothing is written."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import polars as pl
+
+from palpate.core import PalpateError, Problem, Progress, quiet
+from palpate.data.formats import FORMATS
+from palpate.data.formats.base import finished
+from palpate.data.imported import raise_if, require_some
+from palpate.data.listing import LINE, read_list
+from palpate.data.manifest import Manifest
+
+TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
+
+
+def read_samples(
+    path: Path, *, skip_bad: bool = False, root: Path | None = None, progress: Progress = quiet
+) -> tuple[Manifest, list[Problem]]:
+    """The samples that a path names.
+
+    Args:
+        path: ``manifest.parquet`` or its folder; a frame list (``video/frame.jpg,label`` a line); a table with the columns ``vision``
+            or ``tactile``; or the folder of a data set of a known format.
+        skip_bad: leave bad rows out and list them, instead of raising.
+        root: where the paths of a table start.
+        progress: told what is being done.
+
+    Returns:
+        The samples, and what was left out. Samples of a list or of raw videos have no pictures.
+
+    Raises:
+        PalpateError: if there is no such path, or it is nothing of these.
+        ProblemsError: with every bad row, unless ``skip_bad``.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise PalpateError("Samples must be a manifest, a list, a table or a folder", f"nothing at {path}", "Check the path")
+    if is_manifest(path):
+        return Manifest.load(path), []
+    if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
+        found = read_list(path, skip_bad=skip_bad)
+        return found.manifest, found.skipped
+    name = "pairs" if path.is_file() else next((n for n, f in FORMATS.items() if f.detect(path)), "")
+    if not name:
+        raise PalpateError(f"{path} must hold a manifest or a data set of a known format", "neither", "Import it first: palpate import")
+    options = {"root": root} if root is not None and name == "pairs" else {}
+    scan = FORMATS[name].scan(path, progress=progress, **options)
+    # Pictures are not decoded here: who looks at them reports those that cannot be read.
+    rows = finished(scan, "none", progress)
+    raise_if(scan.problems, skip_bad)
+    require_some(len(rows), path, scan.problems)
+    facts = {**FORMATS[name].facts.of_manifest(), "format": name, **scan.facts}
+    return Manifest.from_rows((row for _, row in rows), scan.base.resolve(), facts), scan.problems
+
+
+def is_manifest(path: Path) -> bool:
+    """Whether this is a manifest file or a folder that holds one."""
+    if path.is_dir():
+        return (path / "manifest.parquet").is_file()
+    if path.suffix.lower() != ".parquet":
+        return False
+    try:
+        return str(pl.read_parquet_metadata(path).get("palpate.format", "")).startswith("palpate-manifest/")
+    except Exception:  # polars raises several kinds for a file that is not Parquet; whoever reads it next says so
+        return False
+
+
+def is_list(path: Path) -> bool:
+    """Whether the first line that is not empty is a row of a frame list."""
+    with open(path, "rb") as file:
+        for raw in file:
+            if line := raw.decode("utf-8-sig", errors="replace").strip():
+                return re.match(LINE, line) is not None
+    return False
