@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from audit_samples import clean_audit, full_audit, pictures, pretraining_audit
 from palpate.core import Audit, GalleryItem, LeakPair, Results, SampleRef, Score
 from palpate.report import write_report
 
@@ -101,6 +102,73 @@ def test_page_in_chromium(chromium, page_file, width, scheme):
     assert [url for url in asked if url != page_file.as_uri() and not url.startswith("data:")] == []
     assert page_file.as_uri() in asked
     assert said == []
+
+
+@pytest.fixture(scope="module")
+def audit_page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("audits")
+    names = pictures(folder, 16)
+    long = full_audit(names, name=LONG, matrix=[{"group": LONG, "train": 91982, "val": 12000, "test": 29879, "leaking": 29879}])
+    results = Results("Audits", audits=[full_audit(names), clean_audit(), pretraining_audit(names), long])
+    return write_report(results, folder / "page.html").page
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 360])
+def test_audits_in_chromium(chromium, audit_page, width, scheme):
+    artifacts = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
+    artifacts.mkdir(parents=True, exist_ok=True)
+    context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page = context.new_page()
+    said, asked = [], []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(audit_page.as_uri())
+    page.screenshot(path=artifacts / f"audits-{width}-{scheme}.png", full_page=True)
+    page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    inside = """[...document.querySelectorAll('svg.histogram')].map(s => {
+        const box = s.getBoundingClientRect();
+        return [...s.querySelectorAll('text, rect, line')].every(e => {
+            const b = e.getBoundingClientRect();
+            return b.left >= box.left - 0.5 && b.right <= box.right + 0.5 && b.top >= box.top - 0.5 && b.bottom <= box.bottom + 0.5;
+        });
+    })"""
+    assert page.evaluate(inside) == [True] * 6
+    apart = """[...document.querySelectorAll('svg.histogram')].map(s => {
+        const boxes = [...s.querySelectorAll('text')].map(e => e.getBoundingClientRect());
+        return boxes.every((a, k) => boxes.every((b, j) => j <= k || a.right <= b.left || b.right <= a.left || a.bottom - 2 <= b.top || b.bottom - 2 <= a.top));
+    })"""
+    assert page.evaluate(apart) == [True] * 6  # no label lies on another
+    if width == 360:  # the tables of signals and of the cost are read downwards; nothing of them, nor of the matrix, is cut off
+        assert page.evaluate("[...document.querySelectorAll('.stack, .matrix')].every(t => t.scrollWidth <= t.parentElement.clientWidth)")
+        assert page.evaluate("getComputedStyle(document.querySelector('.stack td'), '::before').content") == '"Flagged"'
+    roles = page.evaluate("[...document.querySelectorAll('.stack tbody td')].every(e => e.getAttribute('role') === 'cell')")
+    context.close()
+    assert roles
+    assert [url for url in asked if url != audit_page.as_uri() and not url.startswith("data:")] == []
+    assert said == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_shaded_counts_and_drawings_can_be_read(chromium, audit_page, scheme):
+    context = chromium.new_context(color_scheme=scheme)
+    page = context.new_page()
+    page.goto(audit_page.as_uri())
+    pairs = page.evaluate("""[...document.querySelectorAll('.matrix td, svg.histogram text')].map(e => {
+        const canvas = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+        const rgb = colour => { canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1); return `rgb(${canvas.getImageData(0, 0, 1, 1).data.slice(0, 3)})`; };
+        const style = getComputedStyle(e), text = e.closest('svg') !== null;
+        const paper = getComputedStyle(document.body).backgroundColor;
+        const clear = text || style.backgroundColor === 'rgba(0, 0, 0, 0)';
+        return rgb(text ? style.fill : style.color) + '|' + rgb(clear ? paper : style.backgroundColor);
+    })""")
+    context.close()
+    assert len(pairs) > 100
+    for pair in set(pairs):
+        a, b = sorted((luminance(c) for c in pair.split("|")), reverse=True)
+        assert (a + 0.05) / (b + 0.05) >= 4.5, pair
 
 
 def luminance(colour):

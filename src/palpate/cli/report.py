@@ -46,24 +46,37 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
 
 
 def _read(path: Path) -> Results:
+    """One file of results, checked, with absolute picture paths.
+
+    Raises:
+        PalpateError: if it is missing, not ours, or incomplete.
+    """
+    from palpate.report import check_results, with_paths
+
     data = read_json(path, "results file")
     kind = data.get("format") if isinstance(data, dict) else None
-    fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")} if isinstance(data, dict) else {}
     try:
         match kind:
             case "palpate-audit/1":
-                return _absolute(Results(title="", audits=[Audit.from_json(fields)]), path.parent)
+                results = Results(title="", audits=_audits(data))
             case "palpate-results/1":
-                results = Results.from_json(fields)
-                return _absolute(results, path.parent)
+                results = Results.from_json({k: v for k, v in data.items() if k not in ("skipped", "failed")})
             case _:
                 raise PalpateError(
                     f"{path} must hold results of palpate", f"format {kind!r}", "Pass the JSON of audit -o, score -o, or of a page"
                 )
+        check_results(results)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise PalpateError(
             f"{path} must hold complete results", f"a missing or unknown field ({error})", "Write it again with palpate"
         ) from None
+    return with_paths(results, lambda name: str((path.parent / name).resolve()))
+
+
+def _audits(data: dict[str, Any]) -> list[Audit]:
+    """The audit of an audit file and, under ``others``, further ones of the same test part (against pretraining data)."""
+    fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed", "others")}
+    return [Audit.from_json(fields), *(Audit.from_json(other) for other in data.get("others", ()))]
 
 
 def _mismatch(results: Results) -> list[str]:
@@ -75,15 +88,6 @@ def _mismatch(results: Results) -> list[str]:
             f"No audit on this page is of the split that these scores are on ({named}): what the audits say of leaks does not speak of them."
         ]
     return []
-
-
-def _absolute(results: Results, base: Path) -> Results:
-    """Picture paths of an earlier page, counted from its own folder, made absolute."""
-    full = lambda name: name if name is None else str((base / name).resolve())  # noqa: E731
-    ref = lambda s: replace(s, vision=full(s.vision), tactile=full(s.tactile))  # noqa: E731
-    audits = [replace(a, worst=[replace(p, test=ref(p.test), train=ref(p.train)) for p in a.worst]) for a in results.audits]
-    gallery = [replace(g, sample=ref(g.sample), generated=full(g.generated), background=full(g.background)) for g in results.gallery]
-    return replace(results, audits=audits, gallery=gallery)
 
 
 def _join(a: Results, b: Results) -> Results:

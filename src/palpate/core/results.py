@@ -65,6 +65,7 @@ class Signal:
         causes: test samples at or over the threshold by cause (``CAUSES``); empty where the signal has one cause.
         worst: the strongest pairs.
         notes: sentences for people.
+        counts: whether flagged samples count as leaking; a shared group that the audit was not asked about is told but not counted.
     """
 
     kind: str
@@ -78,6 +79,7 @@ class Signal:
     causes: Mapping[str, int] = field(default_factory=dict)
     worst: Sequence[LeakPair] = ()
     notes: Sequence[str] = ()
+    counts: bool = True
 
     @property
     def fraction(self) -> float:

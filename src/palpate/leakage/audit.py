@@ -129,8 +129,13 @@ def audit_parts(
 
 
 def known_group(train: Manifest, test: Manifest) -> str:
-    """The first of video, object, session and touch that both sides know of some samples; ``NO_GROUP`` if there is none."""
-    known = (g for g in ("video", "object", "session", "touch") if all(m.table[g].null_count() < len(m) for m in (train, test)))
+    """What the data set says must be kept whole, else the first of video, object, session and touch that both sides know of some samples.
+
+    Returns:
+        A column, or ``NO_GROUP`` if none is known.
+    """
+    said = [str(m.facts["group"]) for m in (test, train) if m.facts.get("group") in GROUPS]
+    known = (g for g in (*said, "video", "object", "session", "touch") if all(m.table[g].null_count() < len(m) for m in (train, test)))
     return next(known, NO_GROUP)
 
 

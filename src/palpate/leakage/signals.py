@@ -90,7 +90,7 @@ class Flags:
         return Signal(
             self.kind, int(np.isfinite(self.score).sum()), int(self.flag.sum()), self.threshold, self.false_positives,
             [float(e) for e in self.edges], [int(n) for n in self.unrelated], [int(n) for n in self.found], causes,
-            self._worst(train, test, gaps, rows, worst), list(self.notes),
+            self._worst(train, test, gaps, rows, worst), list(self.notes), self.counts,
         )  # fmt: skip
 
     def _worst(self, train: Manifest, test: Manifest, gaps: NDArray[np.int64], rows: NDArray[np.int64], worst: int) -> list[LeakPair]:
@@ -156,7 +156,12 @@ def time_gap(gaps: NDArray[np.int64], rows: NDArray[np.int64], near: int = NEAR_
         return None
     score = np.where(gaps >= 0, np.exp2(-gaps / max(near, 1)), 0.0).astype(np.float32)
     return Flags(
-        "time gap", score, (gaps >= 0) & (gaps <= near), rows, threshold=0.5 if near else 1.0, notes=[f"Flagged up to {near} frames."]
+        "time gap",
+        score,
+        (gaps >= 0) & (gaps <= near),
+        rows,
+        threshold=0.5 if near else 1.0,
+        notes=[f"Flagged up to {near} frames; the score is 2^(-gap/{near})."] if near else ["Flagged at a gap of 0 frames only."],
     )
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from palpate.core import Audit, GalleryItem, LeakPair, PalpateError, Progress, Results, SampleRef, quiet, write_json, write_text
+from palpate.core import PalpateError, Progress, Results, quiet, write_json, write_text
+from palpate.report.checks import check_results
 from palpate.report.markdown import render_markdown
 from palpate.report.page import render_page
-from palpate.report.text import plain, summary_lines
+from palpate.report.paths import with_paths
+from palpate.report.sentences import summary_lines
+from palpate.report.text import plain
 
-__all__ = ["ReportFiles", "render_markdown", "render_page", "summary_lines", "write_report"]
+__all__ = ["ReportFiles", "check_results", "render_markdown", "render_page", "summary_lines", "with_paths", "write_report"]
 
 
 @dataclass(frozen=True)
@@ -26,20 +28,8 @@ class ReportFiles:
 
 def _moved(results: Results, base: Path, folder: Path) -> Results:
     """The results with all picture paths counted from ``folder``: they stay right when the run folder moves, and name nobody's disk."""
-
-    def path(name: str | None) -> str | None:
-        if name is None:
-            return None
-        return Path(os.path.relpath(base.resolve() / name, folder.resolve())).as_posix()  # an absolute name replaces the base
-
-    def sample(ref: SampleRef) -> SampleRef:
-        return dataclasses.replace(ref, vision=path(ref.vision), tactile=path(ref.tactile))
-
-    def audit(found: Audit) -> Audit:
-        return dataclasses.replace(found, worst=[LeakPair(sample(p.test), sample(p.train), p.gap) for p in found.worst])
-
-    gallery = [GalleryItem(sample(g.sample), path(g.generated) or g.generated, path(g.background)) for g in results.gallery]
-    return dataclasses.replace(results, audits=[audit(a) for a in results.audits], gallery=gallery)
+    start, end = base.resolve(), folder.resolve()
+    return with_paths(results, lambda name: Path(os.path.relpath(start / name, end)).as_posix())  # an absolute name replaces the base
 
 
 def write_report(

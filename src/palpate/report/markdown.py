@@ -9,10 +9,12 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from palpate.core import Audit, Results, SampleRef
-from palpate.report.page import in_turns, material_of, where
+from palpate.core import Audit, Impact, LeakPair, Results, SampleRef
+from palpate.report.audits import interval_percent, matrix_view, pair_facts, pair_lists, signal_row, signal_view
+from palpate.report.page import in_turns, material_of
+from palpate.report.sentences import leak_line, purpose, summary_lines, there, where
 from palpate.report.tables import Cell, Heat, Table, heat_tables, score_tables
-from palpate.report.text import HINTS, HOW_TO_READ, count, number, percent, plain, purpose, summary_lines
+from palpate.report.text import HINTS, HOW_TO_READ, count, number, percent, plain, plural
 
 #: Rows of pictures listed in the Markdown; the JSON holds all.
 LISTED = 40
@@ -85,41 +87,107 @@ def _sample(sample: SampleRef) -> str:
     return f"{esc(where(sample))}: {_picture(sample.vision)}, {_picture(sample.tactile)}"
 
 
-def _audit(audit: Audit) -> list[str]:
-    group = esc(audit.group)
+def _pair(pair: LeakPair, kind: str, other: str) -> str:
+    """A pair on one line; as the JSON says, where no signal is named."""
+    facts = pair_facts(pair, kind)
+    if not kind:
+        facts[0] = f"gap {count(pair.gap)} frames" if pair.gap is not None else "gap unknown"
+    return f"- {'; '.join(map(esc, facts))}; test {_sample(pair.test)}; {other} {_sample(pair.train)}"
+
+
+def _signals(audit: Audit) -> list[str]:
+    """The signals as a table, what each means, and how the lines were set."""
+    views = [signal_view(s, audit) for s in audit.signals]
+    rows = [[esc(str(v)) for v in signal_row(view).values()] for view in views]
+    lines = ["#### What was looked for", "", *pipe_table(list(signal_row(views[0])), rows)]
+    for view in views:
+        said = [s for s in (view.meaning, view.line, *view.notes) if s]
+        lines += [f"- {esc(view.signal.kind)}: {esc(' '.join(said))}"] if said else []
+    lines.append("")
+    for view in views:
+        if view.bins:
+            head = [f"{esc(view.signal.kind)}: score", "unrelated samples", "test samples"]
+            lines += pipe_table(head, view.bins)
+    return lines
+
+
+def _impact(impact: Impact) -> list[str]:
+    """What the leak costs."""
+    text = lambda value, interval: f"{number(100 * value, 1)} {interval_percent(interval)}".rstrip()  # noqa: E731
     rows = [
-        ["samples", count(audit.train_samples), count(audit.test_samples)],
-        [f"groups ({group})", count(audit.groups_train), count(audit.groups_test)],
+        [
+            esc(f"{r.features}, {r.classifier}"),
+            text(r.given, r.given_interval),
+            text(r.clean, r.clean_interval),
+            text(r.cost, r.cost_interval),
+            text(r.chance, None),
+        ]
+        for r in impact.rows
     ]
-    lines = [f"### {esc(audit.name)}: {esc(percent(audit.leaked_fraction))} leaked", "", *pipe_table(["", "train", "test"], rows)]
-    lines += [
-        f"- test samples in shared groups: {count(audit.test_samples_in_shared_groups)}",
-        f"- shared groups: {count(audit.groups_shared)}",
-        f"- identical samples in both parts: {count(audit.identical_samples)}",
-    ]
+    head = ["accuracy of material, %", "given split", "leak-free", "cost, points", "chance"]
+    lines = ["#### What the leak costs", "", esc(impact.headline), "", *pipe_table(head, rows)]
+    lines += [f"- 95 % intervals by leaving out whole groups ({esc(impact.group)})", *(f"- {esc(note)}" for note in impact.notes)]
+    lines += [f"- leak-free splits: {', '.join(map(code, impact.clean_splits))}"] if impact.clean_splits else []
+    return [*lines, *_tree(plain(impact.settings)), ""]
+
+
+def _matrix(audit: Audit) -> list[str]:
+    """The group-by-part matrix."""
+    view = matrix_view(audit)
+    if view is None:
+        return []
+    heads = {"train": esc(audit.against)}
+    head = [esc(audit.group), *(heads.get(p, p) for p in view.parts), "leaking"]
+    rows = [[esc(r.group), *(text for text, _ in r.cells), count(r.leaking)] for r in view.rows]
+    more = [f"And {plural(view.more, 'more group')}.", ""] if view.more else []
+    return ["#### Groups by part", "", *pipe_table(head, rows), *more]
+
+
+def _finding(audit: Audit) -> list[str]:
+    """Heading, counts and notes."""
+    group, other = esc(audit.group), esc(audit.against)
+    rows = [["samples", count(audit.train_samples), count(audit.test_samples)]]
+    rows += [[f"groups ({group})", count(audit.groups_train), count(audit.groups_test)]] if audit.group != "none" else []
+    against = "" if audit.against == "train" else f"Test against {there(audit)}: "
+    share = audit.leaking_samples / audit.test_samples if audit.signals and audit.test_samples else audit.leaked_fraction
+    lines = [f"### {esc(against + audit.name)}: {esc(percent(share))} leaked", "", *pipe_table(["", other, "test"], rows)]
+    lines += [f"- {esc(leak_line(audit))}"] if audit.signals and audit.test_samples else []
+    if audit.group != "none":
+        lines += [
+            f"- test samples in shared groups: {count(audit.test_samples_in_shared_groups)}",
+            f"- shared groups: {count(audit.groups_shared)}",
+        ]
+    lines.append(f"- identical samples in both parts: {count(audit.identical_samples)}")
     if audit.split:
         lines.append(f"- split: {code(audit.split)}")
     if audit.gap_median is not None:
         lines.append(
-            f"- frames to the nearest train frame: least {count(audit.gap_min)}, median {number(audit.gap_median, 0)}, most {count(audit.gap_max)}"
+            f"- frames to the nearest {other} frame: least {count(audit.gap_min)}, median {number(audit.gap_median, 0)}, most {count(audit.gap_max)}"
         )
-    lines += [f"- {esc(note)}" for note in audit.notes]
-    lines.append("")
+    return [*lines, *(f"- {esc(note)}" for note in audit.notes), ""]
+
+
+def _audit(audit: Audit) -> list[str]:
+    lines = _finding(audit)
     if audit.gap_counts:
         bins = zip(audit.gap_edges, audit.gap_edges[1:], audit.gap_counts, strict=False)
         lines += pipe_table(["gap (frames)", "test samples"], [[f"{count(a)} to {count(b)}", count(n)] for a, b, n in bins])
-    if audit.worst:
-        lines += ["Nearest pairs:", ""]
-        lines += [
-            f"- {'gap ' + count(p.gap) + ' frames' if p.gap is not None else 'gap unknown'}; test {_sample(p.test)}; train {_sample(p.train)}"
-            for p in list(audit.worst)[:LISTED]
-        ]
-        lines.append("")
+    lines += _signals(audit) if audit.signals else []
+    lines += _impact(audit.impact) if audit.impact is not None and audit.impact.rows else []
+    for found in pair_lists(audit):
+        lines += [f"Worst pairs by {esc(found.title)}" if found.kind else "Nearest pairs:", ""]
+        lines += [*(_pair(p, found.kind, esc(audit.against)) for p in found.pairs[:LISTED]), ""]
+    lines += _matrix(audit)
     if audit.materials:
         keys = ("material", "train", "test", "groups_train", "groups_test")
         cells = [[esc(str(m.get("material") or "–")), *(count(m.get(k)) for k in keys[1:])] for m in audit.materials]
-        lines += pipe_table(["material", "train", "test", f"{group}s in train", f"{group}s in test"], cells)
-    return lines
+        parts = (esc(audit.against), "test")
+        lines += pipe_table(["material", *parts, *(f"{esc(audit.group)}s in {part}" for part in parts)], cells)
+    return [*lines, *(["What to do next:", "", *_commands(audit.commands)] if audit.commands else [])]
+
+
+def _commands(commands: Sequence[str]) -> list[str]:
+    return ["```sh", *(c.replace("```", "` ` `") for c in commands), "```", ""]
 
 
 def _tree(value: Any, depth: int = 0) -> list[str]:
@@ -171,7 +239,7 @@ def render_markdown(results: Results) -> str:
     lines += ["## Settings and digests", "", *(_tree(plain(results.settings)) or _hint("settings")), ""]
     lines += ["## Commands", ""]
     if results.commands:
-        lines += ["```sh", *(c.replace("```", "` ` `") for c in results.commands), "```"]
+        lines += _commands(results.commands)
     else:
         lines += _hint("commands")
     return "\n".join(lines).rstrip() + "\n"

@@ -20,26 +20,27 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from palpate import __version__
-from palpate.core import Audit, GalleryItem, LeakPair, PalpateError, Progress, Results, SampleRef, quiet
+from palpate.core import GalleryItem, LeakPair, PalpateError, Progress, Results, SampleRef, quiet
 from palpate.report import plots
+from palpate.report.audits import MAX_PAIRS, OPEN_PAIRS, AuditView, PairRow, audit_view, pair_facts, pair_lists, pair_pictures, side_of
 from palpate.report.pictures import Album, Darkroom, Picture, Wanted
+from palpate.report.sentences import purpose, summary_lines, where
 from palpate.report.tables import heat_tables, score_tables
-from palpate.report.text import HINTS, HOW_TO_READ, count, defined, number, percent, plain, plural, purpose, summary_lines
+from palpate.report.text import HINTS, HOW_TO_READ, count, defined, number, percent, plain, plural
 
 #: Gallery rows that are open, and that the page holds at all; the JSON beside the page names every one.
 OPEN_ROWS, MAX_ROWS = 40, 160
-OPEN_PAIRS, MAX_PAIRS = 6, 24
 #: A list in the settings is cut here; the JSON keeps it whole.
 LONG_LIST = 24
 _DIGEST = re.compile(r"(?:sha256:)?[0-9a-f]{32,128}")
-_NUMBER = re.compile(r"(?<![\w.,])[−-]?\d[\d,]*(?:\.\d+)?(?:\s?%)?(?![\w])")
+_NUMBER = re.compile(r"(?<![\w.,])[−-]?\d[\d,]*(?:\.\d+)?(?:\s?%)?(?!\w|-[A-Za-z])")
 
 
 @dataclass(frozen=True)
 class Row:
-    """A gallery row or a leak pair with its pictures; ``item`` is what it shows."""
+    """A gallery row with its pictures."""
 
-    item: GalleryItem | LeakPair
+    item: GalleryItem
     pictures: Sequence[Picture]
 
 
@@ -51,18 +52,6 @@ class Folds:
     folded: Mapping[str, Sequence[Row]]
     shown: int
     total: int
-
-
-@dataclass(frozen=True)
-class AuditView:
-    """An audit with its drawing and its pairs."""
-
-    audit: Audit
-    histogram: Markup
-    uneven: bool
-    pairs: Sequence[Row]
-    folded: Sequence[Row]
-    total_pairs: int
 
 
 def material_of(sample: SampleRef) -> str:
@@ -78,13 +67,6 @@ def in_turns(items: Sequence[GalleryItem]) -> list[GalleryItem]:
     return [item for turn in zip_longest(*queues.values()) for item in turn if item is not None]
 
 
-def where(sample: SampleRef) -> str:
-    """``"video, frame 12"``, or the id where the sample has no video."""
-    if sample.video is None:
-        return sample.id
-    return sample.video if sample.frame is None else f"{sample.video}, frame {sample.frame}"
-
-
 def _gallery_pictures(item: GalleryItem) -> list[Wanted]:
     s = item.sample
     said = f"{s.material or 'sample'}, {where(s)}"
@@ -95,49 +77,52 @@ def _gallery_pictures(item: GalleryItem) -> list[Wanted]:
     return wanted
 
 
-def _pair_pictures(pair: LeakPair) -> list[Wanted]:
-    sides = (("Test", pair.test), ("Train", pair.train))
-    return [Wanted(s.vision, f"{side} photo: {where(s)}", f"{side} photo") for side, s in sides] + [
-        Wanted(s.tactile, f"{side} touch: {where(s)}", f"{side} touch") for side, s in sides
-    ]
-
-
 @dataclass(frozen=True)
 class _Plan:
-    """All rows in order of importance: open pairs, open gallery, folded pairs, folded gallery."""
+    """All rows in order of importance: open pairs, open gallery, folded pairs, folded gallery.
 
-    rows: Sequence[tuple[int, GalleryItem | LeakPair]]
+    Pairs take turns: every list of every audit shows its strongest pair before any shows its second. A row's place is
+    (audit, list), or None in the gallery.
+    """
+
+    rows: Sequence[tuple[tuple[int, int] | None, GalleryItem | LeakPair]]
     essential: int
+    sides: Sequence[str]
 
     @classmethod
     def of(cls, results: Results) -> _Plan:
-        gallery = [(-1, item) for item in in_turns(results.gallery)[:MAX_ROWS]]
-        pairs = [(k, p) for k, a in enumerate(results.audits) for p in list(a.worst)[:OPEN_PAIRS]]
-        more = [(k, p) for k, a in enumerate(results.audits) for p in list(a.worst)[OPEN_PAIRS:MAX_PAIRS]]
-        return cls([*pairs, *gallery[:OPEN_ROWS], *more, *gallery[OPEN_ROWS:]], len(pairs) + len(gallery[:OPEN_ROWS]))
+        gallery = [(None, item) for item in in_turns(results.gallery)[:MAX_ROWS]]
+        lists = [((k, j), found.pairs) for k, a in enumerate(results.audits) for j, found in enumerate(pair_lists(a))]
+        turn = lambda ranks: [(place, pairs[r]) for r in ranks for place, pairs in lists if r < len(pairs)]  # noqa: E731
+        pairs, more = turn(range(OPEN_PAIRS)), turn(range(OPEN_PAIRS, MAX_PAIRS))
+        rows = [*pairs, *gallery[:OPEN_ROWS], *more, *gallery[OPEN_ROWS:]]
+        return cls(rows, len(pairs) + len(gallery[:OPEN_ROWS]), [side_of(a) for a in results.audits])
 
     def wanted(self) -> list[list[Wanted]]:
-        return [_gallery_pictures(i) if isinstance(i, GalleryItem) else _pair_pictures(i) for _, i in self.rows]
+        return [
+            pair_pictures(item, self.sides[place[0]]) if place is not None and isinstance(item, LeakPair)
+            else _gallery_pictures(item) if isinstance(item, GalleryItem) else []
+            for place, item in self.rows
+        ]  # fmt: skip
 
     def views(self, results: Results, album: Album) -> tuple[Folds, list[AuditView]]:
         """What the album holds, put back into its sections."""
         gallery: list[Row] = []
-        pairs: defaultdict[int, list[Row]] = defaultdict(list)
-        for (section, item), pictures in zip(self.rows, album.rows, strict=False):
-            (gallery if section < 0 else pairs[section]).append(Row(item, pictures))
+        pairs: defaultdict[tuple[int, int], list[PairRow]] = defaultdict(list)
+        for (place, item), pictures in zip(self.rows, album.rows, strict=False):
+            if isinstance(item, GalleryItem):
+                gallery.append(Row(item, pictures))
+            elif place is not None:
+                pairs[place].append(PairRow(item, pictures))
         folds = Folds(_by_material(gallery[:OPEN_ROWS]), _by_material(gallery[OPEN_ROWS:]), len(gallery), len(results.gallery))
-        audits = [
-            AuditView(a, plots.gap_histogram(a), plots.uneven(a.gap_edges), pairs[k][:OPEN_PAIRS], pairs[k][OPEN_PAIRS:], len(a.worst))
-            for k, a in enumerate(results.audits)
-        ]
+        audits = [audit_view(a, [pairs[k, j] for j in range(len(pair_lists(a)))]) for k, a in enumerate(results.audits)]
         return folds, audits
 
 
 def _by_material(rows: Iterable[Row]) -> dict[str, list[Row]]:
     groups: defaultdict[str, list[Row]] = defaultdict(list)
     for row in rows:
-        if isinstance(row.item, GalleryItem):
-            groups[material_of(row.item.sample)].append(row)
+        groups[material_of(row.item.sample)].append(row)
     return dict(sorted(groups.items(), key=lambda pair: pair[0].casefold()))
 
 
@@ -145,9 +130,14 @@ def _template(name: str) -> str:
     return (resources.files("palpate.report") / "templates" / name).read_text(encoding="utf-8")
 
 
+def _unbroken(sentence: str) -> str:
+    """The sentence with percentages that do not break across lines."""
+    return re.sub(r"(?<=\d) %", "\u00a0%", sentence)
+
+
 def _emphasise(sentence: str) -> Markup:
     """The sentence, escaped, with its first number marked."""
-    sentence = re.sub(r"(?<=\d) %", "\u00a0%", sentence)  # a percentage does not break across lines
+    sentence = _unbroken(sentence)
     found = _NUMBER.search(sentence)
     if found is None:
         return escape(sentence)
@@ -193,9 +183,15 @@ def environment() -> Environment:
         lstrip_blocks=True,
         auto_reload=False,
     )
-    functions: dict[str, Any] = {"bar": plots.interval_bar, "axis_row": plots.axis_row, "short_list": _short_list, "like_rows": _like_rows}
+    functions: dict[str, Any] = {
+        "bar": plots.interval_bar,
+        "axis_row": plots.axis_row,
+        "short_list": _short_list,
+        "like_rows": _like_rows,
+        "pair_facts": pair_facts,
+    }
     filters: dict[str, Any] = {
-        "count": count, "number": number, "percent": percent, "plural": plural, "emphasise": _emphasise, "leaf": _leaf,
+        "count": count, "number": number, "percent": percent, "plural": plural, "emphasise": _emphasise, "leaf": _leaf, "plain": plain, "unbroken": _unbroken,
     }  # fmt: skip
     env.globals.update(functions)
     env.filters.update(filters)

@@ -6,13 +6,13 @@ Numbers are written with a true minus sign, comma thousands and, inside one tabl
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from palpate.core import Audit, Results, Score, columns
+from palpate.core import Score
 
 #: What a reader of an empty section can run to fill it.
 HINTS: Mapping[str, tuple[str, str]] = {
@@ -69,6 +69,16 @@ def number(value: float | None, digits: int | None = None) -> str:
     return text
 
 
+def score_text(value: float) -> str:
+    """A score in [0, 1] with three decimals, or as many as it takes to tell it from 1."""
+    if not math.isfinite(value):
+        return "–"
+    digits = 3
+    while value < 1 and f"{value:.{digits}f}" == f"{1:.{digits}f}" and digits < 9:
+        digits += 1
+    return f"{value:.{digits}f}"
+
+
 def plural(n: int, singular: str, many: str | None = None) -> str:
     """``"1 video"``, ``"1,234 videos"``; ``many`` where the plural is not made with an s."""
     return f"{n:,} {singular if n == 1 else many or singular + 's'}"
@@ -94,46 +104,9 @@ def plain(value: Any) -> Any:
     return value if value is None or isinstance(value, str | int | float | bool) else str(value)
 
 
-def purpose(results: Results) -> str:
-    """One sentence that says what the page is."""
-    parts: list[str] = []
-    if results.gallery or results.scores:
-        parts.append("how close touch generated from photos comes to real touch")
-    if results.audits:
-        parts.append("whether the split behind the numbers leaks from train into test")
-    return f"What this page shows: {', and '.join(parts)}." if parts else "Results of palpate; nothing has been measured yet."
-
-
-def audit_line(audit: Audit) -> str:
-    """The finding of one audit in one sentence."""
-    if not audit.test_samples:
-        return f"{audit.name}: the test part is empty, so nothing can leak."
-    if not audit.test_samples_in_shared_groups:
-        return f"{audit.name}: no {audit.group} is shared; none of the {plural(audit.test_samples, 'test sample')} leaks."
-    one = audit.test_samples_in_shared_groups == 1
-    return (
-        f"{audit.name}: {percent(audit.leaked_fraction)} of the test samples leak; {count(audit.test_samples_in_shared_groups)} of "
-        f"{count(audit.test_samples)} {'comes' if one else 'come'} from a {audit.group} that train holds as well."
-    )
-
-
 def setting_of(score: Score) -> tuple[str, str]:
     """Preset and split: scores that differ in one of them stand in different tables."""
     return str(score.settings.get("preset", "")), score.split or ""
-
-
-def score_line(scores: Sequence[Score]) -> str:
-    """The first column with a value, in one sentence; '' if there is none."""
-    first = next((setting_of(s) for s in scores if defined(s)), None)
-    for metric, column in columns(s for s in scores if setting_of(s) == first).items():
-        shown = [s for s in column if defined(s)]
-        if shown:
-            digits = decimals([s.value for s in shown if s.value is not None])
-            said = ", ".join(f"{s.subject} {number(s.value, digits)}{interval_text(s, digits, before=' ')}" for s in shown[:3])
-            floors = [s.floor for s in shown if s.floor is not None]
-            floor = f"; floor {number(floors[0], digits)}" if floors else ""
-            return f"{metric} ({'higher' if shown[0].higher_is_better else 'lower'} is better): {said}{floor}."
-    return ""
 
 
 def interval_text(score: Score, digits: int, before: str = "") -> str:
@@ -141,20 +114,3 @@ def interval_text(score: Score, digits: int, before: str = "") -> str:
     if score.interval is None:
         return ""
     return f"{before}[{number(score.interval[0], digits)}, {number(score.interval[1], digits)}]"
-
-
-def summary_lines(results: Results) -> list[str]:
-    """At most three headline facts for the terminal and the head of the page.
-
-    The facts of the results come first; where there are fewer than three, the first and the last audit and the first
-    metric fill up.
-
-    Raises:
-        PalpateError: if the scores may not stand in one table.
-    """
-    lines = list(results.facts[:3])
-    ends = [results.audits[0], results.audits[-1]] if len(results.audits) > 1 else list(results.audits)
-    candidates = [audit_line(a) for a in ends] + [score_line(results.scores)]
-    if len(results.gallery):
-        candidates.append(f"{plural(len(results.gallery), 'generated touch', 'generated touches')} in the gallery.")
-    return (lines + [c for c in candidates if c and c not in lines])[:3] if len(lines) < 3 else lines

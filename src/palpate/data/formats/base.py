@@ -37,6 +37,7 @@ class Facts:
         image_size: (width, height) of the tactile images as released, in pixels, or None.
         samples: how many there are, in words and with the source.
         group: what a split must keep whole, in words.
+        group_column: the manifest column that says it; audits and splits take it by themselves.
         normalisation: name -> (mean, std) of RGB in [0, 1] with what it is for; valid for the crop that the name says, no other.
     """
 
@@ -49,10 +50,12 @@ class Facts:
     samples: str
     group: str
     normalisation: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = field(default_factory=dict)
+    group_column: str = "video"
 
     def of_manifest(self) -> dict[str, str]:
         """The facts that a manifest keeps."""
-        return {"dataset": self.name, "licence": self.licence, "citation": self.citation, "url": self.url}
+        about = {"dataset": self.name, "licence": self.licence, "citation": self.citation, "url": self.url}
+        return about | ({} if self.group_column == "video" else {"group": self.group_column})
 
 
 @dataclass
@@ -178,7 +181,19 @@ def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) ->
     """Rows whose paths stay inside the root and exist, written relative to it."""
     known: dict[str, tuple[str, str] | None] = {}
     root = base.resolve()
+    folders: dict[str, bool] = {}  # resolving a path is slow: each folder once, and files only where they are links
     good: list[Found] = []
+
+    def problem(given: str) -> tuple[str, str] | None:
+        folder, _, name = given.rpartition("/")
+        if folder not in folders:
+            folders[folder] = (root / folder).resolve().is_relative_to(root)
+        path = root / given
+        leaves = not folders[folder] or name in ("", "..") or "\\" in name or given.startswith("/") or path.is_symlink()
+        if leaves and inside(root, given) is None:
+            return "outside-root", f"the path {given!r} leaves the root {base}"
+        return None if path.is_file() else ("missing-file", f"no file {given!r} in {base}")
+
     for where, row in rows:
         fine = True
         for name in IMAGE_COLUMNS:
@@ -186,11 +201,7 @@ def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) ->
             if given is None:
                 continue
             if given not in known:
-                path = inside(base, given)
-                known[given] = (
-                    ("outside-root", f"the path {given!r} leaves the root {base}") if path is None
-                    else None if path.is_file() else ("missing-file", f"no file {given!r} in {base}")
-                )  # fmt: skip
+                known[given] = problem(given)
             if (found := known[given]) is not None:
                 problems.append(Problem(where, found[0], f"{name}: {found[1]}"))
                 fine = False
