@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output, require_extra
-from palpate.core import Audit, Impact, PalpateError, Problem, ProblemsError, Progress, Results, Split, write_json
+from palpate.core import Audit, Impact, ImpactRow, PalpateError, Problem, ProblemsError, Progress, Results, Split, write_json
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
@@ -87,7 +87,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             others.append(_against_pretraining(options, sides.pretrain, sides.test, cache, progress))
         audit = found.audit
         if options.impact and sides.whole is not None and sides.split is not None:
-            audit = replace(audit, impact=_impact(options, sides.whole, sides.split, audit.group, cache, progress))
+            audit = replace(audit, impact=_impact(options, sides.whole, sides.split, audit, cache, progress))
         audit = replace(audit, commands=_next(options, audit))
     skipped = [str(p) for p in sides.skipped]
     data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "others": [dataclasses.asdict(a) for a in others], "skipped": skipped}
@@ -179,7 +179,7 @@ def _audit(options: Options, sides: _Sides, cache: Path | None, progress: Progre
         "pictures": _pictures(options, sides.train, sides.test, cache, progress),
     }  # fmt: skip
     if sides.whole is not None and sides.split is not None and options.split is not None:
-        return inspect_split(sides.whole, sides.split, name=str(sides.split.rule.get("name", options.split.name)), **common)
+        return inspect_split(sides.whole, sides.split, name=str(sides.split.rule.get("name", options.split.stem)), **common)
     return inspect_parts(sides.train, sides.test, name=f"{options.paths[0].name} / {options.paths[1].name}", **common)
 
 
@@ -216,7 +216,7 @@ def _pictures(options: Options, train: Manifest, test: Manifest, cache: Path | N
     return Pictures(there, options.false_positives, features, name, cache, options.processes)
 
 
-def _impact(options: Options, manifest: Manifest, split: Split, group: str, cache: Path | None, progress: Progress) -> Impact:
+def _impact(options: Options, manifest: Manifest, split: Split, audit: Audit, cache: Path | None, progress: Progress) -> Impact:
     """What leaking costs, on raw pictures or on the towers' embeddings."""
     from palpate.protocol.impact import impact
 
@@ -228,7 +228,7 @@ def _impact(options: Options, manifest: Manifest, split: Split, group: str, cach
         towers = Towers.load(options.encoder)
         there = [m for m, c in MODALITIES.items() if manifest.table[c].null_count() == 0]
         features = {f"{m} tower": embed(manifest, towers, m, cache=cache, progress=progress) for m in there}
-    return impact(manifest, split, group=group, features=features, cache=cache, progress=progress)
+    return impact(manifest, split, group=audit.group, features=features, name=audit.name, cache=cache, progress=progress)
 
 
 def _cache(options: Options) -> Path | None:
@@ -280,6 +280,12 @@ COUNTS = (
 )  # fmt: skip
 
 
+def _row(row: ImpactRow) -> str:
+    """One kind of feature and classifier in a line."""
+    around = f" [{100 * row.cost_interval[0]:.1f}, {100 * row.cost_interval[1]:.1f}]" if row.cost_interval else ""
+    return f"{row.given:.1%} given, {row.clean:.1%} leak-free: costs {100 * row.cost:.1f} points{around}; chance {row.chance:.1%}"
+
+
 def show(audit: Audit, terminal: Terminal) -> None:
     """Prints the counts of an audit and what they mean."""
     terminal.facts(f"Audit of {audit.name} (group: {audit.group})", {name: getattr(audit, name) for name in COUNTS})
@@ -293,6 +299,7 @@ def show(audit: Audit, terminal: Terminal) -> None:
     for note in (*audit.notes, *(f"{s.kind}: {note}" for s in audit.signals for note in s.notes)):
         terminal.say(f"Note: {note}")
     if audit.impact is not None:
+        terminal.facts("What leaking costs: material accuracy", {f"{r.features}, {r.classifier}": _row(r) for r in audit.impact.rows})
         terminal.print(audit.impact.headline)
         for note in audit.impact.notes:
             terminal.say(f"Note: {note}")

@@ -1,0 +1,319 @@
+"""HCT and SSVTP: the official test rows with their measured facts, every dialect of the lists, lists written and read back, SSVTP."""
+
+import json
+import shutil
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+
+from palpate.core import PalpateError, ProblemsError, Split
+from palpate.data.formats import hct, ssvtp, tvl
+from palpate.data.importing import import_dataset, write_lists
+from tvl_forge import COLUMNS, forge_hct, forge_ssvtp, gel, photo, put, write_csv
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return forge_hct(tmp_path / "in").source
+
+
+@pytest.fixture
+def presses(tmp_path):
+    return forge_ssvtp(tmp_path / "in").source
+
+
+def kinds(problems):
+    return Counter(p.kind for p in problems)
+
+
+def read(source, out, **options):
+    return import_dataset(source, out, **options)
+
+
+# ---------------------------------------------------------------- the official test rows
+
+
+@pytest.fixture(scope="module")
+def official(real_data, tmp_path_factory):
+    """The 402 official test rows at their real paths, with small pictures; and what was listed."""
+    items = json.loads((real_data / "tvl" / "test_items.json").read_text())
+    root = tmp_path_factory.mktemp("tvl")
+    sample = tmp_path_factory.mktemp("bytes")
+    content = {"image_fp": put(sample / "v.jpg", photo(1)).read_bytes(), "tactile_fp": put(sample / "t.jpg", gel(1)).read_bytes()}
+    lists: dict[Path, list[list[str]]] = {}
+    for item in items:
+        for side, data in content.items():
+            (root / item[side]).parent.mkdir(parents=True, exist_ok=True)
+            (root / item[side]).write_bytes(data)
+        depth = 2 if item["image_fp"].startswith("hct/") else 1
+        base = PurePosixPath(*PurePosixPath(item["image_fp"]).parts[:depth])
+        paths = [str(PurePosixPath(item[side]).relative_to(base)) for side in content]
+        lists.setdefault(root / base, []).append([*paths, *([""] if depth == 2 else []), item["label"]])
+    for base, rows in lists.items():
+        write_csv(base / "test.csv", COLUMNS if base.parent.name == "hct" else ("url", "tactile", "caption"), rows)
+    return root, items
+
+
+def test_the_official_hct_rows_have_their_measured_facts(official, tmp_path):
+    root, items = official
+    found = read(root, tmp_path / "out", check="none")
+    table = found.manifest.table
+    assert found.facts["format"] == "hct"
+    assert len(found.manifest) == 356
+    assert set(zip(table["vision"], table["tactile"], strict=True)) == {
+        (i["image_fp"][4:], i["tactile_fp"][4:]) for i in items if i["image_fp"].startswith("hct/")
+    }
+    assert Counter(table["domain"]) == {"data1": 9, "data2": 148, "data3": 199}
+    sizes = Counter(Counter(table["video"]).values())
+    assert sizes == {1: 214, 2: 53, 3: 12}
+    assert sum(sizes.values()) == 279
+    assert (min(table["frame"]), max(table["frame"])) == (28, 1409)
+    frames: dict[str, list[int]] = {}
+    for video, frame in table.select("video", "frame").iter_rows():
+        frames.setdefault(video, []).append(frame)
+    assert all(v == sorted(v) for v in frames.values()), "rows are sorted by number, not by name"
+    gaps = [b - a for v in frames.values() for a, b in pairwise(v)]
+    assert (min(gaps), np.median(gaps)) == (1, 19)
+    prefixes = Counter(video.split("-")[0] for video in frames)
+    assert (len(prefixes), sum(n > 1 for n in prefixes.values()), max(prefixes.values())) == (71, 43, 63)
+    texts = table["text"].to_list()
+    assert len(set(texts)) == 336
+    assert Counter(text.count(",") + 1 for text in texts) == {1: 3, 2: 55, 3: 145, 4: 135, 5: 17, 6: 1}
+    words = {video: set(table.filter(table["video"] == video)["text"]) for video, own in frames.items() if len(own) > 1}
+    assert (sum(len(w) > 1 for w in words.values()), len(words)) == (63, 65)
+    assert found.splits["Orig"].counts() == {"test": 356}
+    assert {p.kind for p in found.suspicious} == {"no-background", "other-half"}
+
+
+def test_the_official_folders_join_into_sessions(official, tmp_path):
+    """Of neighbouring folders 82 % start less than a minute apart in data2, 34 % in data3: so many joints have the sessions."""
+    table = read(official[0], tmp_path / "out", check="none").manifest.table
+    joined = {}
+    for rig in ("data2", "data3"):
+        own = table.filter(table["domain"] == rig)
+        folders = own["video"].n_unique()
+        joined[rig] = (folders - own["session"].n_unique()) / (folders - 1)
+        starts = sorted(float(v.rpartition("-")[2]) for v in own["video"].unique())
+        assert joined[rig] == pytest.approx(np.mean(np.diff(starts) < 60))
+    assert round(joined["data2"], 2) == 0.82
+    assert round(joined["data3"], 2) == 0.34
+    alone = read(official[0], tmp_path / "alone", check="none", session_gap=0.0).manifest.table
+    assert alone["session"].n_unique() == 279
+
+
+def test_the_official_ssvtp_rows_and_all_adjectives(official, tmp_path):
+    root, _ = official
+    found = read(root, tmp_path / "out", format="ssvtp", check="none")
+    assert len(found.manifest) == 46
+    assert set(found.manifest.column("video")) == {None}
+    assert found.facts["text_source"] == "column caption"
+    both = found.manifest.column("text") + read(root, tmp_path / "hct", check="none").manifest.column("text")
+    words = {word for text in both for word in text.split(", ")}
+    assert len(words) == 70  # 71 with the empty one after the comma that ends 'textured, stiff, rigid,'
+    assert all(word == word.strip().lower() and "." not in word and word for word in words)
+
+
+# ---------------------------------------------------------------- lists in every dialect
+
+
+def rewrite(root: Path, dialect: str) -> None:
+    """Writes the lists of an HCT tree anew."""
+    above: dict[str, list[list[str]]] = {}
+    for path in sorted(root.glob("data*/*.csv")):
+        rig, part = path.parent.name, path.stem
+        rows = [list(cells.values()) for _, cells in tvl.read_csv(path, [])]
+        header: list[str] | None = list(COLUMNS)
+        if dialect == "no header":
+            header = None
+        elif dialect == "foreign header":
+            header = ["photo", "touch", "empty", "words"]
+        elif dialect == "index":
+            header, rows = ["", *COLUMNS], [[str(k), *row] for k, row in enumerate(rows)]
+        elif dialect == "index without header":
+            header, rows = None, [[str(k), *row] for k, row in enumerate(rows)]
+        elif dialect == "other order":
+            header, rows = list(COLUMNS[::-1]), [row[::-1] for row in rows]
+        elif dialect == "url is the index":
+            header = ["", *COLUMNS[1:]]
+        elif dialect in ("from hct", "one list", "from above"):
+            rows = [[f"{'hct/' * (dialect == 'from above')}{rig}/{cell}" for cell in row[:3]] + row[3:] for row in rows]
+        elif dialect == "dots":
+            rows = [[f"./{cell}".replace("/vision/", "//vision/") for cell in row[:3]] + row[3:] for row in rows]
+        if dialect == "one list":
+            path.unlink()
+            above.setdefault(part, []).extend(rows)
+            continue
+        write_csv(path, header, rows)
+        text = path.read_bytes().replace(b"\r\n", b"\n")
+        if dialect == "windows":
+            text = b"\xef\xbb\xbf" + text.replace(b"\n", b"\r\n")
+        elif dialect == "mark without header":
+            text = b"\xef\xbb\xbf" + text.split(b"\n", 1)[1]
+        elif dialect == "no last newline":
+            text = text.rstrip(b"\n")
+        elif dialect == "capitals and blank lines":
+            text = text.replace(b"url,tactile", b"URL, Tactile").replace(b"\n", b"\n\n")
+        path.write_bytes(text)
+    for part, rows in above.items():
+        write_csv(root / f"{part}.csv", COLUMNS, rows)
+
+
+DIALECTS = [
+    "no header", "foreign header", "index", "index without header", "other order", "url is the index", "from hct", "one list", "from above",
+    "dots", "windows", "mark without header", "no last newline", "capitals and blank lines",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_lists_of_every_dialect_say_the_same(tree, tmp_path, dialect):
+    wanted = read(tree, tmp_path / "before")
+    rewrite(tree, dialect)
+    found = read(tree, tmp_path / "after")
+    assert found.manifest.digest == wanted.manifest.digest
+    assert found.splits["Orig"].digest == wanted.splits["Orig"].digest
+    assert found.suspicious == []
+
+
+def test_the_source_may_be_any_of_three_folders(tree, tmp_path, monkeypatch):
+    whole = read(tree, tmp_path / "a").manifest
+    above = read(tree.parent, tmp_path / "b").manifest
+    assert above.digest == whole.digest
+    one = read(tree / "data2", tmp_path / "c")
+    assert one.manifest.table.equals(whole.table.filter(whole.table["domain"] == "data2"))
+    assert one.splits["Orig"].counts() == {"train": 9, "test": 3}
+    monkeypatch.chdir(tree / "data2")
+    assert read(Path(), tmp_path / "d").manifest.digest == one.manifest.digest
+    forge_ssvtp(tree.parent)
+    assert ssvtp.detect(tree.parent) is False  # it holds hct/, which is taken
+    both = read(tree.parent, tmp_path / "e")
+    assert (both.facts["format"], [p.kind for p in both.suspicious]) == ("hct", ["other-half"])
+    assert len(read(tree.parent, tmp_path / "f", format="ssvtp").manifest) == 9
+    shutil.rmtree(tree)
+    assert read(tree.parent, tmp_path / "g").facts["format"] == "ssvtp"
+    for name in ("hct", "ssvtp"):
+        with pytest.raises(PalpateError, match="none of these"):
+            read(tmp_path, tmp_path / "out", format=name)
+
+
+# ---------------------------------------------------------------- writing lists
+
+
+@pytest.mark.parametrize("forge", [forge_hct, forge_ssvtp])
+@pytest.mark.parametrize("seed", range(3))
+def test_written_lists_read_back_as_the_same_split(tmp_path, forge, seed):
+    root = forge(tmp_path / "in").source
+    if forge is forge_hct:  # one trajectory with a background above dataN, one without
+        videos = sorted({p.parent for p in root.glob("data*/*/vision")})
+        (videos[0] / "background.png").rename(root / "digit_background.png")
+    before = read(root, tmp_path / "before").manifest
+    order = np.random.default_rng(seed).permutation(before.ids)
+    split = Split({str(i): ("train", "train", "val", "test")[k % 4] for k, i in enumerate(order)})
+    files = write_lists(before, split, tmp_path / "lists")
+    after = read(root, tmp_path / "after", lists=tmp_path / "lists")
+    assert after.splits["Lists"].parts == split.parts
+    assert after.manifest.digest == before.digest
+    for file in files:  # and in place
+        shutil.copy(file, root / file.relative_to(tmp_path / "lists"))
+    again = read(root, tmp_path / "again")
+    assert again.splits["Orig"].parts == split.parts
+    assert again.manifest.digest == before.digest
+    assert (after.suspicious, again.suspicious) == ([], [])
+    with pytest.raises(PalpateError, match="must hold"):
+        read(root, tmp_path / "out", lists=tmp_path / "nowhere")
+
+
+def test_lists_of_hct_need_rows_of_its_rigs(presses, tmp_path):
+    manifest = read(presses, tmp_path / "a").manifest
+    with pytest.raises(PalpateError, match="below the folder of its domain"):
+        hct.write_lists(manifest, Split(dict.fromkeys(manifest.ids, "train")), tmp_path / "lists")
+
+
+# ---------------------------------------------------------------- SSVTP
+
+
+def test_ssvtp_finds_touch_and_text_by_the_id_and_tells_what_disagrees(presses, tmp_path):
+    whole = read(presses, tmp_path / "whole").manifest
+    write_csv(
+        presses / "train.csv", ("url", "tactile", "caption"),
+        [
+            ["images_rgb/image_3_rgb.jpg", "images_tac/image_12_tac.jpg", "x"],  # 2: another's touch, other words
+            ["ssvtp/images_rgb/image_12_rgb.jpg", "ssvtp/images_tac/image_12_tac.jpg", "Fabric, coarse, deformable."],
+            ["images_tac/image_21_tac.jpg", "", ""],  # 4: the touch for the photo
+            ["images_rgb/image_437.jpg", "images_tac/image_437_rgb.jpg", ""],  # 5: suffixes wrong
+            ["images_rgb/image_438_rgb.png", "images_tac/image_438_tac.png", ""],  # 6: another suffix
+            ["./images_rgb/image_1000_rgb.jpg", "images_tac//image_1000_tac.jpg", ""],
+            ["images_rgb/image_1001_rgb.jpg", "", ""],
+        ],
+    )  # fmt: skip
+    found = read(presses, tmp_path / "found")
+    assert found.manifest.digest == whole.digest
+    assert [(p.where, p.kind, p.text.split(" row")[0]) for p in found.suspicious] == [
+        (f"{presses / 'train.csv'}:2", "misnamed-path", "4"), (f"{presses / 'train.csv'}:2", "two-captions", "1"),
+    ]  # fmt: skip
+    assert "text/labels_<id>.txt" in found.facts["text_source"]
+
+
+@pytest.mark.parametrize("rows", [None, ("url", "caption"), ("", "tactile", "caption"), ("url",), ()])
+def test_ssvtp_lists_of_every_width(presses, tmp_path, rows):
+    whole = read(presses, tmp_path / "whole").manifest
+    cells = [
+        dict(zip(("url", "tactile", "caption"), r, strict=False))
+        for r in [[v, t, ""] for v, t in zip(whole.column("vision"), whole.column("tactile"), strict=True)]
+    ]
+    (presses / "test.csv").unlink()
+    if rows is None:  # no list at all
+        (presses / "train.csv").unlink()
+    elif rows == ():  # no header
+        write_csv(presses / "train.csv", None, [[c["url"], c["tactile"]] for c in cells])
+    else:
+        write_csv(presses / "train.csv", rows, [[c[name or "url"] for name in rows] for c in cells])
+    found = read(presses, tmp_path / "found")
+    assert found.manifest.digest == whole.digest
+    assert found.splits["Orig"].counts() == {"train": 9} if rows is not None else not found.splits
+
+
+def test_ssvtp_counts_its_losses(presses, tmp_path):
+    (presses / "images_tac" / "image_12_tac.jpg").unlink()
+    (presses / "images_rgb" / "image_21_rgb.jpg").unlink()
+    (presses / "images_rgb" / "image_437_rgb.jpg").write_bytes(b"")
+    (presses / "text" / "labels_4210.txt").unlink()
+    for line in ("images_rgb/photo.jpg,x,y", "../image_1_rgb.jpg,x,y", "images_rgb/image_3_rgb.jpg,,again", ",x,y"):
+        with (presses / "train.csv").open("a") as file:
+            file.write(f"{line}\n")
+    with pytest.raises(ProblemsError) as caught:
+        read(presses, tmp_path / "out")
+    wanted = {"missing-file": 2, "bad-image": 1, "bad-path": 1, "outside-root": 1, "duplicate-id": 1, "empty-cell": 1}
+    assert kinds(caught.value.problems) == wanted
+    found = read(presses, tmp_path / "out", skip_bad=True)
+    assert len(found.manifest) == 6
+    assert kinds(found.suspicious) == {"two-captions": 1}
+    assert dict(zip(found.manifest.ids, found.manifest.column("text"), strict=True))["ssvtp/4210"] == "fabric, coarse, deformable"
+    for name in ("train", "test"):
+        (presses / f"{name}.csv").unlink()
+    with pytest.raises(ProblemsError) as caught:
+        read(presses, tmp_path / "out2")
+    assert kinds(caught.value.problems) == {"unpaired": 2, "bad-image": 1}
+
+
+def test_ssvtp_tells_unlisted_photos_absent_words_and_the_background(presses, tmp_path):
+    write_csv(presses / "train.csv", ("url", "caption"), [["images_rgb/image_3_rgb.jpg", ""]])
+    (presses / "text" / "labels_3.txt").write_text("\n")
+    put(presses / "tac_background.png", gel(0, pressed=False))
+    found = read(presses, tmp_path / "out")
+    assert set(found.manifest.column("background")) == {"tac_background.png"}
+    assert {(p.kind, p.text.split()[0]) for p in found.suspicious} == {("unlisted", "6"), ("no-text", "1")}
+    assert found.manifest.column("text")[0] is None
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        (" Soft ,  FUZZY.", "soft, fuzzy"), ("textured, stiff, rigid,", "textured, stiff, rigid"), ("a.b", "ab"), (" . , ", None), ("", None),
+        (None, None), ("two  words\n, x", "two words, x"),
+    ],
+)  # fmt: skip
+def test_captions_are_cleaned(given, wanted):
+    assert tvl.clean_caption(given) == wanted
