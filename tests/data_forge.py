@@ -1,5 +1,7 @@
 """Small data sets in the true on-disk layouts, whose frames carry their own number."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -56,3 +58,24 @@ def write_frames(folder: Path, count: int) -> None:
 def tree(folder: Path) -> set[str]:
     """All files and folders below ``folder``."""
     return {p.relative_to(folder).as_posix() for p in folder.rglob("*")} if folder.exists() else set()
+
+
+@dataclass(frozen=True)
+class Forged:
+    """A small data set that a forge wrote, all of it below the folder that the forge was given.
+
+    Attributes:
+        source: what a user would name: a folder or a table.
+        samples: how many samples an import must find in it.
+        options: options of the import that it needs; paths below the folder follow a copied tree.
+        auto: whether the format must be recognised by look; False only where nothing on disk tells it (a remote name).
+        remove: takes away what one sample needs, given the source; default: deletes the touch image of the last sample.
+        cut: spoils it instead; default: cuts that file in half.
+    """
+
+    source: Path
+    samples: int
+    options: Mapping[str, object] = field(default_factory=dict)
+    auto: bool = True
+    remove: Callable[[Path], None] | None = None
+    cut: Callable[[Path], None] | None = None

@@ -9,7 +9,7 @@ import pytest
 from data_forge import tree, write_frames, write_image
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.formats import FORMATS
-from palpate.data.importing import import_dataset
+from palpate.data.importing import import_dataset, validate_dataset
 from palpate.data.manifest import Manifest
 
 import_pairs = partial(import_dataset, format="pairs")
@@ -102,8 +102,12 @@ def test_bad_lines_of_jsonl_and_foreign_parquet(images, tmp_path):
 
 def test_missing_columns_and_wrong_names_are_told(images, tmp_path):
     table = write_table(images / "pairs.csv")
+    lone = import_pairs(table, tmp_path / "lone")  # touch_path is no name of ours: told, as one image a sample may be meant
+    assert [(p.where, p.kind) for p in lone.suspicious] == [(str(table), "one-sided")]
+    assert "no column tactile" in lone.suspicious[0].text
+    (images / "neither.csv").write_text("clip,touch_path\nx,t/0.jpg\n")
     with pytest.raises(PalpateError, match="no tactile among clip"):
-        import_pairs(table, tmp_path / "out")
+        import_pairs(images / "neither.csv", tmp_path / "out")
     with pytest.raises(PalpateError, match="no clap among"):
         import_pairs(table, tmp_path / "out", columns={"video": "clap", "tactile": "touch_path"})
     with pytest.raises(PalpateError, match="'clip'"):
@@ -176,8 +180,183 @@ def test_formats_are_found_by_look_or_what_was_looked_for_is_listed(tmp_path):
     assert "readme.txt" in caught.value.got
     with pytest.raises(PalpateError, match="nothing at"):
         import_dataset(tmp_path / "none", tmp_path / "out2")
-    with pytest.raises(PalpateError, match="auto or one of touch-and-go, pairs"):
+    with pytest.raises(PalpateError, match=r"auto or one of touch-and-go, .*pairs"):
         import_dataset(tmp_path / "tag", tmp_path / "out2", format="zip")
     with pytest.raises(PalpateError, match="columns"):
         import_dataset(tmp_path / "tag", tmp_path / "out2", columns={"a": "b"})
     assert not (tmp_path / "out2").exists()
+
+
+def problems_of(table, **options):
+    return [(p.where.rpartition(":")[2], p.kind) for p in validate_dataset(table, format="pairs", **options).invalid]
+
+
+def test_json_arrays_know_their_lines(images, tmp_path):
+    table = images / "p.json"
+    table.write_bytes(
+        b'\xef\xbb\xbf[\r\n {"vision": "v/0.jpg",\n  "tactile": "t/0.jpg"}, 7,\n\n{"vision": "v/1.jpg", "tactile": "t/1.jpg"},\n{"vision": oops}]'
+    )
+    assert problems_of(table) == [("3", "bad-row"), ("6", "bad-row")]
+    found = import_pairs(table, tmp_path / "out", skip_bad=True)
+    assert found.manifest.column("vision") == ["v/0.jpg", "v/1.jpg"]
+    table.write_text('[{"vision": "v/0.jpg"} {"vision": "v/1.jpg"}]')
+    assert problems_of(table) == [("1", "bad-row")]
+    table.write_text('{"vision": ["v/0.jpg"]}')
+    with pytest.raises(PalpateError, match="a JSON list of objects"):
+        import_pairs(table, tmp_path / "out")
+
+
+@pytest.mark.parametrize("sign", [",", ";", "\t"])
+@pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_odd_but_right_files(images, tmp_path, sign, code, end):
+    name = "größe, ½\u2028 x.jpg"  # a line separator that is not the end of a line
+    write_image(images / "v" / name, 1)
+    lines = [
+        f"vision{sign}tactile{sign}text",
+        "",
+        f'"v/{name}"{sign}t/0.jpg{sign}"a ""b"""',
+        f'v/1.jpg{sign}t/1.jpg{sign}5" pipe',
+        f"{sign}{sign} ",
+    ]
+    (images / "odd.csv").write_bytes(end.join(lines).encode(code))
+    manifest = import_pairs(images / "odd.csv", tmp_path / "out").manifest
+    assert manifest.column("vision") == [f"v/{name}", "v/1.jpg"]
+    assert manifest.column("text") == ['a "b"', '5" pipe']
+
+
+def test_rows_that_cannot_be_right_are_told_by_line(images):
+    table = images / "bad.csv"
+    table.write_bytes(
+        b'vision,tactile,frame\nv/0.jpg,t/0.jpg,-1\nv/\xff.jpg,t/0.jpg,1\nv/\x00.jpg,t/0.jpg,1\nv/1.jpg,t/1.jpg,2.5\nv/1.jpg,t/1.jpg,2.0\n"v/2.jpg,t/2.jpg,1\nv/3.jpg,t/3.jpg,1\n'
+    )
+    assert problems_of(table) == [("2", "bad-frame"), ("3", "bad-encoding"), ("4", "bad-encoding"), ("5", "bad-frame"), ("7", "open-quote")]
+    table = images / "bad.jsonl"
+    table.write_text(
+        '{"vision": "v/0.jpg", "text": "\\ud800"}\n{"vision": ["v/0.jpg"]}\n{"vision": "v/1.jpg", "text": "\\u0000"}\n' + "[" * 100_000
+    )
+    assert problems_of(table) == [("1", "bad-encoding"), ("2", "bad-row"), ("3", "bad-encoding"), ("4", "bad-row")]
+
+
+def test_paths_that_no_file_can_have(images):
+    table = images / "t.csv"
+    table.write_text("vision\n" + "ä" * 200 + ".jpg\n" + "v/" * 200 + "0.jpg\nv\n.\nv/0.jpg/x\n~/v/0.jpg\n../x.jpg\nv/0.jpg\n")
+    looked = validate_dataset(table)
+    assert problems_of(table) == [("2", "bad-path"), ("8", "outside-root")]
+    assert [int(p.where.rpartition(":")[2]) for p in looked.missing] == [3, 4, 5, 6, 7]
+
+
+def test_one_modality_is_enough_and_paths_may_follow_from_another(images, tmp_path):
+    table = images / "lone.csv"
+    table.write_text("vision\nv/0.jpg\nv/1.jpg\n")
+    found = import_pairs(table, tmp_path / "a")
+    assert (found.manifest.ids, found.manifest.column("tactile")) == (["v/0", "v/1"], [None, None])
+    found = import_pairs(
+        table, tmp_path / "b", columns={"tactile": "replace(vision, 'v/', 't/')", "frame": "vision ~ /(\\d)/", "video": "'x'"}
+    )
+    assert found.manifest.column("tactile") == ["t/0.jpg", "t/1.jpg"]
+    assert found.manifest.ids == ["x/0", "x/1"]
+    assert found.suspicious == []
+
+
+def test_a_map_that_fails_is_a_problem_of_its_row(images, tmp_path):
+    table = images / "t.csv"
+    table.write_text("vision,tactile\nv/0.jpg,t/0.jpg\nv/1.jpg,t/1.jpg\n")
+    with pytest.raises(ProblemsError) as caught:
+        import_pairs(table, tmp_path / "out", columns={"frame": "vision ~ /1/"})
+    (problem,) = caught.value.problems
+    assert (problem.where, problem.kind) == (f"{table}:2", "bad-map")
+    assert "frame has no value: vision ~ /1/: no match in 'v/0.jpg'" in problem.text
+    with pytest.raises(PalpateError, match="no clap among vision, tactile, at character 6"):
+        import_pairs(table, tmp_path / "out", columns={"frame": "stem(clap)"})
+
+
+def test_groups_of_some_rows_only_are_told_with_their_number(images, tmp_path):
+    table = images / "t.csv"
+    table.write_text("vision,tactile,video,object\nv/0.jpg,t/0.jpg,a,\nv/1.jpg,t/1.jpg,,\nv/2.jpg,t/2.jpg,,\n")
+    found = import_pairs(table, tmp_path / "out")
+    assert [p.kind for p in found.suspicious] == ["null-group"]
+    assert found.suspicious[0].text.startswith("2 of 3 rows have no video")
+    assert f"{table}:3" in found.suspicious[0].text
+    assert validate_dataset(table).ok
+
+
+@pytest.mark.parametrize(
+    "text", ['Wood: 3\n"Synthetic  Fabric": 8 (soft)\n', "id,name\n3,Wood\n8,Synthetic Fabric\n", "Wood;3\r\nSynthetic Fabric;8"]
+)
+def test_classes_name_numbers_and_unknown_ones_are_problems(images, tmp_path, text):
+    (images / "c.txt").write_text(text)
+    table = images / "t.csv"
+    table.write_text(
+        "vision,tactile,material\n" + "".join(f"v/{k}.jpg,t/{k}.jpg,{m}\n" for k, m in enumerate(("3", "8.0", "-1", "Wood", "", "9")))
+    )
+    assert problems_of(table, classes=images / "c.txt") == [("7", "unknown-label")]
+    found = import_pairs(table, tmp_path / "out", classes=images / "c.txt", skip_bad=True)
+    assert found.manifest.column("material") == ["Wood", "Synthetic Fabric", "Wood", None]
+    assert found.inconclusive == 1
+    for bad, word in (("3,Wood\n3,Rock\n", "duplicate-id"), ("3,Wood\nx,y\n", "bad-line"), ("", "none"), ("a,b\n", "none")):
+        (images / "c.txt").write_text(bad)
+        with pytest.raises(PalpateError, match=word):
+            import_pairs(table, tmp_path / "bad", classes=images / "c.txt")
+
+
+def test_parquet_cells_of_any_type_and_brackets_in_names(images, tmp_path):
+    rows = {
+        "vision": ["v/0.jpg", "v/1.jpg"],
+        "frame": [3.0, None],
+        "material": pl.Series(["a", "b"], dtype=pl.Categorical),
+        "text": [1, 2],
+        "emb": [[1.0], [2.0]],
+    }
+    pl.DataFrame(rows).write_parquet(images / "p[1]*.parquet")
+    manifest = import_dataset(images / "p[1]*.parquet", tmp_path / "out").manifest
+    assert manifest.table.select("frame", "material", "text").rows() == [(3, "a", "1"), (None, "b", "2")]
+    for bad, word in (
+        ({"vision": [b"x"]}, "vision of type Binary.*--format hf"),
+        ({"vision": ["v/0.jpg"], "text": [["x"]]}, "text of type List"),
+    ):
+        pl.DataFrame(bad).write_parquet(images / "bad.parquet")
+        with pytest.raises(PalpateError, match=word):
+            import_pairs(images / "bad.parquet", tmp_path / "bad")
+
+
+def test_a_column_of_parts_becomes_the_split(images, tmp_path):
+    table = images / "t.csv"
+    table.write_text(
+        "vision,tactile,fold\n./v/0.jpg,./t/0.jpg,train\nv/1.jpg,t/1.jpg,Validation\nv/2.jpg,t/2.jpg,\nv/3.jpg,t/3.jpg,later\n"
+    )
+    found = import_pairs(table, tmp_path / "out", columns={"split": "fold"}, skip_bad=True)
+    assert dict(found.splits["Orig"].parts) == {"t/0": "train", "t/1": "val"}
+    assert [p.kind for p in found.skipped] == ["unknown-part"]
+    assert found.manifest.ids == ["t/0", "t/1", "t/2"]
+
+
+def test_tables_without_a_header(images, tmp_path):
+    (images / "list.txt").write_text("0.jpg,3\n1.jpg,4")
+    maps = {"vision": "'v/' + path", "tactile": "'t/' + path", "material": "label"}
+    found = import_pairs(images / "list.txt", tmp_path / "out", names="path, label", columns=maps)
+    assert found.manifest.column("tactile") == ["t/0.jpg", "t/1.jpg"]
+    assert found.manifest.column("material") == ["3", "4"]
+    with pytest.raises(PalpateError, match="A table must be one of"):
+        import_pairs(images / "list.txt", tmp_path / "out2")
+
+
+def test_a_folder_of_one_kind_of_images(tmp_path):
+    for name in ("b/x 2.png", "b/deep/7.jpg", "a.jpg", ".hidden/1.jpg"):
+        write_image(tmp_path / "d" / name, 1)
+    found = import_dataset(tmp_path / "d", tmp_path / "out", side="tactile")
+    rows = found.manifest.require_valid().table.select("id", "video", "frame", "vision", "tactile").rows()
+    assert rows == [
+        ("a", None, None, None, "a.jpg"), ("b/deep/7", "b/deep", 7, None, "b/deep/7.jpg"), ("b/x 2", "b", 2, None, "b/x 2.png"),
+    ]  # fmt: skip
+    mapped = import_dataset(tmp_path / "d", tmp_path / "out2", side="vision", columns={"video": "part(path, 0)", "sensor": "'DIGIT'"})
+    assert mapped.manifest.column("video") == ["a.jpg", "b", "b"]
+    assert mapped.manifest.column("sensor") == ["DIGIT"] * 3
+    with pytest.raises(PalpateError, match="--as vision or --as tactile"):
+        import_dataset(tmp_path / "d", tmp_path / "out3")
+
+
+def test_links_in_circles_end(tmp_path):
+    write_image(tmp_path / "d" / "a" / "1.jpg", 1)
+    (tmp_path / "d" / "a" / "again").symlink_to(tmp_path / "d")
+    assert len(import_dataset(tmp_path / "d", tmp_path / "out", side="vision").manifest) == 1

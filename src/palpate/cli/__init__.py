@@ -24,6 +24,8 @@ class Verb:
 
 VERBS: dict[str, Verb] = {
     "import": Verb("importing", "Turn a data set on disk into a manifest", "palpate import touch_and_go/ -o tag/"),
+    "validate": Verb("validate", "Tell what is missing, invalid or suspicious in a data set", "palpate validate touch_and_go/"),
+    "export": Verb("export", "Write a manifest as a Hugging Face data set or a table", "palpate export tag/ --to hf -o tag_hf/"),
     "audit": Verb("audit", "Tell whether a train/test split leaks", "palpate audit train.txt test.txt --fail-over 0.01"),
     "split": Verb("split", "Make a split that does not leak, stratified by material", "palpate split tag/ -o noleak.json"),
     "world": Verb("world", "Write the procedural world: a small synthetic data set", "palpate world -o world/ --preset demo"),

@@ -75,7 +75,9 @@ def validate_dataset(
     """
     name, found = _format(Path(source), format)
     given = _given(name, found, options)
-    if "check" in inspect.signature(found.scan).parameters:
+    taken = inspect.signature(found.scan).parameters
+    given = {key: value for key, value in given.items() if key in taken}  # some options matter to an import alone
+    if "check" in taken:
         given["check"] = check
     return validation(name, found, found.scan(Path(source), progress=progress, **given), check=check, progress=progress)
 
@@ -104,7 +106,9 @@ def _format(source: Path, name: str) -> tuple[str, Format]:
     if name != "auto" and name not in FORMATS:
         raise PalpateError(f"The format must be auto or one of {', '.join(FORMATS)}", repr(name), "Choose one of these")
     if not source.exists() and (name == "auto" or not FORMATS[name].remote):
-        raise PalpateError("The source of an import must exist", f"nothing at {source}", "Check the path")
+        raise PalpateError(
+            "The source of an import must exist", f"nothing at {source}", "Check the path; for a data set on the hub: --format hf"
+        )
     if name == "auto":
         name = next((n for n, f in FORMATS.items() if f.detect(source)), "")
     if not name:

@@ -70,9 +70,7 @@ class Manifest:
         unknown = sorted({name for row in rows for name in row} - set(SCHEMA))
         if unknown:
             raise PalpateError(f"Manifest columns must be among {', '.join(SCHEMA)}", repr(unknown[0]), "Map the column to one of these")
-        return cls(
-            pl.DataFrame([{name: row.get(name) for name in SCHEMA} for row in rows], schema=SCHEMA, orient="row"), Path(root), facts or {}
-        )
+        return cls(pl.DataFrame({name: [row.get(name) for row in rows] for name in SCHEMA}, schema=SCHEMA), Path(root), facts or {})
 
     def __len__(self) -> int:
         return self.table.height
@@ -230,8 +228,9 @@ class Manifest:
         if not path.is_file():
             raise PalpateError("The manifest must exist", f"no file {path}", fix)
         try:
-            meta = pl.read_parquet_metadata(path)
-            table = pl.read_parquet(path)
+            with open(path, "rb") as file:
+                meta = pl.read_parquet_metadata(file)
+            table = pl.read_parquet(path, glob=False)  # a path may hold brackets
         except Exception as error:  # polars raises several kinds for a file that is not Parquet
             raise PalpateError(f"The manifest {path} must be a Parquet file", str(error).splitlines()[0], fix) from None
         if meta.get("palpate.format") != FORMAT or list(table.columns) != list(SCHEMA):

@@ -64,7 +64,8 @@ def is_manifest(path: Path) -> bool:
     if path.suffix.lower() != ".parquet":
         return False
     try:
-        return str(pl.read_parquet_metadata(path).get("palpate.format", "")).startswith("palpate-manifest/")
+        with open(path, "rb") as file:
+            return str(pl.read_parquet_metadata(file).get("palpate.format", "")).startswith("palpate-manifest/")
     except Exception:  # polars raises several kinds for a file that is not Parquet; whoever reads it next says so
         return False
 

@@ -192,7 +192,11 @@ def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) ->
         leaves = not folders[folder] or name in ("", "..") or "\\" in name or given.startswith("/") or path.is_symlink()
         if leaves and inside(root, given) is None:
             return "outside-root", f"the path {given!r} leaves the root {base}"
-        return None if path.is_file() else ("missing-file", f"no file {given!r} in {base}")
+        try:
+            there = path.is_file()
+        except OSError as error:  # e.g. a name that is too long for the disk
+            return "missing-file", f"{given!r} cannot be a file: {error.strerror}"
+        return None if there else ("missing-file", f"no file {given!r} in {base}")
 
     for where, row in rows:
         fine = True

@@ -1,0 +1,174 @@
+"""The verbs import, validate and export: options of every format, statuses, JSON, and what is told."""
+
+import json
+import re
+
+import pytest
+
+from data_forge import write_image
+from forges import FORGES
+from palpate.cli import main
+from palpate.cli.importing import FLAGS, described, format_options
+from palpate.core import Split
+from palpate.data.formats import FORMATS
+from palpate.data.manifest import Manifest
+
+
+def call(capsys, *args):
+    status = main([str(a) for a in args])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+@pytest.fixture
+def tag(tmp_path):
+    return FORGES["touch-and-go"](tmp_path / "forged").source
+
+
+@pytest.fixture
+def table(tmp_path):
+    for k in range(4):
+        write_image(tmp_path / "data" / "v" / f"{k}_rgb.jpg", k)
+        write_image(tmp_path / "data" / "t" / f"{k}_tac.jpg", k)
+    path = tmp_path / "data" / "t.csv"
+    path.write_text("url,kind,clip\n" + "".join(f"v/{k}_rgb.jpg,{k % 2},{'a' if k else ''}\n" for k in range(4)))
+    (tmp_path / "data" / "classes.txt").write_text("Wood: 0\nRock: 1\n")
+    return path
+
+
+MAPS = ["--map", "vision=url", "tactile=replace(replace(url, 'v/', 't/'), '_rgb', '_tac')", "--map", "material=kind", "video=clip"]
+
+
+def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path):
+    args = ["import", table, "-o", tmp_path / "m", *MAPS, "--classes", table.parent / "classes.txt"]
+    status, out, err = call(capsys, *args, "--json")
+    facts = json.loads(out)
+    assert (status, facts["samples"], facts["materials"], facts["skipped"]) == (0, 4, 2, [])
+    assert [p["kind"] for p in facts["suspicious"]] == ["null-group"]
+    assert Manifest.load(tmp_path / "m").column("tactile") == [f"t/{k}_tac.jpg" for k in range(4)]
+    status, out, err = call(capsys, *args)
+    assert "Suspicious, but imported: 1" in err
+    assert "1 of 4 rows have no video" in err
+
+
+def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
+    args = [
+        "import",
+        tag,
+        "-o",
+        tmp_path / "m",
+        "--set",
+        f"labels={tag / 'train.txt'}",
+        "--set",
+        "seed=3",
+        "image_format=png",
+        "--max-per-touch",
+        "1",
+        "--json",
+    ]
+    status, out, _ = call(capsys, *args)
+    assert (status, json.loads(out)["samples"]) == (0, 2)
+    status, out, _ = call(capsys, *args, "--set", f"labels={tag / 'test.txt'}")
+    assert (status, json.loads(out)["samples"]) == (0, 4)
+    assert call(capsys, "validate", tag, *args[4:8])[0] == 0  # the same line serves to look first
+    status, out, _ = call(capsys, "validate", tag, "--set", f"labels={tag / 'train.txt'}", "seed=3", "--json")
+    assert (status, json.loads(out)["samples"]) == (0, 6)
+
+
+@pytest.mark.parametrize(("args", "word"), [
+    (["--set", "colour=red"], "--set of the format touch-and-go takes labels, image_format, seed"), (["--set", "seed=three"], "--set seed must be a whole number"),
+    (["--set", "image_format=gif"], "jpg|png"), (["--set", "seed"], "--set takes OPTION=VALUE"), (["--set", "seed=1", "seed=2"], "must stand once"), (["--set", "size=3"], "Write --size"),
+    (["--map", "video=a", "--map", "video=b"], "each column once"), (["--map", "video="], "--map takes"), (["--format", "zip"], "auto or one of"), (["--format", "zip", "--set", "a=b"], "must be known"),
+    (["--as", "vision"], "side"),
+])  # fmt: skip
+@pytest.mark.parametrize("verb", ["import", "validate"])
+def test_mistakes_in_options_are_one_line_and_status_2(capsys, tag, tmp_path, verb, args, word):
+    status, out, err = call(capsys, verb, tag, *(["-o", tmp_path / "m"] if verb == "import" else []), *args)
+    assert (status, out, word in err, "Traceback" in err) == (2, "", True, False), err
+    assert not (tmp_path / "m").exists()
+
+
+def test_validation_tells_facts_and_fails_on_what_is_asked(capsys, tag, table, tmp_path):
+    status, out, _ = call(capsys, "validate", tag)
+    assert status == 0
+    assert re.search(r"^samples +12 *$", out, re.MULTILINE)
+    for words in (
+        "CC BY 4.0",
+        "121,861 frames of 126 videos",
+        "https://touch-and-go.github.io",
+        "640 x 480",
+        "(0.51808, 0.503, 0.51457)",
+        "Whole.",
+    ):
+        assert words in out
+    (tag / "dataset" / "20220601_182052" / "gelsight_frame" / "0000000007.jpg").unlink()
+    status, out, _ = call(capsys, "validate", tag)
+    assert (status, "Missing: 1" in out, "Not whole: missing." in out) == (1, True, True)
+    assert call(capsys, "validate", tag, "--fail-on", "invalid")[0] == 0
+    status, out, _ = call(capsys, "validate", tag, "--json")
+    data = json.loads(out)
+    assert (status, data["ok"], data["failed"], data["samples"], len(data["missing"]), data["invalid"]) == (
+        1,
+        False,
+        ["missing"],
+        11,
+        1,
+        [],
+    )
+    assert data["missing"][0]["kind"] == "missing-file"
+    assert data["facts"]["licence"] == "CC BY 4.0"
+    assert call(capsys, "validate", table, *MAPS)[0] == 0
+    status, out, _ = call(capsys, "validate", table, *MAPS, "--fail-on", "suspicious")
+    assert (status, "Suspicious: 1" in out) == (1, True)
+    assert call(capsys, "validate")[0] == 2
+
+
+def test_forty_problems_are_shown_and_all_are_in_json(capsys, table):
+    table.write_text("vision,tactile\n" + "x.jpg,y.jpg\n" * 30)
+    status, out, _ = call(capsys, "validate", table)
+    assert (status, out.count("no file"), "... and 20 more" in out) == (1, 40, True)
+    assert len(json.loads(call(capsys, "validate", table, "--json")[1])["missing"]) == 60
+
+
+def test_the_list_of_formats_names_every_option(capsys):
+    status, out, _ = call(capsys, "validate", "--list")
+    data = json.loads(call(capsys, "validate", "--list", "--json")[1])
+    assert (status, list(data)) == (0, list(FORMATS))
+    for name, format in FORMATS.items():  # noqa: A001
+        assert f"\n{name}\n" in f"\n{out}"
+        assert set(data[name]["options"]) | set(FLAGS) >= set(format.options)
+        for key, kind in format_options(name).items():
+            assert f"--set {key}=" in out
+            assert "typing" not in described(kind)
+            assert "class" not in described(kind)
+
+
+def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
+    status, out, _ = call(capsys, "import", table.parent / "v", "--as", "vision", "-o", tmp_path / "m", "--json")
+    assert (status, json.loads(out)["samples"]) == (0, 4)
+    status, _, err = call(capsys, "import", table.parent / "v", "-o", tmp_path / "n")
+    assert (status, "--as vision or --as tactile" in err) == (2, True)
+    status, _, err = call(capsys, "import", table, "--as", "vision", "-o", tmp_path / "n")
+    assert (status, "what a folder of images shows" in err) == (2, True)
+
+
+def test_export_says_how_to_read_it_again_and_that_works(capsys, small_manifest, tmp_path):
+    small_manifest.save(tmp_path / "m" / "manifest.parquet")
+    Split({i: "train" if k % 2 else "test" for k, i in enumerate(small_manifest.ids)}).save(tmp_path / "s.json")
+    status, out, _ = call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "e", "--split", tmp_path / "s.json")
+    assert status == 0
+    command = out.split("again with: palpate ")[1].split()
+    assert call(capsys, *command[:-1], tmp_path / "again", "--json")[0] == 0
+    assert Manifest.load(tmp_path / "again").digest == small_manifest.digest
+    assert Split.load(tmp_path / "again" / "splits" / "Orig.json").digest == Split.load(tmp_path / "s.json").digest
+    assert call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "e")[0] == 2
+    assert call(capsys, "export", tmp_path / "m", "-o", tmp_path / "f")[0] == 2
+
+
+def test_export_to_hugging_face_and_back(capsys, small_manifest, tmp_path):
+    pytest.importorskip("datasets", reason="the extra hf is not installed")
+    small_manifest.save(tmp_path / "m" / "manifest.parquet")
+    status, out, _ = call(capsys, "export", tmp_path / "m", "--to", "hf", "-o", tmp_path / "e", "--json")
+    assert (status, json.loads(out)["samples"]) == (0, 48)
+    assert call(capsys, "import", tmp_path / "e", "-o", tmp_path / "again")[0] == 0
+    assert Manifest.load(tmp_path / "again").digest == small_manifest.digest

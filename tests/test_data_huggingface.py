@@ -1,0 +1,215 @@
+"""Hugging Face data sets: what was exported comes back whole; foreign ones by maps; nothing runs, leaves the folder or is half written."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from generic_forge import hf_rows, save_hf
+from palpate.core import MissingExtraError, PalpateError, ProblemsError, Split
+from palpate.data.exporting import export_dataset
+from palpate.data.formats.huggingface_source import open_source
+from palpate.data.importing import import_dataset, validate_dataset
+from palpate.data.manifest import IMAGE_COLUMNS, Manifest
+
+datasets = pytest.importorskip("datasets", reason="the extra hf is not installed")
+MAPS = {"vision": "rgb", "tactile": "gel", "video": "parent(path)", "frame": "stem(gel)", "material": "kind"}
+
+
+def kinds():
+    return {"rgb": datasets.Image(), "gel": datasets.Image(), "kind": datasets.ClassLabel(names=["Wood", "Rock"])}
+
+
+@pytest.fixture
+def source(tmp_path):
+    return save_hf(tmp_path / "mine", hf_rows(tmp_path / "made"), **kinds())
+
+
+def same_bytes(one: Manifest, other: Manifest) -> bool:
+    return all(
+        (a is None and b is None) or one.path(a).read_bytes() == other.path(b).read_bytes()
+        for column in IMAGE_COLUMNS
+        for a, b in zip(one.column(column), other.column(column), strict=True)
+    )
+
+
+@pytest.mark.parametrize("form", ["saved", "parquet"])
+def test_a_foreign_set_keeps_its_bytes_parts_and_labels(source, tmp_path, form):
+    rows = hf_rows(tmp_path / "again")
+    if form == "parquet":
+        loaded, source = datasets.load_from_disk(str(source)), tmp_path / "shards"
+        (source / "data").mkdir(parents=True)
+        for part, data in loaded.items():
+            data.to_parquet(str(source / "data" / f"{part}-00000-of-00001.parquet"))
+    found = import_dataset(source, tmp_path / "out", columns=MAPS)
+    manifest = Manifest.load(tmp_path / "out").require_valid()
+    assert manifest.ids == [f"data1/0-17.{k // 4}/{k}" for k in range(8)]
+    assert manifest.column("frame") == list(range(8))
+    assert manifest.column("material") == ["Wood", "Rock"] * 4
+    assert [p.read_bytes() for p in manifest.paths("vision")] == [r["rgb"]["bytes"] for r in rows]
+    assert [p.read_bytes() for p in manifest.paths("tactile")] == [r["gel"]["bytes"] for r in rows]
+    assert {p.suffix for p in manifest.paths("vision")} == {".png"}
+    assert found.splits["Orig"].counts() == {"train": 5, "val": 3}
+    assert found.facts["format"] == "hf"
+    assert (found.facts["dataset"], found.facts["text_source"]) == (source.name, "none")
+
+
+@pytest.mark.parametrize("parted", [False, True])
+def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
+    table = small_manifest.table.sample(fraction=1, shuffle=True, seed=3)  # an order of its own, which the parts tear apart
+    facts = {
+        "dataset": "ours",
+        "licence": "CC0",
+        "citation": "nobody, 2024",
+        "url": "https://example.org",
+        "format": "touch-and-go",
+        "text_source": "none",
+    }
+    manifest = Manifest(table, small_manifest.root, facts)
+    split = Split({i: ("train", "val", "test")[k % 3] for k, i in enumerate(manifest.ids) if k % 7}, {"method": "mine"}) if parted else None
+    files = export_dataset(manifest, tmp_path / "hf", to="hf", split=split)
+    assert all(f.is_file() for f in files)
+    loaded = datasets.load_from_disk(str(tmp_path / "hf"))
+    assert sorted(loaded) == (["test", "train", "unused", "validation"] if parted else ["all"])
+    first = next(iter(loaded.values()))
+    assert isinstance(first.features["tactile"], datasets.Image)
+    assert first[0]["tactile"].size == (32, 32)
+    assert (first.info.license, first.info.citation) == ("CC0", "nobody, 2024")
+    assert json.loads(first.info.description)["digest"] == manifest.digest
+    again = import_dataset(tmp_path / "hf", tmp_path / "out")
+    assert again.manifest.digest == manifest.digest
+    assert dict(again.facts) == facts
+    assert same_bytes(manifest, again.manifest)
+    if split is None:
+        assert again.splits == {}
+    else:
+        assert again.splits["Orig"].digest == split.digest
+        assert again.splits["Orig"].rule == {"method": "mine"}
+
+
+@pytest.mark.parametrize(("to", "name"), [("csv", "manifest.csv"), ("jsonl", "manifest.jsonl"), ("parquet", "samples.parquet")])
+def test_tables_come_back_with_their_split(small_manifest, tmp_path, to, name):
+    table = small_manifest.table.with_columns(text=small_manifest.table["id"] + ', "so\n called" 5"')
+    manifest = Manifest(table, small_manifest.root, {})
+    split = Split({i: ("train", "test")[k % 2] for k, i in enumerate(manifest.ids) if k % 5})
+    files = export_dataset(manifest, tmp_path / "o", to=to, split=split)
+    assert {f.relative_to(tmp_path / "o").as_posix() for f in files} == {name, "lists/train.csv", "lists/test.csv"}
+    again = import_dataset(tmp_path / "o" / name, tmp_path / "out", root=manifest.root)
+    assert again.manifest.digest == manifest.digest
+    assert again.splits["Orig"].digest == split.digest
+
+
+def test_an_export_is_whole_or_absent(small_manifest, tmp_path):
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "x").touch()
+    with pytest.raises(PalpateError, match="absent or an empty folder"):
+        export_dataset(small_manifest, tmp_path / "o", to="csv")
+    with pytest.raises(PalpateError, match="must be in the manifest"):
+        export_dataset(small_manifest, tmp_path / "p", to="csv", split=Split({"none": "train"}))
+    small_manifest.paths("tactile")[3].unlink()
+    with pytest.raises(ProblemsError, match="missing-file"):
+        export_dataset(small_manifest, tmp_path / "p", to="hf")
+    assert not (tmp_path / "p").exists()
+
+
+def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_manifest, tmp_path):
+    rows = hf_rows(tmp_path / "made")
+    for row in rows:
+        row["gel"] = rows[0]["gel"]
+    found = import_dataset(save_hf(tmp_path / "mine", rows, **kinds()), tmp_path / "out", columns=MAPS | {"frame": "stem(path)"})
+    assert set(found.manifest.column("tactile")) == {"train/tactile/00000000.jpg"}
+    export_dataset(small_manifest, tmp_path / "hf", to="hf")
+    loaded = datasets.load_from_disk(str(tmp_path / "hf"))
+    outside = {"tactile_path": [f"../../{k}.png" for k in range(len(small_manifest))]}
+    evil = loaded["all"].remove_columns("tactile_path").add_column("tactile_path", outside["tactile_path"])
+    evil.save_to_disk(str(tmp_path / "evil"))
+    again = import_dataset(tmp_path / "evil", tmp_path / "out2")
+    assert all(p.startswith("all/tactile/") for p in again.manifest.column("tactile"))
+    assert not [*tmp_path.glob("*.png"), *(tmp_path / "out2").glob("*.png")]
+
+
+def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_path):
+    rows = hf_rows(tmp_path / "made")
+    secret = tmp_path / "secret.jpg"
+    secret.write_bytes(rows[0]["gel"]["bytes"])
+    rows[1]["gel"] = None
+    rows[2]["gel"] = {"bytes": b"", "path": "x.jpg"}
+    rows[3]["rgb"] = {"bytes": rows[3]["rgb"]["bytes"][:-200], "path": "x.png"}
+    rows[4]["path"] = "a/b"
+    source = tmp_path / "mine"
+    table = [{**{k: v for k, v in row.items() if k not in ("rgb", "gel")}, "rgb": row["rgb"], "gel": row["gel"]} for row in rows]
+    save_hf(source, table, **kinds())
+    maps = MAPS | {"frame": "stem(path)"}
+    with pytest.raises(ProblemsError) as caught:
+        import_dataset(source, tmp_path / "out", columns=maps)
+    told = sorted((p.where, p.kind) for p in caught.value.problems)
+    assert told == [
+        ("mine/train:1", "missing-image"),
+        ("mine/train:2", "bad-image"),
+        ("mine/train:3", "bad-image"),
+        ("mine/train:4", "bad-frame"),
+    ]
+    assert not (tmp_path / "out").exists()
+    looked = validate_dataset(source, columns=maps)
+    assert sorted((p.where, p.kind) for p in [*looked.missing, *looked.invalid]) == told
+    assert len(import_dataset(source, tmp_path / "out", columns=maps, skip_bad=True).manifest) == 4
+    texts = [
+        {"part": "all", "image": str(secret)},
+        {"part": "all", "image": "in.jpg"},
+        {"part": "all", "image": "https://example.org/x.jpg"},
+    ]
+    save_hf(tmp_path / "texts", texts)
+    (tmp_path / "texts" / "in.jpg").write_bytes(secret.read_bytes())
+    found = import_dataset(tmp_path / "texts", tmp_path / "out2", columns={"tactile": "image"}, skip_bad=True)
+    assert [(p.where, p.kind) for p in found.skipped] == [("texts/all:0", "outside-root"), ("texts/all:2", "missing-file")]
+    assert found.manifest.ids == ["all/00000001"]
+
+
+def test_what_cannot_be_opened_is_told(source, tmp_path, monkeypatch):
+    with pytest.raises(PalpateError, match="no vision and no tactile among part, path, kind, rgb, gel"):
+        import_dataset(source, tmp_path / "out")
+    next(source.glob("train/*.arrow")).write_bytes(b"x")
+    with pytest.raises(PalpateError, match="mine must be whole and readable"):
+        import_dataset(source, tmp_path / "out", columns=MAPS)
+    (tmp_path / "csvs").mkdir()
+    (tmp_path / "csvs" / "train.csv").write_text("a\n1\n")
+    with pytest.raises(PalpateError, match="must be made of parquet or arrow"):
+        open_source(tmp_path / "csvs")
+    (tmp_path / "script").mkdir()
+    (tmp_path / "script" / "script.py").write_text("raise SystemExit('ran')")
+    with pytest.raises(PalpateError):
+        open_source(tmp_path / "script")
+    with pytest.raises(PalpateError, match="a name on the hub like user/name"):
+        import_dataset(tmp_path / "none" / "such" / "place", tmp_path / "out", format="hf")
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr(
+        "palpate.data.formats.huggingface_source._streamed", lambda *_: (_ for _ in ()).throw(ConnectionError("offline\nmode"))
+    )
+    with pytest.raises(PalpateError, match=r"user/name must be whole and readable. Got offline\. Check the name"):
+        import_dataset("user/name", tmp_path / "out", format="hf")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_hub_out_of_reach_is_told_at_once_with_what_to_do(tmp_path, monkeypatch):
+    def unreachable(*_, **__):
+        raise OSError("Name or service not known")
+
+    monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
+    monkeypatch.setattr("huggingface_hub.HfApi.dataset_info", unreachable)
+    with pytest.raises(PalpateError, match=r"hub must be within reach.*hf download --repo-type dataset user/name --local-dir DIR"):
+        import_dataset("user/name", tmp_path / "out", format="hf")
+
+
+def test_without_the_extra_the_error_says_what_to_install(small_manifest, source, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "datasets", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'palpate\[hf\]'"):
+        import_dataset(source, tmp_path / "out", columns=MAPS)
+    with pytest.raises(MissingExtraError, match="datasets"):
+        export_dataset(small_manifest, tmp_path / "hf", to="hf")
+    assert not (tmp_path / "hf").exists()
+
+
+def test_formats_load_without_datasets():
+    code = "import sys, palpate.data.importing, palpate.data.exporting; assert not {'datasets', 'torch', 'pyarrow'} & set(sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
