@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from palpate import __version__
 from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output, require_extra
 from palpate.core import Audit, Impact, ImpactRow, PalpateError, Problem, ProblemsError, Progress, Results, Split, write_json
 
@@ -91,7 +92,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         audit = replace(audit, commands=_next(options, audit))
     skipped = [str(p) for p in sides.skipped]
     data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "others": [dataclasses.asdict(a) for a in others], "skipped": skipped}
-    _write(options, [audit, *others], found, data, terminal)
+    _write(options, [audit, *others], found, data, _digests(sides), terminal)
     if options.cache is None and cache is not None:
         shutil.rmtree(cache, ignore_errors=True)
     leaked = max(audit.leaked_fraction, *(a.leaking_samples / a.test_samples for a in (audit, *others)))
@@ -257,7 +258,18 @@ def _next(options: Options, audit: Audit) -> list[str]:
     return lines
 
 
-def _write(options: Options, audits: Sequence[Audit], found: Inspection, data: dict[str, Any], terminal: Terminal) -> None:
+def _digests(sides: _Sides) -> dict[str, str]:
+    """Digests of everything that was compared."""
+    named = {"manifest": sides.whole, "pretraining": sides.pretrain} if sides.whole is not None else {
+        "train": sides.train, "test": sides.test, "pretraining": sides.pretrain,
+    }  # fmt: skip
+    split = {"split": sides.split.digest} if sides.split is not None else {}
+    return {name: m.digest for name, m in named.items() if m is not None} | split
+
+
+def _write(
+    options: Options, audits: Sequence[Audit], found: Inspection, data: dict[str, Any], digests: dict[str, str], terminal: Terminal
+) -> None:
     """The JSON, the page and the table, as asked."""
     if options.output:
         write_json(options.output, data)
@@ -269,7 +281,11 @@ def _write(options: Options, audits: Sequence[Audit], found: Inspection, data: d
     if options.page:
         from palpate.report import write_report
 
-        results = Results(title=f"Audit of {audits[0].name}", audits=audits, commands=[terminal.command, *audits[0].commands])
+        results = Results(
+            title=f"Audit of {audits[0].name}", audits=audits, commands=[terminal.command],
+            settings={"digests": digests, "false positives": options.false_positives, "near frames": options.near, "version": __version__},
+            notes=[f"{len(data['skipped'])} bad rows were left out; the JSON of -o names them."] if data["skipped"] else [],
+        )  # fmt: skip
         with terminal.progress() as progress:
             write_report(results, options.page, progress=progress)
 
