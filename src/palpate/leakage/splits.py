@@ -1,31 +1,36 @@
-"""Leak-free splits: whole groups go to one part, and every material keeps its share.
+"""Leak-free splits: whole groups go to one part, and every material keeps its share as well as it can.
 
-With n_gm the samples of material m in group g and r_p the wanted share of part p, the assignment a(g)
-is chosen to minimise a weighted sum of, heaviest first,
+Groups are connected components (:mod:`palpate.leakage.groups`); with n_gm the samples of material m in group g and r_p the wanted share of part p,
+the assignment a(g) minimises the largest deviation
 
-1. materials that could be in every part (they occur in enough groups) but are missing from one (weight 100),
-2. the largest deviation ``max_{m, p} | sum_{g: a(g)=p} n_gm / n_m - r_p |`` of such a material, and that of the whole (1 each),
-3. the mean squared deviation of all materials and of the whole (0.1),
+    max_{m, p} | sum_{g: a(g)=p} n_gm / n_m - r_p |
 
-by a seeded greedy construction (largest groups first) followed by moves and swaps until none improves.
+over the materials that occur in at least as many groups as there are parts, and over all samples together, each present in every part
+(:mod:`palpate.leakage.assign`). Rarer materials are named and go along. Folds are parts of equal share.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
-from palpate.core import PARTS, PalpateError, Split, rng_for
+from palpate.core import PARTS, PalpateError, Split
 from palpate.data.manifest import Manifest
-from palpate.leakage.audit import GROUPS
+from palpate.leakage.assign import RESOLUTION, Optimum, draw, optimise
+from palpate.leakage.groups import COLUMNS, Nulls, components
+from palpate.leakage.polish import Ints, Problem
+from palpate.leakage.program import EXACT
 
-RULE_VERSION = 1
-#: Swaps tried in one polishing round; beyond it the gain is below a tenth of a percent on Touch and Go.
-SWAP_TRIES = 4000
+RULE_VERSION = 2
+#: A split is refused if its largest group leaves the other parts less than this fraction of what they want.
+LEAST_FILL = 0.25
+#: How a group of linked samples without a common column is called in rules.
+LINKED = "near-duplicates"
 
 
 @dataclass(frozen=True)
@@ -34,9 +39,17 @@ class SplitPlan:
 
     Attributes:
         split: the assignment, its rule and digest.
-        group: the column kept whole; ``reason`` says why, if it was chosen by rule.
-        deviation: largest deviation of any material's share from the wanted one, in [0, 1].
+        group: the first column kept whole (``near-duplicates`` if only links are); ``reason`` says why, if it was chosen by rule.
+        deviation: largest deviation of any material's share, or of all samples', from the wanted one, in [0, 1], recounted.
         rare: materials that occur in too few groups to be in every part.
+        by: all columns kept whole.
+        bound: no split by these groups has a smaller largest deviation.
+        status: ``proven optimal``, or how far from it at most.
+        nodes: branch-and-bound nodes used.
+        limiting: the material with the largest deviation (``all samples`` for the whole).
+        missing: ``material: part`` for each material that could be in every part, but not together with the others.
+        where: group -> part (in folds: the fold that tests it).
+        notes: sentences for people.
     """
 
     split: Split
@@ -44,10 +57,45 @@ class SplitPlan:
     reason: str
     deviation: float
     rare: list[str]
+    by: tuple[str, ...] = ("video",)
+    bound: float = 0.0
+    status: str = ""
+    nodes: int = 0
+    limiting: str = ""
+    missing: list[str] = field(default_factory=list)
+    where: Mapping[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def gap(self) -> float:
+        """``deviation - bound``: how much smaller the largest deviation of another split can be at most."""
+        return max(0.0, self.deviation - self.bound)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A manifest cut into groups: everything that the optimiser and the rule need.
+
+    ``counts`` (G, M + 1): samples of each group by material, then all; ``names`` (G) in its order; ``of`` the group of each sample.
+    """
+
+    manifest: Manifest
+    by: tuple[str, ...]
+    reason: str
+    names: list[str]
+    of: list[str]
+    materials: list[str]
+    counts: Ints
+    rule: dict[str, Any]
+    notes: list[str]
+
+    @property
+    def group(self) -> str:
+        return self.by[0] if self.by else LINKED
 
 
 def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, str]:
-    """The column to keep whole, and why: the video, unless most materials occur in too few videos to be on both sides.
+    """The column to keep whole, and why: what the data set names, else the video, unless most materials occur in too few videos.
 
     Returns:
         (column, reason); the reason is '' for the normal case.
@@ -56,44 +104,72 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, str]:
         PalpateError: if neither videos nor touches nor objects are known.
     """
     table = manifest.table
-    known = [g for g in ("video", "object", "touch") if table[g].null_count() == 0 and table.height]
+    said = [manifest.facts["group"]] if manifest.facts.get("group") in COLUMNS else []
+    known = [g for g in (*said, "video", "object", "touch") if table[g].null_count() == 0 and table.height]
     if not known:
         raise PalpateError(
             "A leak-free split needs the video, object or touch of every sample",
             "nulls in each of these columns",
-            "Import a table that has one: palpate import table.csv --map video=YOUR_COLUMN",
+            "Import a table that has one (palpate import table.csv --map video=YOUR_COLUMN), or group by --near",
         )
-    if known[0] == "touch":
+    first = known[0]
+    if first == "touch":
         return "touch", "The manifest knows no videos: the touch is kept whole."
-    if table[known[0]].n_unique() < parts and "touch" in known:
+    if table[first].n_unique() < parts and "touch" in known:
         return (
             "touch",
-            f"There are fewer than {parts} {known[0]}s: whole touches are kept together instead, and train and test share a {known[0]}.",
+            f"There are fewer than {parts} {first}s: whole touches are kept together instead, and train and test share a {first}.",
         )
-    videos = table.filter(pl.col("material").is_not_null()).group_by("material").agg(pl.col(known[0]).n_unique().alias("n"))
-    if not videos.height:
-        return known[0], ""
-    enough = videos.filter(pl.col("n") >= parts).height
-    if 2 * enough >= videos.height or "touch" not in known:
-        return known[0], "" if known[0] == "video" else "The manifest knows no videos: the object is kept whole."
+    normal = "" if first == "video" else f"The data set says so: the {first} is kept whole." if said == [first] else ""
+    normal = normal or ("" if first == "video" else f"The manifest knows no videos: the {first} is kept whole.")
+    groups = table.filter(pl.col("material").is_not_null()).group_by("material").agg(pl.col(first).n_unique().alias("n"))
+    if not groups.height:
+        return first, normal
+    enough = groups.filter(pl.col("n") >= parts).height
+    if 2 * enough >= groups.height or "touch" not in known:
+        return first, normal
     return "touch", (
-        f"Only {enough} of {videos.height} materials occur in {parts} or more videos, too few for the video to be the group: whole touches are "
-        "kept together instead. Train and test then share videos, so scores are optimistic for new places."
+        f"Only {enough} of {groups.height} materials occur in {parts} or more {first}s, too few for the {first} to be the group: whole touches are "
+        f"kept together instead. Train and test then share {first}s, so scores are optimistic for new places."
     )
 
 
-def leak_free_split(manifest: Manifest, *, train: float = 0.8, val: float = 0.0, group: str = "auto", seed: int = 0) -> SplitPlan:
-    """A split in which no group stands in two parts, stratified by material.
+def leak_free_split(manifest: Manifest, *, train: float = 0.8, val: float = 0.0, seed: int = 0, **options: Any) -> SplitPlan:
+    """A split in which no group stands in two parts, stratified by material; see :func:`leak_free_splits`."""
+    return leak_free_splits(manifest, [seed], train=train, val=val, **options)[0]
+
+
+def leak_free_splits(
+    manifest: Manifest,
+    seeds: Sequence[int],
+    *,
+    train: float = 0.8,
+    val: float = 0.0,
+    group: str = "auto",
+    by: Sequence[str] = (),
+    links: Sequence[NDArray[np.integer]] = (),
+    link_facts: Mapping[str, Any] | None = None,
+    nulls: Nulls = "refuse",
+    tolerance: float = 0.0,
+    name: str = "NoLeak",
+) -> list[SplitPlan]:
+    """Several splits of the same quality, in each of which no group stands in two parts.
 
     Args:
         manifest: the samples; materials may be null (then only the sizes are balanced).
+        seeds: one split a seed. The result depends on the manifest, the options and the seed, on no machine or clock.
         train: wanted share of the train part, in (0, 1).
         val: wanted share of the validation part, in [0, 1); test gets the rest.
-        group: column kept whole, or ``auto`` (:func:`choose_group`).
-        seed: another seed gives another split of about the same quality.
+        group: one column to keep whole, or ``auto`` (:func:`choose_group`); ``by`` goes before it.
+        by: columns to keep whole together.
+        links: labels of near-duplicate clusters, (n,) integers each, negative for none.
+        link_facts: how they were found, for the rule.
+        nulls: what a null in such a column means (:func:`palpate.leakage.groups.components`).
+        tolerance: how much larger than the smallest possible the largest deviation may be; more of it, more different splits.
+        name: the name of the rule.
 
     Raises:
-        PalpateError: on shares out of range, an unknown group, nulls in the group column, or fewer groups than parts.
+        PalpateError: on shares out of range, unknown or null groups, fewer groups than parts, or one group too large to be split off.
     """
     shares = {"train": train, "val": val, "test": 1.0 - train - val}
     if not (0 < train < 1 and 0 <= val < 1 and shares["test"] > 1e-9):
@@ -102,132 +178,198 @@ def leak_free_split(manifest: Manifest, *, train: float = 0.8, val: float = 0.0,
             f"train {train}, val {val}",
             "Pass e.g. --train 0.8 --val 0.0",
         )
-    wanted = {part: share for part, share in shares.items() if share > 1e-9}
+    if not 0 <= tolerance < 1:
+        raise PalpateError("The tolerance must lie in [0, 1)", str(tolerance), "Pass e.g. 0.01")
+    wanted = {part: round(share, 12) for part in PARTS if (share := shares[part]) > 1e-9}
+    task = _task(manifest, len(wanted), group, by, links, link_facts, nulls)
+    problem = _problem(task, np.array(list(wanted.values())))
+    optimum, plans = optimise(problem), []
+    for seed in seeds:
+        assignment = draw(problem, optimum, seed, tolerance)
+        where = {g: list(wanted)[a] for g, a in zip(task.names, assignment.tolist(), strict=True)}
+        rule = {"name": name, **task.rule, "shares": wanted, "seed": seed, "tolerance": tolerance}
+        plans.append(_plan(task, problem, optimum, assignment, list(wanted), where, where, rule))
+    return plans
+
+
+def leak_free_folds(
+    manifest: Manifest,
+    folds: int,
+    *,
+    val: bool = False,
+    seed: int = 0,
+    group: str = "auto",
+    by: Sequence[str] = (),
+    links: Sequence[NDArray[np.integer]] = (),
+    link_facts: Mapping[str, Any] | None = None,
+    nulls: Nulls = "refuse",
+    tolerance: float = 0.0,
+) -> list[SplitPlan]:
+    """Cross-validation without leaks: ``folds`` parts of equal share, each of which is the test part once.
+
+    Args:
+        manifest: the samples.
+        folds: at least 2; with ``val`` at least 3.
+        val: let the next fold be the validation part; else all others are train.
+        seed: as the other options, see :func:`leak_free_splits`.
+        group: see there.
+        by: see there.
+        links: see there.
+        link_facts: see there.
+        nulls: see there.
+        tolerance: see there.
+
+    Returns:
+        One plan a fold; deviations, bounds and rare materials are those of all folds together.
+
+    Raises:
+        PalpateError: as :func:`leak_free_splits`.
+    """
+    if folds < 2 + val:
+        raise PalpateError(f"There must be at least {2 + val} folds" + " with a validation fold" * val, str(folds), "Pass e.g. --folds 5")
+    task = _task(manifest, folds, group, by, links, link_facts, nulls)
+    problem = _problem(task, np.full(folds, 1 / folds))
+    optimum = optimise(problem)
+    assignment = draw(problem, optimum, seed, tolerance)
+    plans: list[SplitPlan] = []
+    for fold in range(folds):
+        part = {k: "test" if k == fold else "val" if val and k == (fold + 1) % folds else "train" for k in range(folds)}
+        where = {g: part[a] for g, a in zip(task.names, assignment.tolist(), strict=True)}
+        fold_of = {g: f"fold {a}" for g, a in zip(task.names, assignment.tolist(), strict=True)}
+        rule = {"name": f"NoLeak fold {fold} of {folds}", **task.rule, "folds": folds, "fold": fold, "seed": seed, "tolerance": tolerance}
+        rule["shares"] = {p: round(n / folds, 12) for p in PARTS if (n := list(part.values()).count(p))}
+        plans.append(_plan(task, problem, optimum, assignment, [f"fold {k}" for k in range(folds)], where, fold_of, rule))
+    return plans
+
+
+def _task(
+    manifest: Manifest,
+    parts: int,
+    group: str,
+    by: Sequence[str],
+    links: Sequence[NDArray[np.integer]],
+    facts: Mapping[str, Any] | None,
+    nulls: Nulls,
+) -> _Task:
+    """Cuts the manifest into groups.
+
+    Raises:
+        PalpateError: if there are no samples, or no such groups, or fewer groups than parts.
+    """
     if not len(manifest):
         raise PalpateError("A split needs samples", "an empty manifest", "Import the data again")
-    column, reason = choose_group(manifest, len(wanted)) if group == "auto" else (group, "")
-    if column not in GROUPS:
-        raise PalpateError(f"The group must be auto or one of {', '.join(GROUPS)}", repr(column), "Pass e.g. --group video")
-    if nulls := manifest.table[column].null_count():
+    table, reason, columns = manifest.table, "", tuple(dict.fromkeys(by))
+    if not columns and group != "auto":
+        columns = (group,)
+    elif not columns:
+        if links and all(table[c].null_count() for c in ("video", "object", "touch")):
+            reason = "The manifest knows no videos: near-duplicates alone are kept together."
+        else:
+            column, reason = choose_group(manifest, parts)
+            columns = (column,)
+    of = components(manifest, columns, links, nulls=nulls)
+    notes = [reason] if reason else []
+    for column in columns:
+        if empty := table[column].null_count():
+            notes.append(
+                f"{empty} samples have no {column}: each is a group of its own unless another column or a near-duplicate joins it."
+            )
+    grouped = table.select("material").with_columns(pl.Series("group", of, dtype=pl.String))
+    names = sorted(set(of))
+    what = " and ".join(columns) + (" and near-duplicates" if links and columns else "") or LINKED
+    if len(names) < parts:
         raise PalpateError(
-            f"Every sample needs a {column} to be split by it", f"{nulls} samples without", "Fill the column, or choose another --group"
+            f"A split into {parts} parts needs at least as many groups",
+            f"{len(names)} {what} group(s)",
+            "Choose a finer group, e.g. --by touch",
         )
-    names, counts, materials = _count(manifest, column)
-    if len(names) < len(wanted):
-        raise PalpateError(
-            f"A split into {len(wanted)} parts needs at least as many groups",
-            f"{len(names)} {column} group(s)",
-            "Choose a finer --group, e.g. touch",
-        )
-    target = np.array(list(wanted.values()))
-    assignment = _assign(counts, target, seed)
-    order = [p for p in PARTS if p in wanted]
-    where = {name: order[a] for name, a in zip(names, assignment, strict=True)}
-    parts = {i: where[g] for i, g in zip(manifest.ids, manifest.column(column), strict=True)}
-    problem = _Problem(counts, target)
-    rule: dict[str, Any] = {
-        "name": "NoLeak", "method": "group, stratified by material", "version": RULE_VERSION, "group": column, "asked": group, "reason": reason,
-        "shares": wanted, "seed": seed,
-    }  # fmt: skip
-    rare = [m for m, n in zip(materials, (counts[:, :-1] > 0).sum(0), strict=True) if n < len(wanted)]
-    return SplitPlan(Split(parts, rule, manifest.digest), column, reason, problem.worst_deviation(assignment), rare)
-
-
-def _count(manifest: Manifest, column: str) -> tuple[list[str], np.ndarray, list[str]]:
-    """Groups, samples of each (group, material) with a last column for the whole group, and the materials."""
-    table = manifest.table
-    names = sorted(table[column].unique().to_list())
     materials = sorted(table["material"].drop_nulls().unique().to_list())
     row, col = {g: k for k, g in enumerate(names)}, {m: k for k, m in enumerate(materials)}
     counts = np.zeros((len(names), len(materials) + 1), np.int64)
-    for g, m, n in table.group_by(column, "material").len().iter_rows():
+    for g, m, n in grouped.group_by("group", "material").len().iter_rows():
         if m is not None:
             counts[row[g], col[m]] += n
         counts[row[g], -1] += n
-    return names, counts, materials
+    if not materials:
+        notes.append("No sample has a material: only the sizes of the parts are balanced.")
+    rule = {
+        "method": "whole groups, smallest largest deviation of any material's share", "version": RULE_VERSION, "group": columns[0] if columns else LINKED,
+        "by": list(columns), "near": dict(facts or {"labels": len(links)}) if links else None, "nulls": nulls, "asked": list(by) or group, "reason": reason,
+        "groups": len(names),
+    }  # fmt: skip
+    return _Task(manifest, columns, reason, names, of, materials, counts, rule, notes)
 
 
-class _Problem:
-    """Cost of an assignment. ``counts`` (G, M + 1), ``target`` (P,): wanted shares."""
+def _problem(task: _Task, target: NDArray[np.float64]) -> Problem:
+    """The problem, if its largest group can be split off.
 
-    def __init__(self, counts: np.ndarray, target: np.ndarray) -> None:
-        self.counts, self.target = counts, target
-        self.share = counts / np.maximum(counts.sum(0), 1)  # of each material, in each group
-        self.possible = (counts > 0).sum(0) >= len(target)  # materials that can be in every part
-
-    def sums(self, assignment: np.ndarray) -> np.ndarray:
-        """Shares by part and material, (P, M + 1)."""
-        out = np.zeros((len(self.target), self.counts.shape[1]))
-        np.add.at(out, assignment, self.share)
-        return out
-
-    def cost(self, sums: np.ndarray) -> np.ndarray:
-        """One number for ``sums`` (..., P, M + 1): missing materials weigh most, then the largest deviation, then the mean square."""
-        off = np.abs(sums - self.target[:, None])
-        missing = ((sums < 1e-12) & self.possible).sum((-2, -1))
-        return 100.0 * missing + np.where(self.possible, off, 0).max((-2, -1)) + off[..., -1].max(-1) + 0.1 * np.square(off).mean((-2, -1))
-
-    def worst_deviation(self, assignment: np.ndarray) -> float:
-        """Largest deviation of a material's share, over materials that can be in every part (over the whole, if none can)."""
-        off = np.abs(self.sums(assignment) - self.target[:, None])
-        use = self.possible.copy()
-        use[-1] = not self.possible[:-1].any()
-        return float(off[:, use].max())
+    Raises:
+        PalpateError: if it leaves the other parts less than ``LEAST_FILL`` of what they want.
+    """
+    sizes = task.counts[:, -1]
+    biggest = int(np.argmax(sizes))
+    held, wanted = float(sizes[biggest] / sizes.sum()), 1 - float(target.max())
+    if 1 - held < LEAST_FILL * wanted:
+        kind = task.group if task.group in COLUMNS else "group"
+        raise PalpateError(
+            f"These samples cannot be split as asked: the parts beside the largest must get at least {LEAST_FILL:.0%} of their wanted {wanted:.1%}",
+            f"{kind} {task.names[biggest]!r} with {held:.1%} of all samples, which leaves them {1 - held:.2%} at best",
+            "Choose a finer group (--by touch), thin that group out, or ask for a larger --train",
+        )
+    return Problem(task.counts, target)
 
 
-def _assign(counts: np.ndarray, target: np.ndarray, seed: int) -> np.ndarray:
-    """Greedy construction and local search; deterministic in ``seed``."""
-    problem, rng = _Problem(counts, target), rng_for(seed, "split")
-    size = counts[:, -1] * np.exp(rng.normal(0, 0.3, len(counts)))
-    assignment = np.full(len(counts), -1, np.int64)
-    sums = np.zeros((len(target), counts.shape[1]))
-    for g in np.argsort(-size, kind="stable"):
-        # The part that is furthest behind in what this group brings.
-        behind = ((target[:, None] - sums) * problem.share[g]).sum(1) / target
-        assignment[g] = int(np.argmax(behind))
-        sums[assignment[g]] += problem.share[g]
-    for part in range(len(target)):  # no part may stay empty
-        if not (assignment == part).any():
-            crowded = np.flatnonzero(assignment == np.bincount(assignment, minlength=len(target)).argmax())
-            assignment[crowded[np.argmin(counts[crowded, -1])]] = part
-    return _polish(problem, assignment, rng)
-
-
-def _polish(problem: _Problem, assignment: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Moves of one group and swaps of two, as long as one lowers the cost; a part is never emptied."""
-    parts = len(problem.target)
-    sums = problem.sums(assignment)
-    cost = float(problem.cost(sums))
-    improved = True
-    while improved:
-        improved = False
-        for g in rng.permutation(len(assignment)):
-            here = int(assignment[g])
-            if (assignment == here).sum() == 1:
-                continue
-            for there in range(parts):
-                if there != here and (new := float(problem.cost(trial := _moved(sums, problem.share[g], here, there)))) < cost - 1e-12:
-                    assignment[g], sums, cost, here, improved = there, trial, new, there, True
-        pairs = rng.integers(0, len(assignment), (SWAP_TRIES, 2))
-        for g, h in pairs:
-            a, b = int(assignment[g]), int(assignment[h])
-            if a != b:
-                trial = _moved(_moved(sums, problem.share[g], a, b), problem.share[h], b, a)
-                if (new := float(problem.cost(trial))) < cost - 1e-12:
-                    assignment[g], assignment[h], sums, cost, improved = b, a, trial, new, True
-    return assignment
-
-
-def _moved(sums: np.ndarray, share: np.ndarray, here: int, there: int) -> np.ndarray:
-    out = sums.copy()
-    out[here] -= share
-    out[there] += share
-    return out
+def _plan(
+    task: _Task, problem: Problem, optimum: Optimum, assignment: Ints, parts: Sequence[str], where: Mapping[str, str], shown: Mapping[str, str],
+    rule: Mapping[str, Any],
+) -> SplitPlan:  # fmt: skip
+    """One assignment as a plan, everything recounted from it."""
+    deviation = problem.worst(assignment)
+    bound = min(optimum.bound, deviation)
+    gap = deviation - bound
+    status = f"within {gap:.5f} of the optimum"
+    if gap <= EXACT:
+        status = "proven optimal"
+    elif deviation <= RESOLUTION + EXACT:
+        status = f"below the resolution of {RESOLUTION:g}, {status}"
+    columns = [*task.materials, "all samples"]
+    off = problem.deviations(assignment).max(0) * problem.used
+    gone = [f"{columns[m]}: {parts[p]}" for p, m in np.argwhere((problem.present(assignment) == 0) & problem.possible).tolist()]
+    rare = [m for m, possible in zip(task.materials, problem.possible, strict=False) if not possible]
+    notes = list(task.notes)
+    if rare:
+        notes.append(f"In fewer than {len(parts)} groups, so not in every part: {', '.join(rare)}.")
+    if gone:
+        notes.append(f"Could be in every part, but not together with the others: {', '.join(gone)}.")
+    rule = {**rule, "deviation": round(deviation, 6), "bound": round(bound, 6), "status": status}
+    parts_of = {i: where[g] for i, g in zip(task.manifest.ids, task.of, strict=True)}
+    split = Split(parts_of, rule, task.manifest.digest)
+    return SplitPlan(
+        split,
+        task.group,
+        task.reason,
+        deviation,
+        rare,
+        task.by,
+        bound,
+        status,
+        optimum.nodes,
+        columns[int(np.argmax(off))],
+        gone,
+        dict(shown),
+        notes,
+    )
 
 
 def describe(plan: SplitPlan) -> Mapping[str, Any]:
     """The plan as JSON for terminals and reports."""
     return {
-        "digest": plan.split.digest, "group": plan.group, "reason": plan.reason, "counts": plan.split.counts(),
-        "largest_material_deviation": round(plan.deviation, 5), "materials_in_too_few_groups": plan.rare,
+        "digest": plan.split.digest, "group": plan.group, "by": list(plan.by), "groups": len(plan.where), "reason": plan.reason, "counts": plan.split.counts(),
+        "largest_material_deviation": round(plan.deviation, 5), "lower_bound": round(plan.bound, 5), "gap": round(plan.gap, 5), "status": plan.status,
+        "limiting_material": plan.limiting, "nodes": plan.nodes, "materials_in_too_few_groups": plan.rare, "materials_left_out": plan.missing,
     }  # fmt: skip
+
+
+def renamed(plan: SplitPlan, **rule: Any) -> SplitPlan:
+    """The plan with more in its rule."""
+    return replace(plan, split=replace(plan.split, rule={**plan.split.rule, **rule}))

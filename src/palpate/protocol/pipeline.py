@@ -54,6 +54,7 @@ from palpate.encoders.presets import preset as encoder_preset
 from palpate.encoders.towers import Towers, load_clip, pick_device
 from palpate.generate import Generated, generate
 from palpate.leakage import audit_split, describe, leak_free_split
+from palpate.leakage.audit import Pictures
 from palpate.protocol.presets import preset as pipeline_preset
 from palpate.protocol.scoring import score_generated
 from palpate.sim import WorldOptions, write_world
@@ -203,10 +204,10 @@ class _Pipeline:
         def build(folder: Path) -> dict[str, Any]:
             plan = leak_free_split(manifest, train=self.preset.train, group=self.options.group, seed=self.options.seed)
             plan.split.save(folder / "noleak.json")
-            audits = [audit_split(manifest, Split.load(path), name=path.stem) for path in own if Split.load(path).ids("test")]
-            audits.append(
-                audit_split(manifest, plan.split, group=plan.group, name="NoLeak" if plan.group == "video" else f"NoLeak by {plan.group}")
-            )
+            look: dict[str, Any] = {"pictures": Pictures(cache=self.cache), "progress": self.progress}
+            audits = [audit_split(manifest, Split.load(path), name=path.stem, **look) for path in own if Split.load(path).ids("test")]
+            name = "NoLeak" if plan.group == "video" else f"NoLeak by {plan.group}"
+            audits.append(audit_split(manifest, plan.split, group=plan.group, name=name, **look))
             if plan.group != "video" and not manifest.table["video"].null_count():
                 audits.append(audit_split(manifest, plan.split, group="video", name=f"NoLeak by {plan.group}, seen by video"))
             write_json(folder / "audits.json", [dataclasses.asdict(a) for a in audits])
