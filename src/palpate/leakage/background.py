@@ -1,0 +1,121 @@
+"""Touch without the sensor: what the contact adds to the picture of the passive gel.
+
+Untouched gel (its colours, its markers) makes all frames of one sensor look alike, so a tactile thumbnail t is compared by what is left after its background b:
+
+1. *Registration.* b is moved by the offset of at most 2 of 32 pixels, in quarters, at which the luminance of both, band-passed, correlates best: a
+   picture that was cropped elsewhere than its background would keep every marker twice.
+2. *Gain.* For each channel r = (t - mean) - g (b - mean) with g in [0.85, 1.15] by least squares, pixels weighted by 1 / (1 + e / 4 median e), e the
+   squared residual of the round before: the contact itself must not set the gain.
+
+A touch without a background of its own takes the pixelwise median of its video's frames; if those are fewer than 8, of its sensor's, else of all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.leakage.verify import REACH, SIDE, Floats, Ints, Shifts, best_offset, band_pass
+
+QUARTERS = Shifts.of(0.25)
+GAIN = (0.85, 1.15)
+ROUNDS = 3
+#: Frames that a median needs, and how many it takes at most.
+FEWEST, MOST = 8, 200
+#: Grey levels squared: keeps the gain at 1 where the background is flat.
+_RIDGE = 0.05
+
+
+def _moves() -> Floats:
+    """(17, 32, 32): matrices that move a column of pixels by each offset, linear between pixels, edges repeated."""
+    eye = np.eye(SIDE)
+    moved = [ndimage.shift(eye, (-float(d), 0), order=1, mode="nearest") for d in QUARTERS.offsets]
+    return np.stack(moved).astype(np.float32)
+
+
+_MOVES = _moves()
+
+
+def planar(pixels: NDArray[np.uint8]) -> Floats:
+    """(n, 32, 32, 3) bytes as (n, 3, 32, 32) float32."""
+    return np.ascontiguousarray(np.moveaxis(pixels, -1, 1), dtype=np.float32)
+
+
+def remove_background(touch: Floats, background: Floats) -> Floats:
+    """What the contact adds.
+
+    Args:
+        touch: (n, 3, 32, 32) YCbCr, 0 to 255.
+        background: (n, 3, 32, 32), each the background of its touch.
+
+    Returns:
+        (n, 3, 32, 32) signed grey levels, each channel's weighted mean near 0.
+    """
+    luma = [band_pass(np.concatenate([x[:, :1], np.zeros_like(x[:, 1:])], axis=1)) for x in (touch, background)]
+    _, place = best_offset(luma[0], luma[1], QUARTERS)
+    down, right = _MOVES[place[:, 0]], _MOVES[place[:, 1]]
+    moved = down[:, None] @ background @ right.transpose(0, 2, 1)[:, None]
+    weight = np.ones((len(touch), 1, SIDE, SIDE), np.float32)
+    left = touch - moved
+    for _ in range(ROUNDS):
+        total = weight.sum(axis=(2, 3), keepdims=True)
+        t = touch - (weight * touch).sum(axis=(2, 3), keepdims=True) / total
+        b = moved - (weight * moved).sum(axis=(2, 3), keepdims=True) / total
+        weighted = weight * b
+        across = (weighted * t).sum(axis=(2, 3), keepdims=True) + _RIDGE * total
+        gain = np.clip(across / ((weighted * b).sum(axis=(2, 3), keepdims=True) + _RIDGE * total), *GAIN)
+        left = t - gain * b
+        error = np.square(left).sum(axis=1, keepdims=True)
+        weight = 1 / (1 + error / (4 * np.median(error, axis=(2, 3), keepdims=True) + 1e-3))
+    return left
+
+
+@dataclass(frozen=True)
+class Backgrounds:
+    """The background of each touch.
+
+    Attributes:
+        row: (n,) for each sample its row in ``pixels``.
+        pixels: (b, 32, 32, 3) YCbCr.
+        own: (n,) whether it is the sample's own background and not a median.
+        medians: how many samples took the median of their video, of their sensor, of all.
+    """
+
+    row: Ints
+    pixels: NDArray[np.uint8]
+    own: NDArray[np.bool_]
+    medians: tuple[int, int, int]
+
+
+def backgrounds(touch: Ints, own: Ints, pixels: NDArray[np.uint8], videos: Ints, sensors: Ints) -> Backgrounds:
+    """Gives each sample its own background or a median.
+
+    Args:
+        touch: (n,) rows of the tactile pictures in ``pixels``; -1 where unreadable.
+        own: (n,) rows of their backgrounds; -1 where there is none.
+        pixels: (u, 32, 32, 3).
+        videos: (n,) codes; -1 where unknown.
+        sensors: (n,) codes; -1 where unknown.
+    """
+    used, row = np.unique(own, return_inverse=True)
+    shift = int(used.size > 0 and used[0] < 0)
+    pictures = [pixels[used[shift:]]]
+    row = row.astype(np.int64) - shift
+    count, counts = len(used) - shift, [0, 0, 0]
+    missing = (own < 0) & (touch >= 0)
+    for level, codes in enumerate((videos, sensors, np.zeros_like(videos))):
+        for code in np.unique(codes[missing & (codes >= 0)]).tolist():
+            members = np.unique(touch[(codes == code) & (touch >= 0)])
+            if len(members) < FEWEST and level < 2:
+                continue
+            if len(members) > MOST:
+                members = members[np.linspace(0, len(members) - 1, MOST).astype(np.int64)]
+            wanted = missing & (codes == code)
+            pictures.append(np.median(pixels[members], axis=0).astype(np.uint8)[None])
+            row[wanted], missing[wanted] = count, False
+            count += 1
+            counts[level] += int(wanted.sum())
+    return Backgrounds(row, np.concatenate(pictures), own >= 0, (counts[0], counts[1], counts[2]))
