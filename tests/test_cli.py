@@ -49,10 +49,10 @@ def test_text_output_has_every_count(capsys, lists):
 
 @pytest.mark.parametrize(("args", "word"), [
     (["audti"], "Did you mean: palpate audit"),
-    (["audit", "one.txt"], "TRAIN and TEST list files"),
-    (["audit", "no.txt", "such.txt"], "no file no.txt"),
+    (["audit", "one.txt"], "TRAIN and TEST"),
+    (["audit", "no.txt", "such.txt"], "nothing at no.txt"),
     (["audit", "--colour", "red"], "Unrecognized"),
-    (["split", "nowhere", "-o", "s.json"], "manifest must exist"),
+    (["split", "nowhere", "-o", "s.json"], "nothing at nowhere"),
     (["split", "nowhere", "-o", "s.json", "--train", "most"], "most"),
     (["import", "nowhere", "-o", "out"], "nothing at nowhere"),
     (["import", ".", "-o", "out", "--map", "vision"], "--map takes"),

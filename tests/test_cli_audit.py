@@ -127,7 +127,7 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
     for args, words in [
         ([one], "TRAIN and TEST"), ([one, one, "--split", split], "TRAIN and TEST"), ([lines, tmp_path / "gone.txt"], "nothing at"),
         ([lines, lines, "--impact"], "--impact needs"), ([one, "--split", split, "--false-positives", "0.7"], "--false-positives"),
-        ([one, "--split", split, "--near", "-1"], "--near"), ([one, "--split", split, "--encoder", tmp_path / "none"], "towers"),
+        ([one, "--split", split, "--near-frames", "-1"], "--near-frames"), ([one, "--split", split, "--encoder", tmp_path / "none"], "towers"),
         ([lines, tmp_path / "bad.txt"], "1 problem"), ([one, "--split", split, "--group", "object", "--no-images"], "object"),
     ]:  # fmt: skip
         status, _, err = run(capsys, *args)

@@ -35,7 +35,7 @@ class Options(Common):
     """What an encoder was pretrained on: a further list, table, manifest or folder that the test part is compared with."""
     group: Literal["auto", "video", "touch", "object", "session", "domain", "sensor"] = "auto"
     """What must not be shared between train and test. `auto` takes the video, or what is known instead of it."""
-    near: int = 30
+    near_frames: int = 30
     """A gap of up to this many frames within a video is a leak of its own."""
     images: bool = True
     """Look at tables alone: compare neither files nor pictures. Bare lists have no pictures anyway."""
@@ -120,7 +120,7 @@ def _check(options: Options) -> None:
         raise PalpateError("--fail-over must lie in [0, 1]", str(options.fail_over), "Pass a fraction, e.g. --fail-over 0.01")
     if not 0 < options.false_positives < 0.5:
         raise PalpateError("--false-positives must lie in (0, 0.5)", str(options.false_positives), "Pass e.g. --false-positives 0.001")
-    for name, value, low in (("--worst", options.worst, 0), ("--near", options.near, 0), ("--processes", options.processes or 1, 1)):
+    for name, value, low in (("--worst", options.worst, 0), ("--near-frames", options.near_frames, 0), ("--processes", options.processes or 1, 1)):
         if value < low:
             raise PalpateError(f"{name} must be at least {low}", str(value), f"Pass e.g. {name} 12")
     if options.table is not None and options.table.suffix.lower() not in (".parquet", ".csv"):
@@ -176,7 +176,7 @@ def _audit(options: Options, sides: _Sides, cache: Path | None, progress: Progre
     from palpate.leakage.audit import inspect_parts, inspect_split
 
     common: dict[str, Any] = {
-        "group": options.group, "worst": options.worst, "near": options.near, "progress": progress,
+        "group": options.group, "worst": options.worst, "near": options.near_frames, "progress": progress,
         "pictures": _pictures(options, sides.train, sides.test, cache, progress),
     }  # fmt: skip
     if sides.whole is not None and sides.split is not None and options.split is not None:
@@ -191,7 +191,7 @@ def _against_pretraining(options: Options, pretrain: Manifest, test: Manifest, c
     name = f"{options.pretrain.name if options.pretrain else 'pretraining'} / test"
     pictures = _pictures(options, pretrain, test, cache, progress)
     return inspect_parts(
-        pretrain, test, name=name, against="pretraining", group=options.group, worst=options.worst, near=options.near, pictures=pictures,
+        pretrain, test, name=name, against="pretraining", group=options.group, worst=options.worst, near=options.near_frames, pictures=pictures,
         progress=progress,
     ).audit  # fmt: skip
 
@@ -283,7 +283,7 @@ def _write(
 
         results = Results(
             title=f"Audit of {audits[0].name}", audits=audits, commands=[terminal.command],
-            settings={"digests": digests, "false positives": options.false_positives, "near frames": options.near, "version": __version__},
+            settings={"digests": digests, "false positives": options.false_positives, "near frames": options.near_frames, "version": __version__},
             notes=[f"{len(data['skipped'])} bad rows were left out; the JSON of -o names them."] if data["skipped"] else [],
         )  # fmt: skip
         with terminal.progress() as progress:

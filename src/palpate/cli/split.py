@@ -204,7 +204,7 @@ def _finish(options: Options, manifest: Manifest, split: Split, group: str, term
     """Audits a new split by its table, and writes the data set's own lists if asked."""
     from palpate.leakage import audit_split
 
-    column = group if group in MODALITIES or group in manifest.table.columns else "auto"
+    column = group if group in manifest.table.columns else "auto"
     audit = audit_split(manifest, split, group=column, name=options.output.name if options.output else "")
     show(audit, terminal)
     files: list[str] = []

@@ -30,7 +30,7 @@ from palpate.leakage.verify import Floats, Ints
 
 COHORT = 128
 #: Share of the cohort that makes a query's level.
-TOP = 1 / 32
+TOP = 1 / 16.0
 WEIGHT = 1.0
 #: z of two equal pictures would be infinite.
 HIGHEST = 0.9995

@@ -17,6 +17,8 @@ from palpate.leakage.verify import BLOCK, Floats, Ints, band_pass, similarities
 
 #: Root mean square difference of two blank thumbnails at which their score is 0, in grey levels.
 FAR = 32.0
+#: Root mean square difference up to which two backgrounds show one gel at two times, in grey levels.
+ONE_GEL = 12.0
 #: Backgrounds of a video that a touch is compared with.
 OTHERS = 16
 
@@ -70,6 +72,9 @@ def gel_at_other_times(pool: Pool, items: Ints, videos: Ints) -> Floats:
         at, other = _others(known, videos[start : start + len(block)], row[block])
         if not len(at):
             continue
+        mine = row[block[at]]
+        near = np.linalg.norm(small_pictures(found.pixels, other) - small_pictures(found.pixels, mine), axis=1) <= ONE_GEL
+        at, other = at[near], other[near]
         touches = band_pass(pool.planes(block))
         gel = band_pass(remove_background(planar(found.pixels[other]), planar(found.pixels[row[block[at]]])))
         both = quantised(np.concatenate([touches, gel]))
