@@ -1,6 +1,6 @@
 """Writes the record TaG-NoLeak again, from Touch and Go's two official lists.
 
-    python recipes/tag_noleak.py LISTS/train.txt LISTS/test.txt [-o src/palpate/leakage/records/tag_noleak.json]
+    python recipes/tag_noleak.py LISTS/train.txt LISTS/test.txt [-o src/palpate/leakage/splits/records/tag_noleak.json]
 
 The lists are in the data set's repository (fredfyyang/Touch-and-Go, "Visuo-tactile contrastive learning/dataset/"). Without -o the shipped
 record is compared with the new one. Exit status 1 if they differ.
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from palpate.core import write_text
 from palpate.core.digest import canonical_json
-from palpate.leakage.noleak import load_record, make_record, verify_record
+from palpate.leakage.splits.noleak import load_record, make_record, verify_record
 
 
 def main() -> int:

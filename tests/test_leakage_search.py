@@ -11,9 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core import MissingExtraError, PalpateError
-from palpate.leakage import search, search_exact, search_pairs, search_threads
+from palpate.leakage import search
 from palpate.leakage.search import clusters_within, nearest, pairs_within
-from palpate.leakage.search_space import Space, base_side, identical_rows, query_side
+from palpate.leakage.search import exact as search_exact
+from palpate.leakage.search import pairs as search_pairs
+from palpate.leakage.search import threads as search_threads
+from palpate.leakage.search.space import Space, base_side, identical_rows, query_side
 
 
 def squared(x, y):

@@ -17,11 +17,11 @@ from palpate.core import PalpateError, Split, digest_file
 from palpate.data.listing import read_lists
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit_split, choose_group, components, describe, leak_free_folds, leak_free_split, leak_free_splits
-from palpate.leakage.assign import RESOLUTION, column_bound, draw, optimise, repair
-from palpate.leakage.noleak import RATIOS, entry, hct_noleak, load_record, make_record, record_split, verify_record
-from palpate.leakage.polish import Problem, Search, greedy, start
-from palpate.leakage.program import EXACT
-from palpate.leakage.recheck import recheck
+from palpate.leakage.splits.assign import RESOLUTION, column_bound, draw, optimise, repair
+from palpate.leakage.splits.noleak import RATIOS, entry, hct_noleak, load_record, make_record, record_split, verify_record
+from palpate.leakage.splits.polish import Problem, Search, greedy, start
+from palpate.leakage.splits.program import EXACT
+from palpate.leakage.splits.recheck import recheck
 
 TOP = Path(__file__).resolve().parents[1]
 
@@ -335,7 +335,7 @@ def test_a_recheck_finds_what_was_tampered_with():
 
 def test_the_record_is_whole_small_and_leak_free(published):
     record = load_record("touch-and-go")
-    assert (TOP / "src/palpate/leakage/records/tag_noleak.json").stat().st_size < 100_000
+    assert (TOP / "src/palpate/leakage/splits/records/tag_noleak.json").stat().st_size < 100_000
     videos, classes = set(published.column("video")), set(published.column("material"))
     for ratio in RATIOS:
         for seed in range(5):

@@ -241,7 +241,7 @@ def write_own_lists(manifest: Manifest, split: Split, folder: Path) -> list[str]
 def _verify(options: Options, path: Path, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Checks an existing split file; status 1 if anything does not hold."""
     from palpate.leakage import audit_split
-    from palpate.leakage.recheck import columns_of, recheck
+    from palpate.leakage.splits.recheck import columns_of, recheck
 
     split = Split.load(path)
     manifest, _ = _read(options.paths, options, terminal)
@@ -269,7 +269,7 @@ def _verify(options: Options, path: Path, terminal: Terminal) -> tuple[dict[str,
 
 def _noleak(options: Options, samples: Sequence[Path], terminal: Terminal) -> dict[str, Any]:
     """The published split of the data set that the first path names."""
-    from palpate.leakage import noleak
+    from palpate.leakage.splits import noleak
 
     assert options.output is not None
     dataset = str(options.paths[0])

@@ -1,9 +1,9 @@
 """Exact nearest neighbours by pruning: a guess for each query, then one sweep that keeps only what could beat it.
 
-1. *Guess*: queries are taken cell by cell (:class:`~palpate.leakage.search_space.Cells`) and compared in full with the nearest cells'
+1. *Guess*: queries are taken cell by cell (:class:`~palpate.leakage.search.space.Cells`) and compared in full with the nearest cells'
    rows until each has k allowed neighbours. The k-th distance t_x found so far bounds the true one from above.
 2. *Sweep*: for the queries of one block, a base row y survives when its distance to the cell's centre c satisfies |y - c| <= max_x (|x -
-   c| + t_x), and then when bound (1) of ``search_space`` on the leading p axes does not exceed t_x. p is chosen by counting survivors on
+   c| + t_x), and then when bound (1) of ``search.space`` on the leading p axes does not exceed t_x. p is chosen by counting survivors on
    a sample: few axes cost little and prune little. When the queries are the base itself, each unordered pair is swept once, for both of
    its rows: a row is no candidate any more once it was a query, and t_x^2 becomes t_x^2 + max(0, t_y^2 - t^2) >= max(t_x^2, t_y^2), with
    t the least threshold of the block, still a sum of a part of x and a part of y.
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress
-from palpate.leakage.search_space import (
+from palpate.leakage.search.space import (
     CELL_AXES,
     Cells,
     Doubles,
@@ -38,7 +38,7 @@ from palpate.leakage.search_space import (
     squared_distances,
     widened,
 )
-from palpate.leakage.search_threads import one_blas_thread
+from palpate.leakage.search.threads import one_blas_thread
 
 QUERIES, ROWS = 192, 1024  # a block of pairs: 0.75 megabyte of float32, small enough to stay in a processor's cache
 LEAST = 32  # queries of one group that make a block of their own

@@ -1,8 +1,8 @@
 """Groups to parts: the smallest largest deviation that exists, and how far from it the answer may be.
 
 *Phase 1* (:func:`optimise`) looks for the smallest t* such that every material that can be in every part, and the whole, deviates by at most
-t* from its wanted share, all present in every part. Upper bounds come from local search (:mod:`palpate.leakage.polish`) and from solving small
-programs exactly (:mod:`palpate.leakage.program`, ``FREE`` groups at a time, those that hold the worst materials among them), then from HiGHS on the
+t* from its wanted share, all present in every part. Upper bounds come from local search (:mod:`palpate.leakage.splits.polish`) and from solving small
+programs exactly (:mod:`palpate.leakage.splits.program`, ``FREE`` groups at a time, those that hold the worst materials among them), then from HiGHS on the
 whole program; lower bounds from each column alone (the subset sums of its groups, or whole numbers of samples) and from HiGHS. Deviations
 under ``RESOLUTION`` count as equal: nobody can tell them apart, and no solver can prove one the smallest. If not all
 materials can be in every part at once, as few as possible are given up.
@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from palpate.core import rng_for
-from palpate.leakage.polish import Ints, Problem, Search, start
-from palpate.leakage.program import EXACT, Program
+from palpate.leakage.splits.polish import Ints, Problem, Search, start
+from palpate.leakage.splits.program import EXACT, Program
 
 #: Deviations below this share count as equal: 0.1 % of a material.
 RESOLUTION = 0.001

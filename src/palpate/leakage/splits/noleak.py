@@ -89,7 +89,7 @@ def load_record(dataset: str) -> dict[str, Any]:
         raise PalpateError(
             f"There is a record for {', '.join(RECORDS)}, and a rule for hct", repr(dataset), "Name one of these before --noleak"
         )
-    with resources.as_file(resources.files("palpate.leakage") / "records" / RECORDS[dataset]) as path:
+    with resources.as_file(resources.files("palpate.leakage.splits") / "records" / RECORDS[dataset]) as path:
         record = read_json(path, "record")
     verify_record(record)
     return record

@@ -1,12 +1,12 @@
 """Leak-free splits: whole groups go to one part, and every material keeps its share as well as it can.
 
-Groups are connected components (:mod:`palpate.leakage.groups`); with n_gm the samples of material m in group g and r_p the wanted share of part p,
+Groups are connected components (:mod:`palpate.leakage.splits.groups`); with n_gm the samples of material m in group g and r_p the wanted share of part p,
 the assignment a(g) minimises the largest deviation
 
     max_{m, p} | sum_{g: a(g)=p} n_gm / n_m - r_p |
 
 over the materials that occur in at least as many groups as there are parts, and over all samples together, each present in every part
-(:mod:`palpate.leakage.assign`). Rarer materials are named and go along. Folds are parts of equal share.
+(:mod:`palpate.leakage.splits.assign`). Rarer materials are named and go along. Folds are parts of equal share.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from palpate.core import PARTS, PalpateError, Split
 from palpate.data.manifest import Manifest
-from palpate.leakage.assign import RESOLUTION, Optimum, draw, optimise
-from palpate.leakage.groups import COLUMNS, Nulls, components
-from palpate.leakage.polish import Ints, Problem
-from palpate.leakage.program import EXACT
+from palpate.leakage.splits.assign import RESOLUTION, Optimum, draw, optimise
+from palpate.leakage.splits.groups import COLUMNS, Nulls, components
+from palpate.leakage.splits.polish import Ints, Problem
+from palpate.leakage.splits.program import EXACT
 
 RULE_VERSION = 2
 #: A split is refused if its largest group leaves the other parts less than this fraction of what they want.
@@ -164,7 +164,7 @@ def leak_free_splits(
         by: columns to keep whole together.
         links: labels of near-duplicate clusters, (n,) integers each, negative for none.
         link_facts: how they were found, for the rule.
-        nulls: what a null in such a column means (:func:`palpate.leakage.groups.components`).
+        nulls: what a null in such a column means (:func:`palpate.leakage.splits.groups.components`).
         tolerance: how much larger than the smallest possible the largest deviation may be; more of it, more different splits.
         name: the name of the rule.
 

@@ -1,7 +1,7 @@
 """The mixed-integer program of a split, for HiGHS by :func:`scipy.optimize.milp`.
 
 ``x_gp`` in {0, 1} puts a *free* group g into part p; the others stay where they are and only count. With the notation of
-:mod:`palpate.leakage.polish`, ``b_pm`` the share of material m that the fixed groups bring to part p, and C the columns that occur in at least as
+:mod:`palpate.leakage.splits.polish`, ``b_pm`` the share of material m that the fixed groups bring to part p, and C the columns that occur in at least as
 many groups as there are parts, and the whole:
 
     sum_p x_gp = 1,    | b_pm + sum_g s_gm x_gp - r_p | <= t    for m in C,
@@ -19,7 +19,7 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import Bounds, LinearConstraint, milp
 
-from palpate.leakage.polish import Floats, Ints, Problem
+from palpate.leakage.splits.polish import Floats, Ints, Problem
 
 #: HiGHS meets its constraints to 1e-6, so a smaller difference is none.
 EXACT = 2e-6

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from palpate.core import PARTS, PalpateError, Split
 from palpate.data.manifest import Manifest
-from palpate.leakage.groups import COLUMNS, components
-from palpate.leakage.noleak import entry, load_record, ratio_name
 from palpate.leakage.splits import choose_group
+from palpate.leakage.splits.groups import COLUMNS, components
+from palpate.leakage.splits.noleak import entry, load_record, ratio_name
 
 
 @dataclass(frozen=True)

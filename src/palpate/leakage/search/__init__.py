@@ -1,8 +1,8 @@
 """Nearest neighbours and near-duplicates among feature vectors: the search engine of the leak audit.
 
 Distances are Euclidean, measured as |x - y| in float64 on the rows as given (never as |x|^2 + |y|^2 - 2 xy, which cancels for
-near-duplicates), ties go to the lowest row, and no N x N matrix is ever held. The mathematics of the exact search is in ``search_space``
-(a bound that never loses a pair) and ``search_exact`` (guess, sweep, measure); beyond :data:`EXACT_LIMIT` different base rows,
+near-duplicates), ties go to the lowest row, and no N x N matrix is ever held. The mathematics of the exact search is in ``search.space``
+(a bound that never loses a pair) and ``search.exact`` (guess, sweep, measure); beyond :data:`EXACT_LIMIT` different base rows,
 :func:`nearest` asks faiss, which is approximate. Identical rows are searched once, so two million frames of the same untouched gel cost
 little more than one.
 """
@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Progress, quiet
-from palpate.leakage.search_exact import Best, Nearest
-from palpate.leakage.search_pairs import close_pairs, clusters
-from palpate.leakage.search_space import Floats, Ints, checked_labels, checked_rows, identical_rows
-from palpate.leakage.search_threads import limited, one_blas_thread
+from palpate.leakage.search.exact import Best, Nearest
+from palpate.leakage.search.pairs import close_pairs, clusters
+from palpate.leakage.search.space import Floats, Ints, checked_labels, checked_rows, identical_rows
+from palpate.leakage.search.threads import limited, one_blas_thread
 
 EXACT_LIMIT = 100_000
 BACKENDS = ("auto", "exact", "faiss")
@@ -122,7 +122,7 @@ def _distinct(
     wanted = rows if x is y and whole else x if len(asked) == len(x) else x[asked]
     groups = (None if qg is None else qg[asked], None if bg is None else bg[kept])
     if backend == "faiss" or (backend == "auto" and len(rows) > EXACT_LIMIT):
-        from palpate.leakage.search_faiss import approximate  # so that nothing of it is imported where nobody asks for it
+        from palpate.leakage.search.approximate import approximate  # so that nothing of it is imported where nobody asks for it
 
         best, name = approximate(wanted, rows, k, *groups, radius, progress)
     else:

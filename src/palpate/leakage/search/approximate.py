@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from palpate.core import MissingExtraError, Progress
-from palpate.leakage.search_exact import Best
-from palpate.leakage.search_space import Floats, Ints, squared_distances
+from palpate.leakage.search.exact import Best
+from palpate.leakage.search.space import Floats, Ints, squared_distances
 
 PROBES, TRAINING_ROWS, SEED, QUERIES = 32, 64, 20240607, 4096
 
@@ -24,7 +24,7 @@ PROBES, TRAINING_ROWS, SEED, QUERIES = 32, 64, 20240607, 4096
 def approximate(
     queries: Floats, base: Floats, k: int, query_groups: Ints | None, base_groups: Ints | None, radius: float | None, progress: Progress
 ) -> tuple[Best, str]:
-    """As :class:`~palpate.leakage.search_exact.Nearest`, approximately; the second value names backend and settings.
+    """As :class:`~palpate.leakage.search.exact.Nearest`, approximately; the second value names backend and settings.
 
     Raises:
         MissingExtraError: if faiss is not installed.

@@ -1,6 +1,6 @@
 """All pairs within a radius, and the clusters that they make, without ever holding them all.
 
-*Pairs*: rows are sorted by cell; each block of rows is swept (bound (1) of ``search_space``, threshold = radius) against the rows behind
+*Pairs*: rows are sorted by cell; each block of rows is swept (bound (1) of ``search.space``, threshold = radius) against the rows behind
 it in that order, and what passes is measured in float64. Each unordered pair is met once.
 
 *Clusters* are the connected components of "at most ``radius`` apart". Their pairs may be far too many (two million nearly identical
@@ -22,8 +22,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from palpate.core import Progress
-from palpate.leakage.search_exact import PENDING, QUERIES, Index, Sieve, choose_axes, within
-from palpate.leakage.search_space import Doubles, Floats, Ints, Space, base_side, query_side, squared_distances
+from palpate.leakage.search.exact import PENDING, QUERIES, Index, Sieve, choose_axes, within
+from palpate.leakage.search.space import Doubles, Floats, Ints, Space, base_side, query_side, squared_distances
 
 BALL_SHARE, BALLS = 0.05, 32  # a ball must hold this share of the rows that are left, else no more balls are drawn
 
