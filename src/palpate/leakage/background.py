@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.leakage.verify import REACH, SIDE, Floats, Ints, Shifts, best_offset, band_pass
+from palpate.leakage.verify import SIDE, Floats, Ints, Shifts, band_pass, best_offset
 
 QUARTERS = Shifts.of(0.25)
 GAIN = (0.85, 1.15)

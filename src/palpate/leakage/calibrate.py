@@ -6,12 +6,12 @@ its own video and of the match's left out; Auckenthaler et al. 2000 call this te
 
     tanh(z - c),  0 where that is negative:
 
-0 = no more alike than unrelated pictures are, 1 = the same picture. Without a video column c is 0, since a query's own video cannot be left out.
+0 = no more alike than unrelated pictures are, 1 = the same picture. Without a video column c is 0, since a query's own video cannot be left out: the score is s.
 
-*Threshold with videos known.* The scores of every sample's best match among OTHER videos are the null. Real near-duplicates may hide in it (a recording that was
+*Threshold with videos known.* The scores of samples' best matches among OTHER videos are the null. Real near-duplicates may hide in it (a recording that was
 uploaded twice), so its tail cannot be trusted: a Gumbel distribution, the limit law of a best match among many, is fitted to the quantiles 10 to
 70 %; what lies above its 1 - 10^-5 quantile is taken for such duplicates and left out; of the rest the highest tenth gives an exponential tail
-(rate = mean excess), and the threshold is where that tail falls to the wanted rate. The share of the null above it is told.
+(rate = mean excess), and the threshold is where that tail falls to the wanted rate, but at least 0.5. The share of the null above it is told.
 
 *Threshold without.* A random pair is almost always unrelated. Queries are compared with random train pictures in blocks of B, a Gumbel distribution is fitted to the
 bulk of the blocks' best z in the same way, and since the best of m independent blocks is Gumbel again, moved by scale * ln m, the threshold is the quantile for
@@ -30,8 +30,7 @@ from palpate.leakage.verify import Floats, Ints
 
 COHORT = 128
 #: Share of the cohort that makes a query's level.
-TOP = 1 / 16.0
-WEIGHT = 1.0
+TOP = 1 / 32
 #: z of two equal pictures would be infinite.
 HIGHEST = 0.9995
 #: Sizes of the blocks of random pairs, and how much wider the fit up to their 90 % quantile may be than that up to 70 %.
@@ -41,6 +40,8 @@ SPREAD = 1.25
 FEWEST = 30
 #: Threshold where nothing can be calibrated: z = 1.1 above the level.
 DEFAULT = 0.8
+#: Lowest threshold with videos: a small excess is no near-duplicate, however alike unrelated pictures are to one another.
+LEAST_EXCESS = 0.5
 #: Without videos, pictures less alike than this are no near-duplicates, however unlike unrelated ones are.
 LEAST = 0.7
 BINS = 50
@@ -91,10 +92,10 @@ def levels(z: Floats, own: Ints, match: Ints, cohort: Ints) -> Floats:
     level = np.where(held & np.isfinite(left), left, 0).sum(axis=1) / top
     if (count == 0).any():
         level[count == 0] = np.median(level[count > 0]) if (count > 0).any() else 0.0
-    return (WEIGHT * level).astype(np.float32)
+    return level.astype(np.float32)
 
 
-def score(z: Floats, level: Floats | float = 0.0) -> Floats:
+def score(z: Floats, level: Floats) -> Floats:
     """tanh(z - level), at least 0; NaN stays NaN."""
     return np.maximum(np.tanh(z - level), 0).astype(np.float32)
 
@@ -114,23 +115,21 @@ def other_videos(excess: Floats, rate: float) -> Calibration:
         rate: wanted share of unrelated samples over the threshold.
     """
     place, scale = gumbel(excess)
-    ceiling = place + scale * -np.log(-np.log1p(-1e-5))
-    kept = excess[excess <= ceiling]
+    kept = excess[excess <= place + scale * -np.log(-np.log1p(-1e-5))]
     shoulder = float(np.quantile(kept, 0.9))
     tail = kept[kept > shoulder]
-    mean = max(float((tail - shoulder).mean()) if len(tail) else scale, scale)
-    cut = shoulder + mean * np.log(max(0.1 / rate, 1.0))
-    threshold = float(np.tanh(max(cut, 0.02)))
-    over = float((score(excess) >= threshold).mean())
+    mean = max(float((tail - shoulder).mean()) if len(tail) else scale, scale / 2)  # ties at the shoulder must not make it vanish
+    threshold = max(float(np.tanh(shoulder + mean * np.log(max(0.1 / rate, 1.0)))), LEAST_EXCESS)
+    unrelated = score(excess, np.zeros_like(excess))
+    over = float((unrelated >= threshold).mean())
     notes = [
         f"Threshold {threshold:.3f} from the best matches of {len(excess)} samples in other videos, for {rate:.2%} of unrelated samples; {over:.2%} of"
         " those lie over it."
     ]
     if dropped := len(excess) - len(kept):
-        notes.append(
-            f"{dropped} of them ({dropped / len(excess):.1%}) are so alike that they are taken for copies across videos and do not set the threshold."
-        )
-    return Calibration(threshold, score(excess), notes)
+        share = f"{dropped} of them ({dropped / len(excess):.1%})"
+        notes.append(f"{share} are so alike that they are taken for copies across videos and do not set the threshold.")
+    return Calibration(threshold, unrelated, notes)
 
 
 def random_blocks(z: Floats, count: int, rate: float) -> Calibration:
@@ -165,7 +164,7 @@ def random_blocks(z: Floats, count: int, rate: float) -> Calibration:
         f"No videos are known, so the threshold {threshold:.3f} comes from random pairs (in blocks of {best[1]}), carried over to the best of"
         f" {count} train pictures, for {rate:.2%} of unrelated samples."
     )
-    return Calibration(threshold, score(best[2]), [note])
+    return Calibration(threshold, np.tanh(best[2]).astype(np.float32), [note])
 
 
 def uncalibrated(rate: float) -> Calibration:

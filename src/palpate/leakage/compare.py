@@ -147,3 +147,20 @@ def best_matches(
     place[first[0]] = candidates[order][first[1]]
     value[first[0]] = values[order][first[1]]
     return place, value
+
+
+def all_or_nearest(comparer: Comparer, items: Ints, count: int, progress: Progress = quiet) -> tuple[Ints, Ints, Floats]:
+    """Pairs of different pictures worth looking at: all if they are few, else each with its ``count`` nearest.
+
+    Returns:
+        (i, j, similarity): places in ``items``; a pair may stand in both orders.
+    """
+    if len(items) ** 2 <= EXHAUSTIVE:
+        found = comparer.grid(items, items, progress) if len(items) else np.zeros((0, 0), np.float32)
+        i, j = np.nonzero(items[:, None] != items[None])
+        return i, j, found[i, j]
+    vectors = comparer.vectors()[items]
+    near = nearest(vectors, vectors, count, self_join=True, progress=progress).index
+    i, k = np.nonzero(near >= 0)
+    j = near[i, k]
+    return i, j, comparer.pairs(items[i], items[j], progress)

@@ -156,7 +156,7 @@ Decoded = tuple[NDArray[np.uint8], dict[int, str]]
 
 def _chunks(chunks: list[Chunk], processes: int, count: int) -> Iterator[tuple[int, Decoded]]:
     """Decodes chunks in processes if they are many, else in threads (Pillow lets go of the interpreter while it decodes)."""
-    left = {start: files for start, files in chunks}
+    left = dict(chunks)
     if processes > 1 and count >= FEW:
         context = multiprocessing.get_context("spawn")  # a forked copy of a process with threads may hang
         try:

@@ -24,25 +24,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
-from palpate.core import PalpateError, Progress, quiet, rng_for
+from palpate.core import PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibrate
-from palpate.leakage.calibrate import Calibration
-from palpate.leakage.causes import blank_matches, gel_at_other_times
-from palpate.leakage.compare import Comparer, Embeddings, Plates, best_matches
+from palpate.leakage.causes import gel_at_other_times
+from palpate.leakage.compare import CANDIDATES, Comparer, Embeddings, Plates, all_or_nearest
+from palpate.leakage.matching import Entries, Found, calibrated, levels_of, match
 from palpate.leakage.pool import Pool, codes, plates, pool
 from palpate.leakage.verify import Floats, Ints
 
 MODALITIES = ("vision", "touch")
-#: Samples whose best match in other videos makes the null.
-NULL_SAMPLES = 4000
-#: So many of train are enough, else those of test are added.
-ENOUGH = 100
-#: Queries that random pairs are drawn for where no videos are known.
-RANDOM_QUERIES = 1500
-#: In how many rounds, and how many train pictures each round draws.
-RANDOM_ROUNDS, RANDOM_WIDTH = 12, 64
+#: Share of a pair's similarity that the passive gel must reach to be the reason for it.
+GEL_SHARE = 0.65
 
 
 @dataclass(frozen=True)
@@ -74,32 +70,6 @@ class NearMatches:
     found: list[int]
     notes: list[str]
     settings: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Entries:
-    """Distinct (picture, video) pairs of one part, so that equal samples are searched once.
-
-    Attributes:
-        item: (e,) pictures; videos: (e,) codes; sample: (e,) the first sample of each.
-        back: (n,) the entry of each sample, -1 where it has no picture.
-    """
-
-    item: Ints
-    videos: Ints
-    sample: Ints
-    back: Ints
-
-    @classmethod
-    def of(cls, item: Ints, videos: Ints) -> _Entries:
-        use = np.flatnonzero(item >= 0)
-        pairs, first, place = np.unique(np.stack([item[use], videos[use]], axis=1), axis=0, return_index=True, return_inverse=True)
-        back = np.full(len(item), -1, np.int64)
-        back[use] = place.ravel()
-        return cls(pairs[:, 0], pairs[:, 1], use[first], back)
-
-    def __len__(self) -> int:
-        return len(self.item)
 
 
 def near_duplicates(
@@ -138,124 +108,110 @@ def near_duplicates(
         pictures, fine = pool(train, test, modality, cache=cache, processes=processes, progress=progress)
         comparer, item, videos = Plates(fine), pictures.item, pictures.videos
     cut = len(train)
-    base, queries = _Entries.of(item[:cut], videos[:cut]), _Entries.of(item[cut:], videos[cut:])
-    found = _match(comparer, base, queries, false_positives, pictures, progress)
+    base, queries = Entries.of(item[:cut], videos[:cut]), Entries.of(item[cut:], videos[cut:])
+    found = match(comparer, base, queries, false_positives, pictures, progress)
     if pictures is not None and modality == "touch":
         found = _name_drift(found, pictures, comparer, base, queries, false_positives, progress)
     return _spread(found, modality, false_positives, comparer, base, queries, len(test), pictures)
 
 
-@dataclass(frozen=True)
-class _Found:
-    """Results for the entries of test."""
+def near_groups(
+    manifest: Manifest,
+    modality: str,
+    *,
+    false_positives: float = 0.001,
+    features: NDArray[np.float32] | None = None,
+    feature_name: str = "",
+    cache: Path | None = None,
+    processes: int | None = None,
+    progress: Progress = quiet,
+) -> NDArray[np.int64]:
+    """Clusters of near-duplicates, to be kept whole by a split.
 
-    score: Floats
-    place: Ints
-    similarity: Floats
-    cause: NDArray[np.str_]
-    calibration: Calibration
+    Two pictures are linked if each is near the other by the rules of :func:`near_duplicates` and the cause is content; a cluster is a connected component. Clusters
+    chain: the first and the last frame of a long slide may share nothing, and two videos are joined by one pair, so a cluster may be as large as a
+    recording. That is what a split needs, but a cluster is no list of duplicates. Each picture is linked to its 16 nearest at most.
 
+    Args:
+        manifest: (n) samples.
+        modality: as in :func:`near_duplicates`.
+        false_positives: as in :func:`near_duplicates`.
+        features: (n, d) embeddings instead of the pictures.
+        feature_name: names them.
+        cache: folder for thumbnails, or None.
+        processes: that decode; None takes one a core.
+        progress: told about the work.
 
-def _match(comparer: Comparer, base: _Entries, queries: _Entries, rate: float, pictures: Pool | None, progress: Progress) -> _Found:
-    """Best matches of all test entries, their scores and causes (but for drift)."""
-    place, similarity = best_matches(comparer, queries.item, base.item, progress=progress)
-    null = _null_sample(base, queries)
-    z = calibrate.fisher(similarity)
-    level: Floats | float = 0.0
-    cohort = _cohort(base)
-    if null is None:
-        calibration = _from_random_pairs(comparer, base, queries, rate, progress)
-    else:
-        level = _levels(comparer, base, queries, place, cohort, progress)
-        apart, alike = best_matches(comparer, null.item, base.item, null.videos, base.videos, progress)
-        has = apart >= 0
-        excess = calibrate.fisher(alike) - _levels(comparer, base, null, apart, cohort, progress)
-        use = has if pictures is None else has & ~pictures.blank[null.item]
-        excess = excess[use]
-        calibration = calibrate.other_videos(excess, rate) if len(excess) >= calibrate.FEWEST else calibrate.uncalibrated(rate)
-    score = calibrate.score(z, level)
-    cause = np.where(score >= calibration.threshold, "content", "").astype("<U15")
-    if pictures is not None:
-        score, place, cause = blank_matches(pictures, queries.item, base.item, score, place, cause, calibration.threshold)
-    return _Found(score, place, similarity, cause, calibration)
+    Returns:
+        (n,) the number of each sample's cluster, 0, 1, ... by first occurrence; -1 for samples that are near no other picture, that show nothing, or that cannot be read.
 
-
-def _null_sample(base: _Entries, queries: _Entries) -> _Entries | None:
-    """The samples whose best match in other videos of train makes the null, None if videos do not tell.
-
-    Those of train come first: copies of train pictures are what test is searched for, and would spoil the null.
+    Raises:
+        PalpateError: as :func:`near_duplicates`.
     """
-    known = np.unique(base.videos[base.videos >= 0])
-    if len(known) < 2:
-        others = queries.videos[queries.videos >= 0]
-        if not len(known) or not (others != known[0]).any():
-            return None
-    parts = [np.flatnonzero(e.videos >= 0) for e in (base, queries)]
-    if len(parts[0]) + len(parts[1]) < calibrate.FEWEST:
-        return None
-    rng = rng_for(0, "near-duplicates", "null")
-    chosen = [np.sort(rng.permutation(rows)[:NULL_SAMPLES]) for rows in parts]
-    if len(known) > 1 and len(chosen[0]) >= ENOUGH:
-        chosen[1] = chosen[1][:0]
-    item = np.concatenate([base.item[chosen[0]], queries.item[chosen[1]]])
-    videos = np.concatenate([base.videos[chosen[0]], queries.videos[chosen[1]]])
-    return _Entries(item, videos, np.arange(len(item)), np.arange(len(item)))
+    none = Manifest(manifest.table.clear(), manifest.root)
+    both = None if features is None else (features, np.asarray(features)[:0])
+    _check(modality, false_positives, both, (len(manifest), 0))
+    if features is not None:
+        comparer: Comparer = Embeddings(np.asarray(features, np.float32), feature_name or "embeddings given")
+        item, videos, pictures = np.arange(len(manifest)), codes((manifest,), "video"), None
+    else:
+        pictures, fine = pool(manifest, none, modality, cache=cache, processes=processes, progress=progress)
+        comparer, item, videos = Plates(fine), pictures.item, pictures.videos
+    entries = Entries.of(item, videos)
+    if pictures is not None:
+        entries = entries.only(~pictures.blank[entries.item])
+    i, j, similarity = all_or_nearest(comparer, entries.item, CANDIDATES, progress)
+    calibration, by_videos = calibrated(comparer, entries, entries, false_positives, pictures, progress)
+    level = np.zeros(len(entries), np.float32)
+    if by_videos:
+        level = levels_of(comparer, entries, entries, np.full(len(entries), -1), progress)
+    linked = calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j])) >= calibration.threshold
+    i, j, similarity = i[linked], j[linked], similarity[linked]
+    if pictures is not None and modality == "touch" and len(i):
+        some = np.unique(np.concatenate([i, j]))
+        gel = np.zeros(len(entries), np.float32)
+        gel[some] = gel_at_other_times(pictures, entries.item[some], entries.videos[some])
+        kept = np.maximum(gel[i], gel[j]) < similarity * GEL_SHARE
+        i, j = i[kept], j[kept]
+    return _clusters(item, entries.item, i, j)
 
 
-def _cohort(base: _Entries) -> Ints:
-    """Random train entries, the same for all queries."""
-    return np.sort(rng_for(0, "near-duplicates", "cohort").permutation(len(base))[: calibrate.COHORT])
-
-
-def _levels(comparer: Comparer, base: _Entries, queries: _Entries, match: Ints, cohort: Ints, progress: Progress) -> Floats:
-    """How alike unrelated pictures are to each query."""
-    if not len(cohort) or not len(queries):
-        return np.zeros(len(queries), np.float32)
-    z = calibrate.fisher(comparer.grid(queries.item, base.item[cohort], progress))
-    z[queries.item[:, None] == base.item[cohort][None]] = np.nan
-    matched = np.where(match >= 0, base.videos[np.maximum(match, 0)], -1)
-    return calibrate.levels(z, queries.videos, matched, base.videos[cohort])
-
-
-def _from_random_pairs(comparer: Comparer, base: _Entries, queries: _Entries, rate: float, progress: Progress) -> Calibration:
-    """The threshold where no videos are known."""
-    count = len(base)
-    if not count or not len(queries):
-        return calibrate.uncalibrated(rate)
-    rng = rng_for(0, "near-duplicates", "random pairs")
-    asked = rng.permutation(len(queries))[:RANDOM_QUERIES]
-    rows: list[Floats] = []
-    for part in np.array_split(asked, min(RANDOM_ROUNDS, len(asked))):  # each with other train pictures
-        other = base.item[rng.permutation(count)[:RANDOM_WIDTH]]
-        found = calibrate.fisher(comparer.grid(queries.item[part], other, progress))
-        found[queries.item[part][:, None] == other[None]] = np.nan
-        rows.append(rng.permuted(found, axis=1))
-    z = np.concatenate(rows)
-    return calibrate.random_blocks(z, count, rate)
+def _clusters(item: Ints, nodes: Ints, i: Ints, j: Ints) -> Ints:
+    """Components of pictures that are linked, or stand for several samples, numbered by first occurrence."""
+    count = int(max(item.max(initial=-1), nodes.max(initial=-1))) + 1
+    if not count:
+        return np.full(len(item), -1, np.int64)
+    graph = coo_matrix((np.ones(len(i), bool), (nodes[i], nodes[j])), shape=(count, count))
+    component = connected_components(graph, directed=False)[1]
+    allowed = np.zeros(count, bool)
+    allowed[nodes] = True
+    use = (item >= 0) & allowed[np.maximum(item, 0)]
+    label = np.where(use, component[np.maximum(item, 0)], -1).astype(np.int64)
+    sizes = np.bincount(label[use], minlength=count)
+    label[use & (sizes[np.maximum(label, 0)] < 2)] = -1
+    _, first, place = np.unique(label[label >= 0], return_index=True, return_inverse=True)
+    label[label >= 0] = np.argsort(np.argsort(first))[place]
+    return label
 
 
 def _name_drift(
-    found: _Found, pictures: Pool, comparer: Comparer, base: _Entries, queries: _Entries, rate: float, progress: Progress
-) -> _Found:
+    found: Found, pictures: Pool, comparer: Comparer, base: Entries, queries: Entries, rate: float, progress: Progress
+) -> Found:
     """Tells touches that are alike through the state of the sensor from those alike in content."""
     cause = found.cause.copy()
     content = np.flatnonzero(cause == "content")
     if len(content):
         gel = gel_at_other_times(pictures, queries.item[content], queries.videos[content])
         cause[content[gel >= found.similarity[content] * GEL_SHARE]] = "sensor drift"
-    slow = _match(Plates(plates(pictures, slow=True)[0]), base, queries, rate, None, progress)
+    slow = match(Plates(plates(pictures, slow=True)[0]), base, queries, rate, None, progress)
     only = (slow.cause == "content") & (found.cause == "") & ~pictures.blank[queries.item]
     score = np.where(only, np.maximum(slow.score, found.calibration.threshold), found.score).astype(np.float32)
     cause[only] = "sensor drift"
     return replace(found, cause=cause, score=score, place=np.where(only, slow.place, found.place))
 
 
-#: Share of a pair's similarity that the passive gel must reach to be the reason for it.
-GEL_SHARE = 0.65
-
-
 def _spread(
-    found: _Found, modality: str, rate: float, comparer: Comparer, base: _Entries, queries: _Entries, count: int, pictures: Pool | None
+    found: Found, modality: str, rate: float, comparer: Comparer, base: Entries, queries: Entries, count: int, pictures: Pool | None
 ) -> NearMatches:
     """From entries to the samples of test."""
     has = queries.back >= 0

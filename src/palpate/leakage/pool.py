@@ -2,8 +2,8 @@
 
 A picture is blank where it shows nothing: a photo without any structure (a lens cap, a black frame), a tactile image that differs from its background no
 more than the passive gel differs from itself. The strength of a picture is the root mean square of its band-passed thumbnail in grey levels; the limit for touch comes from
-pairs of different backgrounds of one video (without videos, of each and the one most like it), which show untouched gel at two times, as 1.25 times the
-95 % quantile of their strength, within 0.4 and 1.8.
+pairs of different backgrounds of one video (without videos, of each and the one most like it), which show untouched gel at two times, as 1.5 times the
+10 % quantile of their strength (the others may hold the beginning of a contact), within 0.3 and 1.1.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from palpate.leakage.verify import SIDE, Floats, Ints, band_pass, even, rms, smo
 #: Strength below which a photo shows nothing.
 BLANK_PHOTO = 1.0
 #: Bounds of the strength below which a touch shows nothing, and the value where no two backgrounds of a video are known.
-BLANK_TOUCH = (0.4, 1.5)
-BLANK_UNKNOWN = 1.5
+BLANK_TOUCH = (0.3, 1.1)
+BLANK_UNKNOWN = 1.1
 #: Local contrast in grey levels up to which a picture counts less: noise and compression.
 FLOOR = {"vision": 3.0, "touch": 20.0}
 #: Pairs of backgrounds that a limit needs, and how many are looked at.

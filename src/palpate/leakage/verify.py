@@ -146,7 +146,7 @@ def best_offset(x: Floats, y: Floats, shifts: Shifts) -> tuple[Floats, Ints]:
 
 
 def similarities(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progress = quiet) -> Floats:
-    """s of pairs of pictures.
+    """S of pairs of pictures.
 
     Args:
         plates: (n, 3, 32, 32) band-passed pictures, of any scale.
@@ -171,7 +171,7 @@ def similarities(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progre
 
 
 def against_all(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progress = quiet) -> Iterator[tuple[slice, Floats]]:
-    """s of every query with every one of a few pictures, in blocks of queries.
+    """S of every query with every one of a few pictures, in blocks of queries.
 
     Args:
         plates: (n, 3, 32, 32).
