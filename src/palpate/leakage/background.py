@@ -70,7 +70,7 @@ def remove_background(touch: Floats, background: Floats) -> Floats:
         left = t - gain * b
         error = np.square(left).sum(axis=1, keepdims=True)
         weight = 1 / (1 + error / (4 * np.median(error, axis=(2, 3), keepdims=True) + 1e-3))
-    return left
+    return left.astype(np.float32, copy=False)
 
 
 @dataclass(frozen=True)

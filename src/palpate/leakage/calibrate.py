@@ -10,7 +10,7 @@ its own video and of the match's left out; Auckenthaler et al. 2000 call this te
 
 *Threshold with videos known.* The scores of samples' best matches among OTHER videos are the null. Real near-duplicates may hide in it (a recording that was
 uploaded twice), so its tail cannot be trusted: a Gumbel distribution, the limit law of a best match among many, is fitted to the quantiles 10 to
-70 %; what lies above its 1 - 10^-5 quantile is taken for such duplicates and left out; of the rest the highest tenth gives an exponential tail
+70 %; what lies so high that not one in 6 sets of q unrelated matches would hold it is taken for such duplicates and left out (three rounds); of the rest the highest tenth gives an exponential tail
 (rate = mean excess), and the threshold is where that tail falls to the wanted rate, but at least 0.5. The share of the null above it is told.
 
 *Threshold without.* A random pair is almost always unrelated. Queries are compared with random train pictures in blocks of B, a Gumbel distribution is fitted to the
@@ -40,10 +40,12 @@ SPREAD = 1.25
 FEWEST = 30
 #: Threshold where nothing can be calibrated: z = 1.1 above the level.
 DEFAULT = 0.8
+#: Rounds of leaving copies out of the null, and one unrelated best match in how many sets of that size may be lost by it.
+ROUNDS, ODDS = 3, 6
 #: Lowest threshold with videos: a small excess is no near-duplicate, however alike unrelated pictures are to one another.
 LEAST_EXCESS = 0.5
 #: Without videos, pictures less alike than this are no near-duplicates, however unlike unrelated ones are.
-LEAST = 0.7
+LEAST = 0.84
 BINS = 50
 
 
@@ -114,8 +116,10 @@ def other_videos(excess: Floats, rate: float) -> Calibration:
         excess: (q,) z - level of each sample's best match in other videos; at least ``FEWEST``.
         rate: wanted share of unrelated samples over the threshold.
     """
-    place, scale = gumbel(excess)
-    kept = excess[excess <= place + scale * -np.log(-np.log1p(-1e-5))]
+    kept, scale = excess, 1.0
+    for _ in range(ROUNDS):
+        place, scale = gumbel(kept)
+        kept = excess[excess <= place + scale * -np.log(-np.log1p(-1 / (ODDS * len(excess))))]
     shoulder = float(np.quantile(kept, 0.9))
     tail = kept[kept > shoulder]
     mean = max(float((tail - shoulder).mean()) if len(tail) else scale, scale / 2)  # ties at the shoulder must not make it vanish

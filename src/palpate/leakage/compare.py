@@ -18,8 +18,8 @@ from palpate.leakage.verify import BLOCK, Floats, Ints, against_all, similaritie
 
 #: Up to so many pairs are all compared, without a search for candidates.
 EXHAUSTIVE = 200_000
-#: Candidates of each query that are verified.
-CANDIDATES = 16
+#: Candidates of each query that are verified; a planted copy was among the first 3 of 192 in every trial.
+CANDIDATES = 8
 
 
 class Comparer(Protocol):

@@ -6,7 +6,7 @@ images are told, not raised: an audit goes on without them.
 
 The search vector of a band-passed thumbnail x (``verify.band_pass``) joins two parts of equal length:
 
-* the magnitudes of the windowed spectrum up to 7 cycles a side, |F(w x)|^(1/2): a shift changes only phases;
+* the magnitudes of the windowed spectrum up to 4 cycles a side, |F(w x)|^(1/2): a shift changes only phases;
 * G_2 x at every fourth pixel: where things are, blurred by more than a shift moves them.
 
 Its neighbours are candidates; ``verify.similarities`` judges them.
@@ -42,7 +42,7 @@ FEW = 2000
 DRAFT = 48
 #: Modes that need no rule of their own.
 PLAIN = ("YCbCr", "RGB", "L")
-_HIGHEST = 7
+_HIGHEST = 4
 _HANN = np.hanning(SIDE + 2)[1:-1]
 _WINDOW = np.outer(_HANN, _HANN).astype(np.float32)
 _BLUR = ndimage.gaussian_filter1d(np.eye(SIDE), 2.0, axis=0, mode="nearest")[2::4].astype(np.float32)
@@ -207,15 +207,15 @@ def search_vectors(plates: NDArray[np.int8]) -> Floats:
         plates: (n, 3, 32, 32) band-passed pictures of any scale.
 
     Returns:
-        (n, 552), both parts of length 1; zeros where a picture is flat.
+        (n, 327), both parts of length 1; zeros where a picture is flat.
     """
     keep = _HIGHEST + 1
     out: list[Floats] = []
     for start in range(0, len(plates), BLOCK):
         x = plates[start : start + BLOCK].astype(np.float32)
-        spectrum = fft.rfft2(x * _WINDOW)
+        spectrum = np.asarray(fft.rfft2(x * _WINDOW), np.complex64)
         near = np.concatenate([spectrum[:, :, :keep, :keep], spectrum[:, :, -_HIGHEST:, :keep]], axis=2)
-        out.append(np.hstack([_unit(np.sqrt(np.abs(near))), _unit(_BLUR @ x @ _BLUR.T)]))
+        out.append(np.hstack([_unit(np.sqrt(np.abs(near)).astype(np.float32)), _unit(np.asarray(_BLUR @ x @ _BLUR.T, np.float32))]))
     return np.concatenate(out) if out else np.zeros((0, 3 * (2 * _HIGHEST + 1) * keep + 192), np.float32)
 
 

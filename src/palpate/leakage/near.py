@@ -31,7 +31,7 @@ from palpate.core import PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibrate
 from palpate.leakage.causes import gel_at_other_times
-from palpate.leakage.compare import CANDIDATES, Comparer, Embeddings, Plates, all_or_nearest
+from palpate.leakage.compare import Comparer, Embeddings, Plates, all_or_nearest
 from palpate.leakage.matching import Entries, Found, calibrated, levels_of, match
 from palpate.leakage.pool import Pool, codes, plates, pool
 from palpate.leakage.verify import Floats, Ints
@@ -39,6 +39,8 @@ from palpate.leakage.verify import Floats, Ints
 MODALITIES = ("vision", "touch")
 #: Share of a pair's similarity that the passive gel must reach to be the reason for it.
 GEL_SHARE = 0.65
+#: Nearest pictures that a picture may be linked to in a cluster.
+LINKS = 16
 
 
 @dataclass(frozen=True)
@@ -160,11 +162,11 @@ def near_groups(
     entries = Entries.of(item, videos)
     if pictures is not None:
         entries = entries.only(~pictures.blank[entries.item])
-    i, j, similarity = all_or_nearest(comparer, entries.item, CANDIDATES, progress)
+    i, j, similarity = all_or_nearest(comparer, entries.item, LINKS, progress)
     calibration, by_videos = calibrated(comparer, entries, entries, false_positives, pictures, progress)
     level = np.zeros(len(entries), np.float32)
     if by_videos:
-        level = levels_of(comparer, entries, entries, np.full(len(entries), -1), progress)
+        level = levels_of(comparer, entries, entries, _best_elsewhere(entries, i, j, similarity), progress)
     linked = calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j])) >= calibration.threshold
     i, j, similarity = i[linked], j[linked], similarity[linked]
     if pictures is not None and modality == "touch" and len(i):
@@ -176,12 +178,21 @@ def near_groups(
     return _clusters(item, entries.item, i, j)
 
 
+def _best_elsewhere(entries: Entries, i: Ints, j: Ints, similarity: Floats) -> Ints:
+    """For each entry its most similar candidate in another video, whose video is then left out of its level; -1 where there is none."""
+    apart = np.flatnonzero((entries.videos[i] != entries.videos[j]) | (entries.videos[i] < 0))
+    apart = apart[np.lexsort((j[apart], similarity[apart]))]
+    best = np.full(len(entries), -1, np.int64)
+    best[i[apart]] = j[apart]  # of several, the last written is the most similar
+    return best
+
+
 def _clusters(item: Ints, nodes: Ints, i: Ints, j: Ints) -> Ints:
     """Components of pictures that are linked, or stand for several samples, numbered by first occurrence."""
     count = int(max(item.max(initial=-1), nodes.max(initial=-1))) + 1
     if not count:
         return np.full(len(item), -1, np.int64)
-    graph = coo_matrix((np.ones(len(i), bool), (nodes[i], nodes[j])), shape=(count, count))
+    graph = coo_matrix((np.ones(len(i), np.int8), (nodes[i], nodes[j])), shape=(count, count))
     component = connected_components(graph, directed=False)[1]
     allowed = np.zeros(count, bool)
     allowed[nodes] = True

@@ -24,7 +24,7 @@ from palpate.leakage.search import nearest
 from palpate.leakage.verify import SIDE, Floats, Ints, band_pass, even, rms, smooth
 
 #: Strength below which a photo shows nothing.
-BLANK_PHOTO = 1.0
+BLANK_PHOTO = 0.6
 #: Bounds of the strength below which a touch shows nothing, and the value where no two backgrounds of a video are known.
 BLANK_TOUCH = (0.3, 1.1)
 BLANK_UNKNOWN = 1.1

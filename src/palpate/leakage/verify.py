@@ -78,7 +78,7 @@ def band_pass(pictures: Floats) -> Floats:
     Returns:
         (n, 3, 32, 32), the filter of this file's head.
     """
-    out = _FINE @ pictures @ _FINE.T - _COARSE @ pictures @ _COARSE.T
+    out: Floats = np.asarray(_FINE @ pictures @ _FINE.T - _COARSE @ pictures @ _COARSE.T, np.float32)
     out[:, 1:] *= CHROMA
     return out
 
@@ -99,7 +99,11 @@ def smooth(pictures: Floats) -> Floats:
 
 def rms(pictures: Floats) -> Floats:
     """Root mean square over channels and pixels: (n,)."""
-    return np.sqrt(np.mean(np.square(pictures, dtype=np.float32), axis=(1, 2, 3)))
+    return np.sqrt(np.mean(np.square(pictures, dtype=np.float32), axis=(1, 2, 3))).astype(np.float32)
+
+
+def _spectrum(x: Floats) -> NDArray[np.complex64]:
+    return np.asarray(fft.rfft2(x), np.complex64)
 
 
 def query_spectra(x: Floats) -> tuple[NDArray[np.complex64], Floats]:
@@ -107,7 +111,7 @@ def query_spectra(x: Floats) -> tuple[NDArray[np.complex64], Floats]:
     inner = x[:, :, REACH:-REACH, REACH:-REACH]
     t = np.zeros_like(x)
     t[:, :, REACH:-REACH, REACH:-REACH] = inner - inner.mean(axis=(2, 3), keepdims=True)
-    return np.conj(fft.rfft2(t)), np.sqrt(np.square(t).sum(axis=(1, 2, 3)))
+    return np.conj(_spectrum(t)), np.sqrt(np.square(t).sum(axis=(1, 2, 3)))
 
 
 def base_spectra(x: Floats, shifts: Shifts = HALVES) -> tuple[NDArray[np.complex64], Floats]:
@@ -118,7 +122,7 @@ def base_spectra(x: Floats, shifts: Shifts = HALVES) -> tuple[NDArray[np.complex
     part = at - low
     energy = energy[:, low] * (1 - part)[:, None] + energy[:, low + 1] * part[:, None]
     energy = energy[:, :, low] * (1 - part) + energy[:, :, low + 1] * part
-    return fft.rfft2(x), np.sqrt(np.maximum(energy, 0)).astype(np.float32)
+    return _spectrum(x), np.sqrt(np.maximum(energy, 0)).astype(np.float32)
 
 
 def _boxes(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,316 @@
+"""Near-duplicates in vision and touch: the similarity against a slow one, the calibration, causes, groups, and rubbish files."""
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from PIL import Image
+
+from leakage_forge import MATERIALS, NoiseVideo, changed, crop, forge, save
+from palpate.core import PalpateError
+from palpate.data.manifest import Manifest
+from palpate.leakage import calibrate
+from palpate.leakage.background import remove_background
+from palpate.leakage.compare import Plates, best_matches
+from palpate.leakage.descriptors import thumbnail, thumbnails
+from palpate.leakage.near import near_duplicates, near_groups
+from palpate.leakage.pool import quantised
+from palpate.leakage.verify import REACH, SIDE, against_all, band_pass, similarities
+
+DROPPED = ("video", "touch", "object", "session", "material", "sensor", "domain")
+
+
+def anonymous(manifest):
+    table = manifest.table.with_columns(pl.lit(None, pl.String).alias(c) for c in DROPPED).with_columns(frame=pl.lit(None, pl.Int64))
+    return Manifest(table, manifest.root)
+
+
+def fields(n, seed=0, sigma=2.0):
+    from scipy import ndimage
+
+    x = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((n, 3, 48, 48)), (0, 0, sigma, sigma))
+    return (40 * x / x.std()).astype(np.float32)
+
+
+def test_similarity_is_the_best_overlap_at_whole_offsets_and_more_between():
+    x = quantised(band_pass(fields(6)[:, :, :SIDE, :SIDE]))
+    i, j = np.array([0, 0, 1, 2, 4]), np.array([0, 1, 2, 3, 5])
+    found = similarities(x, i, j)
+    for s, a, b in zip(found, i, j, strict=True):
+        t = x[a, :, REACH:-REACH, REACH:-REACH].astype(float)
+        t -= t.mean((1, 2), keepdims=True)
+        best = -1.0
+        for dy in range(2 * REACH + 1):
+            for dx in range(2 * REACH + 1):
+                w = x[b, :, dy : dy + t.shape[1], dx : dx + t.shape[2]].astype(float)
+                w = w - w.mean((1, 2), keepdims=True)
+                best = max(best, float((t * w).sum() / np.sqrt((t**2).sum() * (w**2).sum())))
+        assert best - 1e-3 <= s <= best + 0.12
+    assert found[0] == pytest.approx(1, abs=1e-3)
+    grid = np.concatenate([v for _, v in against_all(x, i, np.arange(6))])
+    assert grid[np.arange(5), j] == pytest.approx(found, abs=1e-5)
+
+
+def test_similarity_survives_gain_offset_and_shift_and_tells_others_apart():
+    big = fields(20)
+    a, b = big[:, :, 2:34, 2:34], 1.3 * big[:, :, 4:36, 1:33] + 17
+    plates = quantised(band_pass(np.concatenate([a, b])))
+    n = np.arange(20)
+    assert similarities(plates, n, n + 20).min() > 0.9
+    assert similarities(plates, n, (n + 1) % 20 + 20).max() < 0.6
+
+
+def test_background_leaves_contact_alone_and_takes_shifted_markers_off():
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:36, :36]
+    gel = np.stack([100 + x, 90 + y, 120 - x], 0).astype(np.float32)
+    for cy in range(3, 36, 8):
+        for cx in range(3, 36, 8):
+            gel -= 60 * np.exp(-((y - cy) ** 2 + (x - cx) ** 2) / 3)
+    contact = np.zeros_like(gel)
+    contact[:, 12:20, 14:22] = rng.normal(0, 12, (3, 8, 8))
+    touch = 1.05 * gel + contact
+    for dy, dx in ((0, 0), (1, -1)):
+        t, b = touch[None, :, 2:34, 2:34], gel[None, :, 2 + dy : 34 + dy, 2 + dx : 34 + dx]
+        left = remove_background(t, b)[0]
+        outside = np.ones((32, 32), bool)
+        outside[8:20, 10:22] = False
+        inner = np.s_[:, 4:28, 4:28]
+        assert np.abs(left[inner])[:, outside[4:28, 4:28]].mean() < 1.0
+        assert np.corrcoef(left[:, 10:18, 12:20].ravel(), contact[:, 12:20, 14:22].ravel())[0, 1] > 0.9
+
+
+def test_candidates_find_what_comparing_all_finds(monkeypatch):
+    big = fields(300, sigma=3)
+    rng = np.random.default_rng(1)
+    shift = rng.integers(0, 5, (300, 2))
+    copies = np.stack([big[k, :, a : a + 32, b : b + 32] for k, (a, b) in enumerate(shift)]) + rng.normal(0, 3, (300, 3, 32, 32))
+    comparer = Plates(quantised(band_pass(np.concatenate([big[:, :, 2:34, 2:34], copies.astype(np.float32)]))))
+    queries, base = np.arange(300, 600), np.arange(300)
+    exact, s = best_matches(comparer, queries, base)
+    monkeypatch.setattr("palpate.leakage.compare.EXHAUSTIVE", 0)
+    found, t = best_matches(comparer, queries, base)
+    assert (exact == base).mean() > 0.995
+    assert (found == exact).mean() > 0.995
+    assert t[found == exact] == pytest.approx(s[found == exact], abs=1e-5)
+
+
+def test_copies_across_videos_do_not_move_the_threshold():
+    rng = np.random.default_rng(0)
+    clean = rng.gumbel(0.3, 0.05, 3000).astype(np.float32)
+    plain = calibrate.other_videos(clean, 0.001)
+    assert 0.0002 < (calibrate.score(clean, np.zeros(3000, np.float32)) >= plain.threshold).mean() + 0.0003 < 0.004
+    mixed = np.concatenate([clean, rng.uniform(1.5, 3, 600).astype(np.float32)])
+    assert calibrate.other_videos(mixed, 0.001).threshold == pytest.approx(plain.threshold, abs=0.05)
+
+
+def test_random_pairs_are_carried_over_to_the_whole_train_part():
+    rng = np.random.default_rng(0)
+    z = rng.gumbel(0.1, 0.09, (1500, 64)).astype(np.float32)
+    found = calibrate.random_blocks(z, 5000, 0.001)
+    exact = 0.1 + 0.09 * (np.log(5000) - np.log(-np.log1p(-0.001)))
+    assert np.arctanh(found.threshold) == pytest.approx(exact, rel=0.12)
+
+
+@pytest.fixture(scope="module")
+def leaky(tmp_path_factory):
+    return forge(tmp_path_factory.mktemp("leaky"), 5, objects=3, materials=MATERIALS[:6], kinds=("near-duplicate",))
+
+
+@pytest.mark.parametrize("modality", ["vision", "touch"])
+@pytest.mark.parametrize("known", [True, False])
+def test_planted_copies_are_found_and_others_are_not(leaky, modality, known):
+    train, test = (leaky.train, leaky.test) if known else (anonymous(leaky.train), anonymous(leaky.test))
+    found = near_duplicates(train, test, modality)
+    truth = leaky.truth("near-duplicate")
+    assert found.flag[truth].mean() >= 0.9
+    assert found.flag[~truth].mean() <= 0.03
+    source = [leaky.planted["near-duplicate"][i] for i, t in zip(test.ids, truth & found.flag, strict=True) if t]
+    assert [train.ids[k] for k in found.nearest[truth & found.flag]] == source
+    assert set(found.cause) <= {"", "content", "nothing touched", "sensor drift"}
+    assert sum(found.found) == np.isfinite(found.score).sum() == len(test)
+    assert len(found.edges) == len(found.unrelated) + 1
+
+
+def test_groups_join_copies_and_nothing_else(leaky):
+    both = Manifest.join(leaky.train, leaky.test)
+    label = dict(zip(both.ids, near_groups(both, "vision").tolist(), strict=True))
+    pairs = leaky.planted["near-duplicate"].items()
+    assert all(label[a] == label[b] >= 0 for a, b in pairs)
+    allowed = {frozenset(i.split("/")[0] for i in pair) for pair in pairs}  # videos that a planted pair joins
+    joined = {frozenset((a.split("/")[0], b.split("/")[0])) for a in label for b in label if label[a] == label[b] >= 0}
+    assert sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 4  # a video between two others joins them
+
+
+def rows(root, name, pictures, background=None):
+    out = []
+    for k, picture in enumerate(pictures):
+        save(root / f"{name}{k}.jpg", picture)
+        out.append(
+            {
+                "id": f"{name}/{k}",
+                "video": name,
+                "frame": 10 * k,
+                "vision": f"{name}{k}.jpg",
+                "tactile": f"{name}{k}.jpg",
+                "background": background,
+            }
+        )
+    return out
+
+
+def gels(root, count=6):
+    """Videos of noise touches, each with backgrounds of its own, and their makers."""
+    made, samples = [], []
+    for v in range(count):
+        video = NoiseVideo(np.random.default_rng([9, v]), 104)
+        made.append(video)
+        for t in range(8):
+            save(root / f"v{v}b{t}.jpg", crop(video.background()))
+            save(root / f"v{v}t{t}.jpg", crop(video.touch(t)))
+            samples.append(
+                {"id": f"v{v}/{t}", "video": f"v{v}", "frame": 10 * t, "tactile": f"v{v}t{t}.jpg", "background": f"v{v}b{t}.jpg"}
+            )
+    return made, samples
+
+
+def test_untouched_gel_is_named_and_is_no_leak(tmp_path):
+    videos, samples = gels(tmp_path)
+    for k in range(2):
+        save(tmp_path / f"blank{k}.jpg", crop(videos[0].background()))
+    blank = [{"id": f"blank{k}", "video": f"v{k}", "frame": 500, "tactile": f"blank{k}.jpg", "background": "v0b0.jpg"} for k in range(2)]
+    train = Manifest.from_rows([*samples[:24], blank[0]], tmp_path)
+    test = Manifest.from_rows([*samples[24:], blank[1]], tmp_path)
+    found = near_duplicates(train, test, "touch")
+    assert found.cause[-1] == "nothing touched"
+    assert not found.flag.any()
+    assert found.nearest[-1] == 24
+    assert any("untouched gel" in note for note in found.notes)
+
+
+def test_drift_of_the_gel_is_named_and_is_no_leak(tmp_path):
+    videos, samples = gels(tmp_path)
+    scar = np.zeros((104, 104, 1))
+    scar[30:34, 20:80], scar[50:80, 60:64], scar[60:63, 15:50] = 45, -45, 45
+    worn = [np.clip(videos[0].background() + scar, 0, 255).astype(np.uint8) for _ in range(3)]
+    save(tmp_path / "worn.jpg", crop(worn[2]))
+    later = []
+    for k in range(2):
+        save(tmp_path / f"scar{k}.jpg", crop(worn[k]))
+        later.append({"id": f"scar{k}", "video": "v0", "frame": 500 + k, "tactile": f"scar{k}.jpg", "background": "v0b0.jpg"})
+    other = {"id": "after", "video": "v0", "frame": 900, "tactile": "v0t7.jpg", "background": "worn.jpg"}
+    found = near_duplicates(
+        Manifest.from_rows([*samples[:24], later[0], other], tmp_path), Manifest.from_rows([*samples[24:], later[1]], tmp_path), "touch"
+    )
+    assert found.cause[-1] == "sensor drift"
+    assert not found.flag.any()
+
+
+def test_black_photos_show_nothing(tmp_path):
+    black = rows(tmp_path, "black", [np.full((64, 64, 3), 3, np.uint8)] * 4)
+    others = [rows(tmp_path, f"n{v}", [crop(NoiseVideo(np.random.default_rng([v, 1]), 72).photo(0)) for _ in range(4)]) for v in range(12)]
+    train = Manifest.from_rows([*black[:2], *(row for rows_ in others[:6] for row in rows_)], tmp_path)
+    test = Manifest.from_rows([*black[2:], *(row for rows_ in others[6:] for row in rows_)], tmp_path)
+    found = near_duplicates(train, test, "vision")
+    assert list(found.cause[:2]) == ["nothing touched"] * 2
+    assert not found.flag.any()
+
+
+def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
+    picture = crop(NoiseVideo(np.random.default_rng(3), 72).photo(0))
+    image = Image.fromarray(picture)
+    image.save(tmp_path / "a.jpg", quality=95)
+    for mode, name in (("L", "grey.png"), ("RGBA", "alpha.png"), ("P", "palette.gif"), ("CMYK", "cmyk.jpg"), ("L", "grey.jpg")):
+        image.convert(mode).save(tmp_path / name)
+    Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 257).save(tmp_path / "deep.png")
+    image.resize((301, 97)).save(tmp_path / "wide.jpg")
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:600])
+    (tmp_path / "text.jpg").write_text("no image")
+    names = sorted(p.name for p in tmp_path.iterdir())
+    for name in ("grey.png", "alpha.png", "deep.png", "grey.jpg", "wide.jpg"):
+        seen = thumbnail(tmp_path / name)
+        assert isinstance(seen, np.ndarray)
+        assert seen.shape == (32, 32, 3)
+        assert np.abs(seen[..., 0].astype(float) - thumbnail(tmp_path / "a.jpg")[..., 0]).mean() < 6
+    manifest = Manifest.from_rows([*({"id": n, "vision": n} for n in [*names, "absent.jpg"]), {"id": "none"}], tmp_path)
+    found = near_duplicates(manifest, manifest, "vision")
+    bad = [i in ("empty.jpg", "cut.jpg", "text.jpg", "absent.jpg", "none") for i in manifest.ids]
+    assert np.array_equal(np.isnan(found.score), bad)
+    assert not found.flag[bad].any()
+    assert any("cannot be read" in note for note in found.notes)
+
+
+def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
+    paths = [tmp_path / f"{k}.jpg" for k in range(6)]
+    for k, path in enumerate(paths):
+        save(path, crop(NoiseVideo(np.random.default_rng(k % 5), 72).photo(0)))
+    order: list[Path | None] = [paths[2], paths[0], None, paths[2], *paths]
+    plain = thumbnails(order)
+    assert list(plain.row[:4]) == [0, 1, -1, 0]
+    monkeypatch.setattr("palpate.leakage.descriptors.FEW", 1)
+    cached = thumbnails(order, cache=tmp_path / "cache", processes=2)
+    again = thumbnails(order, cache=tmp_path / "cache")
+    for other in (cached, again):
+        assert np.array_equal(other.row, plain.row)
+        assert np.array_equal(other.pixels, plain.pixels)
+
+
+def test_embeddings_and_their_mistakes(tmp_path):
+    rng = np.random.default_rng(0)
+    train, test = rng.standard_normal((200, 32)), rng.standard_normal((80, 32))
+    test[:20] = train[:20] + 0.05 * rng.standard_normal((20, 32))
+    parts = [
+        Manifest.from_rows([{"id": f"{p}{k}", "video": f"{p}{k // 4}"} for k in range(n)], tmp_path) for p, n in (("a", 200), ("b", 80))
+    ]
+    found = near_duplicates(parts[0], parts[1], "vision", features=(train, test))
+    assert list(np.flatnonzero(found.flag)) == list(range(20))
+    assert list(found.nearest[:20]) == list(range(20))
+    for wrong in ((train[1:], test), (train, test[:, :3]), (np.full_like(train, np.nan), test)):
+        with pytest.raises(PalpateError):
+            near_duplicates(parts[0], parts[1], "vision", features=wrong)
+    with pytest.raises(PalpateError):
+        near_duplicates(parts[0], parts[1], "smell")
+    with pytest.raises(PalpateError):
+        near_duplicates(parts[0], parts[1], "vision", false_positives=0)
+
+
+def test_a_million_rows_of_one_picture_and_tiny_sets_are_answered(tmp_path):
+    save(tmp_path / "a.jpg", crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
+    table = pl.DataFrame({"id": [str(k) for k in range(100_000)]}).with_columns(vision=pl.lit("a.jpg"), video=pl.lit("v"))
+    many = Manifest(
+        Manifest.from_rows([], tmp_path).table.clear(100_000).with_columns(id=table["id"], vision=table["vision"], video=table["video"]),
+        tmp_path,
+    )
+    found = near_duplicates(many, many, "vision")
+    assert found.flag.all()
+    assert any("default" in note for note in found.notes)
+    empty = Manifest(many.table.clear(), tmp_path)
+    assert len(near_duplicates(many, empty, "vision").score) == 0
+    assert np.isnan(near_duplicates(empty, Manifest(many.table.head(3), tmp_path), "vision").score).all()
+
+
+@pytest.mark.slow
+def test_real_clips_without_metadata(real_data, tmp_path):
+    from palpate.data.formats.touch_and_go import import_touch_and_go
+
+    manifest = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path).manifest
+    odd = np.arange(len(manifest)) % 2 == 1
+    hidden = anonymous(manifest)
+    part = lambda keep: Manifest(hidden.table.filter(pl.Series(keep)), hidden.root)  # noqa: E731
+    videos = np.array(manifest.column("video"))
+    for modality, least in (("vision", 0.99), ("touch", 0.9)):
+        found = near_duplicates(part(~odd), part(odd), modality)
+        assert found.flag.mean() >= least
+        same = videos[~odd][found.nearest[found.flag]] == videos[odd][found.flag]
+        assert same.all()
+        for clip in np.unique(videos):
+            assert not near_duplicates(part(videos != clip), part(videos == clip), modality).flag.any()
+
+
+def test_changed_crops_stay_within_the_margin():
+    picture = NoiseVideo(np.random.default_rng(0), 72).photo(0)
+    out = changed(picture, "brightness+shift", np.random.default_rng(0))
+    assert out.shape == (64, 64, 3)
+    assert abs(out.mean() / crop(picture).mean() - 1) < 0.12
