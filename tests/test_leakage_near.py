@@ -248,11 +248,18 @@ def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
         save(path, crop(NoiseVideo(np.random.default_rng(k % 5), 72).photo(0)))
     order: list[Path | None] = [paths[2], paths[0], None, paths[2], *paths]
     plain = thumbnails(order)
-    assert list(plain.row[:4]) == [0, 1, -1, 0]
+    assert list(plain.row) == [2, 0, -1, 2, 0, 1, 2, 3, 4, 0]  # the last file is the first one's picture again
+    assert len(plain.pixels) == 5
     monkeypatch.setattr("palpate.leakage.descriptors.FEW", 1)
+    monkeypatch.setattr("palpate.leakage.descriptors.PIECE", 2)
     cached = thumbnails(order, cache=tmp_path / "cache", processes=2)
     again = thumbnails(order, cache=tmp_path / "cache")
-    for other in (cached, again):
+    pieces = sorted((tmp_path / "cache").glob("*.npz"))
+    assert len(pieces) == 3
+    pieces[0].unlink()  # as after a stop: what is there is used, the rest decoded
+    pieces[1].write_bytes(b"half")
+    mended = thumbnails(order, cache=tmp_path / "cache")
+    for other in (cached, again, mended):
         assert np.array_equal(other.row, plain.row)
         assert np.array_equal(other.pixels, plain.pixels)
 

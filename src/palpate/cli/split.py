@@ -45,6 +45,8 @@ class Options(Common):
     """What to keep whole; samples that share any of these stay together. Default: what the data set names, or the video."""
     near: Annotated[Literal["vision", "touch", "both"] | None, tyro.conf.arg(metavar="vision|touch|both")] = None
     """Keep near-duplicate pictures together as well."""
+    cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """With --near: folder that keeps decoded picture features, so that a run that was stopped goes on."""
     nulls: Literal["refuse", "own"] = "refuse"
     """Samples without a value in a --by column: refuse them, or let each be a group of its own unless something else joins it."""
     seed: int = 0
@@ -166,7 +168,7 @@ def _links(options: Options, manifest: Manifest, terminal: Terminal) -> tuple[li
     from palpate.leakage.near import near_groups
 
     with terminal.progress() as progress:
-        return [near_groups(manifest, modality, progress=progress) for modality in wanted], {"modalities": wanted}
+        return [near_groups(manifest, modality, cache=options.cache, progress=progress) for modality in wanted], {"modalities": wanted}
 
 
 def _write(

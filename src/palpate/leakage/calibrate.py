@@ -11,12 +11,12 @@ its own video and of the match's left out; Auckenthaler et al. 2000 call this te
 *Threshold with videos known.* The scores of samples' best matches among OTHER videos are the null. Real near-duplicates may hide in it (a recording that was
 uploaded twice), so its tail cannot be trusted: a Gumbel distribution, the limit law of a best match among many, is fitted to the quantiles 10 to
 70 %; what lies so high that not one in 6 sets of q unrelated matches would hold it is taken for such duplicates and left out (three rounds); of the rest the highest tenth gives an exponential tail
-(rate = mean excess), and the threshold is where that tail falls to the wanted rate, but at least 0.5. The share of the null above it is told.
+(rate = mean excess), and the threshold is where that tail falls to the wanted rate, but at least 0.55. The share of the null above it is told.
 
 *Threshold without.* A random pair is almost always unrelated. Queries are compared with random train pictures in blocks of B, a Gumbel distribution is fitted to the
 bulk of the blocks' best z in the same way, and since the best of m independent blocks is Gumbel again, moved by scale * ln m, the threshold is the quantile for
 a train part of N pictures, m = N / B. B = 1 bears the most related pairs among the random ones (up to a quarter) but is carried furthest; the lowest threshold of
-B = 1, 2, 4 ... 64 counts, larger blocks only where a fit up to their 90 % quantile is no more than 1.25 times as wide.
+B = 1, 2, 4 ... 64 counts, larger blocks only where a fit up to their 90 % quantile is no more than 1.25 times as wide; never below 0.855.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ DEFAULT = 0.8
 #: Rounds of leaving copies out of the null, and one unrelated best match in how many sets of that size may be lost by it.
 ROUNDS, ODDS = 3, 6
 #: Lowest threshold with videos: a small excess is no near-duplicate, however alike unrelated pictures are to one another.
-LEAST_EXCESS = 0.5
+LEAST_EXCESS = 0.55
 #: Without videos, pictures less alike than this are no near-duplicates, however unlike unrelated ones are.
-LEAST = 0.84
+LEAST = 0.855
 BINS = 50
 
 
@@ -126,9 +126,10 @@ def other_videos(excess: Floats, rate: float) -> Calibration:
     threshold = max(float(np.tanh(shoulder + mean * np.log(max(0.1 / rate, 1.0)))), LEAST_EXCESS)
     unrelated = score(excess, np.zeros_like(excess))
     over = float((unrelated >= threshold).mean())
+    lowest = " (the lowest that is allowed; the data alone would set it lower)" if threshold <= LEAST_EXCESS else ""
     notes = [
-        f"Threshold {threshold:.3f} from the best matches of {len(excess)} samples in other videos, for {rate:.2%} of unrelated samples; {over:.2%} of"
-        " those lie over it."
+        f"Threshold {threshold:.3f}{lowest} from the best matches of {len(excess)} samples in other videos, for {rate:.2%} of unrelated samples; {over:.2%}"
+        " of those lie over it."
     ]
     if dropped := len(excess) - len(kept):
         share = f"{dropped} of them ({dropped / len(excess):.1%})"
@@ -164,8 +165,9 @@ def random_blocks(z: Floats, count: int, rate: float) -> Calibration:
     if best is None:
         return uncalibrated(rate)
     threshold = max(float(np.tanh(best[0])), LEAST)
+    lowest = " (the lowest that is allowed; the data alone would set it lower)" if threshold <= LEAST else ""
     note = (
-        f"No videos are known, so the threshold {threshold:.3f} comes from random pairs (in blocks of {best[1]}), carried over to the best of"
+        f"No videos are known, so the threshold {threshold:.3f}{lowest} comes from random pairs (in blocks of {best[1]}), carried over to the best of"
         f" {count} train pictures, for {rate:.2%} of unrelated samples."
     )
     return Calibration(threshold, np.tanh(best[2]).astype(np.float32), [note])
