@@ -16,7 +16,7 @@ uploaded twice), so its tail cannot be trusted: a Gumbel distribution, the limit
 *Threshold without.* A random pair is almost always unrelated. Queries are compared with random train pictures in blocks of B, a Gumbel distribution is fitted to the
 bulk of the blocks' best z in the same way, and since the best of m independent blocks is Gumbel again, moved by scale * ln m, the threshold is the quantile for
 a train part of N pictures, m = N / B. B = 1 bears the most related pairs among the random ones (up to a quarter) but is carried furthest; the lowest threshold of
-B = 1, 2, 4 ... 64 counts, larger blocks only where a fit up to their 90 % quantile is no more than 1.25 times as wide; never below 0.855.
+B = 1, 2, 4 ... 64 counts, larger blocks only where a fit up to their 90 % quantile is no more than 1.25 times as wide; never below 0.86.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ ROUNDS, ODDS = 3, 6
 #: Lowest threshold with videos: a small excess is no near-duplicate, however alike unrelated pictures are to one another.
 LEAST_EXCESS = 0.55
 #: Without videos, pictures less alike than this are no near-duplicates, however unlike unrelated ones are.
-LEAST = 0.855
+LEAST = 0.86
 BINS = 50
 
 
