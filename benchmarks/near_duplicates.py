@@ -13,6 +13,8 @@ Features (all unit float32 vectors, d = 64 unless said):
   images-128  the same with d = 128
   clips       the 64 lowest DCT coefficients of the real clips' vision frames, each with random shifts up to 4 of 64 pixels, brightness
               +-5 % and noise (needs the shared data and PyAV)
+  descriptors the audit's own vectors, d = 327 (palpate.leakage.descriptors.search_vectors), of the real clips' vision frames with random
+              shifts up to 4 of 36 pixels, brightness +-5 % and noise: what an audit really searches
   isotropic   Gaussian directions with no structure at all: no search prunes these
 
 Tasks, each with its rival on the same float32 vectors, every run in a process of its own with the threads named:
@@ -45,7 +47,7 @@ from pathlib import Path
 
 import numpy as np
 
-ALL = ("videos", "images", "images-128", "clips", "isotropic")
+ALL = ("videos", "images", "images-128", "clips", "descriptors", "isotropic")
 
 
 def main():
@@ -79,8 +81,8 @@ def main():
 def features(kind, n, seed):
     """(n, d) unit float32 vectors, or None where the kind's data is missing."""
     rng = np.random.default_rng(seed)
-    if kind == "clips":
-        x = clip_features(n, rng)
+    if kind in ("clips", "descriptors"):
+        x = (clip_features if kind == "clips" else audit_vectors)(n, rng)
         if x is None:
             return None
     elif kind == "isotropic":
@@ -104,10 +106,9 @@ def drift(rng, n, d, videos=126, step=0.05):
     return x.reshape(-1, d)[:n]
 
 
-def clip_features(n, rng):
-    """Descriptors of augmented real frames."""
+def clip_frames(size, mode):
+    """The real clips' vision frames at a small size, or None where data or PyAV are missing."""
     from PIL import Image
-    from scipy.fft import dctn
 
     root = Path(os.environ.get("PALPATE_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
     files = sorted(root.glob("touch_and_go/clips/dataset/*/video.mp4"))
@@ -119,21 +120,52 @@ def clip_features(n, rng):
     for file in files:
         with av.open(str(file)) as video:
             frames += [
-                np.asarray(Image.fromarray(f.to_ndarray(format="gray")).resize((72, 72), Image.Resampling.BOX), np.float32)
+                np.asarray(
+                    Image.fromarray(f.to_ndarray(format="rgb24")).convert(mode).resize((size, size), Image.Resampling.BOX), np.float32
+                )
                 for f in video.decode(video=0)
             ]
-    if not frames:
-        return None
-    frames = np.stack(frames)
-    order = np.argsort(np.add.outer(np.arange(11) ** 2, np.arange(11) ** 2).ravel(), kind="stable")[1:65]
-    out = np.empty((n, 64))
+    return np.stack(frames) if frames else None
+
+
+def varied(frames, n, side, rng):
+    """Blocks of n frames in turn, each shifted, brighter or darker, and noisy."""
+    room = frames.shape[1] - side
     for start in range(0, n, 1000):
         which = np.arange(start, min(start + 1000, n)) % len(frames)
-        shift = rng.integers(0, 9, size=(len(which), 2))
-        cut = np.stack([frames[w, a : a + 64, b : b + 64] for w, (a, b) in zip(which, shift, strict=True)])
-        cut = cut * rng.uniform(0.95, 1.05, size=(len(which), 1, 1)) + rng.normal(scale=2, size=cut.shape)
-        out[start : start + len(which)] = dctn(cut, axes=(1, 2), norm="ortho")[:, :11, :11].reshape(len(which), -1)[:, order]
+        shift = rng.integers(0, room + 1, size=(len(which), 2))
+        cut = np.stack([frames[w, a : a + side, b : b + side] for w, (a, b) in zip(which, shift, strict=True)])
+        gain = rng.uniform(0.95, 1.05, size=(len(which),) + (1,) * (cut.ndim - 1))
+        yield start, cut * gain + rng.normal(scale=2, size=cut.shape)
+
+
+def clip_features(n, rng):
+    """Low DCT coefficients of varied real frames."""
+    from scipy.fft import dctn
+
+    frames = clip_frames(72, "L")
+    if frames is None:
+        return None
+    order = np.argsort(np.add.outer(np.arange(11) ** 2, np.arange(11) ** 2).ravel(), kind="stable")[1:65]
+    out = np.empty((n, 64))
+    for start, cut in varied(frames, n, 64, rng):
+        out[start : start + len(cut)] = dctn(cut, axes=(1, 2), norm="ortho")[:, :11, :11].reshape(len(cut), -1)[:, order]
     return out
+
+
+def audit_vectors(n, rng):
+    """What the audit searches: vectors of band-passed thumbnails of varied real frames."""
+    from palpate.leakage.background import planar
+    from palpate.leakage.descriptors import search_vectors
+    from palpate.leakage.pool import quantised
+    from palpate.leakage.verify import band_pass
+
+    frames = clip_frames(36, "YCbCr")
+    if frames is None:
+        return None
+    return np.concatenate(
+        [search_vectors(quantised(band_pass(planar(np.clip(cut, 0, 255).astype(np.uint8))))) for _, cut in varied(frames, n, 32, rng)]
+    )
 
 
 # ---- one measurement, in a process of its own

@@ -118,6 +118,41 @@ def test_rows_without_a_video_are_told_and_a_table_is_read_as_it_is(tmp_path, ca
     assert sum("have no video" in note for note in data["notes"]) == 2
 
 
+def test_touches_of_lists_are_numbered_together(real_data, capsys):
+    lists = real_data / "touch_and_go" / "lists"
+    _, data, _ = run(capsys, lists / "train.txt", lists / "test.txt", "--group", "touch")
+    assert (data["groups_train"], data["groups_test"], data["groups_shared"]) == (3378, 1113, 0)  # as measured: no touch mixes the lists
+
+
+def test_frames_that_are_time_stamps_do_not_overflow(tmp_path, capsys):
+    first, gap = 1_700_000_000_000_000_000 // 10, 1_234_567
+    rows = [(f"v{k}", first + k * 10**15) for k in range(40)]
+    (tmp_path / "a.txt").write_text("".join(f"{v}/{f}.jpg,0\n" for v, f in rows))
+    (tmp_path / "b.txt").write_text("".join(f"{v}/{f + gap}.jpg,0\n" for v, f in rows))
+    _, data, _ = run(capsys, tmp_path / "a.txt", tmp_path / "b.txt")
+    assert (data["gap_min"], data["gap_median"], data["gap_max"]) == (gap, gap, gap)
+
+
+def test_a_page_never_replaces_what_lies_beside_it(folders, capsys):
+    (folders / "p.json").write_text('{"a": 1}')
+    assert run(capsys, folders / "a", folders / "b", "--page", folders / "p.html")[0] == 2
+    assert (folders / "p.json").read_text() == '{"a": 1}'
+    assert run(capsys, folders / "a", folders / "b", "--page", folders / "q.html", "-o", folders / "q.json")[0] == 2
+
+
+def test_an_impact_that_cannot_be_measured_does_not_lose_the_audit(small_manifest, tmp_path, capsys):
+    small_manifest.save(tmp_path / "m" / "manifest.parquet")
+    videos = dict(zip(small_manifest.ids, small_manifest.column("video"), strict=True))
+    parts = {i: "test" if v in ("v4", "v5") else "train" for i, v in videos.items()}
+    one = {i: p for i, p in parts.items() if videos[i] in ("v0", "v4")}  # a material in one video
+    Split(one).save(tmp_path / "s.json")
+    status, data, _ = run(capsys, tmp_path / "m", "--split", tmp_path / "s.json", "--impact", "-o", tmp_path / "a.json")
+    assert status == 0
+    assert any("could not be measured" in note for note in data["notes"])
+    assert json.loads((tmp_path / "a.json").read_text())["test_samples"] == 8
+    assert not list(tmp_path.glob(".*.work"))
+
+
 def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
     Split.from_ids(train=small_manifest.ids[:8], test=small_manifest.ids[8:]).save(tmp_path / "s.json")
@@ -133,3 +168,17 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
         status, _, err = run(capsys, *args)
         assert status == 2, args
         assert words in err.splitlines()[0], (args, err)
+
+
+def test_plain_folders_of_pictures_are_photos(folders, capsys):
+    status, data, _ = run(capsys, folders / "a" / "vision", folders / "b" / "vision")
+    assert status == 0
+    assert [(w["test"]["id"], w["train"]["id"]) for s in data["signals"] if s["kind"] == "near-duplicate vision" for w in s["worst"]] == [
+        ("b3", "a5")
+    ]
+    shutil.rmtree(folders / "b" / "tactile")
+    status, data, _ = run(capsys, folders / "a", folders / "b")
+    assert (status, data["leaking_samples"]) == (0, 1)
+    assert any("Only one side has pictures of touch" in note for note in data["notes"])
+    (folders / "empty").mkdir()
+    assert run(capsys, folders / "a", folders / "empty")[0] == 2

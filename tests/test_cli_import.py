@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 
 import pytest
 
@@ -155,13 +156,13 @@ def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
 def test_export_says_how_to_read_it_again_and_that_works(capsys, small_manifest, tmp_path):
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
     Split({i: "train" if k % 2 else "test" for k, i in enumerate(small_manifest.ids)}).save(tmp_path / "s.json")
-    status, out, _ = call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "e", "--split", tmp_path / "s.json")
+    status, out, _ = call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "my e's", "--split", tmp_path / "s.json")
     assert status == 0
-    command = out.split("again with: palpate ")[1].split()
+    command = shlex.split(out.split("again with: palpate ")[1])
     assert call(capsys, *command[:-1], tmp_path / "again", "--json")[0] == 0
     assert Manifest.load(tmp_path / "again").digest == small_manifest.digest
     assert Split.load(tmp_path / "again" / "splits" / "Orig.json").digest == Split.load(tmp_path / "s.json").digest
-    assert call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "e")[0] == 2
+    assert call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "my e's")[0] == 2
     assert call(capsys, "export", tmp_path / "m", "-o", tmp_path / "f")[0] == 2
 
 

@@ -260,6 +260,16 @@ def test_ycb_slide_real_logs_with_the_webcam(tmp_path):
     assert kinds(found.suspicious) == {"missing-object": 1, "missing-log": 2}
 
 
+def test_ycb_slide_logs_0_to_3_train_and_log_4_tests(tmp_path):
+    root = forge_ycb_slide(tmp_path / "data").source
+    logs = root / "real" / "055_baseball"
+    (logs / "dataset_0").rename(logs / "dataset_3")
+    parts = import_dataset(root, tmp_path / "out").splits["sparsh"].parts
+    assert {i.partition("/")[2].rpartition("/")[0]: part for i, part in parts.items()} == {
+        "dataset_0": "train", "dataset_3": "train", "dataset_4": "test",
+    }  # fmt: skip
+
+
 def test_ycb_slide_simulated_part(tmp_path):
     found = imported(forge_ycb_slide, tmp_path, part="sim")
     assert found.manifest.ids == ["025_mug/03/0", "025_mug/03/1"]
@@ -301,6 +311,25 @@ def test_ycb_slide_tells_everything_bad(tmp_path):
     ]  # fmt: skip
     assert found.manifest.column("vision").count(None) == 4
     assert "my own cup/dataset_7/0" not in found.splits["sparsh"].parts  # a log that Sparsh does not know
+
+
+@pytest.mark.parametrize(
+    ("forge", "name", "place", "stray"),
+    [
+        (forge_tarf, "tarf", "touch/bench_40_30", "99999999999999999999.jpg"),
+        (forge_visgel_recordings, "visgel", "2/rec", "frame99999999999999999999.jpg"),
+        (forge_objectfolder, "objectfolder", "2/tactile_data/1/0/gelsight", "99999999999999999999.png"),
+        (forge_ycb_slide, "ycb-slide", "real/055_baseball/dataset_0/frames", "frame_99999999999999999999.jpg"),
+    ],
+)
+def test_numbers_too_long_for_a_frame_are_told_and_left_out(tmp_path, forge, name, place, stray):
+    forged = forge(tmp_path / "data")
+    folder = next(forged.source.glob(place))
+    write_image(folder / stray, 3)
+    looked = validate_dataset(forged.source, format=name)
+    assert looked.samples == forged.samples
+    assert stray in of_kind(looked.suspicious, "unknown-name").text
+    assert len(import_dataset(forged.source, tmp_path / "out", format=name).manifest) == forged.samples
 
 
 # --- all of them

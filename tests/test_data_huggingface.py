@@ -201,6 +201,37 @@ def test_a_hub_out_of_reach_is_told_at_once_with_what_to_do(tmp_path, monkeypatc
         import_dataset("user/name", tmp_path / "out", format="hf")
 
 
+def test_an_id_of_two_parts_is_in_neither_and_parts_follow_the_kept_row(tmp_path):
+    rows = hf_rows(tmp_path / "made")
+    rows[5]["path"] = rows[1]["path"]  # of validation: the id of a row of train
+    rows[2]["path"] = rows[1]["path"]  # twice in train
+    found = import_dataset(
+        save_hf(tmp_path / "mine", rows, **kinds()), tmp_path / "out", columns=MAPS | {"frame": "stem(path)"}, skip_bad=True
+    )
+    assert [(p.where, p.kind) for p in found.skipped] == [("mine/train:2", "duplicate-id"), ("mine/validation:0", "two-parts")]
+    assert found.splits["Orig"].counts() == {"train": 3, "val": 2}
+    assert "data1/0-17.0/1" in found.manifest.ids
+
+
+def test_numbers_that_are_no_class_are_told_and_minus_one_is_inconclusive(tmp_path):
+    rows = hf_rows(tmp_path / "made")
+    rows[1]["kind"], rows[2]["kind"], rows[6]["kind"] = 7, -1, -2
+    source = save_hf(tmp_path / "mine", rows, **kinds() | {"kind": datasets.Value("int64")})
+    for path in source.glob("*/dataset_info.json"):  # a number that the library refuses to write, though not to read
+        info = json.loads(path.read_text())
+        info["features"]["kind"] = {"names": ["Wood", "Rock"], "_type": "ClassLabel"}
+        path.write_text(json.dumps(info))
+    looked = validate_dataset(source, columns=MAPS)
+    told = [("mine/train:1", "unknown-label"), ("mine/validation:1", "unknown-label")]
+    assert sorted((p.where, p.kind) for p in looked.invalid) == told
+    assert looked.samples == 5
+    found = import_dataset(source, tmp_path / "out", columns=MAPS, skip_bad=True)
+    assert sorted((p.where, p.kind) for p in found.skipped) == told
+    assert found.inconclusive == 1
+    assert found.manifest.column("frame") == [0, 3, 4, 5, 7]
+    assert None not in found.manifest.column("material")
+
+
 def test_without_the_extra_the_error_says_what_to_install(small_manifest, source, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "datasets", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'palpate\[hf\]'"):

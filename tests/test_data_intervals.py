@@ -76,6 +76,34 @@ def test_words_backgrounds_root_and_thinning(tmp_path):
     assert manifest.column("material") == [None] * 4
 
 
+def test_what_looks_wrong_is_told_by_import_and_validation(tmp_path):
+    recording(tmp_path, "a")
+    recording(tmp_path, "spare")
+    (tmp_path / "l.csv").write_text("video,start,end,background\na,10,16,2\na,20,22,15\n")
+    found = import_dataset(tmp_path / "l.csv", tmp_path / "out")
+    told = [(p.where, p.kind) for p in found.suspicious]
+    assert told == [(f"{tmp_path / 'l.csv'}:3", "background-in-touch"), (str(tmp_path), "unlisted-video")]
+    assert "frame 15 of 'a'" in found.suspicious[0].text
+    assert list(validate_dataset(tmp_path / "l.csv").suspicious) == found.suspicious
+
+
+def test_validation_decodes_raw_videos(tmp_path):
+    root = recording(tmp_path / "d", "a", raw=True)
+    (root / "l.csv").write_text(LIST)
+    assert validate_dataset(root / "l.csv").samples == 9
+    path = root / "a" / "gelsight.mp4"
+    data = bytearray(path.read_bytes())
+    start = data.index(b"mdat") + 4
+    third = (len(data) - start) // 3
+    data[start + third : start + 2 * third] = b"\xff" * third
+    path.write_bytes(bytes(data))
+    looked = validate_dataset(root / "l.csv")
+    assert [p.kind for p in looked.invalid] == ["bad-video"]
+    with pytest.raises(ProblemsError) as caught:
+        import_dataset(root / "l.csv", tmp_path / "out")
+    assert list(caught.value.problems) == list(looked.invalid)
+
+
 def test_every_bad_interval_is_told_by_its_line(tmp_path):
     root = recording(tmp_path / "d", "a")
     recording(root, "b")

@@ -8,6 +8,7 @@ import pytest
 
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.listing import read_categories, read_frame_table, read_list, read_lists, touches, write_list
+from palpate.data.reading import is_list
 
 
 def write(path, text):
@@ -145,6 +146,21 @@ def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
     ]
     with pytest.raises(PalpateError, match="empty"):
         read_categories(write(tmp_path / "e.txt", "\n"))
+
+
+@pytest.mark.parametrize("code", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lists_of_other_tools(tmp_path, code, end):
+    name = "gr\u00f6\u00dfe\u2028 a"  # a line separator that is not the end of a line
+    path = tmp_path / "l.txt"
+    path.write_bytes(end.join([f"{name}/0001.jpg,3", "", f"{name}/2.jpg,4", "nonsense", "v/3.jpg,5", ""]).encode(code))
+    found = read_list(path, skip_bad=True)
+    assert found.manifest.ids == [f"{name}/0001", f"{name}/2", "v/3"]
+    assert found.rows["line"].to_list() == [1, 3, 5]
+    assert [(p.where, p.kind) for p in found.skipped] == [(f"{path}:4", "no-comma")]
+    assert is_list(path)
+    path.write_bytes(end.join(["Wood: 3", "Rock: 4"]).encode(code))
+    assert read_categories(path) == {3: "Wood", 4: "Rock"}
 
 
 def test_words_for_frames(tmp_path):

@@ -298,6 +298,37 @@ def test_ssvtp_counts_its_losses(presses, tmp_path):
     assert kinds(caught.value.problems) == {"unpaired": 2, "bad-image": 1}
 
 
+def test_an_ssvtp_sample_of_two_lists_is_told_and_is_in_no_part(presses, tmp_path):
+    whole = read(presses, tmp_path / "whole")
+    (both,) = [i for i in whole.manifest.ids if i == "ssvtp/3"]
+    assert whole.splits["Orig"].parts[both] == "train"
+    with (presses / "test.csv").open("a") as file:
+        file.write("images_rgb/image_3_rgb.jpg,x\n")
+    with pytest.raises(ProblemsError, match="two-parts"):
+        read(presses, tmp_path / "out")
+    found = read(presses, tmp_path / "out", skip_bad=True)
+    assert kinds(found.skipped) == {"two-parts": 1}
+    assert found.manifest.ids == whole.manifest.ids
+    assert found.splits["Orig"].parts == {i: part for i, part in whole.splits["Orig"].parts.items() if i != both}
+
+
+def test_a_listed_path_stands_in_only_for_a_file_that_is_absent(presses, tmp_path):
+    place = presses / "images_tac"
+    (place / "image_3_tac.jpg").rename(place / "three.jpg")
+    write_csv(
+        presses / "train.csv", ("url", "tactile"),
+        [
+            ["images_rgb/image_3_rgb.jpg", "images_tac/three.jpg"],  # the derived file is absent
+            ["images_rgb/image_12_rgb.jpg", "images_tac/three.jpg"],  # it is there, and counts
+            ["images_rgb/image_21_rgb.jpg", "images_tac/none.jpg"],  # the listed one is not there
+        ],
+    )  # fmt: skip
+    table = read(presses, tmp_path / "out").manifest.table
+    assert dict(table.select("id", "tactile").head(3).rows()) == {
+        "ssvtp/3": "images_tac/three.jpg", "ssvtp/12": "images_tac/image_12_tac.jpg", "ssvtp/21": "images_tac/image_21_tac.jpg",
+    }  # fmt: skip
+
+
 def test_ssvtp_tells_unlisted_photos_absent_words_and_the_background(presses, tmp_path):
     write_csv(presses / "train.csv", ("url", "caption"), [["images_rgb/image_3_rgb.jpg", ""]])
     (presses / "text" / "labels_3.txt").write_text("\n")

@@ -108,13 +108,14 @@ def test_a_touch_runs_on_through_frames_that_only_contact_json_names(tmp_path):
     assert runs == {"lists alone": ["0001", "0002", "0003"], "contact": ["0001", "0001", "0002"], "untouched": ["0001", "0002", "0003"]}
 
 
-def test_a_row_in_both_lists_is_told_and_stays_with_train(tree, tmp_path):
+def test_a_row_in_both_lists_is_told_and_is_in_no_part(tree, tmp_path):
     rows = (tree / "data1" / "train.csv").read_text().split("\n", 1)[1]
     with (tree / "data1" / "test.csv").open("a") as file:
         file.write(rows)
     found = read(tree, tmp_path / "out", skip_bad=True)
-    assert kinds(found.skipped) == {"duplicate-id": 9}
-    assert found.splits["Orig"].counts() == {"train": 18, "test": 6}
+    assert kinds(found.skipped) == {"two-parts": 9}
+    assert found.splits["Orig"].counts() == {"train": 9, "test": 6}
+    assert len(found.manifest) == 24
 
 
 def test_touches_are_runs_and_sessions_chains(tree, tmp_path):
@@ -310,7 +311,7 @@ def test_every_bad_row_of_hct_is_told_at_once(tree, tmp_path):
     )  # fmt: skip
     wanted = [
         (2, "outside-root"), (3, "outside-root"), (4, "bad-row"), (5, "bad-row"), (6, "bad-path"), (7, "bad-frame"), (8, "empty-cell"),
-        (9, "duplicate-id"), (10, "missing-file"), (10, "missing-file"), (11, "missing-folder"), (12, "bad-encoding"),
+        (9, "two-parts"), (10, "missing-file"), (10, "missing-file"), (11, "missing-folder"), (12, "bad-encoding"),
     ]  # fmt: skip
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")

@@ -151,3 +151,11 @@ def test_visgel_contact_is_the_variance_of_the_laplacian(tmp_path):
     looked = validate_dataset(root, format="visgel")
     assert "4 of 6 frames looked at touch nothing" in of_kind(looked.suspicious, "flat-frames").text
     assert validate_dataset(root, format="visgel", check="header").suspicious == []
+
+
+@pytest.mark.parametrize(("values", "flat"), [((17.9, 18.0, 18.1), 2), ((18.0, 18.1, 18.1), None)])
+def test_visgel_contact_of_18_or_less_is_flat(tmp_path, monkeypatch, values, flat):
+    root = forge_visgel_recordings(tmp_path / "data").source
+    monkeypatch.setattr(visgel, "_contacts", lambda *_: dict(enumerate(values)))
+    told = [p.text for p in validate_dataset(root, format="visgel").suspicious]
+    assert told == ([f"{flat} of 3 frames looked at touch nothing (contact of 18 or less); min_contact=18 leaves such out"] if flat else [])

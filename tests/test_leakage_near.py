@@ -321,3 +321,46 @@ def test_changed_crops_stay_within_the_margin():
     out = changed(picture, "brightness+shift", np.random.default_rng(0))
     assert out.shape == (64, 64, 3)
     assert abs(out.mean() / crop(picture).mean() - 1) < 0.12
+
+
+def uploads(folder: Path, seeds: range, name: str, count: int, *, copied: bool = False) -> list[dict[str, str]]:
+    """``count`` pictures of each video, copies brighter and saved again at quality 60."""
+    rows: list[dict[str, str]] = []
+    for seed in seeds:
+        video = NoiseVideo(np.random.default_rng(seed), 72)
+        for k in range(count):
+            path = folder / f"{name}{seed}-{k}.{'jpg' if copied else 'png'}"
+            picture = crop(video.photo(40 * k))
+            if copied:
+                Image.fromarray(np.clip(picture * 1.05, 0, 255).astype(np.uint8)).save(path, quality=60)
+            else:
+                save(path, picture)
+            rows.append({"id": path.stem, "video": f"{name}{seed}", "vision": path.name})
+    return rows
+
+
+@pytest.mark.parametrize("case", ["eleven videos", "two videos", "one video", "train twice", "most of train twice"])
+def test_copies_are_found_however_many_they_are(tmp_path, case):
+    if case == "eleven videos":  # fewer than a hundred train pictures, and all of test copies
+        train, test = uploads(tmp_path, range(11), "a", 4), uploads(tmp_path, range(11), "b", 4, copied=True)
+    elif case in ("two videos", "one video"):
+        n = 2 if case == "two videos" else 1
+        train, test = uploads(tmp_path, range(n), "a", 20), uploads(tmp_path, range(n), "b", 20, copied=True)
+    elif case == "train twice":  # what test copies stands in train under two names
+        train = uploads(tmp_path, range(8), "a", 5) + uploads(tmp_path, range(3), "c", 5, copied=True)
+        test = uploads(tmp_path, range(3), "b", 5, copied=True)
+    else:
+        train = uploads(tmp_path, range(12), "a", 4) + uploads(tmp_path, range(4, 12), "c", 4, copied=True)
+        test = uploads(tmp_path, range(4), "b", 4, copied=True)
+    found = near_duplicates(Manifest.from_rows(train, tmp_path), Manifest.from_rows(test, tmp_path), "vision")
+    assert found.flag.mean() >= 0.95, found.notes
+
+
+def test_equal_pictures_score_one_however_many_there_are(tmp_path):
+    save(tmp_path / "still.png", crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
+    rows = [{"id": f"{v}/{k}", "video": f"v{v}", "vision": "still.png"} for v in range(40) for k in range(500)]
+    whole = Manifest.from_rows(rows, tmp_path)
+    train, test = (Manifest(whole.table[a:b], tmp_path) for a, b in ((0, 16_000), (16_000, 20_000)))
+    found = near_duplicates(train, test, "vision")
+    assert found.flag.all()
+    assert set(found.score.tolist()) == {1.0}

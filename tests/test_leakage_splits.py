@@ -1,5 +1,6 @@
 """Leak-free splits: against brute force over all assignments, on the published lists, folds, groups, records, and what cannot be split."""
 
+import dataclasses
 import itertools
 import json
 import subprocess
@@ -431,7 +432,7 @@ def test_lists_become_a_split_with_lists_of_their_own_and_are_verified(capsys, l
     leaking = Split({i: "train" if k % 3 else "test" for k, i in enumerate(joined.ids)}, {"name": "Orig"}, joined.digest)
     leaking.save(tmp_path / "orig.json")
     status, said, _ = call(capsys, "split", *lists, "--verify", tmp_path / "orig.json", "--json")
-    assert (status, json.loads(said)["failed"]) == (1, ["one part for each video"])
+    assert (status, json.loads(said)["failed"]) == (1, ["one part for each video", "no signal of the audit flags a test sample"])
     assert call(capsys, "split", lists[0], "--verify", out)[0] == 1
 
 
@@ -480,3 +481,20 @@ def test_a_users_mistake_is_one_line(capsys, lists, tmp_path, monkeypatch, args,
     assert word in err
     assert "Traceback" not in err
     assert not (tmp_path / "x").exists()
+
+
+def test_a_bound_above_what_was_reached_is_never_called_a_proof(monkeypatch):
+    from palpate.leakage import splits
+
+    m = Manifest.from_rows([{"id": str(k), "video": f"v{k}", "material": "ab"[k % 2]} for k in range(40)], ".")
+    real = splits.optimise
+    monkeypatch.setattr(splits, "optimise", lambda *a, **k: dataclasses.replace(real(*a, **k), bound=0.3))
+    with pytest.raises(RuntimeError, match="lower bound"):
+        leak_free_split(m)
+
+
+def test_verify_fails_where_a_signal_flags_a_test_sample(tmp_path, capsys):
+    (tmp_path / "l.txt").write_text("".join(f"v/{k}.jpg,0\n" for k in (1, 2, 9, 10)))
+    assert main(["split", str(tmp_path / "l.txt"), "--by", "touch", "--train", "0.5", "-o", str(tmp_path / "s.json"), "-q"]) == 0
+    assert main(["split", str(tmp_path / "l.txt"), "--verify", str(tmp_path / "s.json"), "--json"]) == 1
+    assert "no signal of the audit flags a test sample" in capsys.readouterr().out

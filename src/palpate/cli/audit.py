@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -87,13 +88,19 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         if sides.pretrain is not None:
             others.append(_against_pretraining(options, sides.pretrain, sides.test, cache, progress))
         audit = found.audit
+        one_sided = [m for m, c in MODALITIES.items() if len({s.table[c].null_count() < len(s) for s in (sides.train, sides.test)}) == 2]
+        if options.images and one_sided:
+            audit = replace(audit, notes=[*audit.notes, f"Only one side has pictures of {one_sided[0]}: they were not compared."])
         if options.impact and sides.whole is not None and sides.split is not None:
-            audit = replace(audit, impact=_impact(options, sides.whole, sides.split, audit, cache, progress))
+            try:
+                audit = replace(audit, impact=_impact(options, sides.whole, sides.split, audit, cache, progress))
+            except PalpateError as error:  # the audit itself is done, and must not be lost
+                audit = replace(audit, notes=[*audit.notes, f"What leaking costs could not be measured: {error}"])
         audit = replace(audit, commands=_next(options, audit))
     skipped = [str(p) for p in sides.skipped]
     data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "others": [dataclasses.asdict(a) for a in others], "skipped": skipped}
     _write(options, [audit, *others], found, data, _digests(sides), terminal)
-    if options.cache is None and cache is not None:
+    if options.cache is None and cache is not None:  # a run that is stopped leaves it, to go on from
         shutil.rmtree(cache, ignore_errors=True)
     leaked = max(audit.leaked_fraction, *(a.leaking_samples / a.test_samples for a in (audit, *others)))
     failed = options.fail_over is not None and leaked > options.fail_over
@@ -118,11 +125,15 @@ def _check(options: Options) -> None:
     """
     if options.fail_over is not None and not 0 <= options.fail_over <= 1:
         raise PalpateError("--fail-over must lie in [0, 1]", str(options.fail_over), "Pass a fraction, e.g. --fail-over 0.01")
-    if not 0 < options.false_positives < 0.5:
-        raise PalpateError("--false-positives must lie in (0, 0.5)", str(options.false_positives), "Pass e.g. --false-positives 0.001")
-    for name, value, low in (("--worst", options.worst, 0), ("--near-frames", options.near_frames, 0), ("--processes", options.processes or 1, 1)):
+    if not 0 < options.false_positives <= 0.1:
+        raise PalpateError("--false-positives must lie in (0, 0.1]", str(options.false_positives), "Pass e.g. --false-positives 0.001")
+    for name, value, low in (
+        ("--worst", options.worst, 0),
+        ("--near-frames", options.near_frames, 0),
+        ("--processes", 1 if options.processes is None else options.processes, 1),
+    ):
         if value < low:
-            raise PalpateError(f"{name} must be at least {low}", str(value), f"Pass e.g. {name} 12")
+            raise PalpateError(f"{name} must be at least {low}", str(value), f"Pass e.g. {name} {max(low, 2)}")
     if options.table is not None and options.table.suffix.lower() not in (".parquet", ".csv"):
         raise PalpateError("--table must end in .parquet or .csv", options.table.name, "Pass e.g. --table signals.parquet")
     if options.impact and options.split is None:
@@ -130,7 +141,15 @@ def _check(options: Options) -> None:
     if options.encoder is not None:
         require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
+    beside = [options.page.with_suffix(s) for s in (".json", ".md")] if options.page else []
+    if options.page and (options.page.suffix != ".html" or options.output in beside):
+        raise PalpateError(
+            "--page must end in .html, and -o must not be the JSON beside it",
+            f"--page {options.page}" + (f" with -o {options.output}" if options.output else ""),
+            "Pass e.g. --page page.html -o audit.json",
+        )
     for output, marks in (
+        *((path, (b'"format": "palpate-', b"Audit of", b"palpate")) for path in beside),
         (options.output, (b'"format": "palpate-',)), (options.page, (b"palpate",)), (options.table, (b"PAR1", b"id,video,frame,material,leaking")),
     ):  # fmt: skip
         if output is not None:
@@ -144,6 +163,7 @@ def _read(options: Options, progress: Progress) -> _Sides:
         PalpateError: on a number of paths that makes no audit.
         ProblemsError: with every bad row, unless ``--skip-bad``.
     """
+    from palpate.data.listing import number_together
     from palpate.data.reading import read_samples
 
     if len(options.paths) != (1 if options.split is not None else 2):
@@ -165,6 +185,10 @@ def _read(options: Options, progress: Progress) -> _Sides:
             skipped += bad
     if problems:
         raise ProblemsError(problems, "Mend the lines, or pass --skip-bad to go on without them")
+    bare = [k for k, m in enumerate(read) if set(m.facts) == {"source"}]
+    if options.split is None and len(bare) > 1:  # lists number their touches each from 1
+        for k, m in zip(bare, number_together(*(read[k] for k in bare)), strict=True):
+            read[k] = m
     pretrain = read.pop() if options.pretrain else None
     if options.split is None:
         return _Sides(skipped, read[0], read[1], pretrain=pretrain)
@@ -242,17 +266,22 @@ def _cache(options: Options) -> Path | None:
 
 def _next(options: Options, audit: Audit) -> list[str]:
     """Command lines that say what to do about what was found."""
+    from palpate.data.reading import is_list
+
     leaks = audit.leaking_samples or audit.leaked_fraction
-    by = audit.group if audit.group in ("video", "object", "session", "touch") else "video"
     near = any(s.flagged for s in audit.signals if s.kind.startswith("near-duplicate"))
+    twice = any(s.flagged for s in audit.signals if s.kind == "identical sample") and not options.split
     lines: list[str] = []
-    if leaks:
-        source = str(options.paths[0]) if options.split else " ".join(map(str, options.paths))
-        lines.append(f"palpate split {source} --by {by}{' --near both' if near else ''} -o noleak.json")
+    source = shlex.join(map(str, options.paths[:1] if options.split else options.paths))
+    if leaks and (options.split or all(p.is_file() and is_list(p) for p in options.paths)):
+        by = "" if options.group == "auto" else f" --by {options.group}"
+        lines.append(
+            f"palpate split {source}{by}{' --near both' if near else ''}{' --skip-bad' if twice or options.skip_bad else ''} -o noleak.json"
+        )
         if options.split:
             lines.append(f"palpate audit {source} --split noleak.json")
     if options.split and not options.impact and leaks:
-        lines.append(f"palpate audit {options.paths[0]} --split {options.split} --impact")
+        lines.append(f"palpate audit {source} --split {shlex.quote(str(options.split))} --impact")
     if not options.split and not audit.signals[-1].kind.startswith("near-duplicate"):
         lines.append("palpate import DATA_SET -o data/ && palpate audit data/ --split data/splits/Orig.json   # pictures too")
     return lines
@@ -284,7 +313,7 @@ def _write(
         results = Results(
             title=f"Audit of {audits[0].name}", audits=audits, commands=[terminal.command],
             settings={"digests": digests, "false positives": options.false_positives, "near frames": options.near_frames, "version": __version__},
-            notes=[f"{len(data['skipped'])} bad rows were left out; the JSON of -o names them."] if data["skipped"] else [],
+            notes=[f"{len(data['skipped'])} bad rows were left out."] if data["skipped"] else [],
         )  # fmt: skip
         with terminal.progress() as progress:
             write_report(results, options.page, progress=progress)
@@ -324,7 +353,9 @@ def show(audit: Audit, terminal: Terminal) -> None:
         share = audit.leaking_samples / audit.test_samples
         more = "" if audit.leaking_samples == audit.test_samples_in_shared_groups else f" {share:.3%} leak by one signal or another."
         terminal.print(
-            f"This split leaks: {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with {other}.{more}"
+            "This split leaks:"
+            + (f" {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with {other}." if audit.group != "none" else "")
+            + more
             + (" Make one that does not: palpate split" if audit.against == "train" else "")
         )
     elif audit.group == "none":

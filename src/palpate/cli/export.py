@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -42,9 +43,14 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     terminal.facts(f"Exported {options.output}", facts)
     if options.to == "hf":
         terminal.print(
-            f"Read it with datasets.load_from_disk({str(options.output)!r}), or again with: palpate import {options.output} -o DIR"
+            f"Read it with datasets.load_from_disk({str(options.output)!r}), or again with: palpate import {_quoted(options.output)} -o DIR"
         )
     else:
         table = next(f for f in files if f.parent == options.output)
-        terminal.print(f"Read it again with: palpate import {table} --root {manifest.root} -o DIR")
+        terminal.print(f"Read it again with: palpate import {_quoted(table)} --root {_quoted(manifest.root)} -o DIR")
     return facts | {"files": [str(f) for f in files]}
+
+
+def _quoted(path: Path) -> str:
+    """A path as one word of a command line."""
+    return shlex.quote(str(path))

@@ -119,6 +119,8 @@ def _check(options: Options) -> None:
         raise PalpateError("A split needs an output file", "no -o", "Pass e.g. -o noleak.json")
     if options.lists is not None and (several or options.verify is not None):
         raise PalpateError("--lists goes with one split", f"{(several or ['--verify'])[0]}", "Make the split you want alone")
+    if options.lists is not None and options.lists.exists() and (not options.lists.is_dir() or any(options.lists.iterdir())):
+        raise PalpateError("--lists must name a new or empty folder", f"something in {options.lists}", "Choose another folder")
     if options.output is not None and not several:
         inputs = [*options.paths, *(options.noleak or ())]
         guard_output(options.output, inputs, (b'"format": "palpate-split/', b'"format": "palpate-noleak/'))
@@ -243,14 +245,13 @@ def write_own_lists(manifest: Manifest, split: Split, folder: Path) -> list[str]
 def _verify(options: Options, path: Path, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Checks an existing split file; status 1 if anything does not hold."""
     from palpate.leakage import audit_split
-    from palpate.leakage.splits.recheck import columns_of, recheck
+    from palpate.leakage.splits.recheck import Check, columns_of, recheck
 
     split = Split.load(path)
     manifest, _ = _read(options.paths, options, terminal)
     links, _ = _links(options, manifest, terminal)
     by = options.by or ((options.group,) if options.group != "auto" else ())
     checks = recheck(manifest, split, by=by, links=links)
-    failed = [c.name for c in checks if not c.ok]
     terminal.facts(
         f"Check of {path} against {len(manifest)} samples", {c.name: f"{'holds' if c.ok else 'FAILS'}: {c.text}" for c in checks}
     )
@@ -261,6 +262,10 @@ def _verify(options: Options, path: Path, terminal: Terminal) -> tuple[dict[str,
         group = (by or columns_of(split, manifest) or ("auto",))[0]
         audit = audit_split(manifest, known, group=group, name=path.name)
         show(audit, terminal)
+        quiet = not audit.leaking_samples
+        told = "none does" if quiet else f"{audit.leaking_samples} of {audit.test_samples} leak"
+        checks.append(Check("no signal of the audit flags a test sample", quiet, told))
+    failed = [c.name for c in checks if not c.ok]
     terminal.print(f"FAIL: {len(failed)} of {len(checks)} checks do not hold." if failed else f"All {len(checks)} checks hold.")
     result = {
         "path": str(path), "digest": split.digest, "checks": [dataclasses.asdict(c) for c in checks], "failed": failed,

@@ -24,6 +24,8 @@ from palpate.data.video import VideoReader
 ImageFormat = Literal["jpg", "png"]
 IMAGE_FORMATS: tuple[str, ...] = ("jpg", "png")
 QUALITY = 95
+#: A manifest's frames have 64 bits, so a longer number is none.
+DIGITS = 18
 
 
 class Frames(Protocol):
@@ -34,6 +36,11 @@ class Frames(Protocol):
 
     def __len__(self) -> int:
         """Number of positions; a folder may have holes."""
+        ...
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """The frames that can be had, in order."""
         ...
 
     def has(self, k: int) -> bool:
@@ -48,7 +55,8 @@ class Frames(Protocol):
 class FolderFrames:
     """Frames in a folder, named by their number (``0000000033.jpg``); other files are ignored.
 
-    ``leaving`` holds the frames that are links to files outside ``root``; they do not count as there.
+    ``leaving`` holds the frames that are links to files outside ``root``; they do not count as there. Of several pictures of one number
+    the first by name is read; ``doubled`` holds the others as (name, name that is read).
     """
 
     raw = False
@@ -57,13 +65,17 @@ class FolderFrames:
         self.source = folder
         self.leaving: set[int] = set()
         self._names: dict[int, str] = {}
+        self.doubled: list[tuple[str, str]] = []
         with os.scandir(folder) as entries:
-            for entry in entries:
+            for entry in sorted(entries, key=lambda e: e.name):
                 stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122 (a data set has hundreds of thousands of these)
-                if stem.isdecimal() and suffix.lower() in SUFFIXES:
-                    self._names[int(stem)] = entry.name
-                    if entry.is_symlink() and inside(root, os.path.relpath(entry.path, root)) is None:
-                        self.leaving.add(int(stem))
+                if not stem.isdecimal() or len(stem) > DIGITS or suffix.lower() not in SUFFIXES:
+                    continue
+                if (before := self._names.setdefault(int(stem), entry.name)) != entry.name:
+                    self.doubled.append((entry.name, before))
+                elif entry.is_symlink() and inside(root, os.path.relpath(entry.path, root)) is None:
+                    self.leaving.add(int(stem))
+        self.numbers: Sequence[int] = sorted(k for k in self._names if k not in self.leaving)
 
     def __len__(self) -> int:
         return max(self._names, default=-1) + 1
@@ -89,18 +101,30 @@ class VideoFrames:
     def __init__(self, source: Path, cache: Path, suffix: ImageFormat, size: int | None) -> None:
         self.source, self.cache, self.suffix, self.size = source, cache, suffix, size
         with VideoReader(source) as reader:
-            self._length = len(reader)
+            self.numbers: Sequence[int] = range(len(reader))
 
     def __len__(self) -> int:
-        return self._length
+        return len(self.numbers)
 
     def has(self, k: int) -> bool:
         """Whether ``k`` lies within the video."""
-        return 0 <= k < self._length
+        return k in self.numbers
 
     def path(self, k: int) -> Path:
         """Where frame ``k`` is cached."""
         return self.cache / f"{k:010d}.{self.suffix}"
+
+    def decode(self, wanted: set[int], decoded: set[int], stop: Event) -> None:
+        """Decodes the wanted frames without keeping them, and enters the whole ones into ``decoded``.
+
+        Raises:
+            PalpateError: if the video breaks off.
+        """
+        with VideoReader(self.source) as reader:
+            for k, _ in reader.frames(sorted(wanted)):
+                if stop.is_set():
+                    return
+                decoded.add(k)
 
     def extract(self, wanted: set[int], created: list[Path], stop: Event) -> None:
         """Decodes the wanted frames that are not cached yet, in one pass, and enters the new files into ``created``.

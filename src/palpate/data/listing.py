@@ -1,6 +1,6 @@
 """Frame lists: one ``video/frame.ext,label`` a line, as Touch and Go and its derivatives ship them.
 
-No header; the order is free; the last line may lack its newline. The label is an integer: -1 is inconclusive,
+No header; the order is free; UTF-8, or UTF-16 with a byte-order mark; any line ends; the last line may lack its own. The label is an integer: -1 is inconclusive,
 others are classes. The line is split at its last comma, so a video's name may hold commas and spaces. The frame
 is the integer value of the file's stem; ``video/33.jpg`` and ``video/0000000033.png`` name the same frame.
 
@@ -20,6 +20,7 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, write_text
 from palpate.data.manifest import SCHEMA, Manifest
+from palpate.data.texts import decoded, lines_of
 
 INCONCLUSIVE = -1
 PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
@@ -128,6 +129,24 @@ def touches(videos: Sequence[str] | pl.Series, frames: Sequence[int] | pl.Series
     return table.select(pl.format("{}#{}", "video", pl.col("number").cast(pl.String).str.zfill(4))).to_series().to_list()
 
 
+def number_together(*manifests: Manifest) -> list[Manifest]:
+    """Manifests of lists that were read apart, with their touches numbered over all of them, so that one name means one touch.
+
+    Manifests with a row that has no video or frame stay as they are.
+    """
+    if any(m.table["video"].null_count() or m.table["frame"].null_count() for m in manifests):
+        return list(manifests)
+    whole = pl.concat([m.table.select("video", "frame", "material") for m in manifests])
+    # A frame that stands in two lists belongs to one touch there and here.
+    alone = whole.unique(["video", "frame"], maintain_order=True)
+    names = alone.with_columns(touch=pl.Series(touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String))
+    found = whole.join(names, on=["video", "frame"], how="left", maintain_order="left")["touch"]
+    out: list[Manifest] = []
+    for m in manifests:
+        out.append(Manifest(m.table.with_columns(touch=found.slice(sum(len(o) for o in out), len(m))), m.root, m.facts))
+    return out
+
+
 def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
     """Writes a frame list, atomically.
 
@@ -224,9 +243,9 @@ def read_frame_table(path: Path) -> FrameTable:
 
 
 def _text(path: Path) -> str:
-    """The file as text; bytes that are no UTF-8 become U+FFFD, a byte-order mark is dropped."""
+    """The file as text; bytes that are no UTF-8, or UTF-16 with a byte-order mark, become U+FFFD."""
     try:
-        return path.read_bytes().decode("utf-8-sig", errors="replace")
+        return decoded(path.read_bytes())
     except FileNotFoundError:
         raise PalpateError("The list must exist", f"no file {path}", "Check the path") from None
     except IsADirectoryError:
@@ -235,7 +254,7 @@ def _text(path: Path) -> str:
 
 def _parse(path: Path) -> tuple[pl.DataFrame, list[Problem]]:
     """The well-formed rows of one list, and a problem for each other line."""
-    lines = pl.DataFrame({"text": pl.Series(_text(path).split("\n"), dtype=pl.String)}).with_row_index("line", offset=1)
+    lines = pl.DataFrame({"text": pl.Series(lines_of(_text(path)), dtype=pl.String)}).with_row_index("line", offset=1)
     lines = lines.with_columns(pl.col("text").str.strip_chars()).filter(pl.col("text") != "")
     table = lines.with_columns(pl.col("text").str.extract_groups(LINE).alias("parts")).unnest("parts")
     table = table.with_columns(

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, quiet
 from palpate.data.formats import FORMATS
 from palpate.data.formats.base import finished
+from palpate.data.formats.pairs import TACTILE, VISION
+from palpate.data.images import SUFFIXES
 from palpate.data.imported import raise_if, require_some
 from palpate.data.listing import LINE, read_list
 from palpate.data.manifest import Manifest
+from palpate.data.texts import decoded, lines_of
 
 TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
 
@@ -24,7 +29,7 @@ def read_samples(
 
     Args:
         path: ``manifest.parquet`` or its folder; a frame list (``video/frame.jpg,label`` a line); a table with the columns ``vision``
-            or ``tactile``; or the folder of a data set of a known format.
+            or ``tactile``; the folder of a data set of a known format; or a folder of pictures of one modality, photos unless it is named as touches are.
         skip_bad: leave bad rows out and list them, instead of raising.
         root: where the paths of a table start.
         progress: told what is being done.
@@ -45,11 +50,20 @@ def read_samples(
         found = read_list(path, skip_bad=skip_bad)
         return found.manifest, found.skipped
     name = "pairs" if path.is_file() else next((n for n, f in FORMATS.items() if f.detect(path)), "")
-    if not name:
-        raise PalpateError(f"{path} must hold a manifest or a data set of a known format", "neither", "Import it first: palpate import")
-    options = {"root": root} if root is not None and name == "pairs" else {}
-    scan = FORMATS[name].scan(path, progress=progress, **options)
+    options: dict[str, Any] = {"root": root} if root is not None and path.is_file() and name == "pairs" else {}
+    if path.is_dir() and name in ("", "pairs"):
+        sides: list[str] = [s for s, names in (("vision", VISION), ("tactile", TACTILE)) if any((path / n).is_dir() for n in names)]
+        if not sides and not any(p.suffix.lower() in SUFFIXES for p in (*path.glob("*"), *path.glob("*/*"))):
+            raise PalpateError(
+                f"{path} must hold a manifest, pictures, or a data set of a known format", "none of them", "Import it first: palpate import"
+            )
+        name = "pairs"
+        if len(sides) < 2:  # pictures of one modality: photos, unless the folder's name says that they are touches
+            options["side"] = sides[0] if sides else "tactile" if path.name.lower() in TACTILE else "vision"
     # Pictures are not decoded here: who looks at them reports those that cannot be read.
+    if "check" in inspect.signature(FORMATS[name].scan).parameters:
+        options["check"] = "none"
+    scan = FORMATS[name].scan(path, progress=progress, **options)
     rows = finished(scan, "none", progress)
     raise_if(scan.problems, skip_bad)
     require_some(len(rows), path, scan.problems)
@@ -73,7 +87,6 @@ def is_manifest(path: Path) -> bool:
 def is_list(path: Path) -> bool:
     """Whether the first line that is not empty is a row of a frame list."""
     with open(path, "rb") as file:
-        for raw in file:
-            if line := raw.decode("utf-8-sig", errors="replace").strip():
-                return re.match(LINE, line) is not None
-    return False
+        head = decoded(file.read(1 << 16))
+    line = next((line.strip() for line in lines_of(head) if line.strip()), "")
+    return re.match(LINE, line) is not None

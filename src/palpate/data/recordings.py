@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import shutil
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
@@ -48,6 +49,15 @@ class Row:
     frame: int
     touch: str
     material: str
+
+
+@dataclass(frozen=True)
+class _Job:
+    """The wanted frames of one side of a recording, or (``resting``) its typical frame in no touch."""
+
+    video: str
+    side: str
+    resting: bool
 
 
 def rows_of(listed: FrameList) -> list[Row]:
@@ -100,6 +110,7 @@ class Recordings:
         image_format, size: of cached frames.
         created: every new file is entered here.
         problems: what is wrong so far.
+        suspicious: what looks wrong, but can be used.
         sides: recording -> side -> frames, for those that could be opened.
         background: touch -> background picture.
         background_frames: touch -> the frame before it that is its background, where there is one.
@@ -115,6 +126,7 @@ class Recordings:
     size: int | None
     created: list[Path]
     problems: list[Problem] = field(default_factory=list)
+    suspicious: list[Problem] = field(default_factory=list)
     sides: dict[str, dict[str, Frames]] = field(default_factory=dict)
     background: dict[str, Path] = field(default_factory=dict)
     background_frames: dict[str, int] = field(default_factory=dict)
@@ -132,6 +144,11 @@ class Recordings:
         for done, (name, found) in enumerate(in_threads(self._open_one, sorted(first)), 1):
             if isinstance(found, dict):
                 self.sides[name] = found
+                for frames in (frames for frames in found.values() if isinstance(frames, FolderFrames)):
+                    self.suspicious += [
+                        Problem(str(frames.source / other), "duplicate-frame", f"{read} has the same number, and is read")
+                        for other, read in frames.doubled
+                    ]
             else:
                 kind, text = found
                 self.problems.append(Problem(first[name].where, kind, f"{text} ({_rows(count[name])} of this recording)"))
@@ -180,10 +197,10 @@ class Recordings:
         """The background of every touch: 4 frames before it, else further back, else (in ``extract``) a typical frame in no touch, else none."""
         for touch, row in {row.touch: row for row in reversed(rows)}.items():
             frames, contact = self.sides[row.video]["tactile"], self.contact.get(row.video, set())
-            k = starts[touch] - BACKGROUND_BEFORE
-            while k >= 0 and (k in contact or not frames.has(k)):
-                k -= 1
-            if k >= 0:
+            there = frames.numbers
+            before = bisect_right(there, starts[touch] - BACKGROUND_BEFORE)
+            k = next((there[i] for i in range(before - 1, -1, -1) if there[i] not in contact), None)
+            if k is not None:
                 self.background_frames[touch] = k
                 self.background[touch] = frames.path(k)
             elif self._untouched(row.video):
@@ -191,14 +208,12 @@ class Recordings:
 
     def _untouched(self, video: str) -> list[int]:
         """Up to 15 evenly spaced frames in no touch; a margin of 4 frames around touches is kept where that leaves any."""
-        frames = self.sides[video]["tactile"]
-        touched = np.zeros(len(frames), bool)
-        for k in self.contact.get(video, set()):
-            if k < len(frames):
-                touched[k] = True
-        near = np.convolve(touched, np.ones(2 * BACKGROUND_BEFORE + 1), mode="same") > 0 if len(frames) > 2 * BACKGROUND_BEFORE else touched
-        for mask in (near, touched):
-            free = [int(k) for k in np.flatnonzero(~mask) if frames.has(int(k))]
+        there = np.asarray(self.sides[video]["tactile"].numbers, np.int64)
+        contact = np.array(sorted(self.contact.get(video, set())), np.int64)
+        for margin in (BACKGROUND_BEFORE, 0):
+            # A frame is near a touch if some frame of contact lies between it less and it plus the margin.
+            near = np.searchsorted(contact, there - margin, "left") < np.searchsorted(contact, there + margin, "right")
+            free = there[~near].tolist()
             if free:
                 return [free[i] for i in sorted({int(p) for p in np.linspace(0, len(free) - 1, min(MEDIAN_OF, len(free))).round()})]
         return []
@@ -224,53 +239,81 @@ class Recordings:
         self.problems.sort(key=lambda p: _place(p.where))
         return [row for row in rows if not any(frames.path(row.frame) in bad for frames in self.sides[row.video].values())]
 
+    def decode(self, rows: list[Row], progress: Progress) -> list[Row]:
+        """Decodes what ``extract`` would cache, and writes nothing; keeps the rows whose pictures are whole."""
+        wanted = self._wanted(rows)
+        whole: dict[tuple[str, str], set[int]] = {key: set() for key in wanted}
+
+        def work(job: _Job, stop: Event) -> None:
+            frames = self.sides[job.video][job.side]
+            if job.resting:
+                nearest_to_median(frames, self._untouched(job.video))
+            elif isinstance(frames, VideoFrames):
+                frames.decode(wanted[job.video, job.side], whole[job.video, job.side], stop)
+
+        self._do("decoding frames", rows, wanted, work, progress)
+        return [row for row in rows if all(not f.raw or row.frame in whole[row.video, s] for s, f in self.sides[row.video].items())]
+
     def extract(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Caches the needed frames of raw videos and the medians; keeps the rows whose pictures are there."""
-        wanted: dict[tuple[str, str], set[int]] = {}
-        first: dict[str, Row] = {}
-        for row in rows:
-            first.setdefault(row.video, row)
-            for side, frames in self.sides[row.video].items():
-                if frames.raw:
-                    wanted.setdefault((row.video, side), set()).add(row.frame)
-                    if side == "tactile" and row.touch in self.background_frames:
-                        wanted[row.video, side].add(self.background_frames[row.touch])
-        touches = {row.touch for row in rows}
-        resting = sorted({video for touch, video in self.resting.items() if touch in touches})
+        wanted = self._wanted(rows)
         if wanted:
             self._require_same_settings(wanted)
-        stop = Event()
-        jobs = [*((video, side, False) for video, side in wanted), *((video, "tactile", True) for video in resting)]
         typical: dict[str, Path] = {}
 
-        def work(job: tuple[str, str, bool]) -> str | None:
-            video, side, rest = job
-            frames = self.sides[video][side]
-            try:
-                if rest:
-                    k, picture = nearest_to_median(frames, self._untouched(video))
-                    typical[video] = frames.path(k)
-                    if frames.raw and not typical[video].is_file():
-                        self.created.append(typical[video])
-                        save_picture(typical[video], picture, self.size)
-                elif isinstance(frames, VideoFrames):
-                    frames.extract(wanted[video, side], self.created, stop)
-            except PalpateError as error:
-                return f"{frames.source}: {error.got}"
-            return None
+        def work(job: _Job, stop: Event) -> None:
+            frames = self.sides[job.video][job.side]
+            if job.resting:
+                k, picture = nearest_to_median(frames, self._untouched(job.video))
+                typical[job.video] = frames.path(k)
+                if frames.raw and not typical[job.video].is_file():
+                    self.created.append(typical[job.video])
+                    save_picture(typical[job.video], picture, self.size)
+            elif isinstance(frames, VideoFrames):
+                frames.extract(wanted[job.video, job.side], self.created, stop)
 
-        progress("extracting frames", 0, len(jobs))
-        for done, ((video, _, _), text) in enumerate(in_threads(work, jobs, stop=stop), 1):
-            if text:
-                self.problems.append(Problem(first[video].where, "bad-video", text))
-            progress("extracting frames", done, len(jobs), video)
-        self.problems.sort(key=lambda p: _place(p.where))
+        self._do("extracting frames", rows, wanted, work, progress)
         self.background |= {touch: typical[video] for touch, video in self.resting.items() if video in typical}
         self.background = {touch: path for touch, path in self.background.items() if path.is_file()}
         rows = [row for row in rows if all(not f.raw or f.path(row.frame).is_file() for f in self.sides[row.video].values())]
         if len({f.raw for row in rows for f in self.sides[row.video].values()}) > 1:
             self._gather(rows)
         return rows
+
+    def _wanted(self, rows: Iterable[Row]) -> dict[tuple[str, str], set[int]]:
+        """(recording, side) -> the frames of a raw video that the rows and their backgrounds need."""
+        wanted: dict[tuple[str, str], set[int]] = {}
+        for row in rows:
+            for side, frames in self.sides[row.video].items():
+                if frames.raw:
+                    wanted.setdefault((row.video, side), set()).add(row.frame)
+                    if side == "tactile" and row.touch in self.background_frames:
+                        wanted[row.video, side].add(self.background_frames[row.touch])
+        return wanted
+
+    def _do(
+        self, what: str, rows: Sequence[Row], wanted: Iterable[tuple[str, str]], work: Callable[[_Job, Event], None], progress: Progress
+    ) -> None:
+        """Does the work for every wanted side and for the typical frame of every resting recording; what breaks off is a problem."""
+        first = {row.video: row for row in reversed(rows)}
+        touches = {row.touch for row in rows}
+        resting = sorted({video for touch, video in self.resting.items() if touch in touches})
+        jobs = [*(_Job(video, side, False) for video, side in wanted), *(_Job(video, "tactile", True) for video in resting)]
+        stop = Event()
+
+        def told(job: _Job) -> str | None:
+            try:
+                work(job, stop)
+            except PalpateError as error:
+                return f"{self.sides[job.video][job.side].source}: {error.got}"
+            return None
+
+        progress(what, 0, len(jobs))
+        for done, (job, text) in enumerate(in_threads(told, jobs, stop=stop), 1):
+            if text:
+                self.problems.append(Problem(first[job.video].where, "bad-video", text))
+            progress(what, done, len(jobs), job.video)
+        self.problems.sort(key=lambda p: _place(p.where))
 
     def _gather(self, rows: Sequence[Row]) -> None:
         """Puts extracted pictures beside the cached ones, as hard links where the disk allows, so that one root holds all."""

@@ -12,12 +12,15 @@ from typing import Any
 from palpate.core import PARTS, PalpateError, Problem, ProblemsError
 from palpate.data.listing import INCONCLUSIVE, SPELLING, read_categories
 from palpate.data.mapping import Cell, Expression
-from palpate.data.tables import decoded, sign_of
+from palpate.data.tables import sign_of
+from palpate.data.texts import decoded
 
 #: What tools call the parts of a split.
 PART_NAMES = {**{part: part for part in PARTS}, "training": "train", "validation": "val", "valid": "val", "dev": "val", "testing": "test"}
 #: What the columns of a split keep whole; where only some rows have a value, a person should look.
 GROUPS = ("video", "object", "session")
+#: What other tools write for an empty cell, in lower case.
+NULL_WORDS = ("na", "nan", "none", "null")
 Row = dict[str, Any]
 
 
@@ -115,14 +118,18 @@ def read_classes(path: Path) -> dict[int, str]:
     return names
 
 
-def half_null(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
-    """Tells of group columns that some rows have and others lack, with the first that lacks it."""
+def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
+    """Tells of group columns that some rows have and others lack, and of words in them that mean null elsewhere; each with the first row."""
     found: list[Problem] = []
     for name in GROUPS:
         without = [where for where, row in rows if name not in row]
         if 0 < len(without) < len(rows):
             text = f"{len(without)} of {len(rows)} rows have no {name}, so no split by {name} can place them; the first is {without[0]}"
             found.append(Problem(str(source), "null-group", text))
+        worded = [where for where, row in rows if str(row.get(name, "")).lower() in NULL_WORDS]
+        if worded:
+            text = f"{len(worded)} of {len(rows)} rows have the {name} NA, NaN, None or null, taken as a name; the first is {worded[0]}"
+            found.append(Problem(str(source), "word-for-null", f"{text}. An empty cell means that there is none"))
     return found
 
 

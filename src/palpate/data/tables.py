@@ -8,7 +8,6 @@ Parquet has no lines: its rows are counted from 1. Only the columns asked for ar
 
 from __future__ import annotations
 
-import codecs
 import csv
 import io
 import json
@@ -22,6 +21,7 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem
 from palpate.data.mapping import Cell, text_of
+from palpate.data.texts import decoded
 
 TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
 Row = dict[str, Any]
@@ -115,13 +115,6 @@ def header_of(path: Path) -> list[str]:
         return [str(name) for name in first] if isinstance(first, dict) else []
     except Exception:  # whatever the file is, it is not a table
         return []
-
-
-def decoded(data: bytes) -> str:
-    """Text of UTF-8, or of UTF-16 with a byte-order mark; what is neither becomes U+FFFD."""
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return data.decode("utf-16", errors="replace")
-    return data.decode("utf-8-sig", errors="replace")
 
 
 def sign_of(path: Path, text: str) -> str:

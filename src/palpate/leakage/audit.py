@@ -20,7 +20,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import MATRIX_ROWS, Audit, LeakPair, PalpateError, Problem, ProblemsError, Progress, Split, quiet
-from palpate.data.listing import FrameList, read_list
+from palpate.data.listing import FrameList, number_together, read_list
 from palpate.data.manifest import Manifest
 from palpate.leakage.signals import NEAR_FRAMES, Flags, identical_bytes, identical_samples, leaking, shared_group, signal_table, time_gap
 
@@ -283,10 +283,11 @@ def nearest_in_video(train: pl.DataFrame, test: pl.DataFrame) -> tuple[np.ndarra
     (at_a, video_a, frame_a), (at_b, video_b, frame_b) = place
     if not at_a.size or not at_b.size:
         return row, gap
-    # One sorted axis for all videos: the stride keeps the frames of two videos apart.
-    low = min(int(frame_a.min()), int(frame_b.min()))
-    stride = max(int(frame_a.max()), int(frame_b.max())) - low + 1
-    key_a, key_b = video_a * stride + frame_a - low, video_b * stride + frame_b - low
+    # One sorted axis for all videos: the stride keeps the frames of two videos apart. Ranks of frames keep their order and cannot
+    # overflow, as frames that are time stamps in nanoseconds would.
+    rank = np.unique(np.concatenate([frame_a, frame_b]), return_inverse=True)[1].astype(np.int64)
+    stride = int(rank.max()) + 1
+    key_a, key_b = video_a * stride + rank[: frame_a.size], video_b * stride + rank[frame_a.size :]
     order = np.argsort(key_a, kind="stable")
     right = np.searchsorted(key_a[order], key_b)
     best = np.full(at_b.size, np.iinfo(np.int64).max)
@@ -354,5 +355,6 @@ def audit_lists(train: Path, test: Path, *, group: str = "video", worst: int = 1
             problems += error.problems
     if problems:
         raise ProblemsError(problems, "Mend the lines, or pass --skip-bad to go on without them")
-    result = audit_parts(lists[0].manifest, lists[1].manifest, group=group, name=f"{train.name} / {test.name}", worst=worst)
+    train_rows, test_rows = number_together(lists[0].manifest, lists[1].manifest)
+    result = audit_parts(train_rows, test_rows, group=group, name=f"{train.name} / {test.name}", worst=worst)
     return result, [str(p) for found in lists for p in found.skipped]

@@ -11,7 +11,8 @@ its own video and of the match's left out; Auckenthaler et al. 2000 call this te
 *Threshold with videos known.* The scores of samples' best matches among OTHER videos are the null. Real near-duplicates may hide in it (a recording that was
 uploaded twice), so its tail cannot be trusted: a Gumbel distribution, the limit law of a best match among many, is fitted to the quantiles 10 to
 70 %; what lies so high that not one in 6 sets of q unrelated matches would hold it is taken for such duplicates and left out (three rounds); of the rest the highest tenth gives an exponential tail
-(rate = mean excess), and the threshold is where that tail falls to the wanted rate, but at least 0.55. The share of the null above it is told.
+(rate = mean excess), and the threshold is where that tail falls to the wanted rate, but at least 0.55. The share of the null above it is told. Above 0.9 it is not
+trusted: train is full of copies (a third of the null is enough), and random pairs set the threshold. Equal pictures score 1, whatever the level.
 
 *Threshold without.* A random pair is almost always unrelated. Queries are compared with random train pictures in blocks of B, a Gumbel distribution is fitted to the
 bulk of the blocks' best z in the same way, and since the best of m independent blocks is Gumbel again, moved by scale * ln m, the threshold is the quantile for
@@ -44,6 +45,10 @@ DEFAULT = 0.8
 ROUNDS, ODDS = 3, 6
 #: Lowest threshold with videos: a small excess is no near-duplicate, however alike unrelated pictures are to one another.
 LEAST_EXCESS = 0.55
+#: Above it a threshold from other videos tells of copies in train, or of features without use, and random pairs set one instead.
+TRUSTED = 0.9
+#: z from which a picture of the cohort is a copy of the query: a similarity of 0.95.
+COPY = float(np.arctanh(0.95))
 #: Without videos, pictures less alike than this are no near-duplicates, however unlike unrelated ones are.
 LEAST = 0.86
 BINS = 50
@@ -167,7 +172,7 @@ def random_blocks(z: Floats, count: int, rate: float) -> Calibration:
     threshold = max(float(np.tanh(best[0])), LEAST)
     lowest = " (the lowest that is allowed; the data alone would set it lower)" if threshold <= LEAST else ""
     note = (
-        f"No videos are known, so the threshold {threshold:.3f}{lowest} comes from random pairs (in blocks of {best[1]}), carried over to the best of"
+        f"Threshold {threshold:.3f}{lowest} from random pairs (in blocks of {best[1]}), carried over to the best of"
         f" {count} train pictures, for {rate:.2%} of unrelated samples."
     )
     return Calibration(threshold, np.tanh(best[2]).astype(np.float32), [note])

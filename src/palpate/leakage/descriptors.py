@@ -26,6 +26,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing.connection import wait
 from pathlib import Path
 
 import numpy as np
@@ -214,7 +215,7 @@ def _chunks(chunks: list[Chunk], processes: int, count: int) -> Iterator[tuple[P
     if processes > 1 and count >= FEW:
         context = multiprocessing.get_context("spawn")  # a forked copy of a process with threads may hang
         try:
-            with ProcessPoolExecutor(processes, context) as pool:
+            with ProcessPoolExecutor(processes, context, initializer=_follow_parent) as pool:
                 try:
                     for (place, _), decoded in zip(chunks, _started(pool, [files for _, files in chunks]), strict=True):
                         del left[place]
@@ -226,6 +227,18 @@ def _chunks(chunks: list[Chunk], processes: int, count: int) -> Iterator[tuple[P
             pass  # called from a script without a main guard, or a worker was killed: the threads below take what is left
     for (place, _), decoded in in_threads(_decode_chunk_at, left.items(), processes):
         yield place, decoded
+
+
+def _follow_parent() -> None:
+    """Ends this process when its parent is gone, be it killed: nobody else would stop it."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+
+        def watch() -> None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def _started(pool: ProcessPoolExecutor, chunks: list[list[Path]]) -> Iterator[Decoded]:

@@ -5,7 +5,7 @@ The unit is the entry, a distinct (picture, video) pair: two million samples of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,6 @@ from palpate.leakage.verify import Floats, Ints
 
 #: Samples whose best match in other videos makes the null.
 NULL_SAMPLES = 4000
-#: So many of train are enough, else those of test are added.
-ENOUGH = 100
 #: Queries that random pairs are drawn for where no videos are known.
 RANDOM_QUERIES = 1500
 #: In how many rounds, and how many train pictures each round draws.
@@ -76,6 +74,10 @@ def match(comparer: Comparer, base: Entries, queries: Entries, rate: float, pict
     calibration, by_videos = calibrated(comparer, base, queries, rate, pictures, progress)
     level = levels_of(comparer, base, queries, place, progress) if by_videos else np.zeros(len(queries), np.float32)
     score = calibrate.score(calibrate.fisher(similarity), level)
+    equal = similarity >= calibrate.HIGHEST
+    if len(base):
+        equal |= (place >= 0) & (queries.item == base.item[place])
+    score[equal] = 1.0  # the same picture is the same picture, however many others are like it
     cause = np.where(score >= calibration.threshold, "content", "").astype("<U15")
     if pictures is not None:
         score, place, cause = blank_matches(pictures, queries.item, base.item, score, place, cause, calibration.threshold)
@@ -86,37 +88,36 @@ def calibrated(
     comparer: Comparer, base: Entries, queries: Entries, rate: float, pictures: Pool | None, progress: Progress
 ) -> tuple[Calibration, bool]:
     """The threshold, and whether it comes from videos, so that scores are above the level of unrelated pictures."""
-    null = null_sample(base, queries)
-    if null is None:
-        return from_random_pairs(comparer, base, queries, rate, pictures, progress), False
-    apart, alike = best_matches(comparer, null.item, base.item, null.videos, base.videos, progress)
-    level = levels_of(comparer, base, null, apart, progress)
-    use = apart >= 0 if pictures is None else (apart >= 0) & ~pictures.blank[null.item]
-    if use.sum() < calibrate.FEWEST:
-        return calibrate.uncalibrated(rate), False
-    return calibrate.other_videos(calibrate.fisher(alike[use]) - level[use], rate), True
+    null, told = null_sample(base), "Train has too few samples of two known videos to tell unrelated pictures by."
+    if null is not None:
+        apart, alike = best_matches(comparer, null.item, base.item, null.videos, base.videos, progress)
+        # The same picture in two videos is a copy for certain and says nothing of unrelated ones.
+        use = (apart >= 0) & (alike < calibrate.HIGHEST) & (null.item != base.item[apart])
+        if pictures is not None:
+            use &= ~pictures.blank[null.item]
+        if use.sum() >= calibrate.FEWEST:
+            level = levels_of(comparer, base, null, apart, progress)
+            found = calibrate.other_videos(calibrate.fisher(alike[use]) - level[use], rate)
+            if found.threshold <= calibrate.TRUSTED:
+                return found, True
+            told = (
+                f"Best matches in other videos would set the threshold to {found.threshold:.3f}: many recordings of train are copies of one another, or"
+                " these features cannot tell pictures apart. Random pairs set it instead."
+            )
+    found = from_random_pairs(comparer, base, queries, rate, pictures, progress)
+    return replace(found, notes=[told, *found.notes]), False
 
 
-def null_sample(base: Entries, queries: Entries) -> Entries | None:
-    """The samples whose best match in other videos of train makes the null, None if videos do not tell.
+def null_sample(base: Entries) -> Entries | None:
+    """The train samples whose best match in other videos of train makes the null, None if videos do not tell.
 
-    Those of train come first: copies of train pictures are what test is searched for, and would spoil the null.
+    Test never enters it: copies of train pictures are what test is searched for.
     """
-    known = np.unique(base.videos[base.videos >= 0])
-    if len(known) < 2:
-        others = queries.videos[queries.videos >= 0]
-        if not len(known) or not (others != known[0]).any():
-            return None
-    parts = [np.flatnonzero(e.videos >= 0) for e in (base, queries)]
-    if len(parts[0]) + len(parts[1]) < calibrate.FEWEST:
+    rows = np.flatnonzero(base.videos >= 0)
+    if len(np.unique(base.videos[rows])) < 2 or len(rows) < calibrate.FEWEST:
         return None
-    rng = rng_for(0, "near-duplicates", "null")
-    chosen = [np.sort(rng.permutation(rows)[:NULL_SAMPLES]) for rows in parts]
-    if len(known) > 1 and len(chosen[0]) >= ENOUGH:
-        chosen[1] = chosen[1][:0]
-    item = np.concatenate([base.item[chosen[0]], queries.item[chosen[1]]])
-    videos = np.concatenate([base.videos[chosen[0]], queries.videos[chosen[1]]])
-    return Entries(item, videos, np.arange(len(item)), np.arange(len(item)))
+    chosen = np.sort(rng_for(0, "near-duplicates", "null").permutation(rows)[:NULL_SAMPLES])
+    return Entries(base.item[chosen], base.videos[chosen], np.arange(len(chosen)), np.arange(len(chosen)))
 
 
 def levels_of(comparer: Comparer, base: Entries, queries: Entries, match: Ints, progress: Progress) -> Floats:
@@ -125,7 +126,8 @@ def levels_of(comparer: Comparer, base: Entries, queries: Entries, match: Ints, 
     if not len(cohort) or not len(queries):
         return np.zeros(len(queries), np.float32)
     z = calibrate.fisher(comparer.grid(queries.item, base.item[cohort], progress))
-    z[queries.item[:, None] == base.item[cohort][None]] = np.nan
+    # Copies of the query among them are not unrelated, and must not raise the level that the copy searched for is held against.
+    z[(queries.item[:, None] == base.item[cohort][None]) | (z >= calibrate.COPY)] = np.nan
     matched = np.where(match >= 0, base.videos[np.maximum(match, 0)], -1)
     return calibrate.levels(z, queries.videos, matched, base.videos[cohort])
 
@@ -143,9 +145,11 @@ def from_random_pairs(
     asked = rng.permutation(len(queries))[:RANDOM_QUERIES]
     rows: list[Floats] = []
     for part in np.array_split(asked, min(RANDOM_ROUNDS, len(asked))):  # each with other train pictures
-        other = base.item[rng.permutation(count)[:RANDOM_WIDTH]]
+        chosen = rng.permutation(count)[:RANDOM_WIDTH]
+        other, theirs = base.item[chosen], base.videos[chosen]
         found = calibrate.fisher(comparer.grid(queries.item[part], other, progress))
-        found[queries.item[part][:, None] == other[None]] = np.nan
+        mine = queries.videos[part][:, None]
+        found[(queries.item[part][:, None] == other[None]) | ((mine == theirs[None]) & (mine >= 0))] = np.nan
         rows.append(rng.permuted(found, axis=1))
     z = np.concatenate(rows)
     return calibrate.random_blocks(z, count, rate)

@@ -169,8 +169,11 @@ def _told(paths: list[Path | None], row: Ints, thumbs: Thumbnails, column: str) 
     if absent := sum(p is None for p in paths):
         notes.append(f"{absent} of {len(paths)} samples have no {column} picture and were not looked at.")
     if bad := int((row < 0).sum()) - absent:
-        names = [f"{Path(name).name}: {why}" for name, why in list(thumbs.unreadable.items())[:3]]
+        mine = {str(p) for p in paths}
+        names = [f"{Path(name).name}: {why}" for name, why in thumbs.unreadable.items() if name in mine][:3]
         notes.append(f"{bad} {column} pictures cannot be read and were not looked at ({'; '.join(names)}).")
+    if others := [name for name in thumbs.unreadable if name not in {str(p) for p in paths}]:
+        notes.append(f"{len(others)} background pictures cannot be read ({', '.join(Path(n).name for n in others[:3])}); medians stand in.")
     return notes
 
 

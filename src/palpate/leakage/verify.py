@@ -2,7 +2,7 @@
 
 A picture is a thumbnail of 32 x 32 pixels in YCbCr, band-passed: with G_s a Gaussian blur of s pixels (edges repeated),
 
-    x = G_1 p - G_4 G_1 p,        chroma times 1.5.
+    x = G_1 p - G_4 G_1 p.
 
 What varies slower than G_4 (light, exposure, vignette) is gone, and what is finer than G_1 (noise, JPEG blocks, shifts below a pixel) counts little.
 Of the query the interior T (2 pixels cut off on each side, each channel's mean removed) is laid over the other picture B at every offset d of -2 ... 2

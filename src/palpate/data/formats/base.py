@@ -69,7 +69,8 @@ class Scan:
         suspicious: what looks wrong but can be used (swapped folders, counts that differ from the published ones ...).
         facts: further facts for the manifest (``layout``, ``text_source`` ...).
         parts: the data set's own splits: name -> id -> part.
-        rules: how each of them was found, for the split file.
+        own: name of the split that the rows' cell ``split`` tells, or empty; :func:`finished` makes it of the rows that stay.
+        rules: how each of the splits was found, for the split file.
         inconclusive: rows left out because their label says that the material is unclear.
     """
 
@@ -79,6 +80,7 @@ class Scan:
     suspicious: list[Problem] = field(default_factory=list)
     facts: dict[str, str] = field(default_factory=dict)
     parts: dict[str, dict[str, str]] = field(default_factory=dict)
+    own: str = ""
     rules: dict[str, dict[str, Any]] = field(default_factory=dict)
     inconclusive: int = 0
 
@@ -170,9 +172,15 @@ def validation(name: str, format: Format, scan: Scan, *, check: Check, progress:
 
 
 def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Found]:
-    """The rows whose paths stay inside, whose images are whole and whose ids stand once; what is wrong with others joins the problems."""
-    rows = unique(checked_paths(scan.rows, scan.base, scan.problems), scan.problems)
+    """The rows whose paths stay inside, whose images are whole and whose ids stand once; what is wrong with others joins the problems.
+
+    Of the rows that stay their cells ``split`` become the split ``scan.own``.
+    """
+    rows = checked_paths(scan.rows, scan.base, scan.problems)
     rows = checked_images(rows, scan.base, check, scan.problems, progress)
+    rows, parts = unique(rows, scan.problems)
+    if scan.own and parts:
+        scan.parts[scan.own] = parts
     scan.problems.sort(key=_place)
     return rows
 
@@ -216,20 +224,35 @@ def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) ->
     return good
 
 
-def unique(rows: Sequence[Found], problems: list[Problem]) -> list[Found]:
-    """Rows with their ids, each standing once; the first keeps it. An absent id is made of video and frame, else of the touch's path."""
-    seen: dict[str, str] = {}
+def unique(rows: Sequence[Found], problems: list[Problem]) -> tuple[list[Found], dict[str, str]]:
+    """Rows with their ids, each standing once; the first keeps it. An absent id is made of video and frame, else of the touch's path.
+
+    Returns:
+        The rows without their cell ``split``, and id -> that cell; an id that stands in two parts is in neither.
+    """
+    seen: dict[str, tuple[str, str | None]] = {}
+    both: set[str] = set()
     good: list[Found] = []
     for where, row in rows:
+        part = row.pop("split", None)
+        made = ""
         if row.get("id") is None:
             named = row.get("video") is not None and row.get("frame") is not None
             path = row.get("tactile") or row.get("vision") or where
             row["id"] = f"{row['video']}/{row['frame']}" if named else str(Path(path).with_suffix("").as_posix())
-        if (before := seen.setdefault(row["id"], where)) != where:
-            problems.append(Problem(where, "duplicate-id", f"the id {row['id']!r} stands at {before} already"))
-        else:
+            made = f", made of {'video and frame' if named else 'the path'} since there is none: map one (--map id=...)"
+        i = row["id"]
+        if i not in seen:
+            seen[i] = where, part
             good.append((where, row))
-    return good
+            continue
+        before, other = seen[i]
+        if part and other and part != other:
+            both.add(i)
+            problems.append(Problem(where, "two-parts", f"{i} is in {part} here and in {other} at {before}, so in no part"))
+        else:
+            problems.append(Problem(where, "duplicate-id", f"the id {i!r} stands at {before} already{made}"))
+    return good, {i: part for i, (_, part) in seen.items() if part and i not in both}
 
 
 def checked_images(rows: Sequence[Found], base: Path, how: Check, problems: list[Problem], progress: Progress) -> list[Found]:

@@ -130,11 +130,9 @@ def scan(
             "text": row.text,
         }
         cells |= {"session": sessions[row.trajectory], "vision": row.vision, "tactile": row.tactile, "background": background}
-        found.rows.append((row.where, cells | {"sensor": FACTS.sensor, "domain": row.trajectory[0]}))
-    parts = {f"{'/'.join(r.trajectory)}/{r.frame}": r.part for r in reversed(rows) if r.part}
-    if parts:
-        name = "Orig" if lists is None else "Lists"
-        found.parts[name] = dict(sorted(parts.items()))
+        found.rows.append((row.where, cells | {"sensor": FACTS.sensor, "domain": row.trajectory[0], "split": row.part}))
+    if any(row.part for row in rows):
+        found.own = name = "Orig" if lists is None else "Lists"
         found.rules[name] = {"method": "official" if lists is None else "lists", "files": reader.files}
     exchange = f"{len(evidence)}, {'mended' if mended else 'as they are'}" if evidence else "none"
     found.facts |= {"session_gap": f"{session_gap:g} s", "swapped_folders": exchange}
@@ -281,8 +279,12 @@ class _Pictures:
     def __len__(self) -> int:
         return len(self.files)
 
+    @property
+    def numbers(self) -> Sequence[int]:
+        return range(len(self.files))
+
     def has(self, k: int) -> bool:
-        return 0 <= k < len(self.files)
+        return k in self.numbers
 
     def path(self, k: int) -> Path:
         return self.files[k]

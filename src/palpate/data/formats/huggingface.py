@@ -28,9 +28,10 @@ from palpate.data.formats.base import Facts, Found, Scan, import_scanned
 from palpate.data.formats.huggingface_source import ROW, Source, one_line, open_source
 from palpate.data.images import BROKEN, Check
 from palpate.data.imported import Imported, removing_on_error
+from palpate.data.listing import INCONCLUSIVE
 from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS, SCHEMA
 from palpate.data.mapping import Cell, Expression, compile_maps, text_of
-from palpate.data.rows import PART_NAMES, half_null, manifest_rows, read_classes
+from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classes
 
 LOOKED_FOR = "a folder written by datasets' save_to_disk, or of Parquet shards; a name on the hub with --format hf"
 FACTS = Facts(
@@ -173,7 +174,7 @@ def _scan(source: Source, columns: Mapping[str, str] | None, classes: Path | Non
     problems: list[Problem] = []
     places: dict[int, int] = {}
     found = Scan([], pictures.folder or source.folder or Path(), problems, facts=dict(source.facts))
-    parts: dict[str, str] = {}
+    parts: set[str] = set()
     total = sum(len(data) for data in source.splits.values() if hasattr(data, "__len__"))
     for split, first, batch in _batches(source):
         rows, unclear = _batch_rows(source, expressions, split, first, batch, known, pictures, problems)
@@ -181,18 +182,19 @@ def _scan(source: Source, columns: Mapping[str, str] | None, classes: Path | Non
         for k, (where, row) in rows:
             if ROW in batch:
                 places[len(found.rows)] = int(batch[ROW][k - first])
-            found.rows.append((where, row))
             if split in PART_NAMES:
-                parts[row["id"]] = PART_NAMES[split]
+                row["split"] = PART_NAMES[split]
+                parts.add(row["split"])
+            found.rows.append((where, row))
         progress("reading rows", first + len(next(iter(batch.values()))), total)
     if len(places) == len(found.rows):
         found.rows = [found.rows[k] for k in sorted(places, key=places.__getitem__)]
-    if len(set(parts.values())) > 1:
+    if len(parts) > 1:
         rule = source.about.get("rule") or {"method": "official", "parts": sorted(s for s in source.splits if s in PART_NAMES)}
-        found.parts, found.rules = {"Orig": parts}, {"Orig": dict(rule)}
+        found.own, found.rules = "Orig", {"Orig": dict(rule)}
     words = any("text" in row for _, row in found.rows)
     found.facts.setdefault("text_source", f"column {(columns or {}).get('text', 'text')}" if words else "none")
-    found.suspicious = half_null(Path(source.name), found.rows)
+    found.suspicious = odd_groups(Path(source.name), found.rows)
     return found
 
 
@@ -231,7 +233,14 @@ def _batch_rows(
     inner = {target: e.column for target, e in expressions.items() if target in IMAGE_COLUMNS and e.column in source.images}
     plain = {target: e for target, e in expressions.items() if target not in inner}
     cells = {name: _texts(source, name, batch[name]) for e in plain.values() for name in e.inputs}
-    rows, unclear = manifest_rows(plain, cells.__getitem__, count, where, classes, problems)
+    told: list[Problem] = []
+    rows, unclear = manifest_rows(plain, cells.__getitem__, count, where, classes, told)
+    inconclusive, unknown = _labels(source, plain, batch)
+    left = {where(k) for k in inconclusive | unknown.keys()}
+    problems += [p for p in told if p.where not in left]
+    problems += [Problem(where(k), "unknown-label", text) for k, text in unknown.items()]
+    rows = [(k, row) for k, row in rows if where(k) not in left]
+    unclear += len(inconclusive)
     good: list[tuple[int, Found]] = []
     for k, row in rows:
         wrong: list[tuple[str, str]] = []
@@ -255,6 +264,20 @@ def _batch_rows(
         if not wrong:
             good.append((first + k, (where(k), row)))
     return good, unclear
+
+
+def _labels(source: Source, plain: Mapping[str, Expression], batch: Mapping[str, list[Any]]) -> tuple[set[int], dict[int, str]]:
+    """Rows whose material is the class -1, which is inconclusive, and row -> what is wrong with its number of a class."""
+    inconclusive: set[int] = set()
+    unknown: dict[int, str] = {}
+    for target, name in ((target, name) for target, e in plain.items() for name in e.inputs if name in source.labels):
+        count = len(source.labels[name])
+        for k, v in enumerate(batch[name]):
+            if v == INCONCLUSIVE and target == "material":
+                inconclusive.add(k)
+            elif v is not None and v != INCONCLUSIVE and not 0 <= v < count:
+                unknown[k] = f"the column {name} has {count} classes, counted from 0, and none of the number {v}"
+    return inconclusive - unknown.keys(), unknown
 
 
 def _texts(source: Source, name: str, values: Sequence[Any]) -> list[Cell]:

@@ -29,6 +29,7 @@ from palpate.data.imported import Imported, raise_if, removing_on_error, require
 from palpate.data.listing import FrameTable
 from palpate.data.manifest import Manifest
 from palpate.data.recordings import Recordings, Row, VideoFiles
+from palpate.data.rows import odd_groups
 from palpate.data.tables import header_of
 
 LOOKED_FOR = f"a table with the columns {', '.join(ORDER)}, beside folders of recordings"
@@ -66,7 +67,7 @@ def scan(
     check: Check = "decode",
     progress: Progress = quiet,
 ) -> Scan:
-    """Looks a list and its recordings over without decoding or writing anything; rows carry no paths.
+    """Looks a list and its recordings over without writing anything; rows carry no paths.
 
     Args:
         source: the list.
@@ -75,7 +76,7 @@ def scan(
         classes: table of classes, whose numbers stand as labels.
         half_open: ``end`` is the first frame after the touch.
         every: take every so manieth frame of a touch, from its first.
-        check: how extracted pictures are checked.
+        check: how extracted pictures are checked; ``decode`` decodes the frames of raw videos that are in use, too.
         progress: told what is being done.
 
     Raises:
@@ -84,16 +85,11 @@ def scan(
     base = _root(source, root, every)
     work = _Whole(base, base, _videos(base), {}, "jpg", None, [])
     rows, touches, inconclusive = _prepared(work, Path(source), columns, classes, half_open, every, check, progress)
+    rows = work.decode(rows, progress) if check == "decode" else rows
     found: list[Found] = [
         (r.where, {"id": r.id, "video": r.video, "frame": r.frame, "touch": r.touch, **touches[r.touch].words}) for r in rows
     ]
-    listed = {touch.video for touch in touches.values()}
-    odd = [
-        Problem(str(base), "unlisted-video", f"the recording {name!r} has no usable interval") for name in sorted(set(work.videos) - listed)
-    ]
-    bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
-    odd += [Problem(touches[t].where, "no-background", f"no frame of {touches[t].video!r} shows the gel untouched") for t in bare]
-    return Scan(found, base, work.problems, odd, {"dataset": source.stem}, inconclusive=inconclusive)
+    return Scan(found, base, work.problems, work.suspicious, {"dataset": source.stem}, inconclusive=inconclusive)
 
 
 def run(
@@ -157,7 +153,7 @@ def run(
         }  # fmt: skip
         manifest = work.manifest(rows, facts, "", words)
         named = manifest.table.with_columns(sensor=pl.lit(sensor, dtype=pl.String))
-        return Imported(Manifest(named, manifest.root, manifest.facts), work.problems, {}, inconclusive).save(out, created)
+        return Imported(Manifest(named, manifest.root, manifest.facts), work.problems, {}, inconclusive, work.suspicious).save(out, created)
 
 
 def _root(source: Path, root: Path | None, every: int) -> Path:
@@ -197,6 +193,8 @@ def _prepared(
     """Everything up to extraction: the rows, the touches by name, how many intervals are inconclusive."""
     problems = work.problems
     listed = read_intervals(source, dict(columns or {}), classes, half_open, problems)
+    words = odd_groups(source, [(i.where, {"video": i.video, **i.words}) for i in listed])
+    work.suspicious += [problem for problem in words if problem.kind == "word-for-null"]
     rows = [Row(i.where, i.video, i.video, i.first, i.where, "") for i in listed]
     opened = {row.where for row in work.open(rows, progress)}
     listed = _within(work, [i for i in listed if i.where in opened])
@@ -210,6 +208,15 @@ def _prepared(
     for name in {row.touch for row in rows}:
         _named_background(work, touches[name])
     rows = work.check(rows, check, progress)
+    used = {touch.video for touch in touches.values()}
+    work.suspicious += [
+        Problem(str(work.root), "unlisted-video", f"the recording {name!r} has no usable interval")
+        for name in sorted(set(work.videos) - used)
+    ]
+    bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
+    work.suspicious += [
+        Problem(touches[t].where, "no-background", f"no frame of {touches[t].video!r} shows the gel untouched") for t in bare
+    ]
     return rows, touches, sum(i.inconclusive for i in listed)
 
 
@@ -257,6 +264,9 @@ def _named_background(work: Recordings, touch: Interval) -> None:
             Problem(touch.where, "missing-file", f"no picture of the background, frame {touch.background}, in {frames.source}")
         )
         return
+    if touch.background in work.contact.get(touch.video, set()):
+        text = f"the listed background, frame {touch.background} of {touch.video!r}, lies in a touch"
+        work.suspicious.append(Problem(touch.where, "background-in-touch", text))
     work.background_frames[touch.touch] = touch.background
     work.background[touch.touch] = frames.path(touch.background)
     work.resting.pop(touch.touch, None)

@@ -20,6 +20,8 @@ from palpate.data.images import SUFFIXES
 from palpate.data.manifest import CLIMBS
 
 FEW = 3
+#: A manifest's frames have 64 bits, so a longer number is none.
+DIGITS = 18
 
 
 @dataclass
@@ -42,7 +44,7 @@ def numbered(folder: Path, pattern: str = r"([0-9]+)", suffixes: Sequence[str] =
 
     Args:
         folder: looked at without its subfolders.
-        pattern: of the whole stem, with one group: the number.
+        pattern: of the whole stem, with one group: the number, which has 18 digits at most.
         suffixes: of pictures, in lower case; other files are not pictures.
     """
     out = Numbered()
@@ -57,7 +59,7 @@ def numbered(folder: Path, pattern: str = r"([0-9]+)", suffixes: Sequence[str] =
         if suffix.lower() not in suffixes:
             continue
         match = re.fullmatch(pattern, stem)
-        if match is None:
+        if match is None or len(match[1]) > DIGITS:
             out.odd.append(name)
         elif (before := found.setdefault(int(match[1]), name)) != name:
             out.doubled.append((name, before))

@@ -27,7 +27,7 @@ from palpate.data.formats.base import Facts, Found, Scan
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import SCHEMA
 from palpate.data.mapping import compile_maps
-from palpate.data.rows import Row, half_null, manifest_rows, read_classes
+from palpate.data.rows import Row, manifest_rows, odd_groups, read_classes
 from palpate.data.tables import TABLES, header_of, open_table
 
 Side = Literal["vision", "tactile"]
@@ -97,7 +97,7 @@ def scan(
                 "side says what a folder of images shows", f"the table {source.name}", f"Leave it out; map a column: {side}=..."
             )
         base, layout = Path(root) if root is not None else source.parent, f"table {source.suffix.lower()[1:] or 'csv'}"
-        rows, inconclusive = _table_rows(source, base, maps, names, known, problems)
+        rows, inconclusive = _table_rows(source, maps, names, known, problems)
     elif source.is_dir():
         if root is not None or names is not None:
             raise PalpateError("Only a table has a root and names of columns", f"the folder {source}", "Leave root and names out")
@@ -107,21 +107,20 @@ def scan(
     else:
         raise PalpateError("The source of an import must exist", f"nothing at {source}", "Check the path")
     progress("reading rows", 1, 1)
-    suspicious = half_null(source, rows)
+    suspicious = odd_groups(source, rows)
     if rows and side is None and (lone := [name for name, _ in SIDES if name not in rows[0][1]]):
         text = f"no column {lone[0]}, so the samples have one image each; if there should be two, map it: --map {lone[0]}=YOUR_COLUMN"
         suspicious.append(Problem(str(source), "one-sided", text))
-    parts = {str(row["id"]): str(row.pop("split")) for _, row in rows if "split" in row}
     words = any("text" in row for _, row in rows)
     facts = {"dataset": source.stem, "layout": layout, "text_source": f"column {maps.get('text', 'text')}" if words else "none"}
     found = Scan(rows, base, problems, suspicious, facts, inconclusive=inconclusive)
-    if parts:
-        found.parts, found.rules = {"Orig": parts}, {"Orig": {"method": "official", "column": maps.get("split", "split")}}
+    if any("split" in row for _, row in rows):
+        found.own, found.rules = "Orig", {"Orig": {"method": "official", "column": maps.get("split", "split")}}
     return found
 
 
 def _table_rows(
-    path: Path, base: Path, maps: Mapping[str, str], names: str | None, classes: Mapping[int, str] | None, problems: list[Problem]
+    path: Path, maps: Mapping[str, str], names: str | None, classes: Mapping[int, str] | None, problems: list[Problem]
 ) -> tuple[list[Found], int]:
     """(place, manifest row) of each usable row of a table, and how many rows are inconclusive."""
     table = open_table(path, None if names is None else [name.strip() for name in names.split(",")])
@@ -143,19 +142,8 @@ def _table_rows(
         if long := [side for side in sides if len(row[side]) > 80 and any(len(p.encode()) > 255 for p in row[side].split("/"))]:
             problems.append(Problem(table.where(k), "bad-path", f"no file system holds a name as long as that of the {long[0]} path"))
             continue
-        if "split" in row:
-            row.setdefault("id", _id_of(row, base))
         rows.append((table.where(k), row))
     return rows, inconclusive
-
-
-def _id_of(row: Row, base: Path) -> str:
-    """The id that a row without one gets, known before the row is placed in a split."""
-    if "video" in row and "frame" in row:
-        return f"{row['video']}/{row['frame']}"
-    path = str(row.get("tactile") or row["vision"])
-    path = os.path.relpath(path, base.resolve()) if os.path.isabs(path) else path  # noqa: PTH117 (texts, and many of them)
-    return posixpath.splitext(posixpath.normpath(path))[0]
 
 
 def _file_rows(

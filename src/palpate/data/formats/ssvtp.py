@@ -82,22 +82,19 @@ def scan(source: Path, *, lists: Path | None = None, progress: Progress = quiet)
     if lists is not None and not there:
         raise PalpateError(f"{lists} must hold train.csv or test.csv", "neither", "Check the path")
     work = _Work(root, found)
-    parts: dict[str, str] = {}
     for part, path in there.items():
         rows = tvl.read_csv(path, found.problems, COLUMNS)
         for done, (where, cells) in enumerate(rows, 1):
             if (row := work.row(where, cells)) is not None:
-                found.rows.append((where, row))
-                parts.setdefault(row["id"], part)
+                found.rows.append((where, row | {"split": part}))
             progress(f"reading {path.name}", done, len(rows))
     used = {str(row[side]) for _, row in found.rows for side in FOLDERS}
     if not there:
         found.rows += work.unlisted()
     elif more := sorted(work.files["vision"] - used):
         found.suspicious.append(Problem(str(root / more[0]), "unlisted", f"{len(more)} photos stand in no list"))
-    if parts:
-        name = "Orig" if lists is None else "Lists"
-        found.parts[name] = dict(sorted(parts.items()))
+    if there:
+        found.own = name = "Orig" if lists is None else "Lists"
         found.rules[name] = {"method": "official" if lists is None else "lists", "files": [path.name for path in there.values()]}
     found.rows.sort(key=lambda row: _order(row[1]["id"]))
     work.finish()

@@ -18,7 +18,8 @@ outside all touches the one nearest to their median; else null.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet, read_json
@@ -28,7 +29,7 @@ from palpate.data.images import Check
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
 from palpate.data.listing import INCONCLUSIVE, FrameList, FrameTable, read_categories, read_frame_table, read_lists, write_list
 from palpate.data.manifest import Manifest
-from palpate.data.recordings import Recordings, VideoFiles, first_frames, rows_of, thin
+from palpate.data.recordings import Recordings, Row, VideoFiles, first_frames, rows_of, thin
 
 FACTS = Facts(
     "Touch and Go",
@@ -135,20 +136,22 @@ def import_touch_and_go(
         rows = work.open(thin(rows, max_per_touch, seed), progress)
         work.choose_backgrounds(rows, starts)
         rows = work.check(rows, check, progress)
+        _look(work, rows, listed)
         raise_if(work.problems, skip_bad)
         require_some(len(rows), root, work.problems)
         rows = work.extract(rows, progress)
         raise_if(work.problems, skip_bad)
         require_some(len(rows), root, work.problems)
-        facts = _facts(root) | {"text_source": "captions.csv" if texts else "none"}
+        facts = _facts(root, categories) | {"text_source": "captions.csv" if texts else "none"}
         manifest = work.manifest(rows, facts, FACTS.sensor, {"text": texts, "object": objects})
-        return Imported(manifest, work.problems, _splits(manifest, official), listed.inconclusive).save(out, created)
+        found = Imported(manifest, work.problems, _splits(manifest, official), listed.inconclusive, work.suspicious)
+        return found.save(out, created)
 
 
 def scan(root: Path, *, labels: Sequence[Path] | Path | None = None, check: Check = "decode", progress: Progress = quiet) -> Scan:
-    """Looks a data set over without decoding or writing anything: lists, recordings, frames and, where extracted, pictures.
+    """Looks a data set over without writing anything: lists, recordings, frames and pictures.
 
-    Rows carry no paths, as frames of raw videos have none yet.
+    With ``check="decode"`` the frames in use are decoded as an import would, those of raw videos too. Rows carry no paths, as frames of raw videos have none yet.
 
     Raises:
         PalpateError: if the root, the list or the recordings are missing.
@@ -167,23 +170,23 @@ def scan(root: Path, *, labels: Sequence[Path] | Path | None = None, check: Chec
     rows = work.open(rows, progress)
     work.choose_backgrounds(rows, starts)
     rows = work.check(rows, check, progress)
+    _look(work, rows, listed)
+    rows = work.decode(rows, progress) if check == "decode" else rows
     found = [(r.where, {"id": r.id, "video": r.video, "frame": r.frame, "touch": r.touch, "material": r.material}) for r in rows]
-    unlisted = sorted(set(videos) - set(listed.contact["video"]))
-    odd = [Problem(str(root), "unlisted-video", f"the recording {name!r} is in no list") for name in unlisted]
-    bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
-    odd += [Problem(r, "no-background", "no frame of its recording shows the gel untouched") for r in bare]
-    return Scan(found, root, work.problems, odd, _facts(root), inconclusive=listed.inconclusive)
+    return Scan(found, root, work.problems, work.suspicious, _facts(root, categories), inconclusive=listed.inconclusive)
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     """Writes ``<part>.txt`` with a ``video/0000000033.jpg,3`` line a sample, as the official lists are.
 
-    A material that is no known class keeps its number if it is one (bare lists without a category table).
+    The classes are those of the manifest's fact ``classes``, which an import with another table than the published one writes, else
+    the published ones. A material that is none of them keeps its number if it is one (bare lists without a category table).
 
     Raises:
         PalpateError: if a sample has no video or frame, or a material that is no class.
     """
-    ids = {name: k for k, name in CATEGORIES.items()}
+    classes: dict[str, str] = json.loads(manifest.facts["classes"]) if "classes" in manifest.facts else {}
+    ids = {name: int(k) for k, name in (classes or CATEGORIES).items()}
     files: list[Path] = []
     for part in split.counts():
         rows: list[tuple[str, int]] = []
@@ -199,8 +202,20 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return files
 
 
-def _facts(root: Path) -> dict[str, str]:
-    """Name and licence of the data; palpate's own world comes in this layout, and must never pass for the real set."""
+def _look(work: Recordings, rows: Sequence[Row], listed: FrameList) -> None:
+    """Tells recordings in no list, and touches without a picture of the gel."""
+    unlisted = sorted(set(work.videos) - set(listed.contact["video"]))
+    work.suspicious += [Problem(str(work.root), "unlisted-video", f"the recording {name!r} is in no list") for name in unlisted]
+    bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
+    work.suspicious += [Problem(touch, "no-background", "no frame of its recording shows the gel untouched") for touch in bare]
+
+
+def _facts(root: Path, categories: Mapping[int, str]) -> dict[str, str]:
+    """Name and licence of the data, and its classes if they are not the published ones.
+
+    Palpate's own world comes in this layout, and must never pass for the real set.
+    """
+    classes = {} if categories == CATEGORIES else {"classes": json.dumps({str(k): name for k, name in categories.items()})}
     mark = root / "world.json"
     about = read_json(mark, "world record") if mark.is_file() else {}
     if isinstance(about, dict) and str(about.get("format", "")).startswith("palpate-world/"):
@@ -209,8 +224,9 @@ def _facts(root: Path) -> dict[str, str]:
             "format": "touch-and-go",
             "synthetic": "yes",
             "digest": str(about.get("digest", "")),
+            **classes,
         }
-    return {**FACTS.of_manifest(), "format": "touch-and-go"}
+    return {**FACTS.of_manifest(), "format": "touch-and-go", **classes}
 
 
 def _require_videos(root: Path) -> dict[str, VideoFiles]:

@@ -54,7 +54,7 @@ DIRECTIONS = ("vision2touch", "touch2vision")
 #: Part of ours -> the word in the lists' names.
 WORDS = {"train": "train", "val": "val", "test": "eval"}
 FIELDS = 8
-FRAME = r"frame_?([0-9]+)"
+FRAME = r"frame_?([0-9]{1,18})"
 SIDES = {"touch": "tactile", "tactile": "tactile", "gelsight": "tactile", "vision": "vision", "rgb": "vision"}
 LOOKED_FOR = f"{LISTS}/{{train,eval}}_{{vision2touch,touch2vision}}.txt, or recordings <n>/<recording>/frame0000.jpg"
 #: How deep recordings may lie below the source, and how many folders ``detect`` opens.

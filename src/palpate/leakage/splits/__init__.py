@@ -325,6 +325,8 @@ def _plan(
 ) -> SplitPlan:  # fmt: skip
     """One assignment as a plan, everything recounted from it."""
     deviation = problem.worst(assignment)
+    if optimum.bound > deviation + EXACT:  # a proof that is wrong must never pass for one
+        raise RuntimeError(f"the lower bound {optimum.bound} lies above a deviation that was reached, {deviation}")
     bound = min(optimum.bound, deviation)
     gap = deviation - bound
     status = f"within {gap:.5f} of the optimum"
