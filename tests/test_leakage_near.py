@@ -364,3 +364,19 @@ def test_equal_pictures_score_one_however_many_there_are(tmp_path):
     found = near_duplicates(train, test, "vision")
     assert found.flag.all()
     assert set(found.score.tolist()) == {1.0}
+
+
+def test_a_changed_file_is_decoded_again_and_cameras_may_be_held_upright(tmp_path):
+    path = tmp_path / "a.jpg"
+    save(path, crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
+    before = thumbnails([path], cache=tmp_path / "cache").pixels.copy()
+    save(path, crop(NoiseVideo(np.random.default_rng(1), 72).photo(0)))
+    assert np.abs(thumbnails([path], cache=tmp_path / "cache").pixels.astype(int) - before).mean() > 5
+    picture = Image.open(path).convert("RGB")
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was turned: shown rotated by a quarter, clockwise
+    picture.save(tmp_path / "turned.png", exif=exif)
+    picture.transpose(Image.Transpose.ROTATE_270).save(tmp_path / "upright.png")
+    turned, upright = thumbnail(tmp_path / "turned.png"), thumbnail(tmp_path / "upright.png")
+    assert np.array_equal(turned, upright)
+    assert not np.array_equal(turned, thumbnail(path))
