@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress, quiet
+from palpate.leakage.calibrate import HIGHEST
 from palpate.leakage.descriptors import search_vectors
 from palpate.leakage.search import nearest
 from palpate.leakage.verify import BLOCK, Floats, Ints, against_all, similarities
@@ -23,9 +24,15 @@ CANDIDATES = 8
 
 
 class Comparer(Protocol):
-    """Features of a pool of pictures."""
+    """Features of a pool of pictures.
+
+    Attributes:
+        name: for people.
+        same: the similarity from which two rows are the same picture, whatever others are like.
+    """
 
     name: str
+    same: float
 
     def vectors(self) -> Floats:
         """(n, d) rows whose nearest neighbours are candidates."""
@@ -49,6 +56,7 @@ class Plates:
 
     def __init__(self, plates: NDArray[np.int8]) -> None:
         self.name = "aligned cross-correlation of 32 x 32 YCbCr, band-passed"
+        self.same = HIGHEST
         self._plates = plates
         self._vectors: Floats | None = None
 
@@ -80,6 +88,7 @@ class Embeddings:
 
     def __init__(self, vectors: Floats, name: str) -> None:
         self.name = name
+        self.same = 1 - 1e-6  # a weak tower puts different pictures very near
         length = np.linalg.norm(vectors, axis=1, keepdims=True)
         self._vectors = (vectors / np.maximum(length, np.float32(1e-12))).astype(np.float32)
 

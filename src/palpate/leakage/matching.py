@@ -74,7 +74,7 @@ def match(comparer: Comparer, base: Entries, queries: Entries, rate: float, pict
     calibration, by_videos = calibrated(comparer, base, queries, rate, pictures, progress)
     level = levels_of(comparer, base, queries, place, progress) if by_videos else np.zeros(len(queries), np.float32)
     score = calibrate.score(calibrate.fisher(similarity), level)
-    equal = similarity >= calibrate.HIGHEST
+    equal = similarity >= comparer.same
     if len(base):
         equal |= (place >= 0) & (queries.item == base.item[place])
     score[equal] = 1.0  # the same picture is the same picture, however many others are like it
@@ -92,7 +92,7 @@ def calibrated(
     if null is not None:
         apart, alike = best_matches(comparer, null.item, base.item, null.videos, base.videos, progress)
         # The same picture in two videos is a copy for certain and says nothing of unrelated ones.
-        use = (apart >= 0) & (alike < calibrate.HIGHEST) & (null.item != base.item[apart])
+        use = (apart >= 0) & (alike < comparer.same) & (null.item != base.item[apart])
         if pictures is not None:
             use &= ~pictures.blank[null.item]
         if use.sum() >= calibrate.FEWEST:

@@ -168,7 +168,7 @@ def near_groups(
     if by_videos:
         level = levels_of(comparer, entries, entries, _best_elsewhere(entries, i, j, similarity), progress)
     linked = calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j])) >= calibration.threshold
-    linked |= similarity >= calibrate.HIGHEST
+    linked |= similarity >= comparer.same
     i, j, similarity = i[linked], j[linked], similarity[linked]
     if pictures is not None and modality == "touch" and len(i):
         some = np.unique(np.concatenate([i, j]))
