@@ -17,7 +17,8 @@ from palpate.cli import main
 from palpate.core import PalpateError, Split, digest_file
 from palpate.data.listing import read_lists
 from palpate.data.manifest import Manifest
-from palpate.leakage import audit_split, choose_group, components, describe, leak_free_folds, leak_free_split, leak_free_splits
+from palpate.leakage import audit_split
+from palpate.leakage.splits import choose_group, components, describe, leak_free_folds, leak_free_split, leak_free_splits
 from palpate.leakage.splits.assign import RESOLUTION, column_bound, draw, optimise, repair
 from palpate.leakage.splits.noleak import RATIOS, entry, hct_noleak, load_record, make_record, record_split, verify_record
 from palpate.leakage.splits.polish import Problem, Search, greedy, start

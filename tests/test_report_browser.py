@@ -77,18 +77,23 @@ def page_file(tmp_path_factory):
     return write_report(forged(folder), folder / "page.html").page
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 360])
-def test_page_in_chromium(chromium, page_file, width, scheme):
+def opened(chromium, file, width, scheme):
+    """The page, the folder for screenshots, and lists that fill with what the page says and asks for."""
     artifacts = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
     artifacts.mkdir(parents=True, exist_ok=True)
-    context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
-    page = context.new_page()
+    page = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme).new_page()
     said, asked = [], []
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.append(request.url))
-    page.goto(page_file.as_uri())
+    page.goto(file.as_uri())
+    return page, artifacts, said, asked
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 360])
+def test_page_in_chromium(chromium, page_file, width, scheme):
+    page, artifacts, said, asked = opened(chromium, page_file, width, scheme)
     for state in ("folded", "open"):
         if state == "open":
             page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
@@ -96,7 +101,7 @@ def test_page_in_chromium(chromium, page_file, width, scheme):
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), state
         assert page.evaluate("Math.max(...[...document.body.children].map(e => e.getBoundingClientRect().right)) <= window.innerWidth")
     pictures = page.evaluate("[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])")
-    context.close()
+    page.context.close()
     assert len(pictures) == 48 * 3 + 1 + 8 * 4
     assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in pictures)
     assert [url for url in asked if url != page_file.as_uri() and not url.startswith("data:")] == []
@@ -116,15 +121,7 @@ def audit_page(tmp_path_factory):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 360])
 def test_audits_in_chromium(chromium, audit_page, width, scheme):
-    artifacts = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
-    artifacts.mkdir(parents=True, exist_ok=True)
-    context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
-    page = context.new_page()
-    said, asked = [], []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
-    page.goto(audit_page.as_uri())
+    page, artifacts, said, asked = opened(chromium, audit_page, width, scheme)
     page.screenshot(path=artifacts / f"audits-{width}-{scheme}.png", full_page=True)
     page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
@@ -145,7 +142,7 @@ def test_audits_in_chromium(chromium, audit_page, width, scheme):
         assert page.evaluate("[...document.querySelectorAll('.stack, .matrix')].every(t => t.scrollWidth <= t.parentElement.clientWidth)")
         assert page.evaluate("getComputedStyle(document.querySelector('.stack td'), '::before').content") == '"Flagged"'
     roles = page.evaluate("[...document.querySelectorAll('.stack tbody td')].every(e => e.getAttribute('role') === 'cell')")
-    context.close()
+    page.context.close()
     assert roles
     assert [url for url in asked if url != audit_page.as_uri() and not url.startswith("data:")] == []
     assert said == []

@@ -14,14 +14,11 @@ import tyro
 
 from palpate import __version__
 from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output, require_extra
-from palpate.core import Audit, Impact, ImpactRow, PalpateError, Problem, ProblemsError, Progress, Results, Split, write_json
+from palpate.core import Audit, FeatureSet, Impact, ImpactRow, PalpateError, Problem, ProblemsError, Progress, Results, Split, write_json
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
     from palpate.leakage.audit import Inspection, Pictures
-
-#: Modality -> image column of a manifest.
-MODALITIES = {"vision": "vision", "touch": "tactile"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +85,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         if sides.pretrain is not None:
             others.append(_against_pretraining(options, sides.pretrain, sides.test, cache, progress))
         audit = found.audit
-        one_sided = [m for m, c in MODALITIES.items() if len({s.table[c].null_count() < len(s) for s in (sides.train, sides.test)}) == 2]
-        if options.images and one_sided:
-            audit = replace(audit, notes=[*audit.notes, f"Only one side has pictures of {one_sided[0]}: they were not compared."])
+        if options.images and (lone := sorted(_modalities(sides.train) ^ _modalities(sides.test))):
+            audit = replace(audit, notes=[*audit.notes, f"Only one side has pictures of {' and '.join(lone)}: they were not compared."])
         if options.impact and sides.whole is not None and sides.split is not None:
             try:
                 audit = replace(audit, impact=_impact(options, sides.whole, sides.split, audit, cache, progress))
@@ -224,21 +220,36 @@ def _pictures(options: Options, train: Manifest, test: Manifest, cache: Path | N
     """How pictures are compared; None if there are none on both sides, or none are wanted."""
     from palpate.leakage.audit import Pictures
 
-    there = [m for m, c in MODALITIES.items() if all(s.table[c].null_count() < len(s) for s in (train, test))]
+    there = sorted(_modalities(train) & _modalities(test), reverse=True)  # vision first
     if not options.images or not there:
         return None
     features: dict[str, Any] = {}
     name = ""
     if options.encoder is not None:
-        from palpate.encoders.embed import embed
-        from palpate.encoders.towers import Towers
-
-        towers = Towers.load(options.encoder)
-        for modality in there:
-            pair = [embed(side, towers, modality, cache=cache, progress=progress).features for side in (train, test)]
-            features[modality] = (pair[0], pair[1])
+        a, b = (_embedded(options.encoder, side, there, cache, progress) for side in (train, test))
+        features = {m: (a[m].features, b[m].features) for m in there}
         name = f"towers {options.encoder.name}"
     return Pictures(there, options.false_positives, features, name, cache, options.processes)
+
+
+def _modalities(samples: Manifest) -> set[str]:
+    """The modalities of which some sample has a picture."""
+    from palpate.data.manifest import MODALITIES
+
+    return {m for m, c in MODALITIES.items() if samples.table[c].null_count() < len(samples)}
+
+
+def _embedded(encoder: Path, samples: Manifest, modalities: Sequence[str], cache: Path | None, progress: Progress) -> dict[str, FeatureSet]:
+    """Embeddings of the samples by modality.
+
+    Raises:
+        PalpateError: if the towers cannot be loaded, or a sample lacks a picture.
+    """
+    from palpate.encoders.embed import embed
+    from palpate.encoders.towers import Towers
+
+    towers = Towers.load(encoder)
+    return {m: embed(samples, towers, m, cache=cache, progress=progress) for m in modalities}
 
 
 def _impact(options: Options, manifest: Manifest, split: Split, audit: Audit, cache: Path | None, progress: Progress) -> Impact:
@@ -247,12 +258,8 @@ def _impact(options: Options, manifest: Manifest, split: Split, audit: Audit, ca
 
     features: Any = "pixels"
     if options.encoder is not None:
-        from palpate.encoders.embed import embed
-        from palpate.encoders.towers import Towers
-
-        towers = Towers.load(options.encoder)
-        there = [m for m, c in MODALITIES.items() if manifest.table[c].null_count() == 0]
-        features = {f"{m} tower": embed(manifest, towers, m, cache=cache, progress=progress) for m in there}
+        there = sorted(_modalities(manifest), reverse=True)
+        features = {f"{m} tower": f for m, f in _embedded(options.encoder, manifest, there, cache, progress).items()}
     return impact(manifest, split, group=audit.group, features=features, name=audit.name, cache=cache, progress=progress)
 
 
@@ -354,7 +361,7 @@ def show(audit: Audit, terminal: Terminal) -> None:
         more = "" if audit.leaking_samples == audit.test_samples_in_shared_groups else f" {share:.3%} leak by one signal or another."
         terminal.print(
             "This split leaks:"
-            + (f" {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with {other}." if audit.group != "none" else "")
+            + (f" {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with {other}." if audit.leaked_fraction > 0 else "")
             + more
             + (" Make one that does not: palpate split" if audit.against == "train" else "")
         )

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from palpate.leakage.splits import SplitPlan
 
 Column = Literal["video", "object", "session", "touch", "domain", "sensor"]
-#: Modality -> image column of a manifest.
-MODALITIES = {"vision": "vision", "touch": "tactile"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +159,8 @@ def _links(options: Options, manifest: Manifest, terminal: Terminal) -> tuple[li
     """
     if options.near is None:
         return [], None
+    from palpate.data.manifest import MODALITIES
+
     wanted = list(MODALITIES) if options.near == "both" else [options.near]
     for modality in wanted:
         if manifest.table[MODALITIES[modality]].null_count() == len(manifest):
@@ -177,7 +177,7 @@ def _write(
     options: Options, manifest: Manifest, plans: Sequence[SplitPlan], names: Sequence[str], skipped: Sequence[Problem], terminal: Terminal
 ) -> dict[str, Any]:
     """Writes one split file, or a folder of them with ``splits.json``; prints what was achieved."""
-    from palpate.leakage import describe
+    from palpate.leakage.splits import describe
 
     assert options.output is not None
     for note in plans[0].notes:

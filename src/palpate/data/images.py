@@ -130,7 +130,7 @@ def image_stamp(manifest: Manifest, column: str) -> str:
         PalpateError: if a row has no such image.
     """
     paths = manifest.paths(column)
-    stamps = {path: _stamp(path) for path in dict.fromkeys(paths)}
+    stamps = {path: file_stamp(path) for path in dict.fromkeys(paths)}
     return digest_json([column, [[name, *stamps[p]] for name, p in zip(manifest.column(column), paths, strict=True)]])
 
 
@@ -218,7 +218,7 @@ def _mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
     return array if array.shape == shape and array.dtype == np.uint8 else None
 
 
-def _stamp(path: Path) -> tuple[int, int]:
+def file_stamp(path: Path) -> tuple[int, int]:
     """Size in bytes and modification time in nanoseconds; (-1, -1) if the file is missing, which decoding will report."""
     try:
         found = path.stat()

@@ -40,6 +40,8 @@ SCHEMA: dict[str, type[pl.DataType]] = {
     "material": pl.String, "text": pl.String, "vision": pl.String, "tactile": pl.String, "background": pl.String, "sensor": pl.String, "domain": pl.String,
 }  # fmt: skip
 IMAGE_COLUMNS = ("vision", "tactile", "background")
+#: Modality -> its image column.
+MODALITIES = {"vision": "vision", "touch": "tactile"}
 FORMAT = "palpate-manifest/2"
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"

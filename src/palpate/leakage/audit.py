@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from palpate.core import MATRIX_ROWS, Audit, LeakPair, PalpateError, Problem, ProblemsError, Progress, Split, quiet
 from palpate.data.listing import FrameList, number_together, read_list
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.signals import NEAR_FRAMES, Flags, identical_bytes, identical_samples, leaking, shared_group, signal_table, time_gap
 
 GROUPS = ("video", "touch", "object", "session", "domain", "sensor")
@@ -227,7 +227,7 @@ def _signals(
         from palpate.leakage.near import near_duplicates
 
         for modality in pictures.modalities:
-            column = "vision" if modality == "vision" else "tactile"
+            column = MODALITIES[modality]
             if modality not in pictures.features and any(m.table[column].null_count() == len(m) for m in (train, test)):
                 continue
             matches = near_duplicates(

@@ -35,7 +35,7 @@ from PIL import Image, ImageOps
 from scipy import fft, ndimage
 
 from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
-from palpate.data.images import BROKEN, check_image, in_threads, read_image
+from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, read_image
 from palpate.leakage.verify import BLOCK, SIDE, Floats, Ints
 
 VERSION = 2
@@ -160,7 +160,7 @@ class _Different:
 
 def _key(files: list[Path]) -> str:
     """Changes with the paths, sizes and times of a piece's files."""
-    return short(digest_json([VERSION, [[str(f), *_stamp(f)] for f in files]]))
+    return short(digest_json([VERSION, [[str(f), *file_stamp(f)] for f in files]]))
 
 
 def _read(path: Path, count: int) -> Decoded | None:
@@ -173,14 +173,6 @@ def _read(path: Path, count: int) -> Decoded | None:
     if pixels.shape != (count, SIDE, SIDE, 3) or pixels.dtype != np.uint8:
         return None
     return pixels, {int(k): str(text) for k, text in zip(bad, why, strict=True)}
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    try:
-        found = path.stat()
-    except OSError:
-        return (-1, -1)
-    return (found.st_size, found.st_mtime_ns)
 
 
 def _decode(pieces: list[tuple[int, list[Path]]], stored: list[Path | None], processes: int | None) -> Iterator[tuple[int, Decoded]]:

@@ -28,7 +28,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from palpate.core import PalpateError, Progress, quiet
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage import calibrate
 from palpate.leakage.causes import gel_at_other_times
 from palpate.leakage.compare import Comparer, Embeddings, Plates, all_or_nearest
@@ -36,7 +36,6 @@ from palpate.leakage.matching import Entries, Found, calibrated, levels_of, matc
 from palpate.leakage.pool import Pool, codes, plates, pool
 from palpate.leakage.verify import Floats, Ints
 
-MODALITIES = ("vision", "touch")
 #: Share of a pair's similarity that the passive gel must reach to be the reason for it.
 GEL_SHARE = 0.65
 #: Nearest pictures that a picture may be linked to in a cluster.

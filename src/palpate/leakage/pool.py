@@ -17,7 +17,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import Progress, quiet
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.background import Backgrounds, backgrounds, planar, remove_background
 from palpate.leakage.descriptors import Thumbnails, thumbnails
 from palpate.leakage.search import nearest
@@ -87,7 +87,7 @@ def pool(
     Returns:
         The pool and its band-passed plates.
     """
-    column = "vision" if modality == "vision" else "tactile"
+    column = MODALITIES[modality]
     parts = (train, test)
     paths = [p for m in parts for p in _paths(m, column)]
     behind = [p for m in parts for p in _paths(m, "background")] if modality == "touch" else []

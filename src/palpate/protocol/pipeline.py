@@ -53,8 +53,8 @@ from palpate.encoders.embed import texts_of
 from palpate.encoders.presets import preset as encoder_preset
 from palpate.encoders.towers import Towers, load_clip, pick_device
 from palpate.generate import Generated, generate
-from palpate.leakage import audit_split, describe, leak_free_split
-from palpate.leakage.audit import Pictures
+from palpate.leakage.audit import Pictures, audit_split
+from palpate.leakage.splits import describe, leak_free_split
 from palpate.protocol.presets import preset as pipeline_preset
 from palpate.protocol.scoring import score_generated
 from palpate.sim import WorldOptions, write_world
