@@ -6,11 +6,12 @@ import io
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter, label
 
 from palpate.core import PalpateError
 from palpate.sim import Video, WorldOptions, plan_world
 from palpate.sim.arrays import f32, to_bytes
-from palpate.sim.gel import make_sensor, marker_shift, press, shade, solve_approach
+from palpate.sim.gel import GRIP_MM, make_sensor, marker_shift, press, shade, solve_approach
 from palpate.sim.plan import contact_frames, first_contact
 
 SMALL = WorldOptions(materials=("Wood", "Brick", "Gravel", "Leather"), objects_per_material=1, tile=128, size=32)
@@ -55,6 +56,36 @@ def test_a_touch_presses_with_its_load_and_the_gel_is_never_exceeded():
     assert shallow.max() < deep.max()
 
 
+def test_the_membrane_is_that_of_the_docstring():
+    """Two relaxing blurs below 2.5 px, written out in float64."""
+    options = dataclasses.replace(SMALL, relax_mm=(0.9, 0.4), optical_mm=0.3, gel_mm=1.0)
+    sensor = make_sensor(options, 0)
+    gap = np.random.default_rng(3).normal(0, 0.4, (32, 32))
+    p = np.maximum(gap + bisect(gap, 0.2), 0)
+    h, w = np.tanh(p), p / (p + GRIP_MM)
+    expected = h
+    for blur in (0.9, 0.4):
+        s = gaussian_filter(expected, blur / sensor.px, truncate=3.0, mode="nearest")
+        expected = s + w * (h - s)
+    expected = gaussian_filter(expected, 0.3 / sensor.px, truncate=3.0, mode="nearest")
+    membrane, contact = press(sensor, f32(gap), 0.2)
+    np.testing.assert_allclose(membrane, expected, atol=1e-5)
+    assert contact.mean() == pytest.approx((p > 0).mean(), abs=1e-3)
+
+
+def test_a_contact_ends_softly():
+    """A ball pressed into the gel: at the rim the slope changes less from pixel to pixel than in the bare foundation."""
+    sensor = make_sensor(dataclasses.replace(SMALL, size=128), 0)
+    y, x = (np.mgrid[:128, :128] - 63.5) * sensor.px
+    gap = f32(-(x * x + y * y) / 40.0)
+    bare = np.maximum(gap + solve_approach(gap, 0.1), 0)
+    soft, contact = press(sensor, gap, 0.1)
+    assert 0.1 < contact.mean() < 0.9
+    kink = lambda m: np.abs(np.diff(m[64], 2)).max()  # noqa: E731
+    assert kink(soft) < 0.5 * kink(bare)
+    assert soft[~contact].max() > 0.01  # the gel is pulled along outside the contact
+
+
 def test_the_background_is_the_shading_without_contact():
     video = Video(SMALL, 0)
     flat = shade(video.sensor, np.zeros((32, 32), np.float32), video.gain)
@@ -79,11 +110,13 @@ def test_shading_is_the_photometric_formula():
     sensor = dataclasses.replace(make_sensor(SMALL, 1), ink=None, texture=np.zeros((32, 32), np.float32))
     row, column = np.mgrid[:32, :32]
     a, b = 0.2, -0.1
-    image = shade(sensor, f32((a * column + b * row) * sensor.px), f32([1.1, 1.0, 0.9]))
+    membrane = (a * column + b * row) * sensor.px
+    image = shade(sensor, f32(membrane), f32([1.1, 1.0, 0.9]))
     normal = np.array([a, b, 1.0]) / np.sqrt(a * a + b * b + 1.0)
     expected = np.zeros((32, 32, 3)) + sensor.ambient
     for k in range(3):
         expected += sensor.field[k][..., None] * max(0.0, float(normal @ sensor.light[k])) * sensor.colour[k]
+    expected *= 1.0 - sensor.dim * membrane[..., None]
     expected = np.clip(expected * sensor.veil[..., None] * [1.1, 1.0, 0.9], 0, 1.2) ** sensor.gamma
     np.testing.assert_allclose(image, expected, atol=2e-3)
 
@@ -104,6 +137,27 @@ def test_digit_has_no_markers_and_one_family_many_units():
     for unit in (second, other_world):
         assert not np.array_equal(first.veil, unit.veil)
         assert np.abs(first.light - unit.light).max() < 0.4  # the lights of one product stay nearly in place
+
+
+@pytest.mark.parametrize(("rows", "pad"), [(8, 14.0), (5, 14.0), (12, 14.0), (8, 28.0)])
+def test_a_pad_shows_its_rows_of_markers(rows, pad):
+    for unit in range(3):
+        ink = make_sensor(dataclasses.replace(SMALL, size=256, markers=rows, pad_mm=pad), unit).ink
+        blobs = label(ink > 0.5)[0]
+        areas = np.bincount(blobs.ravel())[1:]
+        assert rows**2 - 3 <= (areas > 0.3 * np.median(areas)).sum() <= (rows + 2) ** 2
+
+
+def test_units_of_other_options_are_other_units():
+    plain = make_sensor(SMALL, 0)
+    assert make_sensor(dataclasses.replace(SMALL, named=0.1), 0) is plain  # of no concern to the gel
+    assert make_sensor(dataclasses.replace(SMALL, markers=0), 0).ink is None
+    assert make_sensor(dataclasses.replace(SMALL, pad_mm=28.0), 0).px == pytest.approx(2 * plain.px)
+    clean = make_sensor(dataclasses.replace(SMALL, dirt=0.0, vignette=(0.1, 0.1)), 0).veil
+    y, x = (np.mgrid[:32, :32] - 15.5) / 16
+    np.testing.assert_allclose(clean, 1 - 0.1 * (x * x + y * y), atol=1e-3)
+    flat = make_sensor(dataclasses.replace(SMALL, dome_mm=(1000.0, 1000.0)), 0).dome
+    assert flat.max() == pytest.approx(2 * 7.0**2 / 2000, rel=0.1)
 
 
 def test_markers_follow_the_shear():

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from palpate.core import PalpateError, ProblemsError
-from palpate.sim import MATERIALS, PRESETS, WorldOptions, plan_world
+from palpate.sim import DEFAULT, MATERIALS, MINI_SEEDS, PRESETS, Material, Video, WorldOptions, plan_world, seen_by_mini
+from palpate.sim.balance import LEAST, TOUCH_AND_GO_FRAMES, objects_of
+from palpate.sim.motion import make_touches
 from palpate.sim.objects import make_object
-from palpate.sim.options import RANGES
+from palpate.sim.options import CHOICES, PAIRS, RANGES, SERIES
 from palpate.sim.plan import ObjectRef, contact_frames, first_contact, written_frames
 
 
@@ -24,9 +26,64 @@ def test_values_out_of_range_are_refused(name):
         WorldOptions(**{**extra, name: value})
 
 
+@pytest.mark.parametrize("name", PAIRS)
+def test_ranges_must_be_in_order_and_within_bounds(name):
+    low, high = PAIRS[name]
+    for value in (
+        (high, low),
+        (low - 1, high),
+        (low, high + 1),
+        (low, float("nan")),
+        (low,),
+        (low, high, high),
+        "wide",
+        None,
+        low,
+        (True, high),
+    ):
+        with pytest.raises(PalpateError, match=name):
+            WorldOptions(**{name: value})
+    middle = (low + high) / 2
+    extra = {"pad_mm": 5.0} if name == "view_mm" else {}
+    for value in ((low, middle), (middle, middle), [low, middle]):
+        assert getattr(WorldOptions(**{name: value, **extra}), name) == tuple(value)
+
+
+@pytest.mark.parametrize("name", SERIES)
+def test_series_must_be_numbers_within_bounds(name):
+    low, high, least = SERIES[name]
+    for value in ((low - 1,), (low, high + 1), (float("inf"),), (low,) * 9, ("a",), None, *([()] if least else [])):
+        with pytest.raises(PalpateError, match=name):
+            WorldOptions(**{name: value})
+    assert getattr(WorldOptions(**{name: (low, high)}), name) == (low, high)
+
+
+def test_every_option_has_a_range_and_one_digest_per_meaning():
+    tables = {*RANGES, *PAIRS, *SERIES, *CHOICES, "materials"}
+    assert tables == {field.name for field in dataclasses.fields(WorldOptions)}
+    assert all(name in WorldOptions.__doc__ for name in tables)
+    assert WorldOptions(gel_mm=2, view_mm=(30, 40)).digest == WorldOptions(gel_mm=2.0, view_mm=[30.0, 40.0]).digest
+    digests = {WorldOptions().digest}
+    for name, (_, high) in {**RANGES, **PAIRS}.items():
+        digests.add(
+            WorldOptions(
+                **{name: high if name in RANGES else (high * 0.9, high * 0.9), **({"load_mm": (0.1, 0.2)} if name == "gel_mm" else {})}
+            ).digest
+        )
+    assert len(digests) == 1 + len(RANGES) + len(PAIRS)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"gel_mm": 0.5, "load_mm": (0.1, 0.6)}, "load_mm must not exceed gel_mm"),
+        ({"pad_mm": 20.0, "view_mm": (16.0, 40.0)}, "pad must lie in the photo"),
+        ({"balance": "touch-and-go", "objects_per_material": 1}, "2 objects a material"),
+        ({"balance": "steep"}, "balance must be one of"),
+        ({"materials": (1, 2)}, "names or a count"),
+        ({"materials": True}, "materials must be 1 to"),
+        ({"size": 257}, "size must be a whole number from 16 to 256"),
+        ({"hard": float("nan")}, "hard must be a number"),
         ({"look": "taxim"}, "look must be one of"),
         ({"leak": "some"}, "leak must be one of"),
         ({"materials": 0}, "materials must be 1 to"),
@@ -58,9 +115,88 @@ def test_a_count_of_materials_becomes_names():
 
 def test_presets_have_the_frames_that_their_row_says():
     contact = {name: len(plan_world(o)) * o.touches_per_video * o.frames_per_touch for name, o in PRESETS.items()}
-    assert contact == {"tiny": 32, "demo": 1200, "pretrain": 4000, "small": 8000}
+    assert contact == {"tiny": 32, "demo": 1200, "pretrain": 4000, "small": 8000, "full": 36000}
     assert len(plan_world(PRESETS["demo"])) == 100
+    assert DEFAULT == "small"
     assert PRESETS["demo"] == WorldOptions()
+
+
+def test_no_preset_uses_a_seed_of_the_shipped_models():
+    assert not [name for name, options in PRESETS.items() if seen_by_mini(options)]
+    assert seen_by_mini(WorldOptions(seed=MINI_SEEDS[0]))
+    assert seen_by_mini(WorldOptions(seed=MINI_SEEDS[-1]))
+    assert not seen_by_mini(WorldOptions(seed=MINI_SEEDS[-1] + 1))
+
+
+def test_a_quarter_of_the_objects_of_small_have_two_videos():
+    for name in ("small", "full"):
+        videos = {}
+        for plan in plan_world(PRESETS[name]):
+            videos[plan.objects[0]] = videos.get(plan.objects[0], 0) + 1
+        assert set(videos.values()) == {1, 2}
+        for material in MATERIALS:
+            own = [count for ref, count in videos.items() if ref.material == material]
+            assert sum(count == 2 for count in own) == len(own) // 4
+
+
+def test_classes_are_as_unequal_as_in_touch_and_go():
+    options = WorldOptions(balance="touch-and-go", objects_per_material=20)
+    objects = objects_of(options)
+    assert sum(objects.values()) == 400
+    assert min(objects.values()) == LEAST == objects["Natural Fabric"] == objects["Sand"]
+    assert sum(TOUCH_AND_GO_FRAMES.values()) == 121_861
+    big = [name for name in MATERIALS if objects[name] > LEAST]
+    shares = [TOUCH_AND_GO_FRAMES[name] / objects[name] for name in big]
+    assert max(shares) / min(shares) < 1.5  # in proportion, up to whole numbers
+    assert objects["Synthetic Fabric"] > 80
+    planned = {}
+    for plan in plan_world(options):
+        planned[plan.objects[0].material] = planned.get(plan.objects[0].material, 0) + 1
+    assert planned == objects
+    assert set(objects_of(WorldOptions(balance="touch-and-go", objects_per_material=2)).values()) == {2}
+    assert set(objects_of(WorldOptions(materials=("Natural Fabric",), balance="touch-and-go")).values()) == {5}
+
+
+def test_the_shares_of_touch_and_go_are_those_of_its_lists(real_data):
+    frames = dict.fromkeys(MATERIALS, 0)
+    label = {material.label: name for name, material in MATERIALS.items()}
+    for part in ("train", "test"):
+        for line in (real_data / "touch_and_go" / "lists" / f"{part}.txt").read_text().splitlines():
+            frames[label[int(line.rsplit(",", 1)[1])]] += 1
+    assert frames == TOUCH_AND_GO_FRAMES
+
+
+def test_a_users_material_has_the_mean_share(monkeypatch):
+    monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", MATERIALS["Wood"].draw, MATERIALS["Wood"].subtypes))
+    objects = objects_of(WorldOptions(materials=("Wood", "Sand", "Cork"), balance="touch-and-go", objects_per_material=20))
+    assert objects["Sand"] < objects["Cork"] < objects["Wood"]
+
+
+def test_motion_and_camera_obey_their_options():
+    calm = WorldOptions(
+        materials=2, tile=64, size=16, revisit_mm=0.0, jump=0.0, slide_mm=(0.0,), tilt=0.0, shear=0.0, load_mm=(0.2, 0.2), mixed=0.0, hard=1.0,
+        hand=0.0, shadow=0.0, edge=0.0, stains=0.0, view_mm=(31.0, 32.0), blur_px=(0.5,), curved=1.0, radius_mm=(40.0, 40.0),
+    )  # fmt: skip
+    for plan in plan_world(calm):
+        video = Video(calm, plan)
+        touches = make_touches(calm, plan)
+        assert len({touch.place for touch in touches}) == 1
+        assert all(touch.load == pytest.approx(0.2) for touch in touches)
+        assert all(touch.slide == touch.tilt == touch.shear == (0.0, 0.0) for touch in touches)
+        camera = video.camera
+        assert (camera.hand, camera.shadow, camera.edge, camera.blur) == (None, None, None, 0.5)
+        assert 31.0 <= camera.view <= 32.0
+        assert abs(video.thing(0).curvature) == pytest.approx(1 / 40) or video.thing(0).curvature == pytest.approx(-0.3 / 40)
+    far = dataclasses.replace(calm, jump=1.0, slide_mm=(5.0,), hand=1.0)
+    plan = plan_world(far)[0]
+    assert len({touch.place for touch in make_touches(far, plan)}) == far.touches_per_video
+    assert any(Video(far, plan).camera.hand is not None for plan in plan_world(far))
+
+
+def test_views_never_show_the_tile_repeat():
+    views = [Video(WorldOptions(tile=64, size=16, hard=hard), k).camera.view for hard in (0.0, 0.5, 1.0) for k in range(30)]
+    assert 30.0 <= min(views) < 32.0
+    assert 43.0 < max(views) <= 45.0 < 64.0 / 2**0.5
 
 
 def test_pretrain_and_demo_share_no_video_name():

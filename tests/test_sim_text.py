@@ -77,7 +77,13 @@ def test_no_material_has_words_of_colour_or_light():
             assert not set(words(" ".join(material.draw(Tile(64, rng), rng).words))) & LIGHT
 
 
-@pytest.mark.parametrize(("word", "expected"), [("unusual", "an"), ("uniform", "a"), ("even", "an"), ("hard", "a"), ("Elastic", "an")])
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("unusual", "an"), ("uniform", "a"), ("even", "an"), ("hard", "a"), ("Elastic", "an"), ("usual", "a"), ("uninterrupted", "an"),
+        ("unilateral", "a"), ("one-sided", "a"), ("onerous", "an"), ("honest", "an"), ("honeycombed", "a"), ("hourly", "an"), ("Umbral", "an"),
+    ],
+)  # fmt: skip
 def test_articles(word, expected):
     assert article(word) == expected
 
@@ -87,6 +93,46 @@ def test_phrases():
     assert phrase(("unusual", "porous"), "a sponge") == "an unusual, porous sponge"
     assert listed(("a",)) == "a"
     assert listed(("a", "b", "c")) == "a, b and c"
+
+
+def test_no_caption_has_the_prototypes_faults():
+    """ "A unusual" for "an unusual", "tree surface" for bark, words of another sub-type than the one drawn."""
+    options = WorldOptions(
+        tile=64, size=16, objects_per_material=6, named=1.0, touches_per_video=3, materials=("Tree", "Others", "Plants", "Metal")
+    )
+    texts = {}
+    for plan in plan_world(options):
+        video = Video(options, plan)
+        for touch in range(3):
+            texts.setdefault(plan.object_of(touch).material, []).append((video.text(touch), video.thing(touch).surface))
+    for found in texts.values():
+        for text, surface in found:
+            assert not re.search(r"\ba (?:a|e|i|o|unu|une)|\ban (?:[^aeiou]|uni[^nm])", text.lower()), text
+            assert "surface" not in text
+            assert "material" not in text
+            assert surface.noun.removeprefix("a ") in text
+    assert all("tree bark" in text for text, _ in texts["Tree"])
+    assert {surface.noun for _, surface in texts["Others"]} >= {"a sponge", "a rope"}
+    words_of = {}
+    for found in texts.values():
+        for _, surface in found:
+            words_of.setdefault(surface.subtype, set()).add(frozenset(surface.words))
+    assert all(len(sets) == 1 for sets in words_of.values())  # the words belong to the sub-type that was drawn
+    assert len({words for sets in words_of.values() for words in sets}) == len(words_of)
+
+
+def test_captions_of_hct_are_lists_of_adjectives():
+    options = WorldOptions(materials=("Plants", "Wood"), objects_per_material=5, tile=64, size=16, layout="hct")
+    ends = set()
+    for plan in plan_world(options):
+        for touch in range(options.touches_per_video):
+            video = Video(options, plan)
+            surface, parts = video.thing(touch).surface, video.text(touch).split(", ")
+            noun = surface.noun.removeprefix("a ")
+            assert set(parts) <= {*surface.words, noun}
+            assert len(parts) == len(set(parts)) >= 2
+            ends.add(parts[-1] == noun)
+    assert ends == {True, False}
 
 
 def test_the_share_of_named_captions_is_obeyed():

@@ -31,7 +31,19 @@ def read_list(path):
 def test_the_tree_has_the_layout_of_touch_and_go(world):
     out, record = world
     assert sorted(p.name for p in out.iterdir()) == sorted(
-        ["label.txt", "category_reference.txt", "train.txt", "test.txt", "captions.csv", "objects.csv", "world.json", "dataset"]
+        [
+            "label.txt",
+            "category_reference.txt",
+            "train.txt",
+            "test.txt",
+            "captions.csv",
+            "objects.csv",
+            "world.json",
+            "dataset",
+            "manifest.parquet",
+            "splits",
+            "leak.csv",
+        ]
     )
     plans = plan_world(TINY)
     assert sorted(p.name for p in (out / "dataset").iterdir()) == [plan.name for plan in plans]

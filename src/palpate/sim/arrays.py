@@ -8,6 +8,7 @@ constants become arrays through :func:`f32`.
 from __future__ import annotations
 
 import colorsys
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -33,6 +34,13 @@ def blend(a: Array, b: Array, weight: Array) -> Array:
     return a + (b - a) * np.clip(weight, 0.0, 1.0)[..., None]
 
 
+def over(image: Array, colour: Array, weight: Array) -> Array:
+    """A planar image (3, h, w) covered by ``colour``, (3,) or (3, h, w), to the degree ``weight`` in [0, 1], shape (h, w)."""
+    if colour.ndim == 1:
+        colour = colour[:, None, None]
+    return image + (colour - image) * weight
+
+
 def hsv(hue: float, saturation: float, value: float) -> Array:
     """An RGB colour of shape (3,) in [0, 1]; the hue wraps, the others are clipped."""
     return f32(colorsys.hsv_to_rgb(hue % 1.0, min(1.0, max(0.0, saturation)), min(1.0, max(0.0, value))))
@@ -56,25 +64,55 @@ def smooth(field: Array, sigma: float) -> Array:
     if sigma < 2.5:
         return ndimage.gaussian_filter(field, sigma, truncate=3.0, mode="nearest")
     width = round((6.0 * sigma * sigma + 1.0) ** 0.5) | 1
-    return ndimage.uniform_filter(ndimage.uniform_filter(field, width, mode="nearest"), width, mode="nearest")
+    for axis in (0, 1, 0, 1):
+        field = ndimage.uniform_filter1d(field, width, axis, mode="nearest")
+    return field
+
+
+def _wrapped(index: np.ndarray, n: int) -> np.ndarray:
+    """``index`` modulo n; by masking where n is a power of two, since dividing integers is slow."""
+    return index & (n - 1) if n & (n - 1) == 0 else index % n
+
+
+def sample_clipped(field: Array, y: Array, x: Array) -> Array:
+    """Bilinear lookup in (h, w) at pixel positions ``y``, ``x``; positions outside take the nearest edge."""
+    h, w = field.shape
+    y, x = np.clip(y, 0.0, h - 1.0), np.clip(x, 0.0, w - 1.0)
+    top, left = np.minimum(y.astype(np.intp), h - 2), np.minimum(x.astype(np.intp), w - 2)
+    part_y, part_x = f32(y - top), f32(x - left)
+    corner, flat = top * w + left, field.reshape(h * w)
+    a, b, c, d = (flat.take(corner + step) for step in (0, 1, w, w + 1))
+    a += (b - a) * part_x
+    c += (d - c) * part_x
+    return a + (c - a) * part_y
 
 
 def sample_periodic(field: Array, y: Array, x: Array) -> Array:
-    """Bilinear lookup in a periodic field of shape (n, n) or (n, n, k) at pixel positions ``y``, ``x`` of any size (h, w)."""
-    n = field.shape[0]
+    """Bilinear lookup in a periodic field at pixel positions ``y``, ``x`` of any size (h, w).
+
+    Args:
+        field: (n, n), or channels first (k, n, n).
+        y: row of each output pixel.
+        x: column of each output pixel.
+
+    Returns:
+        (h, w), or (k, h, w).
+    """
+    n = field.shape[-1]
     low_y, low_x = np.floor(y), np.floor(x)
     part_y, part_x = y - low_y, x - low_x
-    top = low_y.astype(np.int32) % n
-    left = low_x.astype(np.int32) % n
-    below, right = (top + 1) % n * n, (left + 1) % n
+    top, left = _wrapped(low_y.astype(np.intp), n), _wrapped(low_x.astype(np.intp), n)
+    below, right = _wrapped(top + 1, n) * n, _wrapped(left + 1, n)
     top *= n
-    flat = field.reshape(n * n, -1) if field.ndim == 3 else field.reshape(n * n)
-    if field.ndim == 3:
-        part_y, part_x = part_y[..., None], part_x[..., None]
-    first, second = flat.take(top + left, axis=0), flat.take(below + left, axis=0)
-    first += (flat.take(top + right, axis=0) - first) * part_x
-    second += (flat.take(below + right, axis=0) - second) * part_x
-    return first + (second - first) * part_y
+    corners = top + left, top + right, below + left, below + right
+    flat = field.reshape(*field.shape[:-2], n * n)
+    if field.ndim == 2:
+        a, b, c, d = (flat.take(k) for k in corners)
+    else:
+        a, b, c, d = (flat.take(k, axis=1) for k in corners)
+    a += (b - a) * part_x
+    c += (d - c) * part_x
+    return a + (c - a) * part_y
 
 
 def resample(field: Array, size: int) -> Array:
@@ -96,7 +134,21 @@ def resample(field: Array, size: int) -> Array:
     return f32(field)
 
 
+@lru_cache(maxsize=16)
 def grid(size: int) -> tuple[Array, Array]:
     """Pixel centres of a square image in [-1, 1]: ``y`` of shape (size, 1) and ``x`` of shape (1, size)."""
     at = f32((np.arange(size) + 0.5) / size * 2.0 - 1.0)
+    at.flags.writeable = False
     return at[:, None], at[None]
+
+
+def slopes(field: Array, step: float) -> tuple[Array, Array]:
+    """Derivatives of (n, n) along y and x for pixels of ``step``: central differences, one-sided at the edges."""
+    down, right = np.empty_like(field), np.empty_like(field)
+    np.subtract(field[2:], field[:-2], out=down[1:-1])
+    np.subtract(field[:, 2:], field[:, :-2], out=right[:, 1:-1])
+    down[1:-1] /= 2.0 * step
+    right[:, 1:-1] /= 2.0 * step
+    down[0], down[-1] = (field[1] - field[0]) / step, (field[-1] - field[-2]) / step
+    right[:, 0], right[:, -1] = (field[:, 1] - field[:, 0]) / step, (field[:, -1] - field[:, -2]) / step
+    return down, right

@@ -1,8 +1,8 @@
 """The photo: a view of 30 to 45 mm of the object around the contact, with all that has nothing to do with touch.
 
 An object is lit once a video (sun, ambient light, occlusion in its pits, gloss, stains) on its tile; a frame looks that tile up in perspective,
-adds the object's edge, a cast shadow, the hand with the sensor, blur and noise. The view stays below 45 mm, whose diagonal is one tile, so
-that the 64 mm pattern does not show its repeat.
+adds the object's edge, a cast shadow, the hand with the sensor, blur and noise. The view is at most 45 mm wide (``view_mm``), whose diagonal is
+one tile, so that the 64 mm pattern does not show its repeat.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from palpate.sim.arrays import Array, blend, f32, grid, hsv, sample_periodic, smoothstep
+from palpate.sim.arrays import Array, blend, f32, grid, hsv, over, sample_periodic, smoothstep
 from palpate.sim.motion import State
 from palpate.sim.objects import Thing
 from palpate.sim.options import WorldOptions
 from palpate.sim.tile import TILE_MM
-
-VIEW_MM = (30.0, 45.0)
 
 
 @dataclass(frozen=True)
@@ -78,18 +76,19 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
     rng = options.rng("camera", video)
     scale = 2.0 * options.hard
     happens = lambda share: bool(rng.random() < min(0.95, share * scale))  # noqa: E731
-    elevation, azimuth = math.radians(rng.uniform(18.0, 75.0)), rng.uniform(0.0, 2.0 * math.pi)
+    elevation, azimuth = math.radians(rng.uniform(*options.elevation_deg)), rng.uniform(0.0, 2.0 * math.pi)
     warm = rng.uniform(-1.0, 1.0) * scale
-    view = 40.0 * math.exp(rng.uniform(-0.28, 0.28) * min(1.5, 0.4 + 0.6 * scale))
+    near, far = (math.log(end) for end in options.view_mm)
+    view = math.exp((near + far) / 2.0 + rng.uniform(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale))
     lean = 0.2 * min(1.4, scale)
-    hand, from_side = happens(0.6), rng.uniform(0.0, 2.0 * math.pi)
-    shadow, shadow_at = happens(0.5), (rng.uniform(0.0, math.pi), rng.uniform(-0.6, 0.6), rng.uniform(0.35, 0.75))
-    edge, edge_at = happens(0.35), (rng.uniform(0.0, 2.0 * math.pi), rng.uniform(0.25, 0.75))
+    hand, from_side = happens(options.hand), rng.uniform(0.0, 2.0 * math.pi)
+    shadow, shadow_at = happens(options.shadow), (rng.uniform(0.0, math.pi), rng.uniform(-0.6, 0.6), rng.uniform(0.35, 0.75))
+    edge, edge_at = happens(options.edge), (rng.uniform(0.0, 2.0 * math.pi), rng.uniform(0.25, 0.75))
     bare = rng.random() < 0.6
     skin = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.25, 0.55), rng.uniform(0.25, 0.9))
     glove = hsv(rng.random(), 0.2, rng.uniform(0.08, 0.5))
     return Camera(
-        view=min(VIEW_MM[1], max(VIEW_MM[0], view)),
+        view=view,
         turn=rng.uniform(0.0, 2.0 * math.pi),
         tilt=(max(-0.5, min(0.5, rng.normal(0.0, lean + 1e-9))), max(-0.5, min(0.5, rng.normal(0.0, lean + 1e-9)))),
         sun_to=(math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation)),
@@ -97,7 +96,7 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
         ambient=rng.uniform(0.35, 0.8),
         light=f32(np.array([1.0 + 0.13 * warm, 1.0, 1.0 - 0.13 * warm]) * np.exp(rng.normal(0.0, 0.03 * scale + 1e-9, 3))),
         exposure=math.exp(rng.normal(0.0, 0.2 * scale + 1e-9)),
-        blur=(0.35, 0.6, 1.1)[int(rng.integers(3))],
+        blur=options.blur_px[int(rng.integers(len(options.blur_px)))],
         noise=rng.uniform(0.004, 0.01 + 0.018 * options.hard),
         hand=from_side if hand else None,
         skin=skin if bare else glove,
@@ -109,7 +108,7 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
 
 def _stains(options: WorldOptions, video: int, thing: int) -> list[Stain]:
     rng = options.rng("stains", video, thing)
-    count = round((0, 0, 1, 2, 5)[int(rng.integers(5))] * 2.0 * options.hard)
+    count = round((0, 0, 1, 2, 5)[int(rng.integers(5))] * 2.0 * options.hard * options.stains)
     return [
         Stain(
             place=(rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM)),
@@ -148,7 +147,8 @@ def light_object(options: WorldOptions, camera: Camera, thing: Thing, video: int
     rgb += (mirror * (thing.surface.gloss * 0.55 * camera.sun))[..., None]
     exposure = (0.40 * camera.exposure / (0.12 + float(rgb.mean()))) ** 0.75  # imperfect, so that dark things stay darker
     blur = max(0.3, 0.42 * camera.view / options.size / px)
-    return Scene(ndimage.gaussian_filter(rgb * exposure, (blur, blur, 0.0), mode="wrap", truncate=3.0), px, exposure)
+    lit = np.ascontiguousarray(np.moveaxis(rgb * exposure, 2, 0))
+    return Scene(ndimage.gaussian_filter(lit, (0.0, blur, blur), mode="wrap", truncate=3.0), px, exposure)
 
 
 def photo(options: WorldOptions, camera: Camera, scene: Scene, state: State, video: int, frame: int) -> Array:
@@ -156,7 +156,7 @@ def photo(options: WorldOptions, camera: Camera, scene: Scene, state: State, vid
     rng = options.rng("photo", video, frame)
     size = options.size
     y, x = grid(size)
-    sway = [0.012 * math.sin(w * frame + video * p) for w, p in ((0.31, 1.0), (0.23, 2.0), (0.17, 3.0), (0.11, 5.0))]
+    sway = [0.012 * options.sway * math.sin(w * frame + video * p) for w, p in ((0.31, 1.0), (0.23, 2.0), (0.17, 3.0), (0.11, 5.0))]
     depth = 1.0 + x * (camera.tilt[0] + sway[0]) + y * (camera.tilt[1] + sway[1])
     wy, wx = y / depth, x / depth
     reach = camera.view / 2.0 * (1.0 + sway[3]) / scene.px
@@ -168,33 +168,34 @@ def photo(options: WorldOptions, camera: Camera, scene: Scene, state: State, vid
     if camera.edge is not None:
         angle, distance = camera.edge
         past = smoothstep(math.cos(angle) * wx + math.sin(angle) * wy, distance, distance + 0.03)
-        image = blend(image, camera.beyond * (0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(video)))[..., None], past)
+        image = over(image, camera.beyond[:, None, None] * (0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(video))), past)
     if camera.shadow is not None:
         angle, offset, factor = camera.shadow
-        image *= (1.0 - (1.0 - factor) * smoothstep(math.cos(angle) * x + math.sin(angle) * y, offset, offset + 0.12))[..., None]
+        image *= 1.0 - (1.0 - factor) * smoothstep(math.cos(angle) * x + math.sin(angle) * y, offset, offset + 0.12)
     if camera.hand is not None:
         image = _hand(image, camera, scene.exposure, camera.hand + 0.02 * math.sin(0.2 * frame), 0.10 + 0.55 * state.lift)
     blur = camera.blur * size / 128.0
     if blur > 0.2:
-        image = ndimage.gaussian_filter(image, (blur, blur, 0.0), truncate=2.5)
+        image = ndimage.gaussian_filter(image, (0.0, blur, blur), truncate=2.5)
+    image = np.ascontiguousarray(np.moveaxis(image, 0, 2))
     image += rng.standard_normal((size, size, 3), dtype=np.float32) * np.float32(camera.noise)
     return np.clip(image, 0.0, 1.0) ** 0.8
 
 
 def _hand(image: Array, camera: Camera, exposure: float, angle: float, tip: float) -> Array:
     """Shadow, sensor and two fingers and a back of the hand, entering along ``angle`` up to ``tip`` half widths from the middle."""
-    y, x = grid(image.shape[0])
+    y, x = grid(image.shape[1])
     along, across = math.cos(angle) * x + math.sin(angle) * y, math.cos(angle) * y - math.sin(angle) * x
     box = np.maximum(np.abs(across - 0.06) - 0.2, tip - 0.03 - along)
-    image = image * (1.0 - 0.45 * smoothstep(box, 0.10, -0.06))[..., None]
+    image = image * (1.0 - 0.45 * smoothstep(box, 0.10, -0.06))
     body = np.maximum(np.abs(across) - 0.15, tip - along)
-    case = f32([0.07, 0.07, 0.08]) + 0.9 * np.maximum(0.09 - np.abs(across - 0.03), 0.0)[..., None]
-    image = blend(image, case, smoothstep(body, 0.02, -0.02))
+    case = f32([0.07, 0.07, 0.08])[:, None, None] + 0.9 * np.maximum(0.09 - np.abs(across - 0.03), 0.0)
+    image = over(image, case, smoothstep(body, 0.02, -0.02))
     rim = np.maximum(np.abs(across) - 0.12, np.abs(along - tip - 0.02) - 0.02)
-    image = blend(image, f32([0.16, 0.4, 0.36]), smoothstep(rim, 0.01, -0.01))
+    image = over(image, f32([0.16, 0.4, 0.36]), smoothstep(rim, 0.01, -0.01))
     skin = camera.skin * min(1.2, exposure * 0.9)
     for middle, width, start in ((-0.20, 0.13, 0.24), (0.20, 0.13, 0.32), (0.0, 0.30, 0.68)):
         distance = np.hypot(np.minimum(along - (start + tip), 0.0), across - middle)
         round_ = np.sqrt(np.clip(1.0 - (distance * (1.0 / width)) ** 2, 0.0, 1.0))
-        image = blend(image, skin * (0.45 + 0.6 * round_)[..., None], smoothstep(distance, width, width * 0.86))
+        image = over(image, skin[:, None, None] * (0.45 + 0.6 * round_), smoothstep(distance, width, width * 0.86))
     return image

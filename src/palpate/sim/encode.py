@@ -30,8 +30,16 @@ def write_jpeg(path: Path, image: np.ndarray) -> None:
     Image.fromarray(image).save(path, "JPEG", quality=95, subsampling=0)
 
 
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Writes a uint8 image of shape (h, w, 3), without loss."""
+    Image.fromarray(image).save(path, "PNG")
+
+
 def write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
-    """Writes uint8 images of shape (size, size, 3) as H.264 (constant rate factor 18, one thread, so that bytes repeat).
+    """Writes uint8 images of shape (size, size, 3) as H.264 (constant rate factor 18), so that bytes repeat.
+
+    One thread; x264 without the code whose rounding depends on the processor; and frames converted before they reach the encoder, since those that
+    it converts itself make its decisions differ from run to run.
 
     Raises:
         MissingExtraError: if PyAV is not installed.
@@ -40,11 +48,12 @@ def write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
     import av
 
     with av.open(str(path), "w", format="mp4") as file:
-        stream = file.add_stream("libx264", rate=FPS, options={"crf": "18", "preset": "veryfast"})
+        stream = file.add_stream("libx264", rate=FPS, options={"crf": "18", "preset": "veryfast", "x264-params": "cpu-independent=1"})
         stream.width = stream.height = size
         stream.pix_fmt = "yuv420p"
         stream.thread_count = 1
         stream.time_base = Fraction(1, FPS)
         for image in images:
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
+            file.mux(stream.encode(frame))
         file.mux(stream.encode())

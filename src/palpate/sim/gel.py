@@ -1,15 +1,22 @@
-"""The touch sensor: a gel pad of 14 mm, pressed with a given force, lit by three coloured lights.
+"""The touch sensor: a gel pad (14 mm by default), pressed with a given force, lit by three coloured lights, with or without markers.
 
 - Press: a Winkler foundation. The gap between relief and gel dome is g; the approach d is solved exactly from
   mean(max(g + d, 0)) = load (sort g, then the k largest values touch for the k at which d_k = (N load - sum of k) / k is consistent).
-  The free membrane is relaxed by three blurs with the contact re-imposed after each.
-- Light: I = (ambient + sum_k colour_k F_k(x, y) max(0, n . l_k)) vignette dirt (1 - ink), raised to a gamma; F_k quadratic along the
-  light's direction (near field). The background image is the same formula with no contact.
+- Membrane: penetration p = max(g + d, 0), held h = G tanh(p / G) for a gel of depth G, grip w = p / (p + :data:`GRIP_MM`). From m = h, each blur of
+  ``relax_mm`` gives m <- S m + w (h - S m): the gel follows what presses hard, and bridges the hollows and the rim where it is hardly
+  touched, so that a contact ends softly. The blur ``optical_mm`` follows.
+- Light: with n the normal of m + texture, I = ((ambient + sum_k colour_k F_k(x, y) max(0, n . l_k)) V (1 - q m) (1 - 0.96 ink) gain)^gamma. Near
+  field F_k = 1 + a + 0.35 a² - hump_k r², a = fall_k (x, y) . azimuth_k, in units of half the pad; V = vignette times dirt; q, a unit's own
+  sign, dims or brightens what is indented, as pressing a real pad does. The background image is the same formula with m = 0.
+- Markers: a jittered grid of small squarish dots of ink, large round ones where they are worn, and dust; they move with the gel.
 - Everything of a unit is drawn on 256 x 256 points and averaged down, so that a unit looks the same at every image size.
+
+The numbers of the look ``gelsight`` are fitted to the real clips, see ``benchmarks/world_fidelity.py``.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,18 +25,60 @@ import numpy as np
 from scipy import ndimage
 
 from palpate.core import rng_for
-from palpate.sim.arrays import Array, f32, grid, resample, smooth, smoothstep
+from palpate.sim.arrays import Array, f32, grid, resample, sample_clipped, slopes, smooth, smoothstep
 from palpate.sim.objects import Thing
 from palpate.sim.options import VERSION, WorldOptions
 
-#: Side of the gel pad in mm.
-PATCH_MM = 14.0
-#: Thickness of gel that can be indented, in mm.
-GEL_MM = 1.6
 #: Points a side that a unit is drawn on.
 DRAWN = 256
-#: Blurs in mm that relax the free membrane, and the optical blur after them.
-RELAX_MM, OPTICAL_MM = (1.6, 0.7, 0.3), 0.085
+#: Penetration in mm at which the gel follows the object half the way; below it, it bridges the hollows instead.
+GRIP_MM = 0.04
+#: The lights are green, blue and red.
+_PURE = np.eye(3)[[1, 2, 0]]
+
+
+@dataclass(frozen=True)
+class _Look:
+    """The optics that a family of units has in common; a tuple has one value a light: green, blue, red.
+
+    Attributes:
+        azimuth: of the lights in radians, x to the right and y down; elevation: range of theirs in degrees.
+        mixed: share of white in each light; gain: brightness; fall: near-field slope; hump: loss of the light away from the middle.
+        ambient: light without direction, RGB; spread: deviation of the logarithms of mixed, gain, fall and ambient between units.
+    """
+
+    azimuth: tuple[float, float, float]
+    elevation: tuple[float, float]
+    mixed: float
+    gain: tuple[float, float, float]
+    fall: tuple[float, float, float]
+    hump: tuple[float, float, float]
+    ambient: tuple[float, float, float]
+    spread: tuple[float, float, float, float]
+
+
+_LOOKS = {
+    "gelsight": _Look(  # grey-pink and bright, faint lobes: teal at the top left, violet at the lower left, red on the right
+        azimuth=(-2.2, 2.4, 0.25),
+        elevation=(26.0, 33.0),
+        mixed=0.12,
+        gain=(0.39, 0.50, 0.68),
+        fall=(0.33, 0.25, 0.08),
+        hump=(0.0, 0.0, 0.28),
+        ambient=(0.295, 0.325, 0.31),
+        spread=(0.12, 0.03, 0.15, 0.02),
+    ),
+    "digit": _Look(  # darker, three strong lobes
+        azimuth=(-2.25, 1.94, -0.16),
+        elevation=(30.0, 40.0),
+        mixed=0.13,
+        gain=(0.48, 0.52, 0.54),
+        fall=(0.60, 0.60, 0.60),
+        hump=(0.0, 0.0, 0.0),
+        ambient=(0.10, 0.10, 0.11),
+        spread=(0.15, 0.06, 0.10, 0.10),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -37,16 +86,18 @@ class Sensor:
     """One gel unit at one image size n.
 
     Attributes:
-        look, unit, size: which it is; px: pixel size in mm.
+        look, unit, size: which it is; pad: its side in mm; px: pixel size in mm.
         field: near-field factor of each light, shape (3, n, n); colour: their RGB, (3, 3); light: unit vectors towards them, (3, 3).
         ambient: RGB, (3,); veil: vignette times dirt, (n, n); texture, dome: gel relief in mm, (n, n).
         ink: opacity of the markers in [0, 1], (n, n), or None without markers.
+        dim: loss of light for each mm of indentation; gel: depth that can be indented, in mm; relax, optical: blurs in mm.
         gamma, noise: tone exponent, and deviation of the image noise.
     """
 
     look: str
     unit: int
     size: int
+    pad: float
     px: float
     field: Array
     colour: Array
@@ -56,54 +107,60 @@ class Sensor:
     texture: Array
     dome: Array
     ink: Array | None
+    dim: float
+    gel: float
+    relax: tuple[float, ...]
+    optical: float
     gamma: float
     noise: float
 
 
 def make_sensor(options: WorldOptions, unit: int) -> Sensor:
     """A unit of the family ``options.look``; the family is the same product in every world, the unit depends on the seed."""
-    return _make(options.look, options.seed, unit, options.size)
+    return _make(dataclasses.replace(WorldOptions(), **{name: getattr(options, name) for name in _ASKED}), unit)
+
+
+#: The options that a unit depends on.
+_ASKED = ("look", "seed", "size", "pad_mm", "gel_mm", "relax_mm", "optical_mm", "dome_mm", "markers", "dirt", "vignette", "sensor_noise")
 
 
 @lru_cache(maxsize=64)
-def _make(look: str, seed: int, unit: int, size: int) -> Sensor:
-    family: np.random.Generator = rng_for(0, "sensor family", VERSION, look)
-    rng: np.random.Generator = rng_for(seed, "world", VERSION, "sensor", look, unit)
-    around = lambda value, spread: value * math.exp(rng.normal(0.0, spread))  # noqa: E731
-    turn = -2.25 + family.normal(0.0, 0.2)
-    azimuth = [turn + k * 2.0 * math.pi / 3.0 + family.normal(0.0, 0.08) + rng.normal(0.0, 0.05) for k in range(3)]
-    if look == "gelsight":  # grey-pink middle, coloured corners
-        mixed, gain, fall, ambient = around(0.12, 0.12), around(0.45, 0.05), around(0.46, 0.10), around(0.14, 0.08)
-        elevation = np.deg2rad(family.uniform(24.0, 36.0, 3))
-    else:  # darker, with stronger colour lobes
-        mixed, gain, fall, ambient = around(0.13, 0.15), around(0.43, 0.06), around(0.60, 0.10), around(0.07, 0.10)
-        elevation = np.deg2rad(family.uniform(26.0, 42.0, 3))
-    pure = np.eye(3)[[1, 2, 0]]  # the lights are green, blue, red
-    colour = (pure * (1.0 - mixed) + mixed) * np.exp(rng.normal(0.0, 0.05, (3, 1))) * gain
+def _make(options: WorldOptions, unit: int) -> Sensor:
+    look, pad = _LOOKS[options.look], options.pad_mm
+    family: np.random.Generator = rng_for(0, "sensor family", VERSION, options.look)
+    rng: np.random.Generator = options.rng("sensor", options.look, unit)
+    spread = [math.exp(s * rng.normal()) for s in look.spread]
+    azimuth = [a + rng.normal(0.0, 0.05) for a in look.azimuth]
+    elevation = np.deg2rad(family.uniform(*look.elevation, 3))
+    mixed = look.mixed * spread[0]
+    colour = (_PURE * (1.0 - mixed) + mixed) * (np.exp(rng.normal(0.0, 0.05, (3, 1))) * np.asarray(look.gain)[:, None] * spread[1])
     light = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
     y, x = grid(DRAWN)
-    along = [math.cos(a) * x + math.sin(a) * y for a in azimuth]
-    field = np.stack([np.clip(1.0 + fall * q + 0.35 * fall * fall * q * q, 0.08, None) for q in along])
     square = x * x + y * y
-    veil = (1.0 - rng.uniform(0.03, 0.16) * square) * _dirt(rng)
-    texture = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 0.12 / (PATCH_MM / DRAWN))
-    texture *= 0.0024 / float(texture.std())
-    dome = square * ((PATCH_MM / 2.0) ** 2 / (2.0 * rng.uniform(26.0, 60.0)))
-    ink = _markers(rng) if look == "gelsight" else None
-    down = lambda a: resample(f32(a), size)  # noqa: E731
+    field: list[Array] = []
+    for a, fall, hump in zip(azimuth, look.fall, look.hump, strict=True):
+        along = (math.cos(a) * x + math.sin(a) * y) * (fall * spread[2])
+        field.append(np.clip(1.0 + along + 0.35 * along * along - hump * square, 0.08, None))
+    veil = (1.0 - rng.uniform(*options.vignette) * square) * (1.0 + options.dirt * _dirt(rng))
+    texture = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 0.3 / (pad / DRAWN))
+    texture *= 0.0022 / float(texture.std())
+    dome = square * ((pad / 2.0) ** 2 / (2.0 * rng.uniform(*options.dome_mm)))
+    ink = _markers(options.markers, pad, rng) if options.look == "gelsight" and options.markers else None
+    down = lambda a: resample(f32(a), options.size)  # noqa: E731
     return Sensor(
-        look, unit, size, PATCH_MM / size, np.stack([down(f) for f in field]), f32(colour), f32(light),
-        f32(ambient * rng.uniform(0.9, 1.1, 3)), down(veil), down(texture), down(dome), None if ink is None else down(ink),
-        rng.uniform(0.9, 1.1), rng.uniform(0.004, 0.010),
+        options.look, unit, options.size, pad, pad / options.size, np.stack([down(f) for f in field]), f32(colour), f32(light),
+        f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3)), down(veil), down(texture), down(dome),
+        None if ink is None else down(ink), rng.normal(0.03, 0.06), options.gel_mm, options.relax_mm, options.optical_mm, rng.uniform(0.9, 1.1),
+        rng.uniform(*options.sensor_noise),
     )  # fmt: skip
 
 
 def _dirt(rng: np.random.Generator) -> Array:
-    """Uneven coating, specks and scratches as a factor around 1, on the drawn grid."""
+    """Uneven coating, specks and scratches as a change of brightness around 0, on the drawn grid."""
     y, x = grid(DRAWN)
     low = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), DRAWN / 7, mode="reflect")
     fine = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 1.6)
-    dirt = 1.0 + low * (0.018 / float(low.std())) + fine * (0.008 / float(fine.std()))
+    dirt = low * (0.018 / float(low.std())) + fine * (0.004 / float(fine.std()))
     for _ in range(int(rng.integers(2, 9))):
         cx, cy, width = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.008, 0.03)
         dirt -= rng.uniform(0.03, 0.18) * np.exp(((x - cx) ** 2 + (y - cy) ** 2) * (-0.5 / width**2))
@@ -115,21 +172,44 @@ def _dirt(rng: np.random.Generator) -> Array:
     return dirt
 
 
-def _markers(rng: np.random.Generator) -> Array:
-    """Ink dots on a jittered grid of 7 x 7 over the pad (one more row on each side), on the drawn grid."""
+def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
+    """Opacity of the ink, on the drawn grid: a jittered grid of small squarish dots, the worn ones among them large and round; dust.
+
+    The grid has a pitch of 0.96 pad / rows and begins anywhere, so that a unit shows ``rows`` or one more a side. A small dot has a radius of
+    0.2 mm at the pitch of 8 rows on 14 mm and shrinks with a finer pitch.
+    """
     ink = np.zeros((DRAWN, DRAWN), np.float32)
-    y, x = grid(DRAWN)
-    step = 2.0 / 7.0
-    for i in range(-1, 8):
-        for j in range(-1, 8):
-            cy, cx = -1.0 + (i + 0.5) * step + rng.normal(0.0, 0.023), -1.0 + (j + 0.5) * step + rng.normal(0.0, 0.023)
-            radius, aspect, dark = rng.uniform(0.13, 0.25) * 0.164, rng.uniform(0.85, 1.2), rng.uniform(0.75, 0.95)
-            low_y, low_x = (int(np.searchsorted(g.ravel(), c - 0.1)) for g, c in ((y, cy), (x, cx)))
-            part = np.s_[low_y : low_y + 26, low_x : low_x + 26]
-            if ink[part].size:
-                distance = np.hypot((x[:, part[1]] - cx) * (1.0 / aspect), y[part[0]] - cy)
-                ink[part] = np.maximum(ink[part], smoothstep(distance, radius + 0.012, radius - 0.008) * dark)
+    step, mm = 2.0 * 0.96 / rows, 2.0 / pad
+    scale = min(1.0, step / (0.24 * 14.0 / pad)) * mm
+    first = -1.0 - step * rng.uniform(0.0, 1.0, 2)
+    wear_x, wear_y, wear = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.15, 0.5)
+    for i in range(rows + 3):
+        for j in range(rows + 3):
+            cy, cx = first[0] + (i * step + rng.normal(0.0, 0.012)), first[1] + (j * step + rng.normal(0.0, 0.012))
+            worn = rng.random() < 0.07 + 0.75 * math.exp(-((cx - wear_x) ** 2 + (cy - wear_y) ** 2) / (2.0 * wear * wear))
+            radius = (rng.uniform(0.26, 0.40) if worn else rng.uniform(0.16, 0.215)) * scale
+            _dot(ink, (cy, cx), radius, rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.0), 2.0 if worn else 4.0)
+    for _ in range(int(rng.integers(0, 14))):
+        _dot(
+            ink,
+            (rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0)),
+            rng.uniform(0.03, 0.09) * mm,
+            rng.uniform(0.6, 1.6),
+            rng.uniform(0.4, 0.9),
+            2.0,
+        )
     return ink
+
+
+def _dot(ink: Array, place: tuple[float, float], radius: float, aspect: float, dark: float, power: float) -> None:
+    """Draws one dot (|x|^power + |y|^power < radius^power) of opacity ``dark`` at ``place`` (y, x) in [-1, 1]."""
+    y, x = grid(DRAWN)
+    reach = 1.3 * radius + 0.02
+    (top, bottom), (left, right) = ([int(v) for v in np.searchsorted(y.ravel(), (c - reach, c + reach))] for c in place)
+    if bottom > top and right > left:
+        distance = (np.abs((x[:, left:right] - place[1]) / aspect) ** power + np.abs(y[top:bottom] - place[0]) ** power) ** (1.0 / power)
+        part = np.s_[top:bottom, left:right]
+        ink[part] = np.maximum(ink[part], smoothstep(distance, radius + 0.006, radius - 0.006) * dark)
 
 
 def solve_approach(gap: Array, load: float) -> float:
@@ -146,7 +226,7 @@ def solve_approach(gap: Array, load: float) -> float:
 def gap_of(thing: Thing, sensor: Sensor, relief: Array, load: float, tilt: tuple[float, float]) -> Array:
     """Relief of the object minus the gel's dome, tilted and curved, in mm, shape (n, n); soft objects flatten under the load."""
     y, x = grid(sensor.size)
-    half = PATCH_MM / 2.0
+    half = sensor.pad / 2.0
     if thing.surface.softness:
         relief = relief * (1.0 - 0.5 * thing.surface.softness * min(1.0, load / 0.3))
     return relief - sensor.dome - (x * (half * tilt[0]) + y * (half * tilt[1])) - x * x * (thing.curvature / 2.0 * half * half)
@@ -160,17 +240,20 @@ def press(sensor: Sensor, gap: Array, load: float) -> tuple[Array, Array]:
     """
     penetration = gap + solve_approach(gap, load)
     contact = penetration > 0.0
-    held = np.tanh(np.maximum(penetration, 0.0) * (1.0 / GEL_MM)) * GEL_MM
+    held = np.maximum(penetration, 0.0)
+    grip = held / (held + GRIP_MM)
+    held = np.tanh(held * (1.0 / sensor.gel)) * sensor.gel
     membrane = held
-    for blur in RELAX_MM:
-        membrane = np.where(contact, held, smooth(membrane, blur / sensor.px))
-    return smooth(membrane, OPTICAL_MM / sensor.px), contact
+    for blur in sensor.relax:
+        membrane = smooth(membrane, blur / sensor.px)
+        membrane += grip * (held - membrane)
+    return smooth(membrane, sensor.optical / sensor.px), contact
 
 
 def marker_shift(sensor: Sensor, membrane: Array, shear: tuple[float, float]) -> tuple[Array, Array]:
     """Displacement (dy, dx) of the markers in pixels: dragged by ``shear`` (mm per mm of depth), pushed apart where the gel is deep."""
     depth = smooth(np.minimum(membrane, 1.0), sensor.size / 10)
-    slope_y, slope_x = np.gradient(depth, sensor.px)
+    slope_y, slope_x = slopes(depth, sensor.px)
     unit = 1.0 / sensor.px
     return f32(depth * (shear[1] * unit) - slope_y * (0.107 * unit)), f32(depth * (shear[0] * unit) - slope_x * (0.107 * unit))
 
@@ -184,20 +267,19 @@ def shade(sensor: Sensor, membrane: Array, gain: Array, shift: tuple[Array, Arra
         gain: white balance of the recording, RGB, (3,).
         shift: displacement of the markers in pixels, or None.
     """
-    slope_y, slope_x = np.gradient(membrane + sensor.texture, sensor.px)
-    slope_y, slope_x = f32(slope_y), f32(slope_x)
+    slope_y, slope_x = slopes(membrane + sensor.texture, sensor.px)
     upright = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
     light = [
         np.maximum((slope_x * float(lx) + slope_y * float(ly) + float(lz)) * upright, 0.0) * field
         for (lx, ly, lz), field in zip(sensor.light, sensor.field, strict=True)
     ]
-    veil = sensor.veil
+    veil = sensor.veil * (1.0 - sensor.dim * membrane)
     if sensor.ink is not None:
         ink = sensor.ink
         if shift is not None:
-            row, column = np.mgrid[: sensor.size, : sensor.size].astype(np.float32)
-            ink = ndimage.map_coordinates(ink, [row - shift[0], column - shift[1]], order=1, mode="nearest")
-        veil = veil * (1.0 - 0.88 * ink)
+            at = f32(np.arange(sensor.size))
+            ink = sample_clipped(ink, at[:, None] - shift[0], at - shift[1])
+        veil = veil * (1.0 - 0.96 * ink)
     image = np.empty((sensor.size, sensor.size, 3), np.float32)
     for c in range(3):
         total = sum(light[k] * float(sensor.colour[k, c]) for k in range(3)) + float(sensor.ambient[c])

@@ -1,6 +1,6 @@
 """How a hand moves the sensor: the touches of a video, and where the sensor is at each frame.
 
-The touches of a video revisit one place of the object (deviation 3.5 mm; a quarter of them jump far). A touch comes down during its free
+The touches of a video revisit one place of the object (``revisit_mm``; a share ``jump`` of them goes far away). A touch comes down during its free
 frames, then presses, holds, slides and lifts: over the phase p in [0, 1] of the contact the load follows sin²(pi (0.12 + 0.76 p)) on a base.
 """
 
@@ -56,22 +56,23 @@ def make_touches(options: WorldOptions, plan: VideoPlan) -> list[Touch]:
     touches: list[Touch] = []
     rng = options.rng("motion", plan.index)
     home, turn, last = (0.0, 0.0), 0.0, -1
+    lightest, heaviest = options.load_mm
     for thing in plan.touched:
         fresh = thing != last
         if fresh:
             home, turn, last = (rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM)), rng.uniform(0.0, 2.0 * math.pi), thing
-        far = bool(rng.random() < 0.25) and not fresh
+        far = bool(rng.random() < options.jump) and not fresh
         away = (rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM))
-        near = (home[0] + rng.normal(0.0, 3.5), home[1] + rng.normal(0.0, 3.5))
-        reach = (0.0, 1.5, 5.0)[int(rng.integers(3))]
+        near = (home[0] + options.revisit_mm * rng.normal(), home[1] + options.revisit_mm * rng.normal())
+        reach = options.slide_mm[int(rng.integers(len(options.slide_mm)))]
         touches.append(
             Touch(
                 place=away if far else near,
                 slide=(reach * rng.normal(), reach * rng.normal()),
                 rotation=turn + rng.normal(0.0, 0.5 if far else 0.1),
-                load=math.exp(rng.uniform(math.log(0.09), math.log(0.42))),
-                tilt=(rng.normal(0.0, 0.03), rng.normal(0.0, 0.03)),
-                shear=(0.7 * rng.normal(), 0.7 * rng.normal()),
+                load=math.exp(rng.uniform(math.log(lightest), math.log(heaviest))),
+                tilt=(options.tilt * rng.normal(), options.tilt * rng.normal()),
+                shear=(options.shear * rng.normal(), options.shear * rng.normal()),
             )
         )
     return touches

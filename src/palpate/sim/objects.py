@@ -33,19 +33,19 @@ class Thing:
 
 
 def make_object(options: WorldOptions, ref: ObjectRef) -> Thing:
-    """The object of that name; depends on the seed, the name and the tile size alone.
+    """The object of that name; depends on the seed, the name, the tile size and how objects are curved, on nothing else.
 
     Raises:
         PalpateError: if the material draws something invalid.
     """
-    return _make(options.seed, ref, MATERIALS[ref.material], options.tile)
+    return _make(options.seed, ref, MATERIALS[ref.material], options.tile, options.curved, options.radius_mm)
 
 
 @lru_cache(maxsize=6)
-def _make(seed: int, ref: ObjectRef, material: Material, tile: int) -> Thing:
+def _make(seed: int, ref: ObjectRef, material: Material, tile: int, curved: float, radius_mm: tuple[float, float]) -> Thing:
     rng: np.random.Generator = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
     surface = draw_surface(ref.material, material, tile, rng)
-    flat = rng.random() < 0.6
+    flat = rng.random() >= curved
     bulge = 1.0 if rng.random() < 0.5 else -0.3
-    radius = math.exp(rng.uniform(math.log(25.0), math.log(90.0)))
+    radius = math.exp(rng.uniform(math.log(radius_mm[0]), math.log(radius_mm[1])))
     return Thing(ref, surface, TILE_MM / tile, 0.0 if flat else bulge / radius)

@@ -1,57 +1,38 @@
-"""What a world is made of: the options, their ranges, and the presets."""
+"""What a world is made of: the options, checked against :mod:`palpate.sim.ranges` and against each other."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from palpate.core import PalpateError, Problem, ProblemsError, digest_json, rng_for
 from palpate.sim.materials import MATERIALS
+from palpate.sim.ranges import BACKGROUND_OFFSET, CHOICES, PAIRS, RANGES, SERIES, out_of_range
+
+__all__ = ["BACKGROUND_OFFSET", "CHOICES", "PAIRS", "RANGES", "SERIES", "VERSION", "WorldOptions"]
 
 #: Raised at every change of the pictures, texts or lists; enters every random draw and the digest.
-VERSION = 1
-#: Frames of the background rule: the background of a touch is the frame this many before its first.
-BACKGROUND_OFFSET = 4
-
-#: Option -> smallest and largest value.
-RANGES: dict[str, tuple[float, float]] = {
-    "seed": (0, 2**31 - 1),
-    "size": (16, 512),
-    "objects_per_material": (1, 10_000),
-    "videos_per_object": (1, 100),
-    "touches_per_video": (1, 100),
-    "frames_per_touch": (1, 200),
-    "free_frames": (BACKGROUND_OFFSET + 1, 200),
-    "objects_per_video": (1, 14),
-    "mixed": (0.0, 1.0),
-    "sensors": (1, 100),
-    "hard": (0.0, 1.0),
-    "named": (0.0, 1.0),
-    "test": (0.01, 0.99),
-    "tile": (64, 2048),
-}
-CHOICES: dict[str, tuple[str, ...]] = {
-    "look": ("gelsight", "digit"),
-    "leak": ("frame", "touch", "none"),
-    "layout": ("frames", "videos"),
-    "free_written": ("all", "background"),
-}
+VERSION = 2
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """Everything that decides a world; equal options give equal bytes.
+    """Everything that decides a world; equal options give equal bytes. Ranges stand in :mod:`palpate.sim.ranges`.
 
     Attributes:
         seed: worlds of different seeds share no object, video or text.
-        size: side of the square images in pixels, 16 to 512 (even for ``layout="videos"``).
+        size: side of the square images in pixels, 16 to 256 (even for ``layout="videos"``).
         materials: names of ``MATERIALS``, or how many of them, spread evenly over the table; becomes a tuple of names.
-        objects_per_material: objects of each material that have videos of their own.
+        objects_per_material: objects of each material that have videos of their own (their mean if ``balance`` is not uniform).
+        balance: ``"uniform"``, or ``"touch-and-go"``: classes as unequal as in Touch and Go, see :mod:`palpate.sim.balance`.
         videos_per_object: videos of each object.
+        two_videos: share of the objects that have one video more.
         touches_per_video: contacts in a video.
         frames_per_touch: frames in contact in each touch.
         free_frames: frames without contact before each touch, at least 5, so that the first contact frame - 4 shows the passive sensor.
@@ -62,10 +43,26 @@ class WorldOptions:
         look: ``"gelsight"`` (markers, near-field colours) or ``"digit"`` (no markers, darker, stronger colours).
         hard: 0 to 1, scales everything in the photos that is irrelevant to touch (stains, hand, edges, shadows, light, gain drift).
         named: share of the captions that name the thing; the others say only how it feels.
-        leak: how ``train.txt`` and ``test.txt`` are cut: random ``"frame"``, random whole ``"touch"``, or by video (``"none"``).
-        test: share of the contact frames in ``test.txt``, nearly.
-        layout: ``"frames"`` (JPEG files) or ``"videos"`` (H.264, needs PyAV).
+        leak: how the world's own train and test lists are cut: random ``"frame"``, random whole ``"touch"``, or by video (``"none"``).
+        test: share of the contact frames in the test list, nearly.
+        layout: ``"frames"`` (Touch and Go as JPEG files), ``"videos"`` (Touch and Go as H.264, needs PyAV), ``"hct"`` (HCT of TVL) or ``"raw"``
+            (uint8 arrays).
         tile: pixels a side of an object's 64 mm tile; 256 fits 64 px images, 512 fits 128 px. Another tile is another object.
+        curved: share of the objects that are curved; radius_mm: range of their radius (as dents they are 3.3 times flatter).
+        pad_mm: side of the gel pad; gel_mm: depth to which it can be indented.
+        relax_mm: blurs of the free membrane, the contact re-imposed after each; optical_mm: blur of the sensor's optics.
+        dome_mm: range of the radius of a unit's domed gel.
+        markers: rows of printed markers a side on a ``"gelsight"`` pad, 0 for none; a ``"digit"`` never has any.
+        dirt: factor on uneven coating, specks and scratches; vignette: range of the darkening at half the pad's side.
+        sensor_noise: range of a unit's deviation of the image noise, of 1.
+        load_mm: range of the peak load of a touch, as mean indentation; drawn evenly in its logarithm.
+        revisit_mm: deviation of the places that a video touches around its first; jump: share of the touches that go far away instead.
+        slide_mm: deviations, one drawn a touch, of how far the sensor slides in contact.
+        tilt: deviation of the pad's slope; shear: deviation of the drag in mm per mm of depth.
+        view_mm: range of the width of the photo, drawn evenly in its logarithm; elevation_deg: range of the sun's height.
+        hand, shadow, edge: shares of the videos at ``hard=0.5`` with a hand, a cast shadow, the edge of the object in view.
+        stains: factor on the number of stains and stickers; sway: factor on the slow drift of the camera.
+        blur_px: deviations, one drawn a video, of the photo's blur in pixels at 128 px.
 
     Raises:
         PalpateError: if an option is out of range; :class:`~palpate.core.ProblemsError` if several are.
@@ -75,7 +72,9 @@ class WorldOptions:
     size: int = 64
     materials: tuple[str, ...] | int = 20
     objects_per_material: int = 5
+    balance: Literal["uniform", "touch-and-go"] = "uniform"
     videos_per_object: int = 1
+    two_videos: float = 0.0
     touches_per_video: int = 4
     frames_per_touch: int = 3
     free_frames: int = 5
@@ -88,44 +87,86 @@ class WorldOptions:
     named: float = 0.5
     leak: Literal["frame", "touch", "none"] = "touch"
     test: float = 0.25
-    layout: Literal["frames", "videos"] = "frames"
+    layout: Literal["frames", "videos", "hct", "raw"] = "frames"
     tile: int = 256
+    curved: float = 0.4
+    radius_mm: Span = (25.0, 90.0)
+    pad_mm: float = 14.0
+    gel_mm: float = 1.6
+    relax_mm: tuple[float, ...] = (2.4, 0.9, 0.35)
+    optical_mm: float = 0.14
+    dome_mm: Span = (30.0, 80.0)
+    markers: int = 8
+    dirt: float = 1.0
+    vignette: Span = (0.03, 0.16)
+    sensor_noise: Span = (0.002, 0.006)
+    load_mm: Span = (0.09, 0.42)
+    revisit_mm: float = 3.5
+    jump: float = 0.25
+    slide_mm: tuple[float, ...] = (0.0, 1.5, 5.0)
+    tilt: float = 0.045
+    shear: float = 0.7
+    view_mm: Span = (30.0, 45.0)
+    elevation_deg: Span = (18.0, 75.0)
+    hand: float = 0.6
+    shadow: float = 0.5
+    edge: float = 0.35
+    stains: float = 1.0
+    sway: float = 1.0
+    blur_px: tuple[float, ...] = (0.35, 0.6, 1.1)
 
     def __post_init__(self) -> None:
-        found = [*self._out_of_range()]
-        if isinstance(self.materials, int):
-            count = self.materials
-            if 1 <= count <= len(MATERIALS):
-                names = list(MATERIALS)
-                object.__setattr__(self, "materials", tuple(names[k * len(names) // count] for k in range(count)))
-            else:
-                found.append(PalpateError("materials must be 1 to " + str(len(MATERIALS)), str(count), "Pass a smaller count, or names"))
-        else:
-            object.__setattr__(self, "materials", tuple(self.materials))
-            found.extend(_unknown_materials(self.names))
-        if self.layout == "videos" and self.size % 2:
-            found.append(PalpateError("size must be even for layout='videos'", str(self.size), f"Pass size={self.size + 1}"))
-        if self.layout == "videos" and self.free_written != "all":
-            found.append(PalpateError("layout='videos' must write all free frames", "free_written='background'", "Leave free_written out"))
+        for name in ("materials", *PAIRS, *SERIES):
+            if isinstance(getattr(self, name), list):  # as JSON gives them
+                object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name in (*PAIRS, *SERIES):
+            if isinstance(value := getattr(self, name), tuple):  # 26 and 26.0 are one option, with one digest
+                object.__setattr__(self, name, tuple(float(v) if type(v) is int else v for v in value))
+        for name, (low, _) in RANGES.items():
+            if isinstance(low, float) and type(value := getattr(self, name)) is int:
+                object.__setattr__(self, name, float(value))
+        found = [*out_of_range({f.name: getattr(self, f.name) for f in dataclasses.fields(self)})]
+        found += self._materials()
+        found += [] if found else self._inconsistent()
         if len(found) == 1:
             raise found[0]
         if found:
             raise ProblemsError([Problem("WorldOptions", "bad-option", str(e)) for e in found], str(found[0]))
 
-    def _out_of_range(self) -> list[PalpateError]:
-        found: list[PalpateError] = []
-        for name, (low, high) in RANGES.items():
-            value: Any = getattr(self, name)
-            whole = isinstance(low, int)
-            right_kind = isinstance(value, int) if whole else isinstance(value, int | float)
-            if not right_kind or isinstance(value, bool) or not low <= value <= high:
-                kind = "a whole number" if whole else "a number"
-                found.append(PalpateError(f"{name} must be {kind} from {low:g} to {high:g}", repr(value), f"Pass e.g. {name}={low:g}"))
-        for name, choices in CHOICES.items():
-            if getattr(self, name) not in choices:
-                listed = ", ".join(map(repr, choices))
-                found.append(PalpateError(f"{name} must be one of {listed}", repr(getattr(self, name)), f"Pass {name}={choices[0]!r}"))
-        return found
+    def _materials(self) -> list[PalpateError]:
+        """Turns a count into names; what is wrong with the names."""
+        if isinstance(self.materials, int):
+            count = self.materials
+            if isinstance(count, bool) or not 1 <= count <= len(MATERIALS):
+                must = f"materials must be 1 to {len(MATERIALS)}"
+                return [PalpateError(must, str(count), "Pass a smaller count, or names")]
+            names = list(MATERIALS)
+            object.__setattr__(self, "materials", tuple(names[k * len(names) // count] for k in range(count)))
+            return []
+        if not isinstance(self.materials, tuple) or not all(isinstance(name, str) for name in self.materials):
+            return [PalpateError("materials must be names or a count", repr(self.materials), "Pass e.g. materials=('Wood', 'Grass')")]
+        return _unknown_materials(self.materials)
+
+    def _inconsistent(self) -> Iterator[PalpateError]:
+        """What is wrong between options that are each in range."""
+        if self.layout == "videos" and self.size % 2:
+            yield PalpateError("size must be even for layout='videos'", str(self.size), f"Pass size={self.size + 1}")
+        if self.layout == "videos" and self.free_written != "all":
+            yield PalpateError("layout='videos' must write all free frames", "free_written='background'", "Leave free_written out")
+        if self.load_mm[1] > self.gel_mm:
+            got = f"load_mm up to {self.load_mm[1]:g}, gel_mm {self.gel_mm:g}"
+            yield PalpateError(
+                "load_mm must not exceed gel_mm", got, f"Pass load_mm=({min(self.load_mm[0], self.gel_mm):g}, {self.gel_mm:g})"
+            )
+        if self.pad_mm > self.view_mm[0]:
+            got = f"pad_mm {self.pad_mm:g}, view_mm from {self.view_mm[0]:g}"
+            yield PalpateError(
+                "the pad must lie in the photo: pad_mm must not exceed the lower end of view_mm", got, "Pass a smaller pad_mm"
+            )
+        if self.balance != "uniform" and self.objects_per_material < 2:
+            yield PalpateError(
+                f"balance={self.balance!r} must have 2 objects a material or more", "1", "Pass objects_per_material=2 or more"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:

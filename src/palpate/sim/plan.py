@@ -10,6 +10,7 @@ import datetime
 from dataclasses import dataclass
 
 from palpate.core import seed_for
+from palpate.sim.balance import objects_of
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
 
 
@@ -69,26 +70,35 @@ def written_frames(options: WorldOptions) -> list[int]:
     return frames
 
 
+def chosen_twice(options: WorldOptions, listed: list[ObjectRef]) -> set[ObjectRef]:
+    """The share ``two_videos`` of the objects, drawn so that every material has its share, nearly."""
+    rng = options.rng("two videos")
+    order = sorted((listed[k] for k in rng.permutation(len(listed))), key=lambda ref: options.names.index(ref.material))
+    return {ref for k, ref in enumerate(order) if int((k + 1) * options.two_videos + 0.5) > int(k * options.two_videos + 0.5)}
+
+
 def plan_world(options: WorldOptions) -> list[VideoPlan]:
     """All videos of a world, in the order of their names; objects stand in random order, the videos of one object in a row."""
-    own = [ObjectRef(m, k) for m in options.names for k in range(options.objects_per_material)]
-    own = [own[k] for k in options.rng("order").permutation(len(own))]
-    guests = dict.fromkeys(options.names, options.objects_per_material)
+    objects = objects_of(options)
+    listed = [ObjectRef(m, k) for m, count in objects.items() for k in range(count)]
+    twice = chosen_twice(options, listed)
+    own = [listed[k] for k in options.rng("order").permutation(len(listed))]
+    guests = dict(objects)
     day = datetime.datetime(2026, 1, 1) + datetime.timedelta(days=seed_for(options.seed, "world", VERSION, "date") % 3650)
     plans: list[VideoPlan] = []
     for ref in own:
-        for _ in range(options.videos_per_object):
+        for _ in range(options.videos_per_object + (ref in twice)):
             index = len(plans)
             rng = options.rng("plan", index)
-            objects = [ref]
+            touched_objects = [ref]
             most = min(options.objects_per_video, options.touches_per_video, len(options.names))
             if rng.random() < options.mixed and most > 1:
                 others = [m for m in options.names if m != ref.material]
                 for k in rng.permutation(len(others))[: int(rng.integers(1, most))]:
-                    objects.append(ObjectRef(others[k], guests[others[k]]))
+                    touched_objects.append(ObjectRef(others[k], guests[others[k]]))
                     guests[others[k]] += 1
-            cuts = sorted(int(c) + 1 for c in rng.permutation(options.touches_per_video - 1)[: len(objects) - 1])
+            cuts = sorted(int(c) + 1 for c in rng.permutation(options.touches_per_video - 1)[: len(touched_objects) - 1])
             touched = tuple(sum(touch >= cut for cut in cuts) for touch in range(options.touches_per_video))
             name = (day + datetime.timedelta(seconds=index * 97)).strftime("%Y%m%d_%H%M%S")
-            plans.append(VideoPlan(index, name, int(rng.integers(options.sensors)), tuple(objects), touched))
+            plans.append(VideoPlan(index, name, int(rng.integers(options.sensors)), tuple(touched_objects), touched))
     return plans

@@ -1,11 +1,13 @@
 """What a touch feels like, in words.
 
 The adjectives come from the piece that was drawn (its sub-type), never from the class alone, and never say colour or light. Half of the
-captions (``named``) also name the thing; the others use adjectives alone, so that text is not just the label.
+captions (``named``) also name the thing; the others use adjectives alone, so that text is not just the label. In the layout of HCT a caption is, as
+there, a list of adjectives (``rugged, rough``), followed by the thing where it is named (``rugged, rough, tree bark``).
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from palpate.sim.materials import Surface
@@ -15,13 +17,14 @@ from palpate.sim.options import WorldOptions
 NAMED = ("{phrase}", "this is {phrase}", "the sensor touches {phrase}", "it feels like {phrase}")
 #: ``{list}``: the adjectives, joined by commas and "and".
 UNNAMED = ("{list}", "it feels {list}", "a surface that feels {list}", "{list} to the touch")
-#: Begin with a vowel letter but a consonant sound.
-_CONSONANT_SOUND = ("uni", "use", "eu", "one")
+#: Words with a vowel letter but a consonant sound in front (uniform, usual, one-sided; not uninterrupted), or the reverse (hour, honest).
+_CONSONANT, _VOWEL = re.compile(r"uni(?![nm])|us[eu]|eu|once|one\b"), re.compile(r"[aeiou]|hour|hono|hones|heir")
 
 
 def article(word: str) -> str:
-    """``"a"`` or ``"an"``, by the sound that ``word`` begins with."""
-    return "an" if word[:1].lower() in "aeiou" and not word.lower().startswith(_CONSONANT_SOUND) else "a"
+    """``"a"`` or ``"an"``, by the sound that ``word`` begins with (``"a uniform"``, ``"an unusual"``)."""
+    word = word.lower()
+    return "an" if _VOWEL.match(word) and not _CONSONANT.match(word) else "a"
 
 
 def listed(words: Sequence[str]) -> str:
@@ -31,9 +34,15 @@ def listed(words: Sequence[str]) -> str:
 
 def phrase(words: Sequence[str], noun: str) -> str:
     """``"rugged, rough tree bark"``; of a noun that can be counted (``"a leaf"``): ``"an even, waxy leaf"``."""
-    if noun.startswith("a "):
-        return f"{article(words[0])} {', '.join(words)} {noun[2:]}"
+    counted = bare(noun)
+    if counted != noun:
+        return f"{article(words[0])} {', '.join(words)} {counted}"
     return f"{', '.join(words)} {noun}"
+
+
+def bare(noun: str) -> str:
+    """``"leaf"`` of ``"a leaf"``; other nouns as they are."""
+    return noun.removeprefix("a ").removeprefix("an ")
 
 
 def caption(options: WorldOptions, video: int, touch: int, surface: Surface) -> str:
@@ -41,6 +50,9 @@ def caption(options: WorldOptions, video: int, touch: int, surface: Surface) -> 
     rng = options.rng("text", video, touch)
     words = [surface.words[k] for k in rng.permutation(len(surface.words))]
     words = words[: int(rng.integers(min(2, len(words)), len(words) + 1))]
-    templates = NAMED if rng.random() < options.named else UNNAMED
+    named = bool(rng.random() < options.named)
+    if options.layout == "hct":
+        return ", ".join([*words, bare(surface.noun)] if named else words)
+    templates = NAMED if named else UNNAMED
     sentence = templates[int(rng.integers(len(templates)))].format(phrase=phrase(words, surface.noun), list=listed(words))
     return f"{sentence[0].upper()}{sentence[1:]}."

@@ -9,11 +9,11 @@ import numpy as np
 from palpate.core import PalpateError
 from palpate.sim.arrays import Array, f32, grid, sample_periodic, to_bytes
 from palpate.sim.camera import Scene, light_object, make_camera, photo
-from palpate.sim.gel import PATCH_MM, gap_of, make_sensor, marker_shift, press, shade
+from palpate.sim.gel import gap_of, make_sensor, marker_shift, press, shade
 from palpate.sim.motion import State, make_touches, state_at
 from palpate.sim.objects import Thing, make_object
-from palpate.sim.options import WorldOptions
-from palpate.sim.plan import VideoPlan, plan_world
+from palpate.sim.options import BACKGROUND_OFFSET, WorldOptions
+from palpate.sim.plan import VideoPlan, first_contact, plan_world
 from palpate.sim.text import caption
 
 
@@ -42,6 +42,7 @@ class Video:
         spread = 2.0 * options.hard
         self.gain: Array = f32(np.exp(0.03 * spread * rng.standard_normal(3) + 0.05 * spread * rng.standard_normal()))
         self._scenes: dict[int, Scene] = {}
+        self._states: dict[int, State] = {}
 
     def state(self, frame: int) -> State:
         """Where the sensor is at ``frame``.
@@ -52,7 +53,9 @@ class Video:
         if not 0 <= frame < self.options.video_length:
             last = self.options.video_length - 1
             raise PalpateError(f"A frame of video {self.plan.name} must be 0 to {last}", str(frame), "Choose another frame")
-        return state_at(self.options, self.plan, self.touches, frame)
+        if frame not in self._states:
+            self._states = {frame: state_at(self.options, self.plan, self.touches, frame)}  # photo and touch ask for the same one
+        return self._states[frame]
 
     def thing(self, touch: int) -> Thing:
         """The object of a touch."""
@@ -92,13 +95,19 @@ class Video:
         """The object's relief under the pad in mm, (n, n)."""
         thing = self.thing(state.touch)
         y, x = grid(self.options.size)
-        half = PATCH_MM / 2.0 / thing.px
+        half = self.options.pad_mm / 2.0 / thing.px
         c, s = float(np.cos(state.rotation)) * half, float(np.sin(state.rotation)) * half
         return sample_periodic(thing.surface.height, s * x + c * y + state.place[1] / thing.px, c * x - s * y + state.place[0] / thing.px)
 
     def background(self) -> np.ndarray:
         """The sensor's image when it touches nothing, without noise: uint8, shape (n, n, 3)."""
         return to_bytes(self._passive)
+
+    def background_of(self, touch: int) -> np.ndarray:
+        """The background image that the layout gives a touch: one noiseless picture a video in HCT, else the frame 4 before the touch."""
+        if self.options.layout == "hct":
+            return self.background()
+        return self.tactile(first_contact(self.options, touch) - BACKGROUND_OFFSET)
 
     @cached_property
     def _passive(self) -> Array:

@@ -1,44 +1,46 @@
-"""Writes a world as a tree in the layout of Touch and Go.
+"""Writes a world as a tree in the layout of Touch and Go or of HCT, or as arrays.
 
 ::
 
     world.json                          options, VERSION, counts, the known leak, digest; the mark of a finished world
-    label.txt  category_reference.txt  train.txt  test.txt  captions.csv  objects.csv
+    manifest.parquet  splits/Orig.json  the world's own table and cut
+    leak.csv                            what each test sample shares with train, exactly
+    label.txt  category_reference.txt  train.txt  test.txt  captions.csv  objects.csv      (layout="frames", "videos")
     dataset/<video>/video_frame/0000000012.jpg      photo        (layout="frames")
     dataset/<video>/gelsight_frame/0000000012.jpg   touch
     dataset/<video>/video.mp4  gelsight.mp4         (layout="videos")
+    hct/data1/ ...                                  (layout="hct", see palpate.sim.lists_hct and palpate.sim.naming)
+    vision.npy  tactile.npy  background.npy  ids.txt             (layout="raw", see palpate.sim.raw)
 
 The tree grows in the hidden sibling ``.<name>.<digest>.part``, one finished video after another, and is renamed when whole. A run that was
-killed is continued by the same call; the result is the same as without the interruption.
+killed, or stopped by a full disk, is continued by the same call; the result is the same as without the interruption.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
-import os
 import shutil
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, atomic_folder, digest_json, digest_lines, quiet, read_json, short, write_json, write_text
-from palpate.sim.encode import require_av, write_jpeg, write_mp4
-from palpate.sim.lists import contact_rows, cut, list_files
-from palpate.sim.materials import MATERIALS, Material
+from palpate.core import PalpateError, Progress, digest_json, digest_lines, quiet, read_json, short, write_json, write_text
+from palpate.sim.encode import require_av
+from palpate.sim.lists import cut, leak_counts, leak_file, list_files
+from palpate.sim.lists_hct import hct_list_files
+from palpate.sim.naming import contact_rows, manifest_root
 from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import VideoPlan, plan_world, written_frames
-from palpate.sim.video import Video
+from palpate.sim.presets import SEEN, seen_by_mini
+from palpate.sim.raw import ARRAYS, allocate_arrays
+from palpate.sim.saved import WORLD_FORMAT, require_version
+from palpate.sim.table import world_manifest, world_split
+from palpate.sim.trees import WORK, captions_path, disk_error, is_written, place, write_video
+from palpate.sim.workers import render_all
 
-FORMAT = "palpate-world/1"
 NOTE = "Synthetic: procedural surfaces and a simulated sensor. Shows mechanisms; never compare its numbers with those of real data sets."
-_TEXTS = ".texts"
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class WorldRecord:
         folder: the tree.
         digest: SHA-256 over options, VERSION and lists.
         counts: videos, mixed_videos, objects, touches, contact_frames, written_frames, train_frames, test_frames.
-        leak: the rule of the cut, and what train.txt and test.txt share, see :func:`palpate.sim.lists.leak_of`.
+        leak: the rule of the cut, and what train and test share, see :func:`palpate.sim.lists.leak_counts`.
         rendered: videos that this call rendered; the others were there already.
     """
 
@@ -70,7 +72,8 @@ def write_world(out: Path, options: WorldOptions | None = None, *, workers: int 
         progress: told after each video.
 
     Raises:
-        PalpateError: if ``out`` holds something else, a material draws something invalid, or the world is too small for its cut.
+        PalpateError: if ``out`` holds something else or a world of another version, a material draws something invalid, the world is too small
+            for its cut, or the disk is full; what was finished by then is kept, and the same call goes on.
         MissingExtraError: if videos are asked for and PyAV is not installed.
     """
     options, out = options or WorldOptions(), Path(out)
@@ -83,15 +86,30 @@ def write_world(out: Path, options: WorldOptions | None = None, *, workers: int 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise PalpateError(f"{out} must be absent, empty or a finished world", "something else there", "Choose another folder or remove it")
     plans = plan_world(options)
-    cut(options, plans, contact_rows(options, plans))  # refuses a world that is too small before anything is rendered
+    cut(options, plans, list(contact_rows(options, plans)))  # refuses a world that is too small before anything is rendered
     part = out.absolute().parent / f".{out.absolute().name}.{short(options.digest)}.part"
-    todo = [plan for plan in plans if not _done(part, plan)]
+    _require_same_version(part)
+    try:
+        return _write(part, out, options, plans, workers, progress)
+    except OSError as error:
+        raise disk_error(error, out.absolute().parent) from error
+
+
+def _write(part: Path, out: Path, options: WorldOptions, plans: list[VideoPlan], workers: int, progress: Progress) -> WorldRecord:
+    """Fills ``part`` and renames it to ``out``."""
+    todo: list[VideoPlan] = []
     if not (part / "world.json").is_file():
+        part.mkdir(parents=True, exist_ok=True)
+        write_json(part / WORK / "state.json", {"version": VERSION, "options_digest": options.digest})
+        if options.layout == "raw":
+            allocate_arrays(part, options, len(plans) * options.touches_per_video * options.frames_per_touch)
+        todo = [plan for plan in plans if not is_written(options, part, plan)]
         progress("rendering videos", len(plans) - len(todo), len(plans))
-        for count, name in enumerate(_render(options, todo, part, workers), len(plans) - len(todo) + 1):
+        job = partial(write_video, options, part)
+        for count, name in enumerate(render_all(job, todo, workers), len(plans) - len(todo) + 1):
             progress("rendering videos", count, len(plans), name)
         _finish(part, options, plans)
-    shutil.rmtree(part / _TEXTS, ignore_errors=True)
+    shutil.rmtree(part / WORK, ignore_errors=True)
     if out.exists():
         out.rmdir()
     part.replace(out)
@@ -99,117 +117,91 @@ def write_world(out: Path, options: WorldOptions | None = None, *, workers: int 
 
 
 def _finished(out: Path, options: WorldOptions) -> WorldRecord:
-    """The record of the finished world in ``out``."""
+    """The record of the finished world in ``out``.
+
+    Raises:
+        PalpateError: if it is of another version, or of other options.
+    """
     data = read_json(out / "world.json", "world record")
-    if not isinstance(data, dict) or data.get("format") != FORMAT or data.get("options_digest") != options.digest:
-        raise PalpateError(
-            f"{out} must hold the world that was asked for", "a world of other options", "Choose another folder or remove it"
-        )
+    if not isinstance(data, dict) or not str(data.get("format", "")).startswith("palpate-world/"):
+        raise PalpateError(f"{out} must hold a world", "another world.json", "Choose another folder or remove it")
+    require_version(data, f"The world in {out}")
+    if data.get("format") != WORLD_FORMAT or data.get("options_digest") != options.digest:
+        must = f"{out} must hold the world that was asked for"
+        raise PalpateError(must, "a world of other options", "Choose another folder or remove it")
     return WorldRecord(out, data["digest"], data["counts"], data["leak"], 0)
 
 
-def _done(part: Path, plan: VideoPlan) -> bool:
-    return (part / "dataset" / plan.name).is_dir() and (part / _TEXTS / f"{plan.name}.json").is_file()
+def _require_same_version(part: Path) -> None:
+    """Refuses to start beside an unfinished world of the same name that another version of palpate began.
+
+    Raises:
+        PalpateError: naming its folder.
+    """
+    begin = part.name.rsplit(".", 2)[0]
+    for other in sorted(part.parent.glob("*.part")) if part.parent.is_dir() else []:
+        if other.name.rsplit(".", 2)[0] != begin or not other.is_dir() or not any(other.iterdir()):
+            continue
+        state = other / WORK / "state.json"
+        data = read_json(state, "state of an unfinished world") if state.is_file() else {}
+        if (other / "world.json").is_file():
+            data = read_json(other / "world.json", "world record")
+        require_version(data if isinstance(data, dict) else {}, f"The unfinished world {other} (remove it to begin anew)")
 
 
-def _render(options: WorldOptions, plans: Sequence[VideoPlan], part: Path, workers: int) -> Iterator[str]:
-    """Renders videos and yields their names, in order."""
-    job = partial(_write_video, options, part)
-    if min(workers, len(plans)) < 2:
-        for plan in plans:
-            yield job(plan)
-        return
-    context = multiprocessing.get_context("spawn")  # a forked copy of a process with threads may hang
-    with ProcessPoolExecutor(workers, context, _start_worker, (dict(MATERIALS),)) as pool:
-        try:
-            for name, error in _started(pool, partial(_guarded, job), plans, chunk=max(1, min(4, len(plans) // (2 * workers)))):
-                if error is not None:
-                    raise PalpateError(*error)
-                yield name
-        except BrokenProcessPool:
-            raise PalpateError(
-                "The worker processes must be able to start",
-                "one that died",
-                "Pass workers=1, or call write_world under: if __name__ == '__main__'",
-            ) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _started(pool: ProcessPoolExecutor, job: Any, plans: Sequence[VideoPlan], chunk: int) -> Iterator[Any]:
-    """``pool.map``, whose processes start deaf to Ctrl-C: a terminal sends it to all of them, and each would print a traceback."""
-    if threading.current_thread() is not threading.main_thread():  # only there can signals be set
-        return pool.map(job, plans, chunksize=chunk)
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        return pool.map(job, plans, chunksize=chunk)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _start_worker(materials: dict[str, Material]) -> None:
-    """Gives a new process the table of this one, so that materials which a user added are known there."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    MATERIALS.clear()
-    MATERIALS.update(materials)
-
-
-def _guarded(job: Any, plan: VideoPlan) -> tuple[str, tuple[str, str, str] | None]:
-    """Runs ``job``; a user's mistake comes back as a value, since the exception does not survive pickling."""
-    try:
-        return job(plan), None
-    except PalpateError as error:
-        return plan.name, (error.must, error.got, error.fix)
-
-
-def _write_video(options: WorldOptions, part: Path, plan: VideoPlan) -> str:
-    """Renders one video into ``part``, whole or not at all; returns its name."""
-    video = Video(options, plan)
-    write_json(part / _TEXTS / f"{plan.name}.json", [video.text(touch) for touch in range(options.touches_per_video)])
-    frames = written_frames(options)
-    with atomic_folder(part / "dataset" / plan.name) as folder:
-        if options.layout == "videos":
-            write_mp4(folder / "video.mp4", map(video.vision, frames), options.size)
-            write_mp4(folder / "gelsight.mp4", map(video.tactile, frames), options.size)
-            return plan.name
-        for kind, render in (("video_frame", video.vision), ("gelsight_frame", video.tactile)):
-            (folder / kind).mkdir()
-            for frame in frames:
-                write_jpeg(folder / kind / f"{frame:010d}.jpg", render(frame))
-    return plan.name
-
-
-def _finish(part: Path, options: WorldOptions, plans: Sequence[VideoPlan]) -> None:
+def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
     """Writes the lists and, last, ``world.json``."""
-    for stray in (part / "dataset").glob(".*"):  # left by a killed process
-        shutil.rmtree(stray, ignore_errors=True)
-    captions = {plan.name: read_json(part / _TEXTS / f"{plan.name}.json", "captions of a video") for plan in plans}
-    files, leak = list_files(options, plans, captions)
+    if options.layout != "raw":
+        for folder in {place(options, part, plan).parent for plan in plans}:
+            for stray in folder.glob(".*"):  # left by a killed process
+                shutil.rmtree(stray, ignore_errors=True)
+    captions = {plan.name: read_json(captions_path(part, plan), "captions of a video") for plan in plans}
+    rows = list(contact_rows(options, plans))
+    train, test = cut(options, plans, rows)
+    manifest = world_manifest(options, plans, captions, part)
+    files = {"leak.csv": leak_file(options, train, test)}
+    if options.layout == "hct":
+        own = hct_list_files(options, plans, train, test, captions)
+        files |= {f"hct/{name}": text for name, text in own.items()}
+    elif options.layout == "raw":
+        files["ids.txt"] = "".join(f"{name}\n" for name in manifest.ids)
+    else:
+        files |= list_files(rows, train, test, captions)
     for name, text in files.items():
         write_text(part / name, text)
+    world_split(options, train, test, manifest.digest).save(part / "splits" / "Orig.json")
+    manifest.save(part / "manifest.parquet")
     settings = dataclasses.asdict(options)
     lists = {name: digest_lines(text.splitlines()) for name, text in files.items()}
-    contact = len(plans) * options.touches_per_video * options.frames_per_touch
-    counts = {
+    arrays = {name: {"file": f"{name}.npy", "dtype": "uint8", "shape": [len(rows), options.size, options.size, 3]} for name in ARRAYS}
+    write_json(
+        part / "world.json",
+        {
+            "format": WORLD_FORMAT,
+            "version": VERSION,
+            "note": NOTE,
+            **({"seen_by_shipped_models": SEEN} if seen_by_mini(options) else {}),
+            "digest": digest_json({"version": VERSION, "options": settings, "lists": lists}),
+            "options_digest": options.digest,
+            "manifest_digest": manifest.digest,
+            "manifest_root": manifest_root(options, Path()).as_posix(),
+            "counts": _counts(options, plans, len(rows), len(test)),
+            "leak": {"rule": options.leak, **leak_counts(train, test)},
+            **({"arrays": arrays} if options.layout == "raw" else {}),
+            "options": settings,
+        },
+    )
+
+
+def _counts(options: WorldOptions, plans: Sequence[VideoPlan], contact: int, test: int) -> dict[str, int]:
+    written = contact if options.layout == "raw" else len(plans) * len(written_frames(options))
+    return {
         "videos": len(plans),
         "mixed_videos": sum(len(plan.objects) > 1 for plan in plans),
         "objects": len({ref for plan in plans for ref in plan.objects}),
         "touches": len(plans) * options.touches_per_video,
         "contact_frames": contact,
-        "written_frames": len(plans) * len(written_frames(options)),
-        "train_frames": contact - int(leak["test_frames"]),
-        "test_frames": int(leak["test_frames"]),
+        "written_frames": written,
+        "train_frames": contact - test,
+        "test_frames": test,
     }
-    write_json(
-        part / "world.json",
-        {
-            "format": FORMAT,
-            "version": VERSION,
-            "note": NOTE,
-            "digest": digest_json({"version": VERSION, "options": settings, "lists": lists}),
-            "options_digest": options.digest,
-            "counts": counts,
-            "leak": {"rule": options.leak, **leak},
-            "options": settings,
-        },
-    )

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from palpate.core import Problem, Progress, Split, inside, quiet
+from palpate.core import Problem, Progress, Split, inside, quiet, read_json
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
@@ -56,6 +56,19 @@ class Facts:
         """The facts that a manifest keeps."""
         about = {"dataset": self.name, "licence": self.licence, "citation": self.citation, "url": self.url}
         return about | ({} if self.group_column == "video" else {"group": self.group_column})
+
+
+def world_facts(folder: Path) -> dict[str, str]:
+    """What a tree of palpate's own world says of itself, ``{}`` for any other folder: it must never pass for the real set.
+
+    The blank entries take the place of the real set's licence, citation and address.
+    """
+    mark = folder / "world.json"
+    about = read_json(mark, "world record") if mark.is_file() else {}
+    if not isinstance(about, dict) or not str(about.get("format", "")).startswith("palpate-world/"):
+        return {}
+    named = {"dataset": "palpate's procedural world", "synthetic": "yes", "digest": str(about.get("digest", ""))}
+    return named | dict.fromkeys(("licence", "citation", "url"), "")
 
 
 @dataclass

@@ -37,7 +37,7 @@ import numpy as np
 
 from palpate.core import PalpateError, Problem, Progress, Split, inside, quiet
 from palpate.data.formats import tvl
-from palpate.data.formats.base import Facts, Scan
+from palpate.data.formats.base import Facts, Scan, world_facts
 from palpate.data.formats.hct_lists import RIG, TRAJECTORY, Reader, Row, Trajectory, located, order
 from palpate.data.frames import nearest_to_median
 from palpate.data.images import check_image
@@ -138,6 +138,7 @@ def scan(
     found.facts |= {"session_gap": f"{session_gap:g} s", "swapped_folders": exchange}
     worded = dict.fromkeys(f"{r.part}.csv" if r.part else "finetune.json" for r in rows if r.text)
     found.facts |= {"text_source": f"captions of {', '.join(sorted(worded))}" if worded else "none"}
+    found.facts |= world_facts(Path(source)) or world_facts(root.parent)
     if root == Path(source) / "hct" and (Path(source) / "ssvtp").is_dir():
         found.suspicious.append(
             Problem(str(source), "other-half", "ssvtp/ lies beside hct/ and was not read: import it with --format ssvtp")

@@ -22,8 +22,8 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from palpate.core import PalpateError, Problem, Progress, Split, quiet, read_json
-from palpate.data.formats.base import Facts, Scan
+from palpate.core import PalpateError, Problem, Progress, Split, quiet
+from palpate.data.formats.base import Facts, Scan, world_facts
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
 from palpate.data.images import Check
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
@@ -216,17 +216,7 @@ def _facts(root: Path, categories: Mapping[int, str]) -> dict[str, str]:
     Palpate's own world comes in this layout, and must never pass for the real set.
     """
     classes = {} if categories == CATEGORIES else {"classes": json.dumps({str(k): name for k, name in categories.items()})}
-    mark = root / "world.json"
-    about = read_json(mark, "world record") if mark.is_file() else {}
-    if isinstance(about, dict) and str(about.get("format", "")).startswith("palpate-world/"):
-        return {
-            "dataset": "palpate's procedural world",
-            "format": "touch-and-go",
-            "synthetic": "yes",
-            "digest": str(about.get("digest", "")),
-            **classes,
-        }
-    return {**FACTS.of_manifest(), "format": "touch-and-go", **classes}
+    return {**FACTS.of_manifest(), **world_facts(root), "format": "touch-and-go", **classes}
 
 
 def _require_videos(root: Path) -> dict[str, VideoFiles]:

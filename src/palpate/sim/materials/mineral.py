@@ -80,7 +80,7 @@ def ceramic_tile(tile: Tile, rng: np.random.Generator) -> Surface:
     words: tuple[str, ...] = ("slick", "smooth", "grid-lined")
     if kind == "textured":
         relief = relief + smoothstep(tile.noise(0.8, 4.0, 1.2), -0.2, 0.6) * rng.uniform(0.04, 0.08)
-        words = ("grippy", "mottled", "grid-lined")
+        words = ("grippy", "nubbly", "grid-lined")
     elif kind == "mosaic":
         words = ("slick", "smooth", "densely jointed")
     marble = tile.ridged(1.0, 25.0, 2.4) * (0.0, 0.06, 0.12)[int(rng.integers(3))]

@@ -82,6 +82,8 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
     """
     surface = material.draw(Tile(n, rng), rng)
     fix = f"Mend the function {getattr(material.draw, '__qualname__', material.draw)!r} of this material"
+    if not isinstance(surface, Surface):  # pyright: ignore[reportUnnecessaryIsInstance] - the function may be a user's
+        raise PalpateError(f"The material {name!r} must return a Surface", type(surface).__name__, fix)
     for what, array, shape in (("height", surface.height, (n, n)), ("albedo", surface.albedo, (n, n, 3))):
         if np.shape(array) != shape:
             raise PalpateError(f"The material {name!r} must return a {what} of shape {shape}", f"shape {np.shape(array)}", fix)
