@@ -230,6 +230,28 @@ def report(sizes, seeds, videos):
     yield from unit_table(seeds)
 
 
+def in_words(lines):
+    """What the tables say does not fit: medians outside the clips', and statistics of which under 80 % of the world's frames lie among the real ones."""
+    size, outside, wide = "", [], []
+    for line in lines:
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if line.startswith("## "):
+            size = line[3:].split(":")[0].split(" (")[0]
+        elif "outside by" in line:
+            found = [f"{name} {cell.split()[-1]}" for name, cell in zip("RGB", cells[1:4], strict=False) if "outside by" in cell]
+            outside.append(f"{size}: {cells[0]} by {', '.join(found)}" if found else f"{size}: {cells[0]} by {cells[-1].split()[-1]}")
+        if len(cells) == 7 and cells[5].endswith("%") and float(cells[5].rstrip(" %")) < 80:
+            wide.append(f"{size}: {cells[0]} ({cells[5]})")
+    yield from ("## What does not fit", "")
+    yield from (
+        "Medians of the world outside the spread of the clips (grey levels, or the unit of the row):",
+        "",
+        *(f"- {text}" for text in outside or ["none"]),
+    )
+    yield from ("", "Fewer than 80 % of the world's frames lie between the 5 and 95 % quantiles of the real frames in:", "")
+    yield from (*(f"- {text}" for text in wide or ["none"]), "")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
@@ -246,7 +268,8 @@ def main():
         "Read it with care: the real side is five short clips, which look like one or two pads of one product, and their materials are five of the "
         "world's twenty. `inside` means no more than that the world's median frame could have come from one of them.", "",
     ]  # fmt: skip
-    lines = [*head, *report(asked.sizes, asked.seeds, asked.videos)]
+    body = [*report(asked.sizes, asked.seeds, asked.videos)]
+    lines = [*head, *in_words(body), *body]
     text = "\n".join(lines).rstrip() + "\n"
     if asked.write:
         asked.write.write_text(text, encoding="utf-8")

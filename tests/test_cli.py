@@ -58,7 +58,7 @@ def test_text_output_has_every_count(capsys, lists):
     (["import", ".", "-o", "out", "--map", "vision"], "--map takes"),
     (["demo", "--data", "nowhere"], "nowhere"),
     (["report", "-o", "page.html"], "needs results"),
-    (["generate", "model", "-o", "out"], "--photos or --manifest"),
+    (["generate", "-o", "out"], "photos or --manifest"),
     (["world", "-o", "w", "--size", "7"], "size"),
 ])  # fmt: skip
 def test_a_users_mistake_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, args, word):

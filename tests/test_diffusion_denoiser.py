@@ -56,7 +56,8 @@ def test_every_preset_builds(name):
     preset = PRESETS[name]
     with torch.device("meta"):
         net = build_unet(preset.unet, channels=3, size=preset.size // 4, width=preset.condition.width, background=False)
-        out = net(torch.zeros(1, 3, 16, 16), torch.zeros(1, dtype=torch.long), torch.zeros(1, 1, preset.condition.width)).sample
+        model = Denoiser(net, replace(preset.condition, gap="none"))
+        out = model(torch.zeros(1, 3, 16, 16), torch.zeros(1, dtype=torch.long), torch.zeros(1, 1, preset.condition.width))
     assert out.shape == (1, 3, 16, 16)
 
 
@@ -246,3 +247,21 @@ def test_mistakes_are_told(tmp_path):
         )  # fmt: skip
     with pytest.raises(PalpateError, match=r"\[0, 1\)"):
         ConditionPolicy(width=3, dropout=1.0)
+
+
+@pytest.mark.parametrize("modulate", [False, True])
+def test_the_token_reaches_the_output_and_a_saved_denoiser_is_the_same(tmp_path, modulate):
+    from dataclasses import replace
+
+    policy = ConditionPolicy(width=8)
+    torch.manual_seed(0)
+    net = build_unet(replace(UNET, modulate=modulate), channels=3, size=8, width=8, background=False)
+    model = Denoiser(net, policy).eval()
+    assert (net.class_embedding is not None) == modulate
+    x, t, c = torch.randn(2, 3, 8, 8), torch.tensor([3, 700]), torch.randn(2, 8)
+    with torch.no_grad():
+        out = model(x, t, model.tokens(c, "text"))
+        assert not torch.allclose(out, model(x, t, model.null_tokens(2)), atol=1e-4)
+        model.save(tmp_path / "unet")
+        again = Denoiser.load(tmp_path / "unet", policy)
+        torch.testing.assert_close(again(x, t, again.tokens(c, "text")), out)

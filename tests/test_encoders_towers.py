@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 from transformers import AutoTokenizer, CLIPModel
 
 from palpate.core import PalpateError
+from palpate.encoders import hub
 from palpate.encoders import towers as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images, embed_texts
@@ -158,10 +159,13 @@ def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
     def unreachable(*args, **kwargs):
         raise OSError("We couldn't connect to the hub\nand many more lines")
 
+    refusal = r"within reach.*couldn't connect to the hub\. Pass a folder that holds config\.json, model\.safe"
+    monkeypatch.setattr(hub, "snapshot_download", unreachable)  # asked once, before anything else
+    with pytest.raises(PalpateError, match=refusal):
+        load_clip("openai/clip-vit-base-patch32")
+    monkeypatch.setattr(hub, "snapshot_download", lambda name, allow_patterns: tmp_path / "nothing")
     monkeypatch.setattr(module.CLIPModel, "from_pretrained", unreachable)
-    with pytest.raises(
-        PalpateError, match=r"within reach.*couldn't connect to the hub\. Pass a folder that holds config\.json, model\.safe"
-    ):
+    with pytest.raises(PalpateError, match=refusal):
         load_clip("openai/clip-vit-base-patch32")
 
 

@@ -1,6 +1,7 @@
 """From photos to a folder of touches: names, index, resuming, broken photos."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from PIL import Image
 from diffusion_forge import make_pipeline
 from palpate.core import PalpateError, ProblemsError, inside
 from palpate.data.manifest import Manifest
-from palpate.generate import Generated, file_name, generate, photo_ids
+from palpate.generate import Generated, file_name, generate, generate_one, photo_ids
 
 
 @pytest.fixture(scope="module")
@@ -164,3 +165,95 @@ def test_an_index_that_points_outside_is_refused(pipeline, tmp_path):
     (tmp_path / "out" / "index.json").write_text(json.dumps(index))
     with pytest.raises(PalpateError, match="must lie in images/"):
         Generated.load(tmp_path / "out")
+
+
+def test_one_photo_is_one_picture_that_says_what_it_is(pipeline, tmp_path):
+    (photo,) = write_photos(tmp_path / "in", 1)
+    out = tmp_path / "new" / "touch.png"
+    told = replace(pipeline, training={"synthetic": True, "materials": ["Wood", "Brick"]})
+    assert generate_one(told, photo, out, seed=3)
+    made = generate(told, photos=photo, out=tmp_path / "out", seed=3)
+    with Image.open(out) as one, Image.open(made.paths[0]) as other:
+        assert np.abs(np.asarray(one).astype(int) - np.asarray(other)).max() <= 1
+        assert one.info == other.info
+        text = one.info
+    assert set(text) == {f"palpate.{k}" for k in ("id", "settings", "input", "made-with", "notice")}
+    assert json.loads(text["palpate.made-with"]) == made.settings
+    assert "synthetic data alone" in text["palpate.notice"]
+    assert text["palpate.notice"].endswith("knows only these materials: Brick, Wood.")
+    assert json.loads((tmp_path / "out" / "index.json").read_text())["notice"] == text["palpate.notice"]
+    # Again: nothing to do; another seed or another photo: made again.
+    before = out.read_bytes()
+    assert not generate_one(told, photo, out, seed=3)
+    assert generate_one(told, photo, out, seed=4)
+    assert out.read_bytes() != before
+    Image.new("RGB", (20, 20), "red").save(photo)
+    assert generate_one(told, photo, out, seed=4)
+    assert not [p for p in out.parent.iterdir() if p != out]
+    assert pipeline.notice == ""  # nothing is said of a generator whose record does not call its data synthetic
+
+
+def test_one_photo_that_cannot_be_read_leaves_no_picture(pipeline, tmp_path):
+    (photo,) = write_photos(tmp_path / "in", 1)
+    photo.write_bytes(photo.read_bytes()[:80])
+    with pytest.raises(ProblemsError) as caught:
+        generate_one(pipeline, photo, tmp_path / "touch.png")
+    assert [p.kind for p in caught.value.problems] == ["bad-image"]
+    with pytest.raises(PalpateError, match="no such path"):
+        generate_one(pipeline, tmp_path / "gone.jpg", tmp_path / "touch.png")
+    assert not (tmp_path / "touch.png").exists()
+
+
+def odd_photos(folder: Path) -> dict[str, Path]:
+    """The same picture in forms that cameras and editors write, and a few that hold next to nothing."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    pixels = np.kron(rng.integers(0, 256, (4, 6, 3), dtype=np.uint8), np.ones((8, 8, 1), np.uint8))
+    plain = Image.fromarray(pixels)
+    plain.save(folder / "plain.png")
+    alpha = plain.copy()
+    alpha.putalpha(255)
+    alpha.save(folder / "alpha.png")
+    plain.convert("CMYK").save(folder / "cmyk.tif")
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned by 90 degrees clockwise for display
+    plain.rotate(90, expand=True).save(folder / "turned.png", exif=exif)
+    plain.convert("P", palette=Image.Palette.ADAPTIVE, colors=64).save(folder / "palette.png")
+    Image.fromarray(np.asarray(plain.convert("L")).astype(np.uint16) * 257).save(folder / "deep.png")
+    plain.convert("L").save(folder / "grey.png")
+    Image.new("RGB", (1, 1), "red").save(folder / "dot.png")
+    Image.new("RGBA", (3, 200), (0, 0, 0, 0)).save(folder / "clear.png")
+    return {p.stem: p for p in folder.iterdir()}
+
+
+def test_photos_of_every_kind_give_the_touch_of_what_they_show(pipeline, tmp_path):
+    paths = odd_photos(tmp_path / "in")
+    touches = {}
+    for name, path in paths.items():
+        generate_one(pipeline, path, tmp_path / f"{name}.png")
+        touches[name] = np.asarray(Image.open(tmp_path / f"{name}.png"))
+        assert touches[name].shape == (32, 32, 3), name
+    # The noise belongs to the name of the file; under one name, the same picture gives the same touch.
+    same = {}
+    for name, path in paths.items():
+        twin = tmp_path / name / "photo.img"
+        twin.parent.mkdir()
+        twin.write_bytes(path.read_bytes())
+        generate_one(pipeline, twin, twin.with_name("touch.png"))
+        same[name] = np.asarray(Image.open(twin.with_name("touch.png"))).astype(int)
+    for name, other, limit in (
+        ("alpha", "plain", 0),
+        ("turned", "plain", 0),
+        ("palette", "plain", 0),
+        ("cmyk", "plain", 1),
+        ("deep", "grey", 1),
+    ):
+        assert np.abs(same[name] - same[other]).max() <= limit, name
+    assert np.abs(same["dot"] - same["plain"]).max() > 1
+
+
+def test_a_model_in_the_place_of_photos_is_told(pipeline, tmp_path):
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "palpate.json").write_text("{}")
+    with pytest.raises(PalpateError, match=r"a saved model\. Pass models with --model"):
+        generate(pipeline, photos=tmp_path / "model", out=tmp_path / "out")

@@ -128,7 +128,9 @@ def test_towers_and_generators_of_another_split_are_told(whole, tmp_path):
     place = whole / "data"
     assert main(["split", str(place), "-o", str(tmp_path / "s.json"), "--seed", "9", "--train", "0.5", "-q"]) == 0
     model, towers, made = whole / "generator" / "model", whole / "towers" / "towers", tmp_path / "made"
-    assert main(["generate", str(model), "--manifest", str(place), "--split", str(tmp_path / "s.json"), "-o", str(made), "-q"]) == 0
+    assert (
+        main(["generate", "--model", str(model), "--manifest", str(place), "--split", str(tmp_path / "s.json"), "-o", str(made), "-q"]) == 0
+    )
     args = ["--generated", str(made), "--split", str(tmp_path / "s.json"), "--towers", str(towers), "-o", str(tmp_path / "x.json"), "-q"]
     assert main(["score", str(place), *args]) == 0
     notes = {s["metric"]: s["note"] for s in json.loads((tmp_path / "x.json").read_text())["scores"] if s["subject"] == "made"}
@@ -174,7 +176,7 @@ def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
         "audit tag --split s.json -o audit.json --fail-over 0",
         "encoder tag --split s.json -o towers --preset tiny",
         "train tag --split s.json --towers towers -o model --preset tiny --background",
-        "generate model --manifest tag --split s.json -o made",
+        "generate --model model --manifest tag --split s.json -o made",
         "score tag --generated made --split s.json --towers towers -o scores.json --json",
         "report audit.json scores.json -o page.html",
     ):
@@ -195,9 +197,10 @@ def test_photos_alone_are_enough_to_generate(whole, tmp_path):
     for path in sorted(photos.iterdir())[:3]:
         (tmp_path / "photos" / path.name).write_bytes(path.read_bytes())
     (tmp_path / "photos" / "broken.jpg").write_bytes(path.read_bytes()[:200])
-    assert main(["generate", str(model), "--photos", str(tmp_path / "photos"), "-o", str(tmp_path / "a"), "-q"]) == 2
+    words = ["generate", str(tmp_path / "photos"), "--model", str(model), "-o", str(tmp_path / "a"), "-q"]
+    assert main(words) == 2
     assert not (tmp_path / "a").exists()
-    assert main(["generate", str(model), "--photos", str(tmp_path / "photos"), "-o", str(tmp_path / "a"), "-q", "--skip-bad"]) == 0
+    assert main([*words, "--skip-bad"]) == 0
     assert len(list((tmp_path / "a" / "images").iterdir())) == 3
 
 

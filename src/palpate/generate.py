@@ -1,13 +1,14 @@
-"""Checkpoint + photos or a manifest -> a folder of touches with an index, by id.
+"""Checkpoint + photos or a manifest -> a folder of touches with an index, by id; or one photo -> one picture.
 
 ::
 
     OUT/images/<name>.png    one touch an id; the name is made from the id and cannot leave the folder
-    OUT/index.json           {"format", "complete", "settings", "digest", "images": {id: name}, "skipped": [...]}
+    OUT/index.json           {"format", "complete", "settings", "digest", "notice", "images": {id: name}, "skipped": [...]}
 
-Each PNG carries its id, the digest of the settings and of its photo as text, so a folder that was left half done is
-continued: pictures of the same settings and photo are kept, and the result has the same bytes as one made at a
-stretch. ``settings`` holds the pipeline's digest, seed, sampler and image size; a folder made with others is refused.
+Each PNG carries as text its id, the settings as JSON, their digest, the digest of its photo, and the pipeline's notice, so a folder
+that was left half done is continued: pictures of the same settings and photo are kept, and the result has the same bytes as one made
+at a stretch; and a picture alone still says what it is. ``settings`` holds the pipeline's digest, seed, sampler and image size; a
+folder made with others is refused.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from palpate.core import (
     short,
     write_json,
 )  # fmt: skip
+from palpate.core.digest import canonical_json
 from palpate.data.images import SUFFIXES, load_images, read_image, square
 from palpate.data.manifest import Manifest
 from palpate.diffusion.pipeline import EMBED, Pipeline
@@ -156,9 +158,10 @@ def generate(
     settings = _settings(pipeline, sampler, seed)
     digest = digest_json(settings)
     out = Path(out)
-    index = _open_index(out, settings, digest)
+    index: dict[str, Any] = _open_index(out, settings, digest) | {"notice": pipeline.notice}
+    place = out / "images"
     stamps, bad = _stamps(inputs)
-    todo = [i for i in inputs if i.sample in stamps and not _is_made(out, i.sample, digest, stamps[i.sample])]
+    todo = [i for i in inputs if i.sample in stamps and not _is_made(place / file_name(i.sample), i.sample, digest, stamps[i.sample])]
     conditions, broken = _embed(pipeline, todo, progress)
     bad |= broken
     if bad and not skip_bad:
@@ -172,13 +175,57 @@ def generate(
         rows = torch.stack([conditions[i.sample] for i in chunk])
         touches = pipeline.touch_from_embeddings(rows, [i.sample for i in chunk], seed=seed, sampler=sampler, background=ground)
         for item, touch in zip(chunk, touches, strict=True):
-            _write(out, item.sample, touch, digest, stamps[item.sample])
+            text = _png_text(item.sample, settings, stamps[item.sample], pipeline.notice)
+            _write(place / file_name(item.sample), touch, text)
         progress("generating touches", start + len(chunk), len(todo))
     images = index["images"] | {i.sample: file_name(i.sample) for i in inputs if i.sample not in bad}
     problems = list(bad.values())
     index |= {"complete": True, "images": images, "skipped": [asdict(p) for p in problems]}
     write_json(out / "index.json", index)
     return Generated(out, images, settings, problems, len(todo))
+
+
+def generate_one(
+    pipeline: Pipeline,
+    photo: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    guidance: float | None = None,
+    steps: int | None = None,
+) -> bool:
+    """Makes the touch of one photo as one PNG: the picture and text that :func:`generate` gives for ``photos=photo``.
+
+    It is computed alone, not among the copies that fill a batch, so it takes a fraction of the time; other kernels may round a
+    pixel to the next level.
+
+    Args:
+        pipeline: the generator, with its towers; not the variant w/ BG.
+        photo: an image file; its name is the id.
+        out: the PNG to write, whole or not at all; what lies there is replaced.
+        seed: of the noise.
+        guidance: s; default: the sampler's of the pipeline.
+        steps: of the solver; default: the sampler's.
+
+    Returns:
+        False if ``out`` was there already, made from the same photo with the same settings.
+
+    Raises:
+        PalpateError: on wrong arguments.
+        ProblemsError: if the photo is missing or unreadable.
+    """
+    (item,) = _inputs(pipeline, None, Path(photo), None)
+    sampler = pipeline.sampler_with(guidance=guidance, steps=steps, batch=1)
+    settings = _settings(pipeline, sampler, seed)
+    stamps, bad = _stamps([item])
+    if not bad and _is_made(Path(out), item.sample, digest_json(settings), stamps[item.sample]):
+        return False
+    conditions, broken = _embed(pipeline, [item] if not bad else [], quiet)
+    if bad | broken:
+        raise ProblemsError([*(bad | broken).values()], "Choose another photo, or mend this one")
+    touch = pipeline.touch_from_embeddings(conditions[item.sample][None], [item.sample], seed=seed, sampler=sampler)[0]
+    _write(Path(out), touch, _png_text(item.sample, settings, stamps[item.sample], pipeline.notice))
+    return True
 
 
 def file_name(sample_id: str) -> str:
@@ -239,6 +286,8 @@ def photo_ids(photos: Path | Sequence[Path] | Mapping[str, Path]) -> dict[str, P
             return {photos.name: photos}
         if not photos.is_dir():
             raise PalpateError("The photos must be a folder or files", f"no such path {photos}", "Check the path")
+        if (photos / "palpate.json").is_file():
+            raise PalpateError("The photos must be a folder of images", f"{photos}, a saved model", "Pass models with --model")
         files = sorted(p for p in photos.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
         return {p.relative_to(photos).as_posix(): p for p in files}
     table: dict[str, Path] = {}
@@ -282,19 +331,26 @@ def _stamps(inputs: Sequence[_Input]) -> tuple[dict[str, str], dict[str, Problem
     return stamps, bad
 
 
-def _is_made(out: Path, sample_id: str, digest: str, stamp: str) -> bool:
+def _is_made(file: Path, sample_id: str, digest: str, stamp: str) -> bool:
     try:
-        with Image.open(out / "images" / file_name(sample_id)) as image:
+        with Image.open(file) as image:
             return [image.info.get(f"palpate.{k}") for k in ("id", "settings", "input")] == [sample_id, digest, stamp]
     except OSError:
         return False
 
 
-def _write(out: Path, sample_id: str, touch: np.ndarray, digest: str, stamp: str) -> None:
+def _png_text(sample_id: str, settings: Mapping[str, Any], stamp: str, notice: str) -> PngImagePlugin.PngInfo:
+    """What a touch says of itself; the order decides its bytes."""
     text = PngImagePlugin.PngInfo()
-    for name, value in (("id", sample_id), ("settings", digest), ("input", stamp)):
-        text.add_itxt(f"palpate.{name}", value)
-    with atomic_path(out / "images" / file_name(sample_id)) as part:
+    said = {"id": sample_id, "settings": digest_json(settings), "input": stamp, "made-with": canonical_json(settings), "notice": notice}
+    for name, value in said.items():
+        if value:
+            text.add_itxt(f"palpate.{name}", value)
+    return text
+
+
+def _write(file: Path, touch: np.ndarray, text: PngImagePlugin.PngInfo) -> None:
+    with atomic_path(file) as part:
         Image.fromarray(touch).save(part, format="PNG", pnginfo=text)
 
 

@@ -39,8 +39,8 @@ class Options(Common):
     """Look at tables alone: compare neither files nor pictures. Bare lists have no pictures anyway."""
     false_positives: float = 0.001
     """Rate at which unrelated pictures may pass for near-duplicates; the threshold is calibrated to it on the data."""
-    encoder: Path | None = None
-    """Folder of trained towers whose embeddings replace the built-in picture features."""
+    encoder: str | None = None
+    """Trained towers (a folder, a hub id, or palpate/mini) whose embeddings replace the built-in picture features."""
     impact: bool = False
     """Also measure what leaking costs: material accuracy under this split and under a leak-free one."""
     fail_over: float | None = None
@@ -228,7 +228,7 @@ def _pictures(options: Options, train: Manifest, test: Manifest, cache: Path | N
     if options.encoder is not None:
         a, b = (_embedded(options.encoder, side, there, cache, progress) for side in (train, test))
         features = {m: (a[m].features, b[m].features) for m in there}
-        name = f"towers {options.encoder.name}"
+        name = f"towers {Path(options.encoder).name}"
     return Pictures(there, options.false_positives, features, name, cache, options.processes)
 
 
@@ -239,7 +239,7 @@ def _modalities(samples: Manifest) -> set[str]:
     return {m for m, c in MODALITIES.items() if samples.table[c].null_count() < len(samples)}
 
 
-def _embedded(encoder: Path, samples: Manifest, modalities: Sequence[str], cache: Path | None, progress: Progress) -> dict[str, FeatureSet]:
+def _embedded(encoder: str, samples: Manifest, modalities: Sequence[str], cache: Path | None, progress: Progress) -> dict[str, FeatureSet]:
     """Embeddings of the samples by modality.
 
     Raises:

@@ -25,11 +25,13 @@ class Options(Common):
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("runs/demo")
     """Run folder."""
     preset: Literal["mini", "tiny"] = "mini"
-    """`mini` takes minutes on two cores; `tiny` is for trying the plumbing."""
+    """`mini` takes minutes on two cores; `tiny` is for trying the plumbing, and trains all its models itself."""
     clip: str | None = None
-    """Hub id or folder of a pretrained CLIP, instead of a small one trained first."""
+    """Hub id or folder of a pretrained CLIP, instead of the small one that ships with palpate."""
     autoencoder: str | None = None
-    """Hub id or folder of a pretrained VQ model, instead of a small one trained first."""
+    """Hub id or folder of a pretrained VQ model, instead of the small one that ships with palpate."""
+    from_scratch: bool = False
+    """Take nothing that ships: train the small CLIP, touch tower and autoencoder in the run, on another world and the train part."""
     group: Literal["auto", "video", "touch", "object"] = "auto"
     """What the split keeps whole; `auto` takes the video, or the touch where videos are too few."""
     background: bool = False
@@ -51,8 +53,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
 
     out = options.data if options.data is None else options.data.resolve()
     asked = PipelineOptions(
-        preset=options.preset, data=out, clip=options.clip, autoencoder=options.autoencoder, group=options.group, seed=options.seed,
-        skip_bad=options.skip_bad, background=options.background, device=options.device,
+        preset=options.preset, data=out, clip=options.clip, autoencoder=options.autoencoder, from_scratch=options.from_scratch,
+        group=options.group, seed=options.seed, skip_bad=options.skip_bad, background=options.background, device=options.device,
     )  # fmt: skip
     if (
         options.out.is_dir()
@@ -73,6 +75,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     words = ["palpate", "demo", "--preset", options.preset, "--seed", str(options.seed)]
     words += ["--data", str(options.data)] if options.data else []
     words += [w for name in ("clip", "autoencoder") if (value := getattr(options, name)) for w in (f"--{name}", value)]
+    words += ["--from-scratch"] if options.from_scratch else []
     words += ["--group", options.group] if options.group != "auto" else []
     words += ["--background"] if options.background else []
     words += ["--skip-bad"] if options.skip_bad else []

@@ -22,7 +22,7 @@ class Options(Common):
     output: OutPath
     """Folder for the towers; must be new or empty."""
     clip: str | None = None
-    """Hub id or folder of a pretrained CLIP. Default: the preset's, or, for presets without, a small one trained first on the same train part."""
+    """Hub id or folder of a pretrained CLIP, or palpate/mini. Default: the preset's, or, for presets without, a small one trained first on the same train part."""
     preset: Literal["mini", "tiny", "paper"] = "mini"
     """Size and course; `paper` is the paper's, for GPUs."""
     epochs: float | None = None

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
-from palpate.core import PalpateError
+from palpate.cli.terminal import Common, OutPath, Terminal, guard_output, require_extra
+from palpate.core import PalpateError, Problem, ProblemsError
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
     """Make a tactile image for each photo, or for each sample of a part of a data set. Run again to go on."""
 
-    model: Annotated[Path, tyro.conf.Positional]
-    """Folder of `palpate train`."""
-    output: OutPath
-    """Folder for images/ and index.json."""
-    photos: tuple[Path, ...] = ()
+    photos: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Photos, or one folder of them."""
+    output: OutPath
+    """A .png for one photo; else a folder for images/ and index.json."""
+    model: str = "palpate/mini"
+    """Folder of `palpate train`, hub id, or the generator that ships with palpate, which knows a synthetic world alone."""
     manifest: Path | None = None
     """Instead of photos: manifest file or the folder of an import."""
     split: Path | None = None
@@ -43,34 +44,57 @@ class Options(Common):
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
-    """Generates and prints where the images are."""
+    """Generates and prints where the images are, and what the generator cannot know."""
     require_extra("palpate generate")
-    if bool(options.photos) == (options.manifest is not None):
-        given = "both" if options.photos else "neither"
-        raise PalpateError("Generating takes --photos or --manifest", given, "E.g. palpate generate model/ --photos photo.jpg -o out/")
+    single = _check(options)
     from palpate.core import Split
     from palpate.data.manifest import Manifest
     from palpate.diffusion.pipeline import Pipeline
     from palpate.encoders.towers import pick_device
-    from palpate.generate import generate
+    from palpate.generate import generate, generate_one
 
-    pipeline = Pipeline.load(options.model).to(pick_device(options.device))
     manifest = None if options.manifest is None else Manifest.load(options.manifest)
     if manifest is not None and options.split is not None:
         manifest = manifest.part(Split.load(options.split), options.part)
-    photos = None if manifest is not None else options.photos[0] if len(options.photos) == 1 else list(options.photos)
-    with terminal.progress() as progress:
-        made = generate(
-            pipeline, out=options.output, manifest=manifest, photos=photos, seed=options.seed, guidance=options.guidance, steps=options.steps,
-            batch=options.batch, skip_bad=options.skip_bad, progress=progress,
-        )  # fmt: skip
-    facts = {
-        "folder": str(options.output),
-        "images": len(made.ids),
-        "made_now": made.made,
-        "skipped": len(made.skipped),
-        "pipeline": pipeline.digest,
-    }
-    terminal.facts(f"Touches {options.output}", facts)
-    terminal.skipped(made.skipped)
-    return facts | {"skipped": [asdict(p) for p in made.skipped]}
+    pipeline = Pipeline.load(options.model).to(pick_device(options.device))
+    sampling: dict[str, Any] = {"seed": options.seed, "guidance": options.guidance, "steps": options.steps}
+    skipped: Sequence[Problem] = ()
+    if single:
+        new = generate_one(pipeline, options.photos[0], options.output, **sampling)
+        facts: dict[str, Any] = {"image": str(options.output), "images": 1, "made_now": int(new)}
+    else:
+        photos = None if manifest is not None else options.photos[0] if len(options.photos) == 1 else list(options.photos)
+        with terminal.progress() as progress:
+            made = generate(
+                pipeline, out=options.output, manifest=manifest, photos=photos, batch=options.batch, skip_bad=options.skip_bad,
+                progress=progress, **sampling,
+            )  # fmt: skip
+        skipped = made.skipped
+        facts = {"folder": str(options.output), "images": len(made.ids), "made_now": made.made}
+    facts |= {"skipped": len(skipped), "model": options.model, "pipeline": pipeline.digest, "notice": pipeline.notice or None}
+    terminal.facts(f"Touch{'' if single else 'es'} {options.output}", facts)
+    terminal.skipped(skipped)
+    return facts | {"skipped": [asdict(p) for p in skipped]}
+
+
+def _check(options: Options) -> bool:
+    """Refuses what cannot work before anything large is imported; returns whether one PNG is asked for."""
+    if bool(options.photos) == (options.manifest is not None):
+        given = "both" if options.photos else "neither"
+        raise PalpateError("Generating takes photos or --manifest", given, "E.g. palpate generate photo.jpg -o touch.png")
+    from palpate.data.images import SUFFIXES
+
+    if not options.skip_bad and (missing := [p for p in options.photos if not p.exists()]):
+        problems = [Problem(str(p), "missing-file", "no such file or folder") for p in missing]
+        raise ProblemsError(problems, "Check the names, or pass --skip-bad")
+    suffix = options.output.suffix.lower()
+    if suffix not in SUFFIXES or options.output.is_dir():
+        return False
+    if suffix != ".png":
+        raise PalpateError("A touch is written as PNG, which loses nothing", f"-o {options.output}", f"E.g. -o {options.output.stem}.png")
+    if len(options.photos) != 1 or options.photos[0].is_dir():
+        got = "a manifest" if options.manifest else "a folder" if len(options.photos) == 1 else f"{len(options.photos)} photos"
+        raise PalpateError("-o with .png takes the touch of one photo", got, f"Name a folder, e.g. -o {options.output.stem}/")
+    # Every touch bears this mark near its head: an earlier one may be replaced, a photo may not.
+    guard_output(options.output, options.photos, (b"palpate.settings",))
+    return True

@@ -22,8 +22,8 @@ class Options(Common):
     """Folders of `palpate generate`; several are scored side by side under their folder names."""
     split: Path
     """Split file; its test part is scored."""
-    towers: Path
-    """Folder of `palpate encoder`; its touch tower gives the features."""
+    towers: str
+    """Folder of `palpate encoder`, a hub id, or palpate/mini; the touch tower gives the features."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
     presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ("grouped", "paper")

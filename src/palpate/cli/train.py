@@ -20,12 +20,12 @@ class Options(Common):
     """Manifest file or the folder of an import."""
     split: Path
     """Split file; only its train part is read."""
-    towers: Path
-    """Folder of `palpate encoder`."""
+    towers: str
+    """Folder of `palpate encoder`, a hub id, or palpate/mini, which ships with palpate."""
     output: OutPath
     """Folder for the pipeline; must be new or empty."""
     autoencoder: str | None = None
-    """Hub id or folder of a pretrained VQ model (diffusers VQModel). Default: a small one, trained first on the train part."""
+    """Hub id or folder of a pretrained VQ model (diffusers VQModel), or palpate/mini. Default: a small one, trained first on the train part."""
     preset: Literal["mini", "tiny", "paper"] = "mini"
     """Geometry, schedule and length; `paper` is the paper's, for GPUs."""
     source: Literal["text", "vision", "mixed"] | None = None

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Progress, Split, quiet
 from palpate.data.formats import FORMATS, Format, Validation
-from palpate.data.formats.base import import_scanned, validation
+from palpate.data.formats.base import WORLD, import_scanned, validation, world_facts
 from palpate.data.images import Check
 from palpate.data.imported import Imported
 from palpate.data.listing import write_table
@@ -79,7 +80,9 @@ def validate_dataset(
     given = {key: value for key, value in given.items() if key in taken}  # some options matter to an import alone
     if "check" in taken:
         given["check"] = check
-    return validation(name, found, found.scan(Path(source), progress=progress, **given), check=check, progress=progress)
+    looked = validation(name, found, found.scan(Path(source), progress=progress, **given), check=check, progress=progress)
+    # palpate's own world comes in the layouts of real sets, and must not be introduced as one of them.
+    return replace(looked, facts=WORLD) if world_facts(Path(source)) else looked
 
 
 def write_lists(manifest: Manifest, split: Split, out: Path) -> list[Path]:

@@ -24,7 +24,11 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from palpate.core import PalpateError, digest_json, read_json, write_json
+from palpate.core.cards import write_model_cards
+from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
 from palpate.diffusion.pixels import digest_tensors, to_bytes, to_unit
+from palpate.encoders.half import Rounding, half_copy, round_to_half
+from palpate.encoders.hub import fetch
 
 FORMAT = "palpate-autoencoder/1"
 
@@ -105,26 +109,48 @@ class Autoencoder(nn.Module):
         side = (latents.shape[2] * self.factor, latents.shape[3] * self.factor)
         return np.concatenate(parts) if parts else np.empty((0, *side, 3), np.uint8)
 
-    def save(self, folder: Path) -> None:
-        """Writes the VQModel's ``config.json`` and safetensors, and ``palpate.json`` beside them."""
-        self.vq.save_pretrained(folder, safe_serialization=True)
+    def halve(self) -> Rounding:
+        """Rounds all weights, the codebook's too, to 16 bits, here and now; see :func:`palpate.encoders.half.round_to_half`."""
+        return round_to_half({"vq": self.vq})
+
+    def save(self, folder: Path, *, half: bool = False) -> None:
+        """Writes the VQModel's ``config.json`` and safetensors, ``palpate.json`` and ``README.md`` beside them.
+
+        Args:
+            folder: where to.
+            half: :meth:`halve` first (this object too), and write 16-bit weights.
+
+        Raises:
+            PalpateError: if a weight is too large for 16 bits.
+        """
+        if half:
+            self.halve()
+        (half_copy(self.vq) if half else self.vq).save_pretrained(folder, safe_serialization=True)
         write_json(Path(folder) / "palpate.json", {"format": FORMAT, "patch": self.patch, "digest": self.digest, "card": self.card})
+        write_model_cards(Path(folder))
 
     @classmethod
     def load(cls, source: str | Path) -> Autoencoder:
-        """Loads a VQModel folder, or a hub id (which may need the network).
+        """Loads a shipped autoencoder (``palpate/mini``), a VQModel folder, or a hub id; see :mod:`palpate.core.shipped`.
 
         safetensors are preferred; an old ``.bin`` is read as weights only, and refused if it holds any other object.
+        Weights are float32 in memory.
 
         Raises:
-            PalpateError: if there is no VQModel, or its weights do not match ``palpate.json``.
+            PalpateError: if there is no VQModel, its weights do not match ``palpate.json``, or the hub cannot be reached.
         """
+        place = shipped_folder(source, "autoencoder") or Path(source)
+        fix = f"Name {', '.join(SHIPPED)}, a folder with config.json and plain weights, or a hub id that can be reached"
+        remote = is_hub_id(source)
+        if not remote and not place.is_dir():
+            raise PalpateError("The autoencoder must be a diffusers VQModel", f"no folder {place}", fix)
+        note = (fetch(str(source), ("config.json", "palpate.json"), "autoencoder", fix) if remote else place) / "palpate.json"
         try:
-            vq = VQModel.from_pretrained(str(source), low_cpu_mem_usage=False)
+            vq = VQModel.from_pretrained(
+                str(source) if remote else str(place), low_cpu_mem_usage=False, local_files_only=not remote
+            ).float()
         except (OSError, ValueError, RuntimeError) as error:
-            fix = "Name a folder with config.json and plain weights, or a hub id that can be reached"
             raise PalpateError("The autoencoder must be a diffusers VQModel", f"{source}: {str(error).splitlines()[0]}", fix) from None
-        note = Path(source) / "palpate.json"
         about = read_json(note, "autoencoder card") if note.is_file() else {}
         model = cls(vq, int(about.get("patch", 1)), about.get("card"))
         if about and model.digest != about.get("digest"):

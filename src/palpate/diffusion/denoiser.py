@@ -9,6 +9,9 @@ with m_source = 0 (``gap="none"``, the paper's reading) or the train-side mean o
 which closes the constant part of the gap between text and vision embeddings). The unconditional token of
 classifier-free guidance is all zeros, or learned. Everything here is part of the checkpoint.
 
+Beside cross-attention the token may also be added, through two layers, to the embedding of the time step (``UNetOptions.modulate``), which
+then shifts every residual block: beyond the paper, cheap, and learnt much sooner by a small network than one token of attention.
+
 The variant "w/ BG" concatenates the latent of the no-contact image to the noisy latent along channels.
 """
 
@@ -25,6 +28,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from palpate.core import PalpateError, atomic_path
+from palpate.encoders.half import Rounding, half_copy, round_to_half
 
 Source = Literal["text", "vision"]
 SOURCES: tuple[Source, ...] = ("text", "vision")
@@ -72,6 +76,7 @@ class UNetOptions:
         layers: residual blocks a level.
         head_width: channels of an attention head.
         groups: of the group normalisation.
+        modulate: also add the (first) token to the time embedding; the paper has cross-attention alone.
     """
 
     widths: tuple[int, ...]
@@ -79,6 +84,7 @@ class UNetOptions:
     layers: int = 2
     head_width: int = 32
     groups: int = 32
+    modulate: bool = False
 
 
 def build_unet(options: UNetOptions, *, channels: int, size: int, width: int, background: bool) -> UNet2DConditionModel:
@@ -98,6 +104,8 @@ def build_unet(options: UNetOptions, *, channels: int, size: int, width: int, ba
         layers_per_block=options.layers,
         cross_attention_dim=width,
         norm_num_groups=options.groups,
+        class_embed_type="projection" if options.modulate else None,
+        projection_class_embeddings_input_dim=width if options.modulate else None,
         # diffusers keeps the number of heads under this name.
         attention_head_dim=tuple(max(1, w // options.head_width) for w in options.widths),  # pyright: ignore[reportArgumentType]
     )
@@ -182,11 +190,21 @@ class Denoiser(nn.Module):
             if background is None:
                 raise PalpateError("This generator needs a background image per sample", "none", "Fill the manifest's column background")
             x = torch.cat([x, background], dim=1)
-        return cast("Tensor", self.unet(x, t, encoder_hidden_states=tokens, return_dict=False)[0])
+        first = tokens[:, 0] if self.unet.config["class_embed_type"] == "projection" else None
+        return cast("Tensor", self.unet(x, t, encoder_hidden_states=tokens, class_labels=first, return_dict=False)[0])
 
-    def save(self, folder: Path) -> None:
-        """Writes the U-Net in diffusers' format and ``condition.safetensors`` (means, learned token) beside it."""
-        self.unet.save_pretrained(folder, safe_serialization=True)
+    def halve(self) -> Rounding:
+        """Rounds the U-Net's weights to 16 bits, here and now; see :func:`palpate.encoders.half.round_to_half`."""
+        return round_to_half({"unet": self.unet})
+
+    def save(self, folder: Path, *, half: bool = False) -> None:
+        """Writes the U-Net in diffusers' format and ``condition.safetensors`` (means, learned token) beside it.
+
+        With ``half``, :meth:`halve` first (this object too), and the U-Net's weights are 16-bit; the few others stay float32.
+        """
+        if half:
+            self.halve()
+        (half_copy(self.unet) if half else self.unet).save_pretrained(folder, safe_serialization=True)
         extra = {"means": self.means.cpu().contiguous()} | ({} if self.null is None else {"null": self.null.detach().cpu().contiguous()})
         with atomic_path(Path(folder) / "condition.safetensors") as part:
             save_file(extra, part)
@@ -195,12 +213,12 @@ class Denoiser(nn.Module):
     def load(cls, folder: Path, policy: ConditionPolicy) -> Denoiser:
         """Reads what :meth:`save` wrote."""
         try:
-            unet = UNet2DConditionModel.from_pretrained(str(folder), low_cpu_mem_usage=False, use_safetensors=True)
+            unet = UNet2DConditionModel.from_pretrained(str(folder), low_cpu_mem_usage=False, use_safetensors=True, local_files_only=True)
             extra = load_file(Path(folder) / "condition.safetensors")
         except (OSError, ValueError, RuntimeError) as error:
             fix = "Copy the whole pipeline folder again"
             raise PalpateError("The denoiser must be a folder written by palpate", f"{folder}: {str(error).splitlines()[0]}", fix) from None
-        model = cls(unet, policy)
+        model = cls(unet.float(), policy)
         model.means.copy_(extra["means"])
         if model.null is not None:
             model.null.data.copy_(extra["null"])

@@ -7,6 +7,11 @@
     towers/        the vision tower (and text tower) whose embeddings the denoiser knows
     scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
     palpate.json   preset, condition policy, schedule, sampler, latent statistics, background flag, training record, digest
+    README.md      the card for people
+
+A pipeline that was trained on the towers and the autoencoder of a shipped model may refer to them instead of carrying copies: then
+``autoencoder/`` and ``towers/`` are absent, and ``"shared"`` in ``palpate.json`` names the model. Their digests stand there in either
+case and are checked on loading.
 
 The *digest* names weights, condition policy, schedule and latent statistics: what the pictures depend on beside
 seed, sampler settings and input.
@@ -26,15 +31,19 @@ from torch import Tensor
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, atomic_folder, digest_json, quiet, read_json, write_json
+from palpate.core.cards import write_model_cards
+from palpate.core.shipped import SHIPPED, is_shipped
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Source
 from palpate.diffusion.latents import LatentStats
 from palpate.diffusion.pixels import digest_tensors, to_unit
 from palpate.diffusion.sampling import SamplerOptions, build_scheduler, require_sampling, sample_latents
 from palpate.diffusion.training import Schedule
-from palpate.encoders.towers import Towers
+from palpate.encoders.hub import find_model
+from palpate.encoders.towers import Towers, load_clip
 
 FORMAT = "palpate-pipeline/1"
+SYNTHETIC = "Made by a generator that was trained on synthetic data alone (palpate's procedural world), not on a real sensor."
 #: Photos embedded at once, always: an embedding does not depend on its neighbours.
 EMBED = 32
 
@@ -184,19 +193,48 @@ class Pipeline:
             self.towers.to(str(device))
         return self
 
-    def save(self, folder: Path) -> None:
+    @property
+    def notice(self) -> str:
+        """What everyone who looks at its touches must know; empty for a pipeline trained on real data."""
+        if not self.training.get("synthetic"):
+            return ""
+        records = (self.training, self.training.get("start_record") or {})
+        known = sorted({str(name) for record in records for name in record.get("materials", ())})
+        return f"{SYNTHETIC} It knows only these materials: {', '.join(known)}." if known else SYNTHETIC
+
+    def save(self, folder: Path, *, half: bool = False, shared: str | None = None) -> None:
         """Writes the pipeline; the folder appears whole or not at all.
 
+        Args:
+            folder: must be new or empty.
+            half: round the weights to 16 bits first (of this object too: its digest changes), and write 16-bit weights.
+            shared: a shipped name whose towers and autoencoder this pipeline uses: they are then referred to, not written.
+
         Raises:
-            PalpateError: if the folder exists and is not empty.
+            PalpateError: if the folder exists and is not empty, a weight is too large for 16 bits, or the shared model differs.
         """
+        if shared is not None:
+            self._require_shared(shared)
         with atomic_folder(Path(folder)) as part:
-            self.denoiser.save(part / "unet")
-            self.autoencoder.save(part / "autoencoder")
-            if self.towers is not None:
-                self.towers.save(part / "towers")
+            self.denoiser.save(part / "unet", half=half)
+            if shared is None:
+                self.autoencoder.save(part / "autoencoder", half=half)
+                if self.towers is not None:
+                    self.towers.save(part / "towers", half=half)
+            self.__dict__.pop("digest", None)  # of the weights before rounding
             build_scheduler(self.schedule, self.sampler.method).save_pretrained(part / "scheduler")
-            write_json(part / "palpate.json", self.to_json())
+            write_json(part / "palpate.json", self.to_json() | ({} if shared is None else {"shared": shared}))
+            write_model_cards(part)
+
+    def _require_shared(self, name: str) -> None:
+        autoencoder, towers = _shared_parts(name)
+        here = (self.autoencoder.digest, self.towers.digest("vision") if self.towers else None)
+        if here != (autoencoder.digest, towers.digest("vision")):
+            raise PalpateError(
+                f"A pipeline that refers to {name} must use its autoencoder and vision tower",
+                "others",
+                "Leave out shared, or train on these",
+            )
 
     def to_json(self) -> dict[str, Any]:
         """The content of ``palpate.json``."""
@@ -217,28 +255,51 @@ class Pipeline:
         }
 
     @classmethod
-    def load(cls, folder: Path) -> Pipeline:
+    def load(cls, source: str | Path) -> Pipeline:
         """Reads a saved pipeline and checks its digest.
 
+        Args:
+            source: a shipped name (``palpate/mini``), a folder or a hub id; see :mod:`palpate.core.shipped`.
+
         Raises:
-            PalpateError: if the folder is no pipeline, is of another format, or holds other weights than it says.
+            PalpateError: if the folder is no pipeline, is of another format, holds or refers to other weights than it says, or the
+                hub cannot be reached.
         """
-        folder = Path(folder)
+        folder = find_model(source, "generator", "pipeline", "Make one with: palpate train")
         about = read_json(folder / "palpate.json", "pipeline")
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             raise PalpateError(f"{folder} must be a pipeline ({FORMAT})", "another kind of folder", "Make one with: palpate train")
         stats = about["latents"]
+        if "shared" in about:
+            autoencoder, towers = _shared_parts(str(about["shared"]))
+            if (autoencoder.digest, towers.digest("vision")) != (about["autoencoder"], about["towers"]):
+                must = f"{folder} must find the parts of {about['shared']} that it was trained on"
+                raise PalpateError(must, "those of another version of palpate", "Install the version that it names, or train again")
+        else:
+            autoencoder = Autoencoder.load(folder / "autoencoder")
+            towers = Towers.load(folder / "towers") if about["towers"] else None
         pipeline = cls(
-            autoencoder=Autoencoder.load(folder / "autoencoder"),
+            autoencoder=autoencoder,
             denoiser=Denoiser.load(folder / "unet", ConditionPolicy(**about["condition"])),
             stats=LatentStats(tuple(stats["mean"]), tuple(stats["std"]), stats["scale"]),
             schedule=Schedule(**about["schedule"]),
             sampler=SamplerOptions(**about["sampler"]),
             size=int(about["size"]),
-            towers=Towers.load(folder / "towers") if about["towers"] else None,
+            towers=towers,
             preset=about["preset"],
             training=about["training"],
         )
         if pipeline.digest != about["digest"]:
             raise PalpateError(f"The weights in {folder} must match its palpate.json", "other weights", "Copy the whole folder again")
         return pipeline
+
+
+def _shared_parts(name: str) -> tuple[Autoencoder, Towers]:
+    """Autoencoder and towers of a shipped model; a folder or hub id is refused, as it would mean another thing elsewhere.
+
+    Raises:
+        PalpateError: if the name is none of the shipped ones.
+    """
+    if not is_shipped(name):
+        raise PalpateError(f"A pipeline may refer to {', '.join(SHIPPED)}", repr(name), "Save it with its own towers and autoencoder")
+    return Autoencoder.load(name), Towers(load_clip(name))

@@ -38,6 +38,7 @@ def train_pipeline(
     steps: int | None = None,
     source: Literal["text", "vision", "mixed"] | None = None,
     background: bool = False,
+    start: Pipeline | None = None,
     cache: Path | None = None,
     device: str = "auto",
     progress: Progress = quiet,
@@ -55,12 +56,14 @@ def train_pipeline(
         steps: instead of the preset's length.
         source: instead of the preset's; ``vision`` is the baseline without text (GVST).
         background: the variant w/ BG, which sees the latent of the no-contact image.
+        start: go on from this pipeline's denoiser instead of random weights; it must use the same autoencoder, vision tower and
+            schedule, gives its latent statistics, and its record goes into the new one, so that what it saw stays declared.
         cache: folder for decoded pixels and embeddings.
         device: see :func:`palpate.encoders.towers.pick_device`.
         progress: told what is being done.
 
     Raises:
-        PalpateError: if the train part is empty, or a sample lacks what is needed.
+        PalpateError: if the train part is empty, a sample lacks what is needed, or ``start`` does not fit.
     """
     train = manifest.part(split, "train")
     if not len(train):
@@ -75,23 +78,40 @@ def train_pipeline(
     }
     latents = _latents(train, "tactile", autoencoder, preset, folder, cache, progress)
     grounds = _latents(train, "background", autoencoder, preset, folder, cache, progress) if background else None
-    stats = LatentStats.of(latents, preset.latent_scale)
+    if start is not None:
+        _require_same(start, towers, autoencoder, preset)
+    stats = LatentStats.of(latents, preset.latent_scale) if start is None else start.stats
     policy = preset.condition_for(towers.dim)
     policy = policy if source is None else replace(policy, source=source)
     loop = preset.loop_for(len(train), seed=seed)
     loop = loop if steps is None else replace(loop, steps=steps)
     denoiser = train_denoiser(
         latents, conditions, stats=stats, unet=preset.unet, policy=policy, schedule=preset.schedule, loop=loop, folder=folder / "denoiser",
-        background=grounds, device=place, progress=progress,
+        background=grounds, start=start.denoiser if start else None, device=place, progress=progress,
     )  # fmt: skip
     record = {
         "manifest": manifest.digest, "split": split.digest, "split_rule": dict(split.rule), "train_samples": len(train), "text_source": text_source,
         "autoencoder": autoencoder.digest, "vision": towers.digest("vision"), "text": towers.digest("text"), "source": policy.source,
         "background": background, "loop": asdict(loop), "unet": asdict(preset.unet), "seed": seed, "palpate": __version__,
-        "parameters": sum(p.numel() for p in denoiser.unet.parameters()),
+        "parameters": sum(p.numel() for p in denoiser.unet.parameters()), "synthetic": bool(manifest.facts.get("synthetic")),
+        "materials": sorted({str(m) for m in train.column("material") if m}),
+        "start": start.digest if start else None, "start_record": dict(start.training) if start else None,
     }  # fmt: skip
     # The pipeline carries the frozen pair alone: the touch tower scores, it does not generate.
     return Pipeline(autoencoder, denoiser, stats, preset.schedule, preset.sampler, preset.size, Towers(towers.clip), preset.name, record)
+
+
+def _require_same(start: Pipeline, towers: Towers, autoencoder: Autoencoder, preset: DiffusionPreset) -> None:
+    """A denoiser goes on only in the space that it knows."""
+    vision = start.towers.digest("vision") if start.towers else None
+    pairs = {
+        "autoencoder": (start.autoencoder.digest, autoencoder.digest),
+        "vision tower": (vision, towers.digest("vision")),
+        "schedule": (start.schedule, preset.schedule),
+    }
+    if other := [name for name, (theirs, ours) in pairs.items() if theirs != ours]:
+        got = f"another {', another '.join(other)}"
+        raise PalpateError("The pipeline to start from must share autoencoder, vision tower and schedule", got, "Leave it out")
 
 
 def _latents(

@@ -62,6 +62,7 @@ def train_denoiser(
     loop: LoopOptions,
     folder: Path,
     background: Tensor | np.ndarray | None = None,
+    start: Denoiser | None = None,
     key: str = "",
     device: str | torch.device = "cpu",
     progress: Progress = quiet,
@@ -78,6 +79,8 @@ def train_denoiser(
         loop: length, rate, averaging; its seed also seeds the weights.
         folder: for checkpoints and the log.
         background: latents (n, c, h, w) of the no-contact images, for the variant w/ BG.
+        start: go on from these weights instead of random ones; the geometry must be the same. The modality means are those of
+            ``conditions`` all the same.
         key: anything else that a checkpoint must match (latents and conditions are compared by digest anyway).
         device: where to train.
         progress: called after each step.
@@ -86,7 +89,7 @@ def train_denoiser(
         The denoiser with averaged weights, frozen.
 
     Raises:
-        PalpateError: if a source is missing or lengths differ.
+        PalpateError: if a source is missing, lengths differ, or ``start`` has another geometry.
     """
     n, channels, size = latents.shape[0], latents.shape[1], latents.shape[2]
     tables = {source: torch.as_tensor(np.asarray(table), dtype=torch.float32) for source, table in conditions.items()}
@@ -102,15 +105,28 @@ def train_denoiser(
         torch.manual_seed(seed_for(loop.seed, "denoiser"))
         net = build_unet(unet, channels=channels, size=size, width=policy.width, background=background is not None)
         model = Denoiser(net, policy, means).to(device)
+    if start is not None:
+        _copy_weights(start, model)
     with torch.no_grad():
         tokens: dict[Source, Tensor] = {s: model.tokens(tables[s], s).to("cpu") for s in policy.sources}
     data = {f"tokens.{s}": value for s, value in tokens.items()} | {"latents": torch.tensor(np.asarray(latents))}
     if background is not None:
         data["background"] = torch.tensor(np.asarray(background))
-    key = digest_json([key, asdict(stats), asdict(unet), asdict(policy), asdict(schedule), digest_tensors(data)])
+    begin = [] if start is None else [digest_tensors(start.unet.state_dict())]
+    key = digest_json([key, asdict(stats), asdict(unet), asdict(policy), asdict(schedule), digest_tensors(data), *begin])
     loss = DiffusionLoss(latents, tokens, background, stats, schedule)
     fit(model, loss, n, loop, folder, what="generator", key=key, progress=progress)
     return model.eval().requires_grad_(requires_grad=False)
+
+
+def _copy_weights(source: Denoiser, target: Denoiser) -> None:
+    """The U-Net, and the unconditional token if both have learned one; other shapes are refused."""
+    shapes = [{name: tuple(v.shape) for name, v in d.unet.state_dict().items()} for d in (source, target)]
+    if shapes[0] != shapes[1]:
+        raise PalpateError("The denoiser to start from must have the geometry of the preset", "another geometry", "Leave it out")
+    target.unet.load_state_dict(source.unet.state_dict())
+    if source.null is not None and target.null is not None:
+        target.null.data.copy_(source.null.data)
 
 
 class DiffusionLoss:

@@ -112,7 +112,7 @@ def material_accuracy(
     majority = Counter(_labelled(train, "train")[1]).most_common(1)[0][0]
     share = 1 / len(counts) * (majority in counts) if balanced else counts[majority] / len(labels)
     recall = {name: float(hit[[label == name for label in labels]].mean()) for name in sorted(counts)}
-    return _score(
+    return mean_over_groups(
         "material accuracy (balanced)" if balanced else "material accuracy", hit, rows, groups, subject, split, test.encoder, seed,
         {"probe": "logistic regression"},
         {"chance": 1 / len(probe.classes), "majority": share, "recall": recall, "l2": probe.l2,
@@ -183,7 +183,7 @@ def retrieval(
         value = hits[k][used] / seen[used]
         names = [g for g, u in zip(groups, used, strict=True) if u]
         out.append(
-            _score(
+            mean_over_groups(
                 f"{name} top-{k}", value, seen[used], names, subject, split, queries.encoder, seed if pool else None, settings,
                 {"chance": chance[k], "key_encoder": keys.encoder}, "mean over pools" if pool else "mean",
             )
@@ -269,7 +269,7 @@ def _choose(x: Floats, y: NDArray[np.int64], rows: Floats, groups: Sequence[str]
     return max(GRID, key=lambda l2: (right[l2], l2))
 
 
-def _score(
+def mean_over_groups(
     metric: str, value: Floats, rows: Floats, groups: Sequence[str], subject: str, split: str | None, encoder: str | None,
     seed: int | None, settings: Mapping[str, object], details: Mapping[str, object], estimator: str = "mean",
 ) -> Score:  # fmt: skip

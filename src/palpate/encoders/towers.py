@@ -8,38 +8,39 @@ A saved set is a folder::
     palpate.json        the card: preset, training and split digests, seeds, steps, versions, loss curve, digests of the towers
     clip/               transformers' CLIPModel: config.json, model.safetensors, tokenizer files, preprocessor_config.json
     touch/              transformers' CLIPVisionModelWithProjection: config.json, model.safetensors, preprocessor_config.json
+    README.md           the card for people; clip/ has both files of its own
 
-The digest of a tower is SHA-256 over the architecture, the preprocessing (for text: the tokenizer) and every weight.
+The digest of a tower is SHA-256 over the architecture, the preprocessing (for text: the tokenizer) and every weight. Weights may be
+saved in 16 bits (:mod:`palpate.encoders.half`); they are rounded before the digest is taken, and are 32 bits again when loaded.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import pickle
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError
 from torch import Tensor, nn
 from transformers import AutoTokenizer, CLIPModel, CLIPVisionConfig, CLIPVisionModelWithProjection
-from transformers.utils import logging as hf_logging
 from transformers.utils.hub import cached_file
 
-from palpate.core import PalpateError, atomic_folder, digest_json, read_json, seed_for, write_json
-from palpate.core.digest import canonical_json
+from palpate.core import PalpateError, atomic_folder, read_json, seed_for, write_json
+from palpate.core.cards import write_model_cards
+from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
+from palpate.encoders.half import Rounding, round_to_half
+from palpate.encoders.hub import fetch, find_model
 from palpate.encoders.preprocess import Preprocess
 from palpate.encoders.tokenizer import save_tokenizer
+from palpate.encoders.weights import UNREADABLE, architecture, digest_modules, load_weights, save_weights, silent, tokenizer_digest
 
 TowerName = Literal["vision", "text", "touch"]
 TOWERS: tuple[TowerName, ...] = get_args(TowerName)
 FORMAT = "palpate-towers/1"
+CLIP_FORMAT = "palpate-clip/1"
 #: What a local CLIP folder must hold, as alternatives.
 CLIP_FILES = {
     "config.json": ("config.json",),
@@ -47,13 +48,6 @@ CLIP_FILES = {
     "tokenizer.json (or vocab.json and merges.txt)": ("tokenizer.json", "vocab.json"),
     "preprocessor_config.json": ("preprocessor_config.json",),
 }
-#: What transformers and huggingface_hub raise for an unreachable hub, absent files, foreign formats and pickled objects.
-UNREADABLE = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError, pickle.UnpicklingError)
-#: The part of a configuration that decides what a tower computes; the rest varies between versions of transformers.
-ARCHITECTURE = (
-    "hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads", "image_size", "patch_size", "num_channels",
-    "vocab_size", "max_position_embeddings", "eos_token_id", "projection_dim", "hidden_act", "layer_norm_eps",
-)  # fmt: skip
 
 
 @dataclass
@@ -94,55 +88,73 @@ class FrozenClip:
         """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalised; differentiable."""
         return F.normalize(_projected(self.model.get_image_features(pixel_values=pixels)), dim=-1)
 
-    def digest(self, tower: TowerName) -> str:
+    def digest(self, tower: str) -> str:
         """SHA-256 of the vision or the text tower."""
         if tower == "vision":
             parts = {"tower": self.model.vision_model, "projection": self.model.visual_projection}
-            facts = {"preprocess": asdict(self.preprocess), **_architecture(_config(self.model).vision_config)}
+            facts = {"preprocess": asdict(self.preprocess), **architecture(_config(self.model).vision_config)}
         else:
             parts = {"tower": self.model.text_model, "projection": self.model.text_projection}
-            facts = {"tokenizer": _tokenizer_digest(self.tokenizer), **_architecture(_config(self.model).text_config)}
-        return _digest(parts, facts)
+            facts = {"tokenizer": tokenizer_digest(self.tokenizer), **architecture(_config(self.model).text_config)}
+        return digest_modules(parts, facts)
 
-    def save(self, folder: Path) -> None:
+    def halve(self) -> Rounding:
+        """Rounds the weights to 16 bits, here and now; see :func:`palpate.encoders.half.round_to_half`."""
+        return round_to_half({"clip": self.model})
+
+    def save(self, folder: Path, *, half: bool = False) -> None:
         """Writes the standard CLIP folder, which ``CLIPModel.from_pretrained`` reads; whole or not at all.
 
+        Args:
+            folder: must be new or empty.
+            half: :meth:`halve` first (this object too), and write 16-bit weights.
+
         Raises:
-            PalpateError: if the folder exists and is not empty.
+            PalpateError: if the folder exists and is not empty, or a weight is too large for 16 bits.
         """
         with atomic_folder(Path(folder)) as part:
-            self._write(part)
+            self._write(part, half=half)
+            write_model_cards(part)
 
-    def _write(self, folder: Path) -> None:
-        with _silent():
-            self.model.save_pretrained(folder)
+    def _write(self, folder: Path, *, half: bool) -> None:
+        if half:
+            self.halve()
+        save_weights(self.model, folder, half=half)
+        with silent():
             save_tokenizer(self.tokenizer, folder)
         write_json(folder / "preprocessor_config.json", self.preprocess.to_config())
-        write_json(folder / "palpate.json", {"format": "palpate-clip/1", "name": self.name, "card": self.card})
+        digests = {tower: self.digest(tower) for tower in ("vision", "text")}
+        write_json(folder / "palpate.json", {"format": CLIP_FORMAT, "name": self.name, "digests": digests, "card": self.card})
 
 
 def load_clip(name_or_folder: str | Path, *, device: str = "cpu") -> FrozenClip:
-    """A frozen CLIP from a local folder or from the hub; a local folder needs no network.
+    """A frozen CLIP that ships with the package, from a local folder or from the hub; only the last needs a network.
 
     Args:
-        name_or_folder: a folder as :meth:`FrozenClip.save` or transformers writes it, or a hub id (``openai/clip-vit-large-patch14``).
-            safetensors is preferred; a ``.bin`` is read as weights only.
+        name_or_folder: a shipped name (``palpate/mini``), a folder as :meth:`FrozenClip.save` or transformers writes it, or a hub id
+            (``openai/clip-vit-large-patch14``); which comes first: :mod:`palpate.core.shipped`. safetensors is preferred; a
+            ``.bin`` is read as weights only.
         device: see :func:`pick_device`.
 
     Raises:
-        PalpateError: if files are missing, unreadable or of another model, or the hub cannot be reached.
+        PalpateError: if files are missing, unreadable, of another model or changed since, or the hub cannot be reached.
     """
-    name, folder = str(name_or_folder), Path(name_or_folder)
-    local = folder.is_dir()
+    shipped = shipped_folder(name_or_folder, "clip")
+    folder = shipped or Path(name_or_folder)
+    name = str(folder) if shipped else str(name_or_folder)
+    local = not is_hub_id(name_or_folder)
+    note = folder / "palpate.json"
     if local:
         missing = [what for what, choices in CLIP_FILES.items() if not any((folder / c).is_file() for c in choices)]
         if missing:
             raise PalpateError(
                 f"The CLIP folder {folder} must hold {', '.join(CLIP_FILES)}", f"no {', no '.join(missing)}", "Add the files"
             )
+    else:  # a small file first: out of reach, the hub is asked once instead of many times
+        note = fetch(name, ("config.json", "palpate.json"), "CLIP", f"Pass a folder that holds {', '.join(CLIP_FILES)}") / "palpate.json"
     try:
-        with _silent():
-            model = _whole(CLIPModel, name, local_files_only=local)
+        with silent():
+            model = load_weights(CLIPModel, name, local_files_only=local)
             tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
             processor = cached_file(name, "preprocessor_config.json", local_files_only=local)
     except UNREADABLE as error:
@@ -151,8 +163,10 @@ def load_clip(name_or_folder: str | Path, *, device: str = "cpu") -> FrozenClip:
         raise PalpateError(must, (str(error).splitlines() or [type(error).__name__])[0], fix) from None
     config = read_json(Path(str(processor)), "image processor")
     preprocess = Preprocess.from_config(config, int(_config(model).vision_config.image_size))
-    card = read_json(folder / "palpate.json", "CLIP card") if local and (folder / "palpate.json").is_file() else {}
-    clip = FrozenClip(model.float().eval().requires_grad_(False), tokenizer, preprocess, card.get("name", name), card.get("card", {}))
+    about = read_json(note, "CLIP card") if note.is_file() else {}
+    called = str(name_or_folder) if shipped else about.get("name", name)
+    clip = FrozenClip(model.float().eval().requires_grad_(False), tokenizer, preprocess, called, about.get("card", {}))
+    _require_digests(clip.digest, about.get("digests", {}), name)
     move(clip.model, pick_device(device))
     return clip
 
@@ -223,45 +237,57 @@ class Towers:
         if tower == "vision" or tower == "text":
             return self.clip.digest(tower)
         touch, preprocess = self._touch(tower)
-        return _digest({"touch": touch}, {"preprocess": asdict(preprocess), **_architecture(touch.config)})
+        return digest_modules({"touch": touch}, {"preprocess": asdict(preprocess), **architecture(touch.config)})
 
-    def save(self, folder: Path) -> None:
+    def halve(self) -> Rounding:
+        """Rounds the weights of all towers to 16 bits, here and now; see :func:`palpate.encoders.half.round_to_half`."""
+        return round_to_half({"clip": self.clip.model} | ({} if self.touch is None else {"touch": self.touch}))
+
+    def save(self, folder: Path, *, half: bool = False) -> None:
         """Writes the folder described at the head of this file; whole or not at all.
 
+        Args:
+            folder: must be new or empty.
+            half: :meth:`halve` first (this object too), and write 16-bit weights.
+
         Raises:
-            PalpateError: if the folder exists and is not empty.
+            PalpateError: if the folder exists and is not empty, or a weight is too large for 16 bits.
         """
         with atomic_folder(Path(folder)) as part:
             (part / "clip").mkdir()
-            self.clip._write(part / "clip")  # pyright: ignore[reportPrivateUsage]
+            if half:
+                self.halve()
+            self.clip._write(part / "clip", half=half)  # pyright: ignore[reportPrivateUsage]
             if self.touch is not None and self.touch_preprocess is not None:
-                with _silent():
-                    self.touch.save_pretrained(part / "touch")
+                save_weights(self.touch, part / "touch", half=half)
                 write_json(part / "touch" / "preprocessor_config.json", self.touch_preprocess.to_config())
             names = [t for t in TOWERS if t != "touch" or self.touch is not None]
             write_json(part / "palpate.json", {"format": FORMAT, "digests": {t: self.digest(t) for t in names}, "card": self.card})
+            write_model_cards(part)
 
     @classmethod
-    def load(cls, folder: Path, *, device: str = "cpu") -> Towers:
+    def load(cls, source: str | Path, *, device: str = "cpu") -> Towers:
         """Reads what :meth:`save` wrote and checks every tower against its digest.
 
+        Args:
+            source: a shipped name (``palpate/mini``), a folder or a hub id; see :mod:`palpate.core.shipped`.
+            device: see :func:`pick_device`.
+
         Raises:
-            PalpateError: if the folder is of another kind, incomplete, or changed since.
+            PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub cannot be reached.
         """
-        folder = Path(folder)
+        folder = find_model(source, "towers", "set of towers", "Train one with: palpate encoder")
         card = read_json(folder / "palpate.json", "card of the towers")
         if not isinstance(card, Mapping) or card.get("format") != FORMAT:
             raise PalpateError(f"{folder} must hold towers ({FORMAT})", "another kind of folder", "Train with: palpate encoder")
-        towers = cls(load_clip(folder / "clip"), card=dict(card["card"]))
+        # A shipped CLIP keeps its name, so that cards of what is trained beside it say it.
+        clip = load_clip(source) if str(source) in SHIPPED and isinstance(source, str) else load_clip(folder / "clip")
+        towers = cls(clip, card=dict(card["card"]))
         if "touch" in card["digests"]:
             towers.touch = _load_touch(folder / "touch")
             config = read_json(folder / "touch" / "preprocessor_config.json", "touch preprocessing")
             towers.touch_preprocess = Preprocess.from_config(config, int(_config(towers.touch).image_size))
-        for name, digest in card["digests"].items():
-            if towers.digest(name) != digest:
-                raise PalpateError(
-                    f"The {name} tower in {folder} must match its digest", "weights or settings that were changed", "Save the towers again"
-                )
+        _require_digests(towers.digest, card["digests"], str(folder))
         return towers.to(device)
 
     def _touch(self, tower: str) -> tuple[CLIPVisionModelWithProjection, Preprocess]:
@@ -313,61 +339,23 @@ def _config(model: nn.Module) -> Any:
     return model.config
 
 
+def _require_digests(digest: Callable[[str], str], wanted: Mapping[str, str], place: str) -> None:
+    for name, value in wanted.items():
+        if digest(name) != value:
+            must = f"The {name} tower in {place} must match its digest"
+            raise PalpateError(must, "weights or settings that were changed", "Save the towers again")
+
+
 def _load_touch(folder: Path) -> CLIPVisionModelWithProjection:
     try:
-        with _silent():
-            model = _whole(CLIPVisionModelWithProjection, str(folder), local_files_only=True, use_safetensors=True)
+        with silent():
+            model = load_weights(CLIPVisionModelWithProjection, str(folder), local_files_only=True, use_safetensors=True)
     except UNREADABLE as error:
         got = (str(error).splitlines() or ["unreadable files"])[0]
         raise PalpateError(f"The touch tower {folder} must hold config.json and model.safetensors", got, "Save the towers again") from None
     return model.float().eval().requires_grad_(False)
 
 
-def _whole(kind: Any, name: str, **how: bool) -> Any:
-    """``kind.from_pretrained``, refusing what transformers only warns about: weights that the file lacks are drawn at random."""
-    model, report = kind.from_pretrained(name, output_loading_info=True, **how)
-    if lacking := sorted(report["missing_keys"]):
-        raise ValueError(f"{len(lacking)} weights are missing, first {lacking[0]}")
-    return model
-
-
 def _projected(output: Any) -> Tensor:
     """The projected features: a tensor in transformers 4, the field ``pooler_output`` in 5."""
     return output if isinstance(output, Tensor) else output.pooler_output
-
-
-def _architecture(config: Any) -> dict[str, Any]:
-    return {name: getattr(config, name) for name in ARCHITECTURE if hasattr(config, name)}
-
-
-def _tokenizer_digest(tokenizer: Any) -> str:
-    backend = getattr(tokenizer, "backend_tokenizer", None)
-    if backend is None:  # a slow tokenizer of transformers 4
-        return digest_json(tokenizer.get_vocab())
-    # Truncation and padding are state of the last call, not of the tokenizer.
-    table = json.loads(backend.to_str())
-    return digest_json({k: v for k, v in table.items() if k not in ("truncation", "padding")})
-
-
-def _digest(parts: Mapping[str, nn.Module], facts: Mapping[str, Any]) -> str:
-    state = hashlib.sha256(canonical_json(dict(facts)).encode())
-    for part, module in sorted(parts.items()):
-        for name, value in sorted(module.state_dict().items()):
-            array: np.ndarray = value.detach().cpu().contiguous().numpy()
-            state.update(f"{part}.{name} {array.dtype} {array.shape}\n".encode())
-            state.update(array.tobytes())
-    return state.hexdigest()
-
-
-@contextmanager
-def _silent() -> Generator[None]:
-    """No load reports or progress bars of transformers inside; its settings are restored."""
-    level, bars = hf_logging.get_verbosity(), hf_logging.is_progress_bar_enabled()
-    hf_logging.set_verbosity_error()
-    hf_logging.disable_progress_bar()
-    try:
-        yield
-    finally:
-        hf_logging.set_verbosity(level)
-        if bars:
-            hf_logging.enable_progress_bar()

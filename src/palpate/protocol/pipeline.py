@@ -2,12 +2,13 @@
 
 ::
 
-    world -> data -> split -> pretraining world -> clip -> autoencoder -> towers -> generator -> generated -> scores
+    world -> data -> split -> (pretraining world -> clip -> autoencoder) -> towers -> generator -> generated -> scores
 
 Each stage reads the ones before it and is kept in the run folder under the digest of what it read
 (:class:`palpate.core.Run`), so a run that was killed goes on from its last finished stage, and a changed option
-redoes only what depends on it. ``world`` is skipped where data is given; ``pretraining``, ``clip`` and
-``autoencoder`` are skipped where pretrained models are given.
+redoes only what depends on it. ``world`` is skipped where data is given. The stages in brackets train small stand-ins for
+pretrained models; they are skipped where such models are given or taken from those that ship with the package, which is the
+preset's choice (:attr:`PipelinePreset.models`). What each model saw stands in its card, which the next model's card contains.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
@@ -40,6 +40,7 @@ from palpate.core import (
     read_json,
     write_json,
 )
+from palpate.core.shipped import Part, is_shipped, shipped_folder
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
@@ -55,6 +56,7 @@ from palpate.encoders.towers import Towers, load_clip, pick_device
 from palpate.generate import Generated, generate
 from palpate.leakage.audit import Pictures, audit_split
 from palpate.leakage.splits import describe, leak_free_split
+from palpate.protocol.inputs import fresh, reconstruction, repeats, require_unseen, stamp_of
 from palpate.protocol.presets import preset as pipeline_preset
 from palpate.protocol.scoring import score_generated
 from palpate.sim import WorldOptions, write_world
@@ -67,8 +69,9 @@ class PipelineOptions:
     Attributes:
         preset: see :data:`palpate.protocol.presets.PRESETS`.
         data: a data set on disk, or None for the embedded world.
-        clip: hub id or folder of a pretrained CLIP, or None to train a small one first.
-        autoencoder: hub id or folder of a pretrained VQ model, or None to train a small one first.
+        clip: shipped name, hub id or folder of a pretrained CLIP; None: the preset's choice.
+        autoencoder: shipped name, hub id or folder of a pretrained VQ model; None: the preset's choice.
+        from_scratch: where ``clip`` or ``autoencoder`` is None, train a small one first, and take nothing that ships.
         group: what the split keeps whole; ``auto`` falls back to touches where videos are too few.
         seed: of the split, the weights, the order of training and the noise.
         skip_bad: leave bad rows and images of ``data`` out and list them.
@@ -81,6 +84,7 @@ class PipelineOptions:
     data: Path | None = None
     clip: str | None = None
     autoencoder: str | None = None
+    from_scratch: bool = False
     group: str = "auto"
     seed: int = 0
     skip_bad: bool = False
@@ -100,6 +104,7 @@ class PipelineOutcome:
         scores: see :func:`palpate.protocol.scoring.score_generated`.
         stages: by name, with digests, facts and times.
         options: what was asked for.
+        models: the pretrained models that were taken, by role (``clip``, ``autoencoder``); None: trained in the run.
     """
 
     manifest: Manifest
@@ -109,11 +114,13 @@ class PipelineOutcome:
     scores: list[Score]
     stages: Mapping[str, Stage]
     options: PipelineOptions
+    models: Mapping[str, str | None]
 
     def settings(self) -> dict[str, Any]:
         """Options, digests, versions and times, for the page."""
         packages = ("numpy", "torch", "diffusers", "transformers", "polars", "pillow")
         return {
+            "models": dict(self.models),
             "options": {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(self.options).items()},
             "digests": {"manifest": self.manifest.digest, "split": self.split.digest}
             | {name: stage.facts["digest"] for name, stage in self.stages.items() if "digest" in stage.facts},
@@ -148,25 +155,33 @@ def run_pipeline(
     work = _Pipeline(options, Run(Path(out), say), progress)
     manifest = work.data()
     split, audits = work.split(manifest)
-    pretraining = None if options.clip and options.autoencoder else work.pretraining(manifest, split)
-    clip = options.clip or work.clip(pretraining)
-    autoencoder = options.autoencoder or work.autoencoder(pretraining, manifest, split)
+    pretraining = None if work.ready["clip"] and work.ready["autoencoder"] else work.pretraining(manifest, split)
+    clip = work.ready["clip"] or work.clip(pretraining)
+    autoencoder = work.ready["autoencoder"] or work.autoencoder(pretraining, manifest, split)
     towers = work.towers(manifest, split, clip, pretraining)
     model = work.generator(manifest, split, towers, autoencoder)
     generated = work.generated(manifest, split, model)
     scores = work.scores(manifest, split, generated, towers)
-    return PipelineOutcome(manifest, split, audits, generated, scores, work.run.stages, options)
+    return PipelineOutcome(manifest, split, audits, generated, scores, work.run.stages, options, work.ready)
 
 
 class _Pipeline:
     """The stages; each method returns what later ones read."""
 
     def __init__(self, options: PipelineOptions, run: Run, progress: Progress) -> None:
+        if options.data is not None and not options.data.exists():
+            raise PalpateError("The data must exist", f"nothing at {options.data}", "Check --data")
         self.options, self.run, self.progress = options, run, progress
         self.preset = pipeline_preset(options.preset)
         self.encoder = encoder_preset(self.preset.encoder)
         self.diffusion = diffusion_preset(self.preset.diffusion)
         self.cache = run.folder / "cache"
+        self.shipped = None if options.from_scratch else self.preset.models
+        #: Pretrained models by role; None: trained in this run.
+        self.ready = {"clip": options.clip or self.shipped, "autoencoder": options.autoencoder or self.shipped}
+        for part in ("clip", "towers", "autoencoder", "generator"):  # an unknown or absent model is told now, not minutes later
+            for name in filter(None, self.ready.values()):
+                shipped_folder(name, part)
 
     def _digest(self, *names: str) -> dict[str, str]:
         return {name: self.run.stages[name].digest for name in names if name in self.run.stages}
@@ -181,8 +196,8 @@ class _Pipeline:
     def data(self) -> Manifest:
         """The manifest of the given data, or of the embedded world."""
         source = self.options.data if self.options.data is not None else self._world("world", self.preset.world)
-        if not source.exists():
-            raise PalpateError("The data must exist", f"nothing at {source}", "Check --data")
+        if any(map(is_shipped, filter(None, self.ready.values()))):
+            require_unseen(source)
         size = None if self.options.data is None else 4 * self.diffusion.size
 
         def build(folder: Path) -> dict[str, Any]:
@@ -193,7 +208,7 @@ class _Pipeline:
                 "skipped": [str(p) for p in done.skipped], "inconclusive": done.inconclusive, "facts": dict(done.facts),
             }  # fmt: skip
 
-        inputs = {"source": str(source.resolve()), "stamp": _stamp(source), "skip_bad": self.options.skip_bad, "size": size}
+        inputs = {"source": str(source.resolve()), "stamp": stamp_of(source), "skip_bad": self.options.skip_bad, "size": size}
         stage = self.run.stage("data", inputs | self._digest("world"), build)
         return Manifest.load(stage.folder)
 
@@ -239,7 +254,7 @@ class _Pipeline:
                 pretraining, everything, self.encoder, folder / "training", seed=self.options.seed, cache=self.cache, device=self.options.device,
                 progress=self.progress,
             )  # fmt: skip
-            clip.save(_fresh(folder / "clip"))
+            clip.save(fresh(folder / "clip"))
             return {"digest": clip.digest("vision"), "text": clip.digest("text"), "samples": len(pretraining)}
 
         inputs = {"preset": self.encoder, "train": pretraining.digest, "seed": self.options.seed}
@@ -258,14 +273,14 @@ class _Pipeline:
         def build(folder: Path) -> dict[str, Any]:
             images = cached_images(pretraining, "tactile", self.diffusion.size, self.cache, self.progress)
             mine = cached_images(own, "tactile", self.diffusion.size, self.cache, self.progress)
-            images = np.concatenate([images, *[mine] * _repeats(len(images), len(mine), self.preset.repeat)])
+            images = np.concatenate([images, *[mine] * repeats(len(images), len(mine), self.preset.repeat)])
             key = digest_lines([pretraining.digest, own.digest])
             held_out = cached_images(manifest.part(split, "test"), "tactile", self.diffusion.size, self.cache, self.progress)
             model = train_autoencoder(
                 images, options, folder / "training", held_out=held_out, seed=self.options.seed, key=key, device=pick_device(self.options.device),
                 progress=self.progress,
             )  # fmt: skip
-            model.save(_fresh(folder / "autoencoder"))
+            model.save(fresh(folder / "autoencoder"))
             return {"digest": model.digest, "images": len(images), "on test touches": model.card["held_out"]}
 
         inputs = {
@@ -281,7 +296,11 @@ class _Pipeline:
         return str(stage.folder / "autoencoder")
 
     def towers(self, manifest: Manifest, split: Split, clip: str, pretraining: Manifest | None) -> Towers:
-        """The frozen pair with a touch tower: trained on the pretraining samples, if there are any, then on the train part."""
+        """The frozen pair with a touch tower, trained on the train part, from where there is something to go on from.
+
+        That is the shipped touch tower beside the shipped CLIP, or one trained on the pretraining samples first; else random weights.
+        """
+        ready = clip if is_shipped(clip) else None
 
         def build(folder: Path) -> dict[str, Any]:
             frozen = load_clip(clip, device=self.options.device)
@@ -292,18 +311,22 @@ class _Pipeline:
                 "progress": self.progress,
             }
             before, after = self.preset.touch_epochs
-            if pretraining is None:
+            if ready is not None:
+                start = Towers.load(ready)
+                towers = train_touch(manifest, split, frozen, self.encoder, folder / "training", epochs=after, start=start, **common)
+            elif pretraining is None:
                 towers = train_touch(manifest, split, frozen, self.encoder, folder / "training", **common)
             else:
                 everything = Split.from_ids(train=pretraining.ids, rule={"name": "pretraining"}, manifest=pretraining.digest)
                 start = train_touch(pretraining, everything, frozen, self.encoder, folder / "pretraining", epochs=before, **common)
                 towers = train_touch(manifest, split, frozen, self.encoder, folder / "training", epochs=after, start=start, **common)
-            towers.save(_fresh(folder / "towers"))
+            towers.save(fresh(folder / "towers"))
             return {"digest": towers.digest("touch"), "text_source": towers.card.get("text_source")}
 
         inputs = {
             "preset": self.encoder,
             "clip": self._model_stamp("clip", clip),
+            "start": ready and self._model_stamp("towers", ready),
             "seed": self.options.seed,
             "epochs": self.preset.touch_epochs,
         }
@@ -313,15 +336,19 @@ class _Pipeline:
 
     def generator(self, manifest: Manifest, split: Split, towers: Towers, autoencoder: str) -> Pipeline:
         """The trained pipeline."""
+        fits = self.shipped is not None and set(self.ready.values()) == {self.shipped} and not self.options.background
+        start = self.shipped if self.preset.start and fits else None
 
         def build(folder: Path) -> dict[str, Any]:
             pipeline = train_pipeline(
                 manifest, split, towers, Autoencoder.load(autoencoder), self.diffusion, folder / "training", seed=self.options.seed,
-                background=self.options.background, cache=self.cache, device=self.options.device, progress=self.progress,
+                background=self.options.background, start=Pipeline.load(start) if start else None, cache=self.cache,
+                device=self.options.device, progress=self.progress,
             )  # fmt: skip
-            pipeline.save(_fresh(folder / "model"))
-            loop = pipeline.training["loop"]
+            pipeline.save(fresh(folder / "model"))
+            loop, model = pipeline.training["loop"], pipeline.autoencoder
             return {
+                "autoencoder on test touches": reconstruction(manifest, split, model, pipeline.size, self.cache, self.progress),
                 "digest": pipeline.digest, "parameters": pipeline.training["parameters"], "steps": loop["steps"], "batch": loop["batch"],
                 "learning_rate": loop["lr"], "source": pipeline.training["source"], "sampler": dataclasses.asdict(pipeline.sampler),
             }  # fmt: skip
@@ -330,6 +357,7 @@ class _Pipeline:
             "preset": self.diffusion,
             "autoencoder": self._model_stamp("autoencoder", autoencoder),
             "background": self.options.background,
+            "start": start and self._model_stamp("generator", start),
         }
         stage = self.run.stage("generator", inputs | {"seed": self.options.seed} | self._digest("split", "data", "towers"), build)
         return Pipeline.load(stage.folder / "model")
@@ -361,26 +389,10 @@ class _Pipeline:
         stage = self.run.stage("scores", inputs | self._digest("split", "data", "generated", "towers"), build)
         return [Score.from_json(s) for s in read_json(stage.folder / "scores.json", "scores")]
 
-    def _model_stamp(self, name: str, source: str) -> str:
-        """What names a frozen model: its stage's digest, the digest of its folder, or its hub id."""
-        if name in self.run.stages:
-            return self.run.stages[name].digest
+    def _model_stamp(self, part: Part, source: str) -> str:
+        """What names a ready model: its stage's digest, the digest of its folder, or its hub id."""
+        if (shipped := shipped_folder(source, part)) is not None:
+            return digest_folder(shipped, "**/*.json")  # they hold the digests of the weights
+        if part in self.run.stages:
+            return self.run.stages[part].digest
         return digest_folder(Path(source)) if Path(source).is_dir() else source
-
-
-def _fresh(folder: Path) -> Path:
-    """The folder, without what a call that was killed between saving and finishing its stage left in it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    return folder
-
-
-def _repeats(others: int, mine: int, share: float) -> int:
-    """How often ``mine`` (already there once among ``others``) must be added to be ``share`` of the whole; at most 8 times."""
-    rest = max(0, others - mine)
-    return int(np.clip(np.ceil(share / (1 - share) * rest / max(1, mine)) - 1, 0, 8))
-
-
-def _stamp(source: Path) -> str:
-    """Names, sizes and modification times of the files below ``source``: changes when the data set does."""
-    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
-    return digest_lines(f"{p.relative_to(source)} {(s := p.stat()).st_size} {s.st_mtime_ns}" for p in files)

@@ -16,11 +16,15 @@ class PipelinePreset:
     Attributes:
         name: for ``--preset``.
         world: the embedded data set, used where no data is given.
-        pretraining: another world, of other objects, on which the frozen towers and the autoencoder are trained.
+        pretraining: another world, of other objects, on which towers and autoencoder are trained where no ready ones are taken.
         encoder, diffusion: names of the presets of those rooms.
+        models: shipped models that stand for the pretrained ones: the frozen CLIP and autoencoder, and the touch tower that training
+            goes on from; None: all are trained in the run.
+        start: whether the generator goes on from that of ``models`` instead of from random weights.
         train: share of the train part.
         repeat: the train part's touches are repeated until they are this share of the autoencoder's training set.
-        touch_epochs: passes of the touch tower over the pretraining samples, then over the train part.
+        touch_epochs: passes of the touch tower over the pretraining samples, then over the train part (the first are left out where
+            it goes on from a ready one).
         cost: measured on two CPU cores.
     """
 
@@ -29,6 +33,8 @@ class PipelinePreset:
     pretraining: WorldOptions
     encoder: str
     diffusion: str
+    models: str | None = None
+    start: bool = False
     train: float = 0.75
     repeat: float = 1 / 3
     touch_epochs: tuple[float, float] = (5, 6)
@@ -45,7 +51,7 @@ _MINI_BEFORE = replace(WORLDS["pretrain"], materials=_TEN, objects_per_material=
 PRESETS = {p.name: p for p in (
     #              name    world   pretraining                encoder diffusion
     PipelinePreset("tiny", _TINY,  replace(_TINY, seed=1000), "tiny", "tiny", train=0.75, cost="for tests: under a minute"),
-    PipelinePreset("mini", _MINI,  _MINI_BEFORE,              "mini", "mini", train=0.85, cost="about 8 minutes on two x86-64 cores, one of them busy most of the time"),
+    PipelinePreset("mini", _MINI,  _MINI_BEFORE,              "mini", "mini", models="palpate/mini", start=True, train=0.85, cost="about 4 minutes on two x86-64 cores, one of them busy most of the time"),
 )}
 # fmt: on
 

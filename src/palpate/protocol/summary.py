@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from palpate.core import Audit, GalleryItem, Results, Score, rng_for
+from palpate.core.shipped import is_shipped
 from palpate.data.manifest import Manifest
 from palpate.generate import Generated
 from palpate.protocol.pipeline import PipelineOutcome
@@ -23,6 +24,10 @@ SYNTHETIC = (
 SMALL_MODELS = (
     "Small and trained in this run, on another synthetic world and the train part: {}. They stand where pretrained models stand in the paper; "
     "--clip and --autoencoder take those."
+)
+SHIPPED_MODELS = (
+    "Small, shipped with palpate ({}) and trained on synthetic worlds of reserved seeds, none of them this data: {}. They stand where pretrained "
+    "models stand in the paper; --clip and --autoencoder take those."
 )
 LABEL_TEXT = (
     "This data set has no texts: training used template texts made from the material, so text carries no more than the label, and class-aware scores "
@@ -120,11 +125,7 @@ def _notes(outcome: PipelineOutcome) -> list[str]:
     notes: list[str] = []
     if outcome.manifest.facts.get("synthetic"):
         notes.append(SYNTHETIC)
-    small = ["the frozen vision and text towers"] * (not outcome.options.clip) + ["the frozen autoencoder"] * (
-        not outcome.options.autoencoder
-    )
-    if small:
-        notes.append(SMALL_MODELS.format(" and ".join(small)))
+    notes += _model_notes(outcome)
     rule: Mapping[str, object] = outcome.split.rule
     if rule.get("reason"):
         notes.append(str(rule["reason"]))
@@ -143,10 +144,24 @@ def _notes(outcome: PipelineOutcome) -> list[str]:
     return notes
 
 
+def _model_notes(outcome: PipelineOutcome) -> list[str]:
+    """Which of the models are small stand-ins, and what they saw."""
+    roles = {"clip": "the frozen vision and text towers", "autoencoder": "the frozen autoencoder"}
+    trained = [what for role, what in roles.items() if outcome.models[role] is None]
+    by_name: dict[str, list[str]] = {}
+    for role, what in roles.items():
+        if (name := outcome.models[role]) and is_shipped(name):
+            by_name.setdefault(name, []).append(what)
+            if role == "clip":
+                by_name[name].append("the touch tower's starting weights, which were then trained on the train part")
+    shipped = [SHIPPED_MODELS.format(name, ", ".join(what)) for name, what in by_name.items()]
+    return ([SMALL_MODELS.format(" and ".join(trained))] if trained else []) + shipped
+
+
 def _next_steps(outcome: PipelineOutcome) -> list[str]:
     run = Path(outcome.stages["data"].folder).parent
     return [
         f"palpate audit {run / 'data'} --split {run / 'split' / 'noleak.json'} --worst 50",
-        f"palpate generate {run / 'generator' / 'model'} --photos YOUR_PHOTOS/ -o touches/",
+        f"palpate generate YOUR_PHOTOS/ --model {run / 'generator' / 'model'} -o touches/",
         f"palpate score {run / 'data'} --split {run / 'split' / 'noleak.json'} --generated YOUR_TOUCHES/ --towers {run / 'towers' / 'towers'} -o scores.json",
     ]

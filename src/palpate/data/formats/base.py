@@ -58,13 +58,20 @@ class Facts:
         return about | ({} if self.group_column == "video" else {"group": self.group_column})
 
 
+#: palpate's own world, in whichever layout.
+WORLD = Facts(
+    name="palpate's procedural world (synthetic)", citation="none: made by palpate world", licence="Apache-2.0", url="", sensor="simulated",
+    image_size=None, samples="as world.json says", group="video",
+)  # fmt: skip
+
+
 def world_facts(folder: Path) -> dict[str, str]:
     """What a tree of palpate's own world says of itself, ``{}`` for any other folder: it must never pass for the real set.
 
     The blank entries take the place of the real set's licence, citation and address.
     """
-    mark = folder / "world.json"
-    about = read_json(mark, "world record") if mark.is_file() else {}
+    mark, up = folder / "world.json", folder.parent / "world.json"  # HCT's rigs lie one folder down
+    about = read_json(mark, "world record") if mark.is_file() else (read_json(up, "world record") if up.is_file() else {})
     if not isinstance(about, dict) or not str(about.get("format", "")).startswith("palpate-world/"):
         return {}
     named = {"dataset": "palpate's procedural world", "synthetic": "yes", "digest": str(about.get("digest", ""))}

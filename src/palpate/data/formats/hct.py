@@ -37,7 +37,7 @@ import numpy as np
 
 from palpate.core import PalpateError, Problem, Progress, Split, inside, quiet
 from palpate.data.formats import tvl
-from palpate.data.formats.base import Facts, Scan, world_facts
+from palpate.data.formats.base import WORLD, Facts, Scan, world_facts
 from palpate.data.formats.hct_lists import RIG, TRAJECTORY, Reader, Row, Trajectory, located, order
 from palpate.data.frames import nearest_to_median
 from palpate.data.images import check_image
@@ -108,6 +108,8 @@ def scan(
     if not rigs:
         raise PalpateError(f"{source} must be HCT: {LOOKED_FOR}", "none of these", f"Unpack it from {tvl.URL}")
     found = Scan([], root, facts={"layout": f"hct: {', '.join(rigs)}"})
+    found.facts |= world_facts(root)
+    sensor = WORLD.sensor if "synthetic" in found.facts else FACTS.sensor
     reader = Reader(root, rigs, found, contact)
     rows = reader.rows(lists)
     sessions = sessions_of({row.trajectory for row in rows}, session_gap)
@@ -130,7 +132,7 @@ def scan(
             "text": row.text,
         }
         cells |= {"session": sessions[row.trajectory], "vision": row.vision, "tactile": row.tactile, "background": background}
-        found.rows.append((row.where, cells | {"sensor": FACTS.sensor, "domain": row.trajectory[0], "split": row.part}))
+        found.rows.append((row.where, cells | {"sensor": sensor, "domain": row.trajectory[0], "split": row.part}))
     if any(row.part for row in rows):
         found.own = name = "Orig" if lists is None else "Lists"
         found.rules[name] = {"method": "official" if lists is None else "lists", "files": reader.files}
@@ -138,7 +140,6 @@ def scan(
     found.facts |= {"session_gap": f"{session_gap:g} s", "swapped_folders": exchange}
     worded = dict.fromkeys(f"{r.part}.csv" if r.part else "finetune.json" for r in rows if r.text)
     found.facts |= {"text_source": f"captions of {', '.join(sorted(worded))}" if worded else "none"}
-    found.facts |= world_facts(Path(source)) or world_facts(root.parent)
     if root == Path(source) / "hct" and (Path(source) / "ssvtp").is_dir():
         found.suspicious.append(
             Problem(str(source), "other-half", "ssvtp/ lies beside hct/ and was not read: import it with --format ssvtp")

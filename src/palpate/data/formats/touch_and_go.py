@@ -23,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet
-from palpate.data.formats.base import Facts, Scan, world_facts
+from palpate.data.formats.base import WORLD, Facts, Scan, world_facts
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
 from palpate.data.images import Check
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
@@ -143,7 +143,7 @@ def import_touch_and_go(
         raise_if(work.problems, skip_bad)
         require_some(len(rows), root, work.problems)
         facts = _facts(root, categories) | {"text_source": "captions.csv" if texts else "none"}
-        manifest = work.manifest(rows, facts, FACTS.sensor, {"text": texts, "object": objects})
+        manifest = work.manifest(rows, facts, WORLD.sensor if "synthetic" in facts else FACTS.sensor, {"text": texts, "object": objects})
         found = Imported(manifest, work.problems, _splits(manifest, official), listed.inconclusive, work.suspicious)
         return found.save(out, created)
 

@@ -1,0 +1,337 @@
+"""One world, several ways to cut it: how much of a touch probe's accuracy is leakage.
+
+    python benchmarks/split_protocols.py --seeds 0 1 2 --write docs/world_protocols.md
+    python benchmarks/split_protocols.py --seeds 0 --modalities touch          # a first look, about two minutes
+
+The contact frames of a preset are cut into train and test by random frame (as HCT-Orig), by random whole touch (as the Touch and Go lists), by whole
+video, and by whole object (a video counts with its first object; the other objects of a mixed video are in no other); every protocol trains on the same
+number of frames. Features are patch words: small patches of contact minus background (touch; the background is the frame that the background rule
+names, and printed markers are filled in first in both, since their shift tells more about drag than about material) or of the photo (vision), projected
+on their leading principal components, words by k-means, the square root of each image's word frequencies; components and words are learnt on the train
+side alone. Classifiers: logistic regression on standardised features, whose penalty is chosen by leaving out whole videos of the train side in every
+protocol, and the nearest neighbour by cosine. Retrieval: a ridge regression from vision to touch words, cosine among 100 samples of the test side.
+Intervals are robust to whole videos deviating together, Student's t. Rows are not weighted (not balanced); chance is one in the number of materials, and
+the share of the largest class is printed. Frames are rendered into memory without JPEG; only the table is written.
+"""
+
+import argparse
+import datetime
+import multiprocessing
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+from sklearn.cluster import MiniBatchKMeans
+from sklearn.linear_model import LogisticRegression
+from threadpoolctl import threadpool_limits
+
+from palpate.core import FeatureSet, rng_for, short
+from palpate.encoders.probe import retrieval
+from palpate.metrics.intervals import mean_interval
+from palpate.sim import PRESETS, VERSION, Video, plan_world
+from palpate.sim.options import BACKGROUND_OFFSET
+from palpate.sim.plan import contact_frames, first_contact
+
+PROTOCOLS = {"frame": "random frame", "touch": "random whole touch", "video": "by video", "object": "by object"}
+TEST_SHARE = 0.25
+PATCH, STRIDE, COMPONENTS, WORDS, SAMPLED = 8, 4, 32, 1024, 60_000
+PENALTIES, FOLDS = (1e-3, 3e-3, 1e-2), 3  # C of scikit-learn, strongest first
+POOL, RIDGE = 100, 0.1
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Contact frames of a world: images (n, s, s, 3) uint8, and where each comes from."""
+
+    vision: np.ndarray
+    touch: np.ndarray
+    background: np.ndarray
+    material: np.ndarray
+    video: np.ndarray
+    contact: np.ndarray  # "video/touch"
+    thing: np.ndarray  # the main object of the video; the guests of a mixed video appear in no other
+    ids: np.ndarray
+
+    def images(self, modality):
+        """What the words are made of, (n, s, s, 3) float32 in [-1, 1]."""
+        if modality == "vision":
+            return self.vision.astype(np.float32) / 255
+        return np.concatenate(
+            [without_markers(a) - without_markers(b) for a, b in zip(*map(chunks, (self.touch, self.background)), strict=True)]
+        )
+
+
+def chunks(images, size=500):
+    """Views of a few images each."""
+    return [images[k : k + size] for k in range(0, len(images), size)]
+
+
+def without_markers(images):
+    """(n, s, s, 3) in [0, 1] with the printed dots, pixels darker than 0.8 of the brightest around, filled in from the pixels beside them."""
+    x, width = images.astype(np.float32) / 255, round(images.shape[1] * 9 / 64) | 1
+    grey = x.mean(axis=3)
+    around = ndimage.uniform_filter(ndimage.maximum_filter(grey, (1, width, width)), (0, width, width))
+    clear = ~ndimage.binary_dilation(grey < 0.8 * around, np.ones((1, 3, 3)))
+    clear = clear[..., None].astype(np.float32)
+    spread = lambda a: ndimage.gaussian_filter(a, (0, width / 4.5, width / 4.5, 0))  # noqa: E731
+    return x * clear + (1 - clear) * spread(x * clear) / np.maximum(spread(clear), 1e-3)
+
+
+def render_video(options, plan):
+    """All contact frames of one video: vision, touch, background, and per frame (material, video, touch, main object, frame)."""
+    video, images, names = Video(options, plan), [], []
+    for touch in range(options.touches_per_video):
+        background = video.tactile(first_contact(options, touch) - BACKGROUND_OFFSET)
+        for frame in contact_frames(options, touch):
+            images.append((video.vision(frame), video.tactile(frame), background))
+            names.append((plan.object_of(touch).material, plan.name, touch, plan.objects[0].name, frame))
+    return [np.stack(column) for column in zip(*images, strict=True)], names
+
+
+def render(options, processes=2):
+    """The contact frames of a world, in memory."""
+    plans, job = plan_world(options), partial(render_video, options)
+    if processes > 1:
+        with multiprocessing.get_context("spawn").Pool(processes) as pool:
+            parts = pool.map(job, plans, chunksize=4)
+    else:
+        parts = list(map(job, plans))
+    vision, touch, background = (np.concatenate([images[k] for images, _ in parts]) for k in range(3))
+    rows = [row for _, names in parts for row in names]
+    return Frames(
+        vision,
+        touch,
+        background,
+        np.array([material for material, *_ in rows]),
+        np.array([video for _, video, *_ in rows]),
+        np.array([f"{video}/{touch}" for _, video, touch, *_ in rows]),
+        np.array([thing for *_, thing, _ in rows]),
+        np.array([f"{video}/{frame}" for _, video, *_, frame in rows]),
+    )
+
+
+def cut(frames, protocol, seed, share=TEST_SHARE):
+    """Rows of train and test: a random ``share`` of the units, drawn material by material so that each has its part."""
+    unit = {"frame": frames.ids, "touch": frames.contact, "video": frames.video, "object": frames.thing}[protocol]
+    names, first, inverse = np.unique(unit, return_index=True, return_inverse=True)
+    order = rng_for(seed, "split protocols", protocol).permutation(len(names))
+    order = order[np.argsort(frames.material[first][order], kind="stable")]
+    at = np.arange(len(order))
+    tested = np.zeros(len(names), bool)
+    tested[order] = np.floor((at + 1) * share + 0.5) > np.floor(at * share + 0.5)
+    return np.flatnonzero(~tested[inverse]), np.flatnonzero(tested[inverse])
+
+
+def equal_cuts(frames, seed):
+    """Protocol -> rows of train and test, the train sides thinned at random to one size."""
+    cuts = {protocol: cut(frames, protocol, seed) for protocol in PROTOCOLS}
+    size = min(len(train) for train, _ in cuts.values())
+    thin = lambda rows, protocol: np.sort(rng_for(seed, "thinning", protocol).permutation(rows)[:size])  # noqa: E731
+    return {protocol: (thin(train, protocol), test) for protocol, (train, test) in cuts.items()}
+
+
+def patches_of(images):
+    """All patches of (n, s, s, 3) as rows (n, k, PATCH * PATCH * 3)."""
+    windows = np.lib.stride_tricks.sliding_window_view(images, (PATCH, PATCH), axis=(1, 2))[:, ::STRIDE, ::STRIDE]
+    return windows.reshape(len(images), windows.shape[1] * windows.shape[2], -1)
+
+
+def patch_words(images, train, seed, words=WORDS):
+    """Square roots of word frequencies, (n, words) float32; components and words come from the rows ``train`` alone."""
+    rng = rng_for(seed, "patch words")
+    some = images[np.sort(rng.permutation(train)[:1500])]
+    pool = patches_of(some).reshape(-1, PATCH * PATCH * 3)
+    pool = pool[rng.permutation(len(pool))[:SAMPLED]]
+    mean = pool.mean(axis=0)
+    values, vectors = np.linalg.eigh(np.cov((pool - mean).T))
+    basis = vectors[:, ::-1][:, :COMPONENTS] / np.sqrt(values[::-1][:COMPONENTS] + 1e-4)
+    basis, offset = basis.astype(np.float32), (mean @ basis).astype(np.float32)
+    found = MiniBatchKMeans(words, batch_size=4096, n_init=1, max_iter=20, random_state=int(rng.integers(2**31))).fit(pool @ basis - offset)
+    centres = found.cluster_centers_.astype(np.float32)
+    half = (centres**2).sum(axis=1) / 2
+    out = np.empty((len(images), words), np.float32)
+    for k in range(0, len(images), 64):
+        parts = patches_of(images[k : k + 64])
+        best = ((parts.reshape(-1, parts.shape[2]) @ basis - offset) @ centres.T - half).argmax(axis=1).reshape(len(parts), -1)
+        flat = best + np.arange(len(parts))[:, None] * words
+        out[k : k + 64] = np.sqrt(np.bincount(flat.ravel(), minlength=len(parts) * words).reshape(-1, words) / parts.shape[1])
+    return out
+
+
+def feature_set(features, frames, rows, encoder):
+    return FeatureSet(list(frames.ids[rows]), features[rows], list(frames.material[rows]), list(frames.video[rows]), encoder)
+
+
+def accuracy(hit, groups):
+    """The mean of ``hit`` and its interval over groups."""
+    return float(hit.mean()), mean_interval(hit.astype(float), groups, 0.95)[0]
+
+
+def nearest(train, test):
+    """Accuracy of the material of the most similar training row."""
+    labels, best = np.array(train.labels), []
+    for k in range(0, len(test.ids), 500):
+        best.append((test.features[k : k + 500] @ train.features.T).argmax(axis=1))
+    return accuracy(labels[np.concatenate(best)] == np.array(test.labels), test.groups)
+
+
+def logistic(train, test, seed):
+    """Accuracy of a logistic regression, and the penalty C that leaving out whole videos of train chose (the stronger on a tie)."""
+    mean, sd = train.features.mean(axis=0), train.features.std(axis=0) + 1e-6
+    x, y, groups = (train.features - mean) / sd, np.array(train.labels), np.array(train.groups)
+    names = np.unique(groups)
+    fold = (rng_for(seed, "folds").permutation(len(names)) % FOLDS)[np.searchsorted(names, groups)]
+    fit = lambda rows, c: LogisticRegression(C=c, max_iter=200, tol=1e-3).fit(x[rows], y[rows])  # noqa: E731
+    right = {c: sum((fit(fold != f, c).predict(x[fold == f]) == y[fold == f]).sum() for f in range(FOLDS)) for c in PENALTIES}
+    chosen = max(PENALTIES, key=right.__getitem__)
+    hit = fit(slice(None), chosen).predict((test.features - mean) / sd) == np.array(test.labels)
+    return accuracy(hit, test.groups), chosen
+
+
+def across(vision, touch):
+    """Retrieval of touch by vision: ridge regression on train, cosine among POOL samples of test; (value, interval, chance) for top 1 and 5."""
+    (source, queries), (target, keys) = vision, touch
+    x_mean, y_mean = source.features.mean(axis=0), target.features.mean(axis=0)
+    x = source.features - x_mean
+    gram = x.T @ x
+    gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / len(gram)
+    weight = np.linalg.solve(gram, x.T @ (target.features - y_mean))
+    guess = FeatureSet(queries.ids, (queries.features - x_mean) @ weight, None, queries.groups, "ridge")
+    centred = FeatureSet(keys.ids, keys.features - y_mean, None, keys.groups, "ridge")
+    pool = min(POOL, len(keys.ids))
+    return [(s.value, s.interval, s.details["chance"]) for s in retrieval(guess, centred, pool=pool)]
+
+
+def measure(frames, images, protocol, seed):
+    """For ``images`` by modality: measure -> (value, interval, chance) of one protocol, the number of train and test frames under "frames", and the penalties chosen under "C"."""
+    train, test = equal_cuts(frames, seed)[protocol]
+    chance, sides = 1 / len(set(frames.material)), {}
+    row = {"frames": (len(train), len(test)), "C": {}}
+    for modality in images:
+        features = patch_words(images[modality], train, seed)
+        sides[modality] = tuple(feature_set(features, frames, rows, "patch words") for rows in (train, test))
+        (value, interval), row["C"][modality] = logistic(*sides[modality], seed)
+        row[f"{modality}, logistic regression"] = (value, interval, chance)
+        row[f"{modality}, nearest neighbour"] = (*nearest(*sides[modality]), chance)
+    if len(images) == 2:
+        for k, found in zip((1, 5), across(sides["vision"], sides["touch"]), strict=True):
+            row[f"vision to touch, top {k} of {POOL}"] = found
+    return row
+
+
+_KEPT = {}
+
+
+def keep(frames, modalities):
+    """Gives a worker process the frames, once."""
+    threadpool_limits(1)
+    _KEPT["frames"], _KEPT["images"] = frames, {modality: frames.images(modality) for modality in modalities}
+
+
+def job(task):
+    """Measures one (protocol, seed) in a worker process."""
+    return task, measure(_KEPT["frames"], _KEPT["images"], *task)
+
+
+def measure_all(frames, seeds, modalities, processes):
+    """A list with one dictionary a seed: protocol -> measures."""
+    tasks = [(protocol, seed) for seed in seeds for protocol in PROTOCOLS]
+    found = {seed: {} for seed in seeds}
+    with multiprocessing.get_context("spawn").Pool(processes, keep, (frames, modalities)) as pool:
+        for (protocol, seed), row in pool.imap(job, tasks):
+            found[seed][protocol] = row
+            values = ", ".join(f"{name} {100 * v[0]:.1f}" for name, v in row.items() if name not in ("frames", "C"))
+            print(f"seed {seed} {PROTOCOLS[protocol]:18s} C {row['C']}: {values}", flush=True)
+    return [found[seed] for seed in seeds]
+
+
+def steps_of(results):
+    """Differences in points, per seed: frame - touch and touch - video of the touch probe."""
+    value = lambda r, p: 100 * r[p]["touch, logistic regression"][0]  # noqa: E731
+    return [(value(r, "frame") - value(r, "touch"), value(r, "touch") - value(r, "video")) for r in results]
+
+
+def table(results):
+    """Markdown: a row a protocol; the mean over split seeds, the mean half width of the intervals, and the range over seeds."""
+    measures = [name for name in results[0]["frame"] if name not in ("frames", "C")]
+    lines = ["| split | " + " | ".join(measures) + " |", "|---" * (len(measures) + 1) + "|"]
+    for protocol, title in PROTOCOLS.items():
+        cells = []
+        for name in measures:
+            found = [r[protocol][name] for r in results]
+            values = [100 * value for value, *_ in found]
+            half = np.mean([50 * (interval[1] - interval[0]) for _, interval, _ in found if interval] or [np.nan])
+            spread = f" ({min(values):.1f} to {max(values):.1f})" if len(results) > 1 else ""
+            cells.append(f"{np.mean(values):.1f} ± {half:.1f} %{spread}")
+        lines.append(f"| {title} | " + " | ".join(cells) + " |")
+    chance = [f"{100 * np.mean([r['video'][name][2] for r in results]):.1f} %" for name in measures]
+    lines.append("| chance | " + " | ".join(chance) + " |")
+    return "\n".join(lines)
+
+
+def page(results, seeds, preset, options, frames, command):
+    """The whole Markdown file."""
+    steps = steps_of(results)
+    each = ", ".join(f"seed {s}: {a:+.1f} and {b:+.1f}" for s, (a, b) in zip(seeds, steps, strict=True))
+    means = np.mean(steps, axis=0)
+    met = (
+        "In every seed each step is at least 5 points."
+        if np.min(steps) >= 5
+        else f"The smallest step is {np.min(steps):+.1f} points, below 5."
+    )
+    sizes = "; ".join(f"{PROTOCOLS[p]} {results[0][p]['frames'][1]}" for p in PROTOCOLS)
+    chosen = sorted({c for r in results for p in PROTOCOLS for c in r[p]["C"].values()})
+    counts = np.unique(frames.material, return_counts=True)[1]
+    return f"""# Ways to cut one world
+
+Made by a committed command; do not edit by hand. Synthetic: the table shows a mechanism, and its numbers are never compared with those of real data.
+
+    {command}
+
+World: preset `{preset}`, version {VERSION}, options digest `{short(options.digest)}`, {len(frames.ids)} contact frames of {len(set(frames.video))} videos and
+{len(set(frames.thing))} objects with videos of their own. Split seeds {", ".join(map(str, seeds))}; {datetime.date.today().isoformat()}.
+
+A cell: mean over split seeds ± half width of the 95 % interval over videos (mean over seeds), and the range over seeds.
+
+{table(results)}
+
+Steps of the touch probe (logistic regression) in points, random frame to whole touch and whole touch to video: {each}; mean {means[0]:+.1f} and {means[1]:+.1f}.
+{met}
+
+Train: {results[0]["frame"]["frames"][0]} frames in every protocol. Test (first seed): {sizes}. Rows are not weighted: the materials have {counts.min()} to
+{counts.max()} frames, so always naming the most frequent one is right in {100 * counts.max() / counts.sum():.1f} %. Penalties chosen (C): {", ".join(f"{c:g}" for c in chosen)}.
+Features, classifiers and intervals are described at the head of `benchmarks/split_protocols.py`.
+"""
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--preset", default="small", choices=tuple(PRESETS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="split seeds; the world stays the same")
+    parser.add_argument("--modalities", nargs="+", default=["touch", "vision"], choices=("touch", "vision"))
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--write", type=Path, help="Markdown file to write (needs touch)")
+    chosen = parser.parse_args()
+    options, start = PRESETS[chosen.preset], time.perf_counter()
+    frames = render(options, chosen.processes)
+    print(
+        f"preset {chosen.preset}, version {VERSION}, options {short(options.digest)}: {len(frames.ids)} contact frames, "
+        f"{len(set(frames.video))} videos, in memory after {time.perf_counter() - start:.0f} s",
+        flush=True,
+    )
+    results = measure_all(frames, chosen.seeds, tuple(chosen.modalities), chosen.processes)
+    print(table(results))
+    if "touch" in chosen.modalities:
+        print("steps of touch in points:", ", ".join(f"{a:+.1f} {b:+.1f}" for a, b in steps_of(results)))
+    if chosen.write:
+        command = f"python benchmarks/split_protocols.py {' '.join(sys.argv[1:])}"
+        chosen.write.write_text(page(results, chosen.seeds, chosen.preset, options, frames, command))
+    print(f"{time.perf_counter() - start:.0f} s in all")
+
+
+if __name__ == "__main__":
+    main()

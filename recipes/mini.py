@@ -1,0 +1,287 @@
+"""Trains the models that ship with palpate (``palpate/mini``), scores them on worlds that they have not seen, and writes their cards.
+
+    python recipes/mini.py --work runs/mini                     # everything: worlds, towers, autoencoder, generator, scores
+    python recipes/mini.py --work runs/mini --only autoencoder  # one part and what it needs; parts may run side by side after "worlds"
+    python recipes/mini.py --work runs/mini --ship              # and put the result into src/palpate/mini
+    python recipes/mini.py --work runs/mini --verify            # score what is shipped again and compare with its cards
+
+Stopped half-way, the same command goes on. Only worlds of the seeds ``palpate.sim.presets.MINI_SEEDS`` are read, which nothing else may use:
+
+=============  ========  ====================================================================================
+world          seed      read by
+=============  ========  ====================================================================================
+touches        900000    every part
+digit          900001    the autoencoder alone: the other look of the sensor
+one unit       900002    the generator alone: one gel unit, because a photo cannot tell which of several will touch
+new touches    900050    scores: new objects, videos and gel units
+new digit      900051    scores of the autoencoder
+=============  ========  ====================================================================================
+
+Weights are rounded to 16 bits before anything is scored, so the scores are those of the shipped files; what rounding costs is in the cards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mini_cards import ship, write_page
+from mini_scores import score_all
+
+from palpate.core import PalpateError, Run, Split, digest_json, read_json, write_json
+from palpate.core.shipped import SHIPPED, shipped_root
+from palpate.data.images import cached_images
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.autoencoder_training import train_autoencoder
+from palpate.diffusion.pipeline import Pipeline
+from palpate.diffusion.presets import MINI as DIFFUSION
+from palpate.diffusion.recipe import train_pipeline
+from palpate.encoders.contrastive import train_clip, train_touch
+from palpate.encoders.presets import preset
+from palpate.encoders.towers import Towers, load_clip
+from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
+
+NAME = "palpate/mini"
+#: Its table of scores is written from the cards.
+PAGE = Path(__file__).parents[1] / "docs" / "mini.md"
+SEED = 0
+_BASE = replace(PRESETS["pretrain"], touches_per_video=3, frames_per_touch=2)
+WORLDS: dict[str, WorldOptions] = {
+    "touches": replace(_BASE, seed=900_000, objects_per_material=150, sensors=8),
+    "digit": replace(_BASE, seed=900_001, objects_per_material=30, sensors=4, look="digit"),
+    "one unit": replace(_BASE, seed=900_002, objects_per_material=100, sensors=1),
+    "new touches": replace(_BASE, seed=900_050, objects_per_material=10),
+    "new digit": replace(_BASE, seed=900_051, objects_per_material=4, look="digit"),
+}
+ENCODER = preset("mini")
+#: Passes over the touches. One core sees about 400 photos or touches a second in training.
+CLIP_EPOCHS, TOUCH_EPOCHS = 14.0, 8.0
+AUTOENCODER = replace(DIFFUSION.autoencoder, steps_free=12_000, steps_quantised=1_200) if DIFFUSION.autoencoder else None
+GENERATOR_STEPS = 8_000
+PARTS = ("worlds", "clip", "towers", "autoencoder", "generator", "scores")
+LIMITS = (
+    "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. Real photos and real touches are out of its range.",
+    "Made to show mechanisms and to test code offline; never compare its numbers with those of real data sets.",
+)
+
+
+def main() -> int:
+    """Runs the asked parts; the exit status is 1 if ``--verify`` finds other scores than the cards say."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=Path("runs/mini"), help="folder for worlds, checkpoints and results")
+    parser.add_argument("--only", choices=PARTS, default="scores", help="the last part to make")
+    parser.add_argument("--ship", action="store_true", help="write src/palpate/mini of this checkout")
+    parser.add_argument("--verify", action="store_true", help="score the shipped models again instead of training")
+    parser.add_argument("--share", type=float, default=1.0, help="share of all training lengths, to try the recipe out (not for shipping)")
+    options = parser.parse_args()
+    recipe = Recipe(options.work, options.share)
+    try:
+        if options.verify:
+            return recipe.verify()
+        recipe.make(options.only)
+        if options.ship:
+            recipe.ship()
+    except PalpateError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("Stopped; the same command goes on.\n")
+        return 130
+    return 0
+
+
+def say(line: str) -> None:
+    """A line for whoever watches, at once."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+class Recipe:
+    """The parts, each a stage of a run folder; a finished stage is read, not made again."""
+
+    def __init__(self, work: Path, share: float) -> None:
+        self.run, self.share = Run(work, say), share
+        self.cache = work / "cache"
+        self.shown = 0.0
+
+    def progress(self, what: str, done: int, total: int, remark: str = "") -> None:
+        """A line every twentieth of the way."""
+        at = done / total if total else 0.0
+        if at >= self.shown + 0.05 or at in (0.0, 1.0) or at < self.shown:
+            self.shown = at
+            say(f"  {what}: {done} of {total} {remark}")
+
+    def make(self, last: str) -> None:
+        """Makes the parts up to ``last``, leaving out those that it does not need."""
+        for name in WORLDS:
+            self.world(name)
+        wanted = {
+            "worlds": (), "clip": (self.clip,), "towers": (self.towers,), "autoencoder": (self.autoencoder,),
+            "generator": (self.generator,), "scores": (self.scores,),
+        }[last]  # fmt: skip
+        for part in wanted:
+            part()
+
+    def world(self, name: str) -> Manifest:
+        """The samples of a world."""
+        options = WORLDS[name]
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            record = write_world(folder / "tree", options, workers=len(os.sched_getaffinity(0)), progress=self.progress)
+            return {"digest": record.digest, "frames": record.counts["contact_frames"], "videos": record.counts["videos"]}
+
+        stage = self.run.stage(f"world {name}", {"options": options.digest}, build)
+        return Manifest.load(stage.folder / "tree")
+
+    def _everything(self, manifest: Manifest) -> Split:
+        return Split.from_ids(train=manifest.ids, rule={"name": "everything, for the shipped models"}, manifest=manifest.digest)
+
+    def clip(self) -> Path:
+        """Vision and text, by contrast of photos and captions."""
+        train = self.world("touches")
+        epochs = CLIP_EPOCHS * self.share
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            clip = train_clip(
+                train,
+                self._everything(train),
+                ENCODER,
+                folder / "training",
+                epochs=epochs,
+                seed=SEED,
+                cache=self.cache,
+                progress=self.progress,
+            )
+            clip.save(folder / "clip")
+            return {"vision": clip.digest("vision"), "text": clip.digest("text")}
+
+        stage = self.run.stage("clip", {"preset": ENCODER, "epochs": epochs, "seed": SEED, "train": train.digest}, build)
+        return stage.folder / "clip"
+
+    def towers(self) -> Towers:
+        """The pair and a touch tower that learns from it, rounded to 16 bits."""
+        clip, train = self.clip(), self.world("touches")
+        epochs = TOUCH_EPOCHS * self.share
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            towers = train_touch(
+                train, self._everything(train), load_clip(clip), ENCODER, folder / "training", epochs=epochs, seed=SEED, cache=self.cache,
+                progress=self.progress,
+            )  # fmt: skip
+            towers.save(folder / "towers")
+            return {"touch": towers.digest("touch")}
+
+        stage = self.run.stage("towers", {"preset": ENCODER, "epochs": epochs, "seed": SEED, "clip": self.run.stages["clip"].digest}, build)
+        return Towers.load(stage.folder / "towers")
+
+    def autoencoder(self) -> Autoencoder:
+        """The VQ autoencoder, of touches of both looks."""
+        parts = [self.world(name) for name in ("touches", "digit")]
+        if AUTOENCODER is None:
+            raise PalpateError("The preset mini must train an autoencoder", "none", "Give it AutoencoderOptions")
+        length = lambda steps: max(1, round(steps * self.share))  # noqa: E731
+        options = replace(AUTOENCODER, steps_free=length(AUTOENCODER.steps_free), steps_quantised=length(AUTOENCODER.steps_quantised))
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            images = np.concatenate([cached_images(part, "tactile", DIFFUSION.size, self.cache, self.progress) for part in parts])
+            model = train_autoencoder(
+                images, options, folder / "training", seed=SEED, key=digest_json([p.digest for p in parts]), progress=self.progress
+            )
+            model.save(folder / "autoencoder")
+            return {"digest": model.digest}
+
+        inputs = {"options": options, "seed": SEED, "train": [p.digest for p in parts]}
+        return Autoencoder.load(self.run.stage("autoencoder", inputs, build).folder / "autoencoder")
+
+    def generator(self) -> Pipeline:
+        """From a photo to a touch, in the space of the rounded towers and autoencoder."""
+        towers, autoencoder, train = self.towers(), self.autoencoder(), self.world("one unit")
+        towers.halve()
+        autoencoder.halve()
+        steps = max(1, math.ceil(GENERATOR_STEPS * self.share))
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            pipeline = train_pipeline(
+                train, self._everything(train), towers, autoencoder, DIFFUSION, folder / "training", seed=SEED, steps=steps, cache=self.cache,
+                progress=self.progress,
+            )  # fmt: skip
+            pipeline.save(folder / "model")
+            return {"digest": pipeline.digest, "train": len(train)}
+
+        inputs = {
+            "preset": DIFFUSION, "steps": steps, "seed": SEED, "vision": towers.digest("vision"), "text": towers.digest("text"),
+            "autoencoder": autoencoder.digest, "train": train.digest,
+        }  # fmt: skip
+        return Pipeline.load(self.run.stage("generator", inputs, build).folder / "model")
+
+    def scores(self) -> dict[str, Any]:
+        """Scores of the full and of the rounded models on the new worlds, as rows for the cards."""
+        full = self.towers(), self.autoencoder(), self.generator()
+        digests = [full[0].digest("touch"), full[0].digest("vision"), full[1].digest, full[2].digest]
+
+        def build(folder: Path) -> Mapping[str, Any]:
+            exact = score_all(*full, self._samples(), self.cache, None, self.progress)
+            rounding = self._halve(*full)
+            rounded = score_all(*full, self._samples(), self.cache, folder / "generated", self.progress)
+            write_json(folder / "scores.json", {"rounded": rounded, "exact": exact, "rounding": rounding})
+            return {"rounding": rounding}
+
+        stage = self.run.stage("scores", {"models": digests, "worlds": [self.world(n).digest for n in WORLDS]}, build)
+        return read_json(stage.folder / "scores.json", "scores")
+
+    def _samples(self) -> dict[str, Manifest]:
+        return {name: self.world(name) for name in WORLDS}
+
+    @staticmethod
+    def _halve(towers: Towers, autoencoder: Autoencoder, pipeline: Pipeline) -> dict[str, float]:
+        """Rounds all weights to 16 bits, in place; the largest relative change of a tensor of each model."""
+        changes = {"towers": towers.halve(), "autoencoder": autoencoder.halve(), "generator": pipeline.denoiser.halve()}
+        return {name: change.relative for name, change in changes.items()}
+
+    def ship(self) -> None:
+        """Writes ``src/palpate/mini``: weights in 16 bits, and cards."""
+        if self.share != 1.0:
+            raise PalpateError("Shipped models must have been trained in full", f"--share {self.share:g}", "Leave out --share")
+        scores, towers, autoencoder, pipeline = self.scores(), self.towers(), self.autoencoder(), self.generator()
+        self._halve(towers, autoencoder, pipeline)
+        target = shipped_root() / SHIPPED[NAME]
+        ship(target, towers, autoencoder, pipeline, scores, self._worlds(), LIMITS)
+        if PAGE.is_file():
+            write_page(PAGE, target)
+        say(f"Shipped in {target}")
+
+    def _worlds(self) -> list[dict[str, Any]]:
+        stages = {name: self.run.stages[f"world {name}"].facts for name in WORLDS}
+        return [
+            {"world": name, "seed": o.seed, "look": o.look, "version": VERSION, "frames": stages[name]["frames"], "videos": stages[name]["videos"],
+             "digest": stages[name]["digest"]}
+            for name, o in WORLDS.items()
+        ]  # fmt: skip
+
+    def verify(self) -> int:
+        """Scores the shipped models again; every score must come out as its card says, within 0.002 of its scale."""
+        towers, autoencoder, pipeline = Towers.load(NAME), Autoencoder.load(NAME), Pipeline.load(NAME)
+        rows = score_all(towers, autoencoder, pipeline, self._samples(), self.cache, None, self.progress)
+        cards = {"towers": towers.card, "autoencoder": autoencoder.card, "generator": dict(pipeline.training)}
+        bad = 0
+        for part, scored in rows.items():
+            said = {row["score"]: row["value"] for row in cards[part]["scores"]}
+            for row in scored:
+                value, card = row["value"], said.get(row["score"])
+                same = card is not None and abs(value - card) <= 0.002 * max(1.0, abs(card))
+                bad += not same
+                told = "nothing" if card is None else f"{card:.4g}"
+                say(f"{part}: {row['score']}: {value:.4g}, the card says {told}{'' if same else '  DIFFERS'}")
+        return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

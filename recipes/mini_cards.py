@@ -1,0 +1,107 @@
+"""The wording of the shipped models' cards, and the writing of ``src/palpate/mini``."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from palpate.core import read_json, write_text
+from palpate.core.cards import write_model_cards
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.pipeline import Pipeline
+from palpate.encoders.towers import Towers
+from palpate.sim import VERSION
+
+NAME = "palpate/mini"
+RECIPE = "python recipes/mini.py --work runs/mini --ship"
+TAGS = ("synthetic",)
+SUMMARIES = {
+    "towers": (
+        "Vision, text and touch towers of palpate's world",
+        "Three small towers with one space of 128 dimensions: a CLIP (vision and text, own tokenizer) trained on photos and captions of the procedural "
+        "world, and a touch tower trained against it with the three-way InfoNCE. They take the part of the frozen CLIP of the paper where no hub is in reach.",
+    ),
+    "autoencoder": (
+        "VQ f4 autoencoder of touches of palpate's world",
+        "A diffusers VQModel that turns a touch of 64 x 64 pixels into 16 x 16 codes and back. It takes the part of latent diffusion's vq-f4. Trained on "
+        "touches of both looks of the sensor (with markers and without).",
+    ),
+    "generator": (
+        "From a photo to a touch of palpate's world",
+        "A latent diffusion model, conditioned on captions and photos in turn and driven by photos, in the space of the towers and the autoencoder beside it. "
+        "It knows the world's twenty materials and nothing else, tells rough from smooth better than one rough material from another, and always answers for the one gel unit it has learnt.",
+    ),
+}
+READ = {
+    "towers": ("touches", "new touches"),
+    "autoencoder": ("touches", "digit", "new touches", "new digit"),
+    "generator": ("one unit", "new touches"),
+}
+
+
+def ship(
+    target: Path, towers: Towers, autoencoder: Autoencoder, pipeline: Pipeline, scores: Mapping[str, Any], worlds: Sequence[Mapping[str, Any]],
+    limits: Sequence[str],
+) -> None:  # fmt: skip
+    """Replaces what is shipped; the models must be rounded to 16 bits already, since the scores are theirs.
+
+    Args:
+        target: the folder of the package.
+        towers: vision, text and touch.
+        autoencoder: of touches.
+        pipeline: the generator, in the space of the other two.
+        scores: rows by model under ``rounded`` and ``exact``, and the change by ``rounding``.
+        worlds: rows that describe the worlds.
+        limits: sentences for every card.
+    """
+
+    def card(part: str) -> dict[str, Any]:
+        title, summary = SUMMARIES[part]
+        rows = [dict(row) for row in scores["rounded"][part]]
+        before = {row["score"]: row["value"] for row in scores["exact"][part]}
+        for row in rows:
+            row["in 32 bits"] = before[row["score"]]
+        data = [
+            {**world, "used for": "scores" if str(world["world"]).startswith("new") else "training"}
+            for world in worlds
+            if world["world"] in READ[part]
+        ]
+        return {
+            "name": NAME, "title": title, "summary": summary, "tags": list(TAGS), "license": "apache-2.0", "data": data, "scores": rows,
+            "limits": list(limits), "recipe": RECIPE, "world version": VERSION, "synthetic": True,
+            "largest relative change by 16 bits": scores["rounding"][part],
+        }  # fmt: skip
+
+    shutil.rmtree(target, ignore_errors=True)
+    towers.card = {**towers.card, **card("towers")}
+    towers.clip.card = {**towers.clip.card, **card("towers")}
+    towers.save(target / "towers", half=True)
+    autoencoder.card = {**autoencoder.card, **card("autoencoder")}
+    autoencoder.save(target / "autoencoder", half=True)
+    pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
+    pipeline.save(target / "generator", half=True, shared=NAME)
+    write_model_cards(target)
+
+
+MARKS = ("<!-- scores of the cards -->", "<!-- end of the scores -->")
+
+
+def scores_table(target: Path) -> str:
+    """The scores of all cards below ``target`` as one Markdown table."""
+    lines = ["| part | score | value | 95 % by video | chance | in 32 bits |", "|---|---|---|---|---|---|"]
+    for part, key in (("towers", "card"), ("autoencoder", "card"), ("generator", "training")):
+        for row in read_json(target / part / "palpate.json", "card")[key]["scores"]:
+            interval = " to ".join(f"{v:.3g}" for v in row.get("interval", ()))
+            chance = f"{row['chance']:.3g}" if "chance" in row else ""
+            lines.append(f"| {part} | {row['score']} | {row['value']:.4g} | {interval} | {chance} | {row['in 32 bits']:.4g} |")
+    return "\n".join(lines)
+
+
+def write_page(page: Path, target: Path) -> None:
+    """Puts the table between the marks of ``docs/mini.md``."""
+    text = page.read_text(encoding="utf-8")
+    start, end = text.index(MARKS[0]) + len(MARKS[0]), text.index(MARKS[1])
+    write_text(page, f"{text[:start]}\n{scores_table(target)}\n{text[end:]}")

@@ -1,0 +1,86 @@
+"""A generator that goes on from another: it begins with those weights, and only where it speaks the same language."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from diffusion_forge import make_pipeline
+from mini_forge import make_towers
+from palpate.core import PalpateError, Split
+from palpate.data.manifest import Manifest
+from palpate.diffusion.denoiser import ConditionPolicy, UNetOptions
+from palpate.diffusion.latents import LatentStats
+from palpate.diffusion.presets import TINY
+from palpate.diffusion.recipe import train_pipeline
+from palpate.diffusion.training import Schedule, train_denoiser
+from palpate.encoders.loop import LoopOptions
+from palpate.encoders.towers import Towers
+
+
+def train(folder: Path, steps: int, start=None, **changes):
+    torch.manual_seed(3)
+    how = {
+        "stats": LatentStats((0.0,) * 3, (1.0,) * 3), "unet": TINY.unet, "policy": TINY.condition_for(6), "schedule": TINY.schedule,
+        "loop": LoopOptions(steps=steps, batch=2, lr=1e-2, warmup=0),
+    }  # fmt: skip
+    return train_denoiser(torch.randn(4, 3, 8, 8), {"text": torch.randn(4, 6)}, folder=folder, start=start, **(how | changes))
+
+
+def same(a, b) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a.unet.parameters(), b.unet.parameters(), strict=True))
+
+
+def test_it_begins_with_the_weights_of_the_other_and_leaves_those_alone(tmp_path):
+    start = make_pipeline().denoiser
+    kept = [p.clone() for p in start.unet.parameters()]
+    assert same(train(tmp_path / "a", 0, start), start)
+    assert not same(train(tmp_path / "b", 0), start)
+    moved = train(tmp_path / "c", 2, start)
+    assert not same(moved, start)
+    assert all(torch.equal(a, b) for a, b in zip(kept, start.unet.parameters(), strict=True))
+    # A checkpoint of a run from random weights is not continued by one that starts elsewhere.
+    train(tmp_path / "d", 2)
+    assert same(train(tmp_path / "d", 2, start), moved)
+
+
+def test_another_geometry_is_refused(tmp_path):
+    start = make_pipeline().denoiser
+    with pytest.raises(PalpateError, match="geometry of the preset"):
+        train(tmp_path, 1, start, unet=UNetOptions(widths=(16, 16), attention=(False, True), layers=1, head_width=16, groups=8))
+
+
+def test_a_learned_unconditional_token_goes_along(tmp_path):
+    policy = ConditionPolicy(width=6, null="learned")
+    start = make_pipeline(policy=policy).denoiser
+    made = train(tmp_path / "a", 0, start, policy=policy)
+    assert torch.equal(made.null, start.null)
+
+
+def test_other_towers_autoencoders_and_schedules_are_refused(small_manifest, tmp_path):
+    towers = make_towers()
+    start = replace(make_pipeline(width=towers.dim), towers=Towers(towers.clip))
+    manifest = Manifest(small_manifest.table, small_manifest.root, {"synthetic": "yes"})
+    split = Split.from_ids(train=manifest.ids[:8], test=manifest.ids[8:], rule={"name": "t"}, manifest=manifest.digest)
+    preset = replace(TINY, loop=replace(TINY.loop, steps=1))
+
+    def run(towers=towers, autoencoder=start.autoencoder, preset=preset):
+        return train_pipeline(manifest, split, towers, autoencoder, preset, tmp_path / "work", start=start, device="cpu")
+
+    other = make_pipeline().autoencoder
+    other.vq.quantize.embedding.weight.data.add_(1)
+    for change, word in (
+        ({"towers": make_towers(seed=4)}, "another vision tower"),
+        ({"autoencoder": other}, "another autoencoder"),
+        ({"preset": replace(preset, schedule=Schedule(prediction="v_prediction"))}, "another schedule"),
+    ):
+        with pytest.raises(PalpateError, match=word):
+            run(**change)
+    made = run()
+    assert made.stats == start.stats
+    assert made.training["start"] == start.digest
+    assert made.training["start_record"] == dict(start.training)
+    assert made.training["synthetic"] is True
+    assert made.training["materials"] == sorted(set(manifest.part(split, "train").column("material")))
+    assert all(name in made.notice for name in made.training["materials"])

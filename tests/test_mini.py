@@ -1,0 +1,303 @@
+"""Models by name: what ships with the package, what lies in a folder, what the hub has; 16-bit weights; model cards."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from diffusion_forge import make_pipeline
+from mini_forge import make_towers, write_shipped
+from palpate.core import PalpateError, shipped
+from palpate.core.cards import model_card, write_model_cards
+from palpate.core.shipped import PARTS, SHIPPED, is_hub_id, shipped_folder, shipped_root
+from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.pipeline import Pipeline
+from palpate.encoders import hub
+from palpate.encoders.half import round_to_half
+from palpate.encoders.towers import Towers, load_clip
+
+MINI = shipped_root() / "mini"
+needs_mini = pytest.mark.skipif(not MINI.is_dir(), reason="no models in src/palpate/mini yet")
+
+
+@pytest.fixture
+def no_network(monkeypatch):
+    """Counts attempts to reach anything; each fails."""
+    attempts: list[object] = []
+
+    def refuse(*args, **kwargs):
+        attempts.append(args)
+        raise OSError("no network here")
+
+    for name in ("getaddrinfo", "create_connection"):
+        monkeypatch.setattr(socket, name, refuse)
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    return attempts
+
+
+@pytest.fixture
+def mini(tmp_path, monkeypatch):
+    """``palpate/mini`` as tests write it, and the working directory beside it."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return write_shipped(tmp_path / "root", monkeypatch)
+
+
+def photos(n: int = 3) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (n, 20, 20, 3), dtype=np.uint8)
+
+
+def test_every_loader_takes_the_shipped_name_without_a_network(mini, no_network):
+    clip, towers, autoencoder = load_clip("palpate/mini"), Towers.load("palpate/mini"), Autoencoder.load("palpate/mini")
+    pipeline = Pipeline.load("palpate/mini")
+    assert clip.name == towers.clip.name == "palpate/mini"
+    assert clip.digest("vision") == towers.digest("vision") == pipeline.towers.digest("vision") == mini.towers.digest("vision")
+    assert towers.touch is not None
+    assert autoencoder.digest == pipeline.autoencoder.digest
+    assert pipeline.digest == mini.digest
+    assert np.array_equal(pipeline.touch(photos(), list("abc"), seed=1), mini.touch(photos(), list("abc"), seed=1))
+    assert no_network == []
+
+
+def test_a_folder_of_the_same_name_does_not_shadow_what_ships(mini):
+    here = make_towers(seed=5)
+    here.save(Path("palpate/mini"))
+    assert Towers.load("palpate/mini").digest("touch") != here.digest("touch")
+    for own in ("./palpate/mini", Path("palpate/mini"), Path("palpate/mini").resolve(), str(Path("palpate/mini").resolve())):
+        assert Towers.load(own).digest("touch") == here.digest("touch")
+
+
+@pytest.mark.parametrize("load", [load_clip, Towers.load, Autoencoder.load, Pipeline.load])
+def test_names_that_mean_nothing_are_told(mini, load, no_network):
+    for name in ("palpate/maxi", "palpate/", "palpate/mini/", "palpate/mini/../mini"):
+        with pytest.raises(PalpateError, match=r"must be one of palpate/mini\. Got 'palpate/.*a folder of that name is written \./palpate"):
+            load(name)
+    for name in ("no-such", "a/b/c", "../x"):
+        with pytest.raises(PalpateError):
+            load(name)
+    assert no_network == []
+
+
+def test_an_installation_without_the_files_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(shipped, "shipped_root", lambda: tmp_path)
+    with pytest.raises(PalpateError, match=r"palpate/mini must lie in the installed package\. Got no towers in"):
+        Towers.load("palpate/mini")
+
+
+def test_what_may_be_asked_of_the_hub(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "owner" / "local").mkdir(parents=True)
+    names = ("owner/name", "openai/clip-vit-large-patch14", "a.b/c_d-1.0")
+    assert [n for n in names if is_hub_id(n)] == list(names)
+    assert not any(map(is_hub_id, ("owner/local", "palpate/mini", "name", "a/b/c", "../a", "/a/b", "./a/b", "", Path("owner/name"))))
+    assert shipped_folder(Path("palpate/mini"), "clip") is None
+
+
+def test_a_hub_id_works_like_a_folder(mini, tmp_path, monkeypatch):
+    asked = []
+    places = {"o/towers": shipped_folder("palpate/mini", "towers"), "o/generator": shipped_folder("palpate/mini", "generator")}
+
+    def snapshot(name, allow_patterns):
+        asked.append((name, tuple(allow_patterns)))
+        return str(places[name])
+
+    monkeypatch.setattr(hub, "snapshot_download", snapshot)
+    assert Towers.load("o/towers").digest("touch") == Towers.load("palpate/mini").digest("touch")
+    assert Pipeline.load("o/generator").digest == mini.digest
+    assert [name for name, _ in asked] == ["o/towers", "o/generator"]
+    assert not any(".bin" in p or p == "*" for _, patterns in asked for p in patterns)
+
+
+def test_a_hub_out_of_reach_is_a_mistake_in_one_line(monkeypatch, no_network):
+    for load in (load_clip, Towers.load, Autoencoder.load, Pipeline.load):
+        with pytest.raises(PalpateError, match=r"o/none must be a local folder, one of palpate/mini, or a hub id within reach") as caught:
+            load("o/none")
+        assert "\n" not in str(caught.value)
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    (file,) = folder.glob("*model*.safetensors")
+    return load_file(file)
+
+
+def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
+    towers, exact = make_towers(), make_towers()
+    towers.save(tmp_path / "t", half=True)
+    again = Towers.load(tmp_path / "t")
+    assert {v.dtype for part in ("clip", "touch") for v in weights(tmp_path / "t" / part).values()} == {torch.float16}
+    assert {p.dtype for m in (again.clip.model, again.touch) for p in m.parameters()} == {torch.float32}
+    for name in ("vision", "text", "touch"):
+        assert again.digest(name) == towers.digest(name) != exact.digest(name)
+    for mine, before in zip(towers.touch.parameters(), exact.touch.parameters(), strict=True):
+        assert np.array_equal(mine.detach().numpy(), before.detach().numpy().astype(np.float16).astype(np.float32))
+    # The same weights in 32 bits are the same model; 16 bits are half the file.
+    towers.save(tmp_path / "full")
+    assert Towers.load(tmp_path / "full").digest("touch") == towers.digest("touch")
+    sizes = [sum(f.stat().st_size for f in (tmp_path / n).rglob("*.safetensors")) for n in ("t", "full")]
+    assert sizes[0] < 0.6 * sizes[1]
+    model = make_pipeline().autoencoder
+    full = model.digest
+    model.save(tmp_path / "a", half=True)
+    assert Autoencoder.load(tmp_path / "a").digest == model.digest != full
+    stored = weights(tmp_path / "a")
+    assert stored["quantize.embedding.weight"].dtype == torch.float16
+    assert torch.equal(stored["quantize.embedding.weight"].float(), model.vq.quantize.embedding.weight)
+    assert model.halve().relative == 0  # rounded once is rounded for good
+
+
+def test_a_whole_pipeline_in_half(tmp_path):
+    pipeline = replace(make_pipeline(), towers=None)
+    before = pipeline.digest  # kept by the object: must not outlive the rounding
+    pipeline.save(tmp_path / "p", half=True)
+    assert Pipeline.load(tmp_path / "p").digest == pipeline.digest != before
+    assert {v.dtype for v in weights(tmp_path / "p" / "unet").values()} == {torch.float16}
+
+
+def test_rounding_is_measured_and_refused_where_it_makes_infinity():
+    module = torch.nn.Linear(3, 1, bias=False)
+    module.weight.data = torch.tensor([[1.0, 1.0 + 2**-11 + 2**-20, 1e-9]])
+    done = round_to_half({"m": module})
+    assert module.weight.tolist() == [[1.0, 1.0 + 2**-10, 0.0]]
+    assert (done.where, done.lost) == ("m.weight", 1)
+    assert done.relative == pytest.approx(np.linalg.norm([2**-11 - 2**-20, 1e-9]) / np.linalg.norm([1, 1 + 2**-11 + 2**-20]), rel=1e-3)
+    for bad in (70000.0, float("nan"), float("inf")):
+        other = torch.nn.Linear(2, 1, bias=False)
+        other.weight.data = torch.tensor([[0.1, 0.2]])
+        module.weight.data = torch.tensor([[bad, 0.1, 0.1]])
+        with pytest.raises(PalpateError, match=r"finite and below 65,520.*m\.weight"):
+            round_to_half({"a": other, "m": module})
+        assert other.weight.tolist() == torch.tensor([[0.1, 0.2]]).tolist()
+
+
+def test_a_generator_that_refers_carries_no_copies_and_checks_what_it_finds(mini, tmp_path, monkeypatch):
+    folder = shipped_folder("palpate/mini", "generator")
+    assert sorted(p.name for p in folder.iterdir()) == ["README.md", "palpate.json", "scheduler", "unet"]
+    about = json.loads((folder / "palpate.json").read_text())
+    assert (about["shared"], about["autoencoder"], about["towers"]) == (
+        "palpate/mini", mini.autoencoder.digest, mini.towers.digest("vision"),
+    )  # fmt: skip
+    with pytest.raises(PalpateError, match="must use its autoencoder and vision tower"):
+        replace(mini, towers=make_towers(seed=9)).save(tmp_path / "other", shared="palpate/mini")
+    assert not (tmp_path / "other").exists()
+    with pytest.raises(PalpateError, match="may refer to palpate/mini"):
+        mini.save(tmp_path / "other", shared=str(tmp_path))
+    # A later version of the package ships other towers.
+    import shutil
+
+    place = shipped_folder("palpate/mini", "towers")
+    shutil.rmtree(place)
+    make_towers(seed=7).save(place, half=True)
+    with pytest.raises(PalpateError, match="must find the parts of palpate/mini that it was trained on"):
+        Pipeline.load("palpate/mini")
+    (folder / "palpate.json").write_text(json.dumps(about | {"shared": "../../towers"}))
+    with pytest.raises(PalpateError, match="may refer to palpate/mini"):
+        Pipeline.load("palpate/mini")
+
+
+def test_changed_clip_weights_are_noticed(mini):
+    note = shipped_folder("palpate/mini", "clip") / "palpate.json"
+    about = json.loads(note.read_text())
+    note.write_text(json.dumps(about | {"digests": about["digests"] | {"text": "0" * 64}}))
+    with pytest.raises(PalpateError, match=r"text tower in .* must match its digest"):
+        load_clip("palpate/mini")
+
+
+def test_a_card_is_made_of_the_json_alone(mini):
+    folder = shipped_folder("palpate/mini", "towers").parent
+    files = {p: p.read_text() for p in folder.rglob("README.md")}
+    assert sorted(p.parent.relative_to(folder).as_posix() for p in files) == [".", "autoencoder", "generator", "towers", "towers/clip"]
+    for path, text in files.items():
+        if path.parent != folder:
+            assert text == model_card(json.loads(path.with_name("palpate.json").read_text()))
+        path.unlink()
+    write_model_cards(folder)
+    assert {p: p.read_text() for p in folder.rglob("README.md")} == files
+    contents = (folder / "README.md").read_text()
+    for line in (
+        "| [towers/clip](towers/clip/README.md) | Vision and text towers | 0.0 |",
+        "| [generator](generator/README.md) | From a photo",
+    ):
+        assert line in contents
+
+
+def test_a_card_says_what_it_must(mini):
+    rows = [{"score": "PSNR", "value": 31.234567, "interval": [30.0, 32.5]}, {"score": "a|b", "n": 3, "value": None}]
+    card = {
+        "title": "T", "summary": "S.", "tags": ["x", "clip"], "scores": rows, "data": {"seeds": "1-2"}, "limits": ["Not real."],
+        "recipe": "python recipes/r.py", "digest of split": "ab", "loss": [{"loss": 1.0}] * 50,
+    }  # fmt: skip
+    text = model_card({"format": "palpate-clip/1", "digests": {"vision": "00ff"}, "card": card, "name": "palpate/mini"})
+    head, body = text.split("---\n")[1:3]
+    assert head == (
+        'license: "apache-2.0"\nlibrary_name: "transformers"\npipeline_tag: "zero-shot-image-classification"\n'
+        'tags:\n- "palpate"\n- "tactile"\n- "clip"\n- "x"\n'
+    )
+    for line in (
+        "# T", "S.", "| score | value | interval | n |", "| PSNR | 31.23 | [30, 32.5] |  |", "| a\\|b |  |  | 3 |", "| seeds |", "- Not real.",
+        "python recipes/r.py", "- vision: `00ff`", ' "digest of split": "ab",', 'clip = load_clip("palpate/mini")',
+    ):  # fmt: skip
+        assert f"\n{line}\n" in body, line
+    assert len(text) < 2500
+    with pytest.raises(PalpateError, match="made of one of palpate-clip/1"):
+        model_card({"format": "other"})
+
+
+def size(folder: Path) -> int:
+    return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
+
+
+@needs_mini
+def test_what_ships_is_small_enough_complete_and_16_bit():
+    assert set(SHIPPED) == {"palpate/mini"}
+    assert all((MINI / place / "palpate.json").is_file() for place in PARTS.values())
+    assert size(MINI / "towers") + size(MINI / "autoencoder") < 12e6
+    assert size(MINI / "generator") < 10e6
+    files = [p for p in MINI.rglob("*") if p.is_file()]
+    assert {p.suffix for p in files} <= {".json", ".md", ".safetensors"}
+    for place in ("towers/clip", "towers/touch", "autoencoder", "generator/unet"):
+        assert {v.dtype for v in weights(MINI / place).values() if v.is_floating_point()} == {torch.float16}
+
+
+@needs_mini
+def test_what_ships_loads_and_answers_without_a_network(no_network):
+    towers, pipeline = Towers.load("palpate/mini"), Pipeline.load("palpate/mini")
+    assert towers.digest("vision") == pipeline.towers.digest("vision")
+    assert "synthetic" in pipeline.notice
+    made = pipeline.touch(photos(1), ["a"], seed=0, steps=2)
+    assert made.shape == (1, pipeline.size, pipeline.size, 3)
+    assert made.std() > 0
+    assert no_network == []
+
+
+@needs_mini
+@pytest.mark.parametrize("place", sorted(set(PARTS.values())))
+def test_the_cards_of_what_ships_are_whole_and_current(place):
+    about = json.loads((MINI / place / "palpate.json").read_text())
+    card = about.get("card", about.get("training"))
+    assert {"title", "summary", "data", "scores", "recipe", "limits"} <= set(card)
+    assert (MINI / place / "README.md").read_text() == model_card(about)
+    assert "900" in json.dumps(card["data"])  # seeds that no experiment uses
+
+
+@pytest.mark.slow
+@needs_mini
+def test_a_fresh_process_with_the_hub_switched_off(tmp_path):
+    code = (
+        "import socket\n"
+        "def no(*a, **k): raise SystemExit('the network was asked')\n"
+        "socket.getaddrinfo = socket.create_connection = socket.socket.connect = no\n"
+        "from palpate.diffusion.pipeline import Pipeline\nfrom palpate.encoders.towers import Towers, load_clip\n"
+        "print(Pipeline.load('palpate/mini').digest, Towers.load('palpate/mini').dim, load_clip('palpate/mini').dim)"
+    )
+    env = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | {"HF_HOME": str(tmp_path)}
+    for more in ({}, {"HF_HUB_OFFLINE": "1"}):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env | more, check=False, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr

@@ -1,0 +1,94 @@
+"""The pipeline on ready models: what falls away, what goes on from where, and that every card says what its model saw."""
+
+from dataclasses import replace
+
+import pytest
+
+from mini_forge import WORLD, write_shipped
+from palpate.core import PalpateError, read_json, shipped
+from palpate.core.shipped import shipped_folder
+from palpate.diffusion.pipeline import Pipeline
+from palpate.encoders.towers import Towers
+from palpate.protocol import presets
+from palpate.protocol.pipeline import PipelineOptions, run_pipeline
+from palpate.protocol.summary import summarise
+from palpate.sim import MINI_SEEDS, write_world
+
+OPTIONS = PipelineOptions(preset="tiny", device="cpu", workers=1)
+
+
+@pytest.fixture
+def mini(tmp_path, monkeypatch):
+    """The preset tiny, on shipped models that the test wrote."""
+    generator = write_shipped(tmp_path / "root", monkeypatch)
+    monkeypatch.setitem(presets.PRESETS, "tiny", replace(presets.PRESETS["tiny"], models="palpate/mini", start=True))
+    return generator
+
+
+def test_no_preset_plays_in_a_world_that_the_shipped_models_saw():
+    for preset in presets.PRESETS.values():
+        assert preset.world.seed not in MINI_SEEDS
+        assert preset.pretraining.seed not in MINI_SEEDS
+
+
+@pytest.mark.slow
+def test_shipped_models_take_the_place_of_three_stages(mini, tmp_path):
+    done = run_pipeline(OPTIONS, tmp_path / "run")
+    assert list(done.stages) == ["world", "data", "split", "towers", "generator", "generated", "scores"]
+    assert done.models == {"clip": "palpate/mini", "autoencoder": "palpate/mini"}
+    towers, model = Towers.load(tmp_path / "run" / "towers" / "towers"), Pipeline.load(tmp_path / "run" / "generator" / "model")
+    ready = Towers.load("palpate/mini")
+    assert towers.digest("vision") == ready.digest("vision")
+    assert towers.digest("touch") != ready.digest("touch")
+    assert towers.card["start_card"]["data"] == WORLD
+    assert towers.card["clip"] == "palpate/mini"
+    assert model.training["start"] == mini.digest
+    assert model.training["start_record"]["data"] == WORLD
+    assert model.stats == mini.stats
+    assert "Brick" in model.notice
+    assert {s.encoder for s in done.scores if s.metric == "TMMD"} == {towers.digest("touch")}
+    bound = done.stages["generator"].facts["autoencoder on test touches"]
+    assert (bound["n"], bound["codes"]) == (len(done.split.ids("test")), 64)
+    results = summarise(done, "palpate demo")
+    (note,) = [n for n in results.notes if "shipped with palpate (palpate/mini)" in n]
+    assert "the touch tower's starting weights" in note
+    assert not [n for n in results.notes if "trained in this run" in n]
+    assert results.settings["models"] == done.models
+    lines: list[str] = []
+    run_pipeline(OPTIONS, tmp_path / "run", say=lines.append)
+    assert all("already done" in line for line in lines)
+    # A rewritten page changes nothing; another card, everything that carries it, and the same weights make the same pictures.
+    place = shipped_folder("palpate/mini", "clip")
+    for name, kept in (("README.md", set(done.stages)), ("palpate.json", {"world", "data", "split", "generated"})):
+        (place / name).write_text((place / name).read_text().replace("}", "} ", 1) + "\n")
+        lines.clear()
+        run_pipeline(OPTIONS, tmp_path / "run", say=lines.append)
+        assert {line.split(":")[0] for line in lines if "already done" in line} == kept
+
+
+@pytest.mark.slow
+def test_from_scratch_and_the_variant_with_backgrounds_start_from_nothing(mini, tmp_path):
+    done = run_pipeline(replace(OPTIONS, from_scratch=True), tmp_path / "a")
+    assert {"pretraining", "clip", "autoencoder"} <= set(done.stages)
+    assert Pipeline.load(tmp_path / "a" / "generator" / "model").training["start"] is None
+    assert Towers.load(tmp_path / "a" / "towers" / "towers").card["start_card"].get("data") is None
+    assert any("trained in this run" in n for n in summarise(done, "x").notes)
+    run_pipeline(replace(OPTIONS, background=True), tmp_path / "b")
+    assert Pipeline.load(tmp_path / "b" / "generator" / "model").training["start"] is None
+
+
+def test_a_world_that_the_shipped_models_saw_is_refused(mini, tmp_path):
+    tiny = replace(presets.PRESETS["tiny"].world, seed=MINI_SEEDS[3])
+    write_world(tmp_path / "seen", tiny, workers=1)
+    assert read_json(tmp_path / "seen" / "world.json", "world")["seen_by_shipped_models"]
+    with pytest.raises(PalpateError, match=r"must not have been trained on the data.*another --seed, or pass --from-scratch"):
+        run_pipeline(replace(OPTIONS, data=tmp_path / "seen"), tmp_path / "run")
+
+
+def test_absent_and_unknown_models_are_told_before_any_work(tmp_path, monkeypatch):
+    with pytest.raises(PalpateError, match=r"must be one of palpate/mini\. Got 'palpate/maxi'"):
+        run_pipeline(replace(OPTIONS, clip="palpate/maxi"), tmp_path / "run")
+    monkeypatch.setattr(shipped, "shipped_root", lambda: tmp_path)
+    with pytest.raises(PalpateError, match="must lie in the installed package"):
+        run_pipeline(replace(OPTIONS, autoencoder="palpate/mini"), tmp_path / "run")
+    assert not list((tmp_path / "run").glob("*"))

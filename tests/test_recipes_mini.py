@@ -1,0 +1,103 @@
+"""The recipe of the shipped models, in small: every part, its resumption, the shipped folder, and the check of the cards."""
+
+import importlib
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from palpate.core import PalpateError, digest_folder, read_json
+from palpate.core import shipped as shipped_module
+from palpate.sim.presets import MINI_SEEDS
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+
+
+@pytest.fixture
+def mini(monkeypatch):
+    monkeypatch.syspath_prepend(str(RECIPES))
+    names = ("mini", "mini_scores", "mini_cards")
+    modules = [importlib.import_module(name) for name in names]
+    yield modules[0]
+    for name in names:
+        sys.modules.pop(name)
+
+
+@pytest.fixture
+def small(mini, monkeypatch, tmp_path):
+    """The recipe with worlds and trainings of a few seconds, shipping into a folder of the test."""
+    few = {"materials": ("Wood", "Brick", "Grass"), "objects_per_material": 4, "touches_per_video": 2}
+    monkeypatch.setattr(mini, "WORLDS", {name: replace(options, **few) for name, options in mini.WORLDS.items()})
+    monkeypatch.setattr(mini, "CLIP_EPOCHS", 1.0)
+    monkeypatch.setattr(mini, "TOUCH_EPOCHS", 1.0)
+    monkeypatch.setattr(mini, "AUTOENCODER", replace(mini.AUTOENCODER, steps_free=3, steps_quantised=2, codes=32))
+    monkeypatch.setattr(mini, "GENERATOR_STEPS", 3)
+    monkeypatch.setattr(sys.modules["mini_scores"], "GENERATED", 8)
+    monkeypatch.setattr(sys.modules["mini_scores"], "POOL", 10)
+    monkeypatch.setattr(shipped_module, "shipped_root", lambda: tmp_path / "package")
+    monkeypatch.setattr(mini, "shipped_root", lambda: tmp_path / "package")
+    monkeypatch.setattr(mini, "PAGE", tmp_path / "mini.md")
+    (tmp_path / "mini.md").write_text("before\n<!-- scores of the cards -->\nold\n<!-- end of the scores -->\nafter\n")
+    return mini
+
+
+def test_the_page_tells_the_scores_of_the_cards(mini):
+    target = shipped_module.shipped_root() / "mini"
+    assert sys.modules["mini_cards"].scores_table(target) in (RECIPES.parent / "docs" / "mini.md").read_text(encoding="utf-8")
+
+
+def test_only_reserved_seeds_are_read_and_none_twice(mini):
+    seeds = [options.seed for options in mini.WORLDS.values()]
+    assert len(set(seeds)) == len(seeds)
+    assert all(seed in MINI_SEEDS for seed in seeds)
+
+
+@pytest.mark.slow
+def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
+    recipe = small.Recipe(tmp_path / "work", 1.0)
+    recipe.make("autoencoder")
+    assert not (tmp_path / "work" / "clip").exists()  # it does not need the towers
+    recipe.make("scores")
+    recipe.ship()
+    target = tmp_path / "package" / "mini"
+    first = digest_folder(target)
+    scores = {part: read_json(target / part / "palpate.json", "card") for part in ("towers", "autoencoder", "generator")}
+    rows = {row["score"]: row for row in scores["towers"]["card"]["scores"]}
+    assert rows["zero-shot material, vision"]["chance"] == pytest.approx(1 / 20)  # of all twenty, though three occur here
+    assert {"codebook perplexity, gelsight", "PSNR [dB], digit", "codes never used, digit"} <= {
+        row["score"] for row in scores["autoencoder"]["card"]["scores"]
+    }
+    assert any(row["score"] == "TMMD, generated" for row in scores["generator"]["training"]["scores"])
+    assert "900050" in (target / "towers" / "README.md").read_text()
+    page = (tmp_path / "mini.md").read_text()
+    assert page.startswith("before\n")
+    assert page.endswith("after\n")
+    assert "old" not in page
+    assert "| autoencoder | codes | 32 |" in page
+    # Again: everything is read, nothing trained, and the same bytes are shipped.
+    capsys.readouterr()
+    again = small.Recipe(tmp_path / "work", 1.0)
+    again.make("scores")
+    said = capsys.readouterr().out
+    assert "already done" in said
+    assert "training" not in said
+    shutil.rmtree(target)
+    again.ship()
+    assert digest_folder(target) == first
+    assert again.verify() == 0
+    # A card that promises more than the weights keep is told.
+    about = read_json(target / "autoencoder" / "palpate.json", "card")
+    about["card"]["scores"][0]["value"] += 1.0
+    from palpate.core import write_json
+
+    write_json(target / "autoencoder" / "palpate.json", about)
+    capsys.readouterr()
+    assert again.verify() == 1
+    assert capsys.readouterr().out.count("DIFFERS") == 1
+
+
+def test_a_shortened_training_is_not_shipped(small, tmp_path):
+    with pytest.raises(PalpateError, match="in full"):
+        small.Recipe(tmp_path / "work", 0.5).ship()
