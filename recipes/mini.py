@@ -47,6 +47,7 @@ from palpate.diffusion.recipe import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_touch
 from palpate.encoders.presets import preset
 from palpate.encoders.towers import Towers, load_clip
+from palpate.protocol.inputs import fresh
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 
 NAME = "palpate/mini"
@@ -160,7 +161,7 @@ class Recipe:
                 cache=self.cache,
                 progress=self.progress,
             )
-            clip.save(folder / "clip")
+            clip.save(fresh(folder / "clip"))
             return {"vision": clip.digest("vision"), "text": clip.digest("text")}
 
         stage = self.run.stage("clip", {"preset": ENCODER, "epochs": epochs, "seed": SEED, "train": train.digest}, build)
@@ -176,7 +177,7 @@ class Recipe:
                 train, self._everything(train), load_clip(clip), ENCODER, folder / "training", epochs=epochs, seed=SEED, cache=self.cache,
                 progress=self.progress,
             )  # fmt: skip
-            towers.save(folder / "towers")
+            towers.save(fresh(folder / "towers"))
             return {"touch": towers.digest("touch")}
 
         stage = self.run.stage("towers", {"preset": ENCODER, "epochs": epochs, "seed": SEED, "clip": self.run.stages["clip"].digest}, build)
@@ -195,7 +196,7 @@ class Recipe:
             model = train_autoencoder(
                 images, options, folder / "training", seed=SEED, key=digest_json([p.digest for p in parts]), progress=self.progress
             )
-            model.save(folder / "autoencoder")
+            model.save(fresh(folder / "autoencoder"))
             return {"digest": model.digest}
 
         inputs = {"options": options, "seed": SEED, "train": [p.digest for p in parts]}
@@ -213,7 +214,7 @@ class Recipe:
                 train, self._everything(train), towers, autoencoder, DIFFUSION, folder / "training", seed=SEED, steps=steps, cache=self.cache,
                 progress=self.progress,
             )  # fmt: skip
-            pipeline.save(folder / "model")
+            pipeline.save(fresh(folder / "model"))
             return {"digest": pipeline.digest, "train": len(train)}
 
         inputs = {
@@ -244,6 +245,7 @@ class Recipe:
     def _halve(towers: Towers, autoencoder: Autoencoder, pipeline: Pipeline) -> dict[str, float]:
         """Rounds all weights to 16 bits, in place; the largest relative change of a tensor of each model."""
         changes = {"towers": towers.halve(), "autoencoder": autoencoder.halve(), "generator": pipeline.denoiser.halve()}
+        vars(pipeline).pop("digest", None)  # cached before the weights changed
         return {name: change.relative for name, change in changes.items()}
 
     def ship(self) -> None:
@@ -274,6 +276,9 @@ class Recipe:
         bad = 0
         for part, scored in rows.items():
             said = {row["score"]: row["value"] for row in cards[part]["scores"]}
+            if missing := sorted(set(said) - {row["score"] for row in scored}):
+                bad += len(missing)
+                say(f"{part}: the card has scores that are no longer made: {', '.join(missing)}  DIFFERS")
             for row in scored:
                 value, card = row["value"], said.get(row["score"])
                 same = card is not None and abs(value - card) <= 0.002 * max(1.0, abs(card))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,10 +36,14 @@ SUMMARIES = {
         "It knows the world's twenty materials and nothing else, tells rough from smooth better than one rough material from another, and always answers for the one gel unit it has learnt.",
     ),
 }
+PAIR = (
+    "Vision and text towers of palpate's world",
+    "A small CLIP with its own tokenizer, trained on photos and captions of the procedural world; its space has 128 dimensions. The touch tower beside it was trained against it.",
+)
 READ = {
     "towers": ("touches", "new touches"),
     "autoencoder": ("touches", "digit", "new touches", "new digit"),
-    "generator": ("one unit", "new touches"),
+    "generator": ("one unit", "touches", "new touches"),
 }
 
 
@@ -64,26 +69,49 @@ def ship(
         before = {row["score"]: row["value"] for row in scores["exact"][part]}
         for row in rows:
             row["in 32 bits"] = before[row["score"]]
-        data = [
-            {**world, "used for": "scores" if str(world["world"]).startswith("new") else "training"}
-            for world in worlds
-            if world["world"] in READ[part]
-        ]
+        data = [{**world, "used for": _use(part, str(world["world"]))} for world in worlds if world["world"] in READ[part]]
         return {
             "name": NAME, "title": title, "summary": summary, "tags": list(TAGS), "license": "apache-2.0", "data": data, "scores": rows,
             "limits": list(limits), "recipe": RECIPE, "world version": VERSION, "synthetic": True,
             "largest relative change by 16 bits": scores["rounding"][part],
         }  # fmt: skip
 
-    shutil.rmtree(target, ignore_errors=True)
     towers.card = {**towers.card, **card("towers")}
-    towers.clip.card = {**towers.clip.card, **card("towers")}
-    towers.save(target / "towers", half=True)
+    pair = card("towers")
+    pair["title"], pair["summary"] = PAIR
+    pair["scores"] = [row for row in pair["scores"] if "touch" not in row["score"]]
+    towers.clip.card = {**towers.clip.card, **pair}
     autoencoder.card = {**autoencoder.card, **card("autoencoder")}
-    autoencoder.save(target / "autoencoder", half=True)
     pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
-    pipeline.save(target / "generator", half=True, shared=NAME)
-    write_model_cards(target)
+    with _replacing(target):
+        towers.save(target / "towers", half=True)
+        autoencoder.save(target / "autoencoder", half=True)
+        pipeline.save(target / "generator", half=True, shared=NAME)
+        write_model_cards(target)
+
+
+@contextmanager
+def _replacing(target: Path) -> Generator[None]:
+    """Puts what was at ``target`` aside, and back if the new one fails."""
+    before = target.with_name(f".{target.name}.before")
+    if target.exists():
+        shutil.rmtree(before, ignore_errors=True)
+        target.rename(before)
+    try:
+        yield
+    except BaseException:
+        shutil.rmtree(target, ignore_errors=True)
+        if before.exists():
+            before.rename(target)
+        raise
+    shutil.rmtree(before, ignore_errors=True)
+
+
+def _use(part: str, world: str) -> str:
+    """What a world was used for by a part."""
+    if world.startswith("new"):
+        return "scores"
+    return "training of the towers and the autoencoder" if part == "generator" and world == "touches" else "training"
 
 
 MARKS = ("<!-- scores of the cards -->", "<!-- end of the scores -->")

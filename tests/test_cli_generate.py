@@ -56,9 +56,17 @@ def test_several_photos_and_folders_become_folders(place, capsys):
         "c": ["photo.jpg"],
     }
     assert all("synthetic" in i["notice"] for i in index.values())
-    (place / "folder.png").mkdir()  # a folder is a folder, whatever its name
-    assert call(capsys, "photo.jpg", "-o", "folder.png", "-q")[0] == 0
-    assert (place / "folder.png" / "index.json").is_file()
+    (place / "folder.png").mkdir()  # whoever names a picture does not mean to fill a folder
+    status, _, err = call(capsys, "photo.jpg", "-o", "folder.png", "-q")
+    assert (status, "the folder folder.png" in err, "Choose another name" in err) == (2, True, True)
+    assert not any((place / "folder.png").iterdir())
+
+
+@pytest.mark.parametrize("guidance", ["-1", "-0.001", "nan", "inf", "-inf"])
+def test_guidance_must_be_a_number_from_zero_on(place, capsys, guidance):
+    status, _, err = call(capsys, "photo.jpg", "-o", "y.png", "--guidance", guidance)
+    assert (status, "finite number from 0 on" in err) == (2, True)
+    assert not (place / "y.png").exists()
 
 
 def test_what_cannot_be_done_is_one_line_and_writes_nothing(place, capsys):

@@ -237,3 +237,27 @@ def test_latents_are_encoded_once(tmp_path):
     n = len(calls)
     encode_latents(model, Rows(), list("abcdX"), tmp_path, key="other", batch=2)
     assert len(calls) > n
+
+
+def test_a_card_that_cannot_be_used_is_told(tmp_path):
+    random_model().save(tmp_path / "ae")
+    file = tmp_path / "ae" / "palpate.json"
+    about = json.loads(file.read_text())
+    cases = [
+        ([], "must be a JSON object"),
+        ({}, "must have the format palpate-autoencoder/1"),
+        (about | {"format": "x"}, "must have the format palpate-autoencoder/1"),
+        *(({k: v for k, v in about.items() if k != key}, f"Got no {key}") for key in ("patch", "digest", "card")),
+        *((about | {"patch": patch}, "patch must be a whole number") for patch in ("x", "4", 4.0, None, 0, -4, True)),
+        (about | {"card": []}, "card an object"),
+        (about | {"patch": 2}, "must have 12 input and output channels"),
+    ]
+    for content, word in cases:
+        file.write_text(json.dumps(content))
+        with pytest.raises(PalpateError, match=word):
+            Autoencoder.load(tmp_path / "ae")
+    file.write_text(json.dumps(about))
+    weights = next((tmp_path / "ae").glob("*.safetensors"))
+    weights.write_bytes(weights.read_bytes()[:50])
+    with pytest.raises(PalpateError, match="must be a diffusers VQModel"):
+        Autoencoder.load(tmp_path / "ae")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from palpate.core import PalpateError
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, UNetOptions, build_unet
@@ -265,3 +266,42 @@ def test_the_token_reaches_the_output_and_a_saved_denoiser_is_the_same(tmp_path,
         model.save(tmp_path / "unet")
         again = Denoiser.load(tmp_path / "unet", policy)
         torch.testing.assert_close(again(x, t, again.tokens(c, "text")), out)
+
+
+def test_the_token_reaches_the_output_through_the_time_embedding_alone():
+    torch.manual_seed(0)
+    for modulate in (True, False):
+        net = build_unet(replace(UNET, modulate=modulate), channels=3, size=8, width=8, background=False)
+        model = Denoiser(net, ConditionPolicy(width=8)).eval()
+        values = [p for name, p in net.named_parameters() if "attn2.to_v" in name]
+        assert values
+        x, t = torch.randn(2, 3, 8, 8), torch.tensor([3, 700])
+        with torch.no_grad():
+            for weights in values:
+                weights.zero_()  # cross-attention now adds the same to every token
+            a, b = (model(x, t, model.tokens(torch.randn(2, 8), "text")) for _ in range(2))
+        assert torch.allclose(a, b, atol=1e-6) != modulate
+
+
+@pytest.mark.filterwarnings("ignore:It is deprecated:FutureWarning")
+@pytest.mark.parametrize("harm", ["cut", "no means", "no null", "shape", "config", "weights"])
+def test_a_broken_folder_is_told(tmp_path, harm):
+    policy, folder = replace(POLICY, null="learned"), tmp_path / "unet"
+    denoiser(policy).save(folder)
+    extra = folder / "condition.safetensors"
+    tensors = load_file(extra)
+    if harm == "cut":
+        extra.write_bytes(extra.read_bytes()[:40])
+    elif harm == "shape":
+        save_file({**tensors, "means": torch.zeros(1, 12)}, extra)
+    elif harm == "config":
+        (folder / "config.json").write_text("[]")
+    elif harm == "weights":
+        weights = folder / "diffusion_pytorch_model.safetensors"
+        weights.write_bytes(weights.read_bytes()[:100])
+    else:
+        del tensors[harm.removeprefix("no ")]
+        save_file(tensors, extra)
+    with pytest.raises(PalpateError, match="must be a folder written by palpate") as told:
+        Denoiser.load(folder, policy)
+    assert str(folder) in told.value.got

@@ -106,7 +106,7 @@ def test_tampering_is_noticed(tmp_path):
         with pytest.raises(PalpateError, match="must match its palpate"):
             Pipeline.load(tmp_path / "p")
     file.write_text(json.dumps({"format": "other"}))
-    with pytest.raises(PalpateError, match="must be a pipeline"):
+    with pytest.raises(PalpateError, match="must have the format palpate-pipeline"):
         Pipeline.load(tmp_path / "p")
     with pytest.raises(PalpateError, match="must exist"):
         Pipeline.load(tmp_path / "nowhere")
@@ -142,3 +142,38 @@ def test_what_cannot_be_done_is_refused():
         without_towers(make_pipeline()).touch(photos(1), ["a"], seed=0)
     with pytest.raises(PalpateError, match="one condition"):
         make_pipeline().touch(photos(2), ["a"], seed=0)
+
+
+def test_a_card_that_cannot_be_used_is_told_with_file_and_entry(tmp_path):
+    without_towers(make_pipeline()).save(tmp_path / "p")
+    file = tmp_path / "p" / "palpate.json"
+    about = json.loads(file.read_text())
+    for key in ("digest", "preset", "size", "condition", "schedule", "sampler", "latents", "autoencoder", "towers", "training"):
+        file.write_text(json.dumps({k: v for k, v in about.items() if k != key}))
+        with pytest.raises(PalpateError, match="must have the keys") as told:
+            Pipeline.load(tmp_path / "p")
+        assert told.value.got == f"no {key}"
+        assert str(file) in told.value.must
+    bad = {
+        "condition": [about["condition"] | {"extra": 1}, [], {}, None, about["condition"] | {"dropout": "x"}],
+        "schedule": [{"more": 1}, "x"],
+        "sampler": [{"methods": "ddim"}, {"steps": "x"}, {"guidance": None}, 3],
+        "latents": [{}, {"mean": None, "std": [1], "scale": "std"}, {"mean": ["x"], "std": [1], "scale": "std"}, []],
+        "size": ["x", None, [32]],
+        "training": [[], None, "x"],
+    }
+    for key, values in bad.items():
+        for value in values:
+            file.write_text(json.dumps(about | {key: value}))
+            with pytest.raises(PalpateError, match=f"^{key} in .*palpate.json must be as palpate writes it"):
+                Pipeline.load(tmp_path / "p")
+    for value, word in (({"method": "nope"}, "method must be ddim or dpm"), ({"guidance": -1.0}, "from 0 on"), ({"steps": 0}, "steps")):
+        file.write_text(json.dumps(about | {"sampler": about["sampler"] | value}))
+        with pytest.raises(PalpateError, match=word):
+            Pipeline.load(tmp_path / "p")
+    for text, word in (("[]", "must be a JSON object"), (json.dumps(about | {"size": float("nan")}), "finite numbers")):
+        file.write_text(text)
+        with pytest.raises(PalpateError, match=word):
+            Pipeline.load(tmp_path / "p")
+    file.write_text(json.dumps(about))
+    Pipeline.load(tmp_path / "p")

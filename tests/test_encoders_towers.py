@@ -252,3 +252,29 @@ def test_augmentation():
         assert np.allclose(np.polyval(line, picture.flatten().numpy()), result.flatten().numpy(), atol=1e-4)
     with pytest.raises(PalpateError, match="crop"):
         Augment(crop=1.0)
+
+
+def test_json_that_cannot_be_used_is_told(towers, tmp_path):
+    towers.save(tmp_path / "t")
+    own, inner = tmp_path / "t" / "palpate.json", tmp_path / "t" / "clip" / "palpate.json"
+    cases = []
+    for file in (own, inner):
+        about = json.loads(file.read_text())
+        cases += [(file, [], "must be a JSON object"), (file, about | {"format": "x"}, "must have the format palpate-")]
+        cases += [(file, {k: v for k, v in about.items() if k != key}, f"Got no {key}") for key in ("digests", "card")]
+        cases += [(file, about | {"digests": value}, "an object with vision and text") for value in ({}, [], None, {"vision": "0"})]
+        cases += [(file, about | {"card": value}, "card an object") for value in ([], None, "x")]
+    for place in ("clip", "touch"):
+        file = tmp_path / "t" / place / "preprocessor_config.json"
+        about = json.loads(file.read_text())
+        cases += [(file, [], "must be a JSON object")]
+        wrong = ({"size": "x"}, {"size": []}, {"image_mean": [1]}, {"image_std": "abc"}, {"crop_size": {"height": []}})
+        cases += [(file, about | change, "An entry in .* must be as palpate writes it") for change in wrong]
+    for file, content, word in cases:
+        good = file.read_text()
+        file.write_text(json.dumps(content))
+        with pytest.raises(PalpateError, match=word) as told:
+            Towers.load(tmp_path / "t")
+        assert str(file) in told.value.must
+        file.write_text(good)
+    Towers.load(tmp_path / "t")

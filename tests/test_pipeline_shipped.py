@@ -5,11 +5,13 @@ from dataclasses import replace
 import pytest
 
 from mini_forge import WORLD, write_shipped
-from palpate.core import PalpateError, read_json, shipped
+from palpate.core import PalpateError, read_json, shipped, write_json
 from palpate.core.shipped import shipped_folder
+from palpate.data.importing import import_dataset
 from palpate.diffusion.pipeline import Pipeline
 from palpate.encoders.towers import Towers
 from palpate.protocol import presets
+from palpate.protocol.inputs import require_unseen
 from palpate.protocol.pipeline import PipelineOptions, run_pipeline
 from palpate.protocol.summary import summarise
 from palpate.sim import MINI_SEEDS, write_world
@@ -83,6 +85,21 @@ def test_a_world_that_the_shipped_models_saw_is_refused(mini, tmp_path):
     assert read_json(tmp_path / "seen" / "world.json", "world")["seen_by_shipped_models"]
     with pytest.raises(PalpateError, match=r"must not have been trained on the data.*another --seed, or pass --from-scratch"):
         run_pipeline(replace(OPTIONS, data=tmp_path / "seen"), tmp_path / "run")
+    # Nor by any file or folder of it, a link to it, or a table elsewhere that was made of it.
+    refusal = "must not have been trained on the data"
+    (tmp_path / "link").symlink_to(tmp_path / "seen" / "manifest.parquet")
+    for part in ("seen/manifest.parquet", "seen/dataset", "link"):
+        with pytest.raises(PalpateError, match=refusal):
+            run_pipeline(replace(OPTIONS, data=tmp_path / part), tmp_path / "run")
+    done = import_dataset(tmp_path / "seen", tmp_path / "import").manifest
+    (tmp_path / "seen").rename(tmp_path / "gone")
+    assert done.facts["world_seed"] == str(MINI_SEEDS[3])
+    with pytest.raises(PalpateError, match=refusal):
+        require_unseen(tmp_path, done.facts)
+    require_unseen(tmp_path, done.facts | {"world_seed": "7"})
+    # The nearest world tells: a fresh one inside the folder of a seen one is unseen.
+    write_json(tmp_path / "gone" / "new" / "world.json", {"format": "palpate-world/1"})
+    require_unseen(tmp_path / "gone" / "new" / "manifest.parquet")
 
 
 def test_absent_and_unknown_models_are_told_before_any_work(tmp_path, monkeypatch):

@@ -71,6 +71,12 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     }
     assert any(row["score"] == "TMMD, generated" for row in scores["generator"]["training"]["scores"])
     assert "900050" in (target / "towers" / "README.md").read_text()
+    assert not any("touch" in row["score"] for row in read_json(target / "towers" / "clip" / "palpate.json", "card")["card"]["scores"])
+    trained = {
+        part: {row["seed"] for row in (about.get("card") or about["training"])["data"] if row["used for"] == "training"}
+        for part, about in scores.items()
+    }
+    assert trained == {"towers": {900_000}, "autoencoder": {900_000, 900_001}, "generator": {900_002}}
     page = (tmp_path / "mini.md").read_text()
     assert page.startswith("before\n")
     assert page.endswith("after\n")
@@ -96,6 +102,41 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     capsys.readouterr()
     assert again.verify() == 1
     assert capsys.readouterr().out.count("DIFFERS") == 1
+
+
+@pytest.mark.slow
+def test_a_stop_between_saving_and_the_end_of_a_part_is_mended(small, tmp_path, monkeypatch):
+    from palpate.encoders.towers import FrozenClip
+
+    save = FrozenClip.save
+
+    def stopped(self, folder, **how):
+        save(self, folder, **how)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FrozenClip, "save", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            small.Recipe(tmp_path / "work", 1.0).make("clip")
+    recipe = small.Recipe(tmp_path / "work", 1.0)
+    recipe.make("clip")
+    assert (tmp_path / "work" / "clip" / "clip" / "model.safetensors").is_file()
+
+
+def test_a_failed_shipping_leaves_what_was_there(mini, tmp_path):
+    cards = sys.modules["mini_cards"]
+    (tmp_path / "mini").mkdir()
+    (tmp_path / "mini" / "kept").write_text("old")
+
+    def fill():
+        with cards._replacing(tmp_path / "mini"):
+            (tmp_path / "mini").mkdir()
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="full"):
+        fill()
+    assert (tmp_path / "mini" / "kept").read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["mini"]
 
 
 def test_a_shortened_training_is_not_shipped(small, tmp_path):

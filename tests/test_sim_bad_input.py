@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import json
 import os
+import pickle
 import resource
 import subprocess
 import sys
@@ -13,7 +14,19 @@ import pytest
 
 from palpate.cli import main
 from palpate.core import PalpateError, ProblemsError, digest_folder
-from palpate.sim import MATERIALS, MINI_SEEDS, PRESETS, VERSION, Material, Surface, WorldOptions, load_options, save_options, write_world
+from palpate.sim import (
+    MATERIALS,
+    MINI_SEEDS,
+    PRESETS,
+    VERSION,
+    Material,
+    Surface,
+    World,
+    WorldOptions,
+    load_options,
+    save_options,
+    write_world,
+)
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
 
@@ -209,7 +222,8 @@ def test_an_unfinished_world_of_another_version_is_refused_by_name(tmp_path):
     changed(old / ".work" / "state.json", version=VERSION - 1)
     with pytest.raises(PalpateError, match=r"\.w\.0123456789ab\.part.*Got version"):
         write_world(tmp_path / "w", TINY)
-    (old / ".work" / "state.json").unlink()  # as the first version left them
+    (old / ".work" / "state.json").unlink()
+    (old / "dataset").mkdir()  # as the first version left them
     with pytest.raises(PalpateError, match="Got no version"):
         write_world(tmp_path / "w", TINY)
 
@@ -281,3 +295,64 @@ def test_a_world_of_the_shipped_models_says_so(tmp_path, capsys):
     assert "shipped mini models" in json.loads((tmp_path / "w" / "world.json").read_text())["seen_by_shipped_models"]
     write_world(tmp_path / "v", TINY)
     assert "seen_by_shipped_models" not in json.loads((tmp_path / "v" / "world.json").read_text())
+
+
+HUGE = 10**400
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, HUGE) for name in ("seed", "size", "hard", "pad_mm", "materials", "look", "view_mm")),
+        *((name, 10**5000) for name in ("seed", "hard", "materials", "look", "view_mm")),
+        ("view_mm", (30.0, HUGE)),
+        ("relax_mm", [10**5000]),
+        ("materials", ["Wood", HUGE]),
+        ("look", np.array(["gelsight", "digit"])),
+        ("view_mm", np.array([30.0, 40.0])),
+        ("hard", np.array([0.1, 0.2])),
+        ("materials", np.arange(1000)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
+)
+def test_huge_numbers_and_arrays_are_refused_in_one_short_line(name, value):
+    with pytest.raises(PalpateError, match=f"{name} must be") as error:
+        WorldOptions(**{name: value})
+    assert error.value.got
+    assert error.value.fix
+    assert len(str(error.value)) < 400
+    assert "\n" not in str(error.value)
+
+
+def test_huge_numbers_in_a_file_are_refused(tmp_path):
+    path = tmp_path / "o.json"
+    save_options(WorldOptions(seed=5), path)
+    text = path.read_text()
+    path.write_text(text.replace('"seed": 5', f'"seed": {HUGE}'))
+    with pytest.raises(PalpateError, match="seed must be a whole number"):
+        load_options(path)
+    path.write_text(text.replace('"hard": 0.5', f'"hard": {HUGE}'))
+    with pytest.raises(PalpateError, match="hard must be a number"):
+        load_options(path)
+    path.write_text(text.replace('"seed": 5', f'"seed": {"1" * 5000}'))
+    with pytest.raises(PalpateError, match="must be JSON"):
+        load_options(path)
+    path.write_text("[" * 100_000)
+    with pytest.raises(PalpateError, match="must be JSON"):
+        load_options(path)
+
+
+def test_a_sample_that_is_not_there_is_an_index_error_too():
+    world = World(TINY)
+    for k in (len(world), -len(world) - 1, 10**5000):
+        with pytest.raises(IndexError) as error:
+            world[k]
+        assert isinstance(error.value, PalpateError)
+        assert f"0 to {len(world) - 1}" in error.value.must
+        assert type(pickle.loads(pickle.dumps(error.value))) is type(error.value)
+
+
+@pytest.mark.parametrize("cache", [0, 1.5, True, "a", None])
+def test_a_cache_must_be_a_whole_number(cache):
+    with pytest.raises(PalpateError, match="cache must be a whole number"):
+        World(TINY, cache=cache)

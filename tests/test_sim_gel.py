@@ -167,6 +167,20 @@ def test_markers_follow_the_shear():
     assert float(dy[16, 16]) == pytest.approx(-0.5 * 0.35 / sensor.px, rel=1e-4)
 
 
+def test_markers_are_pushed_apart_along_both_sides():
+    """Above a round bump, without shear: displaced by 0.107 mm x the slope of the smoothed depth, outwards."""
+    sensor = make_sensor(SMALL, 0)
+    y, x = (np.mgrid[:32, :32] - 15.5) * sensor.px
+    bump = f32(0.8 * np.exp(-(x * x + y * y) / 8.0))
+    dy, dx = marker_shift(sensor, bump, (0.0, 0.0))
+    np.testing.assert_allclose(dy, dx.T, atol=1e-4)
+    depth = gaussian_filter(bump.astype(float), 3.2, mode="nearest")
+    expected = -np.gradient(depth, axis=0) / sensor.px * 0.107 / sensor.px
+    assert np.abs(expected).max() > 0.02
+    np.testing.assert_allclose(dy[2:-2, 2:-2], expected[2:-2, 2:-2], atol=0.25 * np.abs(expected).max())
+    assert dy[20, 16] > 0 > dy[11, 16]
+
+
 @pytest.mark.parametrize("look", ["gelsight", "digit"])
 def test_a_frame_alone_equals_the_frame_in_its_video(look):
     options = dataclasses.replace(SMALL, look=look)

@@ -2,12 +2,15 @@
 
 import csv
 import dataclasses
+from collections import Counter
 
 import pytest
 
 from palpate.data.importing import import_dataset
 from palpate.leakage.audit import inspect_split
-from palpate.sim import PRESETS, write_world
+from palpate.sim import PRESETS, WorldOptions, plan_world, write_world
+from palpate.sim.lists import cut
+from palpate.sim.naming import contact_rows
 
 BASE = dataclasses.replace(
     PRESETS["tiny"], objects_per_material=4, two_videos=0.5, touches_per_video=3, frames_per_touch=3, mixed=0.3, size=32, tile=64
@@ -62,3 +65,23 @@ def test_the_nearest_train_sample_is_named(tmp_path):
         if near:
             assert (int(row["gap"]), place(row["nearest"])[1]) == min(near)
             assert place(row["nearest"]) in train
+
+
+def cut_of(options):
+    plans = plan_world(options)
+    return cut(options, plans, list(contact_rows(options, plans)))
+
+
+@pytest.mark.parametrize("leak", ["frame", "touch", "none"])
+def test_a_share_near_0_or_1_leaves_each_list_one_unit_and_the_other_the_rest(leak):
+    options = WorldOptions(materials=2, objects_per_material=2, touches_per_video=1, frames_per_touch=1, leak=leak, mixed=0.0)
+    low, high = (cut_of(dataclasses.replace(options, test=share)) for share in (0.01, 0.99))
+    assert (len(low[0]), len(low[1])) == (3, 1)
+    assert (len(high[0]), len(high[1])) == (1, 3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_cut_by_video_takes_its_share_of_every_material(seed):
+    options = WorldOptions(seed=seed, materials=5, objects_per_material=8, leak="none", test=0.25, mixed=0.0)
+    taken = Counter(name for name, _ in {(row.video.objects[0].material, row.video.index) for row in cut_of(options)[1]})
+    assert taken == dict.fromkeys(options.names, 2)

@@ -70,13 +70,13 @@ def flat(n=64):
 @pytest.mark.parametrize(
     ("change", "must"),
     [
-        (lambda h, a: Surface(h * np.nan, a, "x", ("odd",)), "finite height"),
-        (lambda h, a: Surface(h, a / 0.0, "x", ("odd",)), "finite albedo"),
-        (lambda h, a: Surface(h[:-1], a, "x", ("odd",)), "height of shape"),
-        (lambda h, a: Surface(h, a[..., 0], "x", ("odd",)), "albedo of shape"),
-        (lambda h, a: Surface(h, a, "y", ("odd",)), "subtypes"),
+        (lambda h, a: Surface(h * np.nan, a, "x", ("odd", "new")), "finite height"),
+        (lambda h, a: Surface(h, a / 0.0, "x", ("odd", "new")), "finite albedo"),
+        (lambda h, a: Surface(h[:-1], a, "x", ("odd", "new")), "height of shape"),
+        (lambda h, a: Surface(h, a[..., 0], "x", ("odd", "new")), "albedo of shape"),
+        (lambda h, a: Surface(h, a, "y", ("odd", "new")), "subtypes"),
         (lambda h, a: Surface(h, a, "x", ()), "feels"),
-        (lambda h, a: Surface(h, a, "x", ("odd",), softness=1.5), "softness"),
+        (lambda h, a: Surface(h, a, "x", ("odd", "new"), softness=1.5), "softness"),
     ],
 )
 def test_a_broken_material_is_refused_by_name(change, must):
@@ -88,7 +88,7 @@ def test_a_broken_material_is_refused_by_name(change, must):
 
 
 def test_float64_of_a_users_material_becomes_float32():
-    material = Material(20, "cork", lambda tile, rng: Surface(np.ones((tile.n, tile.n)), np.ones((tile.n, tile.n, 3)), "x", ("odd",)))
+    material = Material(20, "cork", lambda tile, rng: Surface(np.ones((tile.n, tile.n)), np.ones((tile.n, tile.n, 3)), "x", ("odd", "new")))
     surface = draw_surface("Cork", material, 64, rng_for(0))
     assert surface.height.dtype == surface.albedo.dtype == np.float32
     assert surface.noun == "cork"

@@ -88,8 +88,11 @@ def _check(options: Options) -> bool:
         problems = [Problem(str(p), "missing-file", "no such file or folder") for p in missing]
         raise ProblemsError(problems, "Check the names, or pass --skip-bad")
     suffix = options.output.suffix.lower()
-    if suffix not in SUFFIXES or options.output.is_dir():
+    if suffix not in SUFFIXES:
         return False
+    if options.output.is_dir():
+        must = f"-o with {options.output.suffix} takes the touch of one photo, as a file"
+        raise PalpateError(must, f"the folder {options.output}", "Choose another name; a folder's must not end like a picture's")
     if suffix != ".png":
         raise PalpateError("A touch is written as PNG, which loses nothing", f"-o {options.output}", f"E.g. -o {options.output.stem}.png")
     if len(options.photos) != 1 or options.photos[0].is_dir():

@@ -166,8 +166,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Writes the world and prints what it holds."""
     from palpate.sim import render_contact_sheet, write_world
     from palpate.sim.presets import SEEN, seen_by_mini
+    from palpate.sim.sheet import require_sheet_path
 
     world = world_options(options)
+    if options.sheet:
+        require_sheet_path(options.sheet, options.output)
     if seen_by_mini(world):
         terminal.say(f"Seed {world.seed}: {SEEN}")
     with terminal.progress() as progress:

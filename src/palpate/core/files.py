@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -85,8 +85,44 @@ def read_json(path: Path, what: str) -> Any:
         raise PalpateError(f"The {what} must exist", f"no file {path}", "Check the path") from None
     except IsADirectoryError:
         raise PalpateError(f"The {what} must be a file", f"the folder {path}", "Name the file itself") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, a number of too many digits, too deep
         raise PalpateError(f"The {what} {path} must be JSON", str(error), "Write it again with palpate") from None
+
+
+def read_record(path: Path, what: str, *, form: str | None = None, keys: Sequence[str] = ()) -> dict[str, Any]:
+    """Reads a JSON object that a loader takes its settings from.
+
+    Args:
+        path: the file.
+        what: its role, for the error (``"pipeline card"``).
+        form: what its ``format`` must be; None: a file of others, which has none.
+        keys: that it must have.
+
+    Raises:
+        PalpateError: if the file is missing, is not JSON, holds NaN or infinity, or is no object of that format with those keys.
+    """
+    record, fix = read_json(path, what), "Name another folder, or copy the whole folder again"
+    if not isinstance(record, dict):
+        raise PalpateError(f"The {what} {path} must be a JSON object", f"a {type(record).__name__}", fix)
+    if form is not None and record.get("format") != form:
+        raise PalpateError(f"The {what} {path} must have the format {form}", repr(record.get("format")), fix)
+    if missing := [name for name in keys if name not in record]:
+        raise PalpateError(f"The {what} {path} must have the keys {', '.join(keys)}", f"no {', no '.join(missing)}", fix)
+    try:
+        json.dumps(record, allow_nan=False)
+    except ValueError as error:
+        raise PalpateError(f"The {what} {path} must hold finite numbers", str(error), fix) from None
+    return record
+
+
+@contextmanager
+def told_of(path: Path, key: str) -> Generator[None]:
+    """What goes wrong inside while values of a file are used is told as a mistake in its entry ``key``."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        must = f"{key} in {path} must be as palpate writes it"
+        raise PalpateError(must, f"{type(error).__name__}: {error}", "Copy the whole folder again") from None
 
 
 def inside(root: Path, relative: str) -> Path | None:

@@ -23,12 +23,13 @@ from diffusers.utils import logging as diffusers_logging
 from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from palpate.core import PalpateError, digest_json, read_json, write_json
+from palpate.core import PalpateError, digest_json, read_record, write_json
 from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
-from palpate.diffusion.pixels import digest_tensors, to_bytes, to_unit
+from palpate.diffusion.pixels import architecture, digest_tensors, to_bytes, to_unit
 from palpate.encoders.half import Rounding, half_copy, round_to_half
 from palpate.encoders.hub import fetch
+from palpate.encoders.weights import UNREADABLE
 
 FORMAT = "palpate-autoencoder/1"
 
@@ -68,8 +69,8 @@ class Autoencoder(nn.Module):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of patch and weights."""
-        return digest_json([self.patch, digest_tensors(self.vq.state_dict())])
+        """SHA-256 of patch, architecture and weights."""
+        return digest_json([self.patch, architecture(self.vq.config), digest_tensors(self.vq.state_dict())])
 
     def latents(self, unit: Tensor) -> Tensor:
         """Images (n, 3, h, w) in [-1, 1] -> latents before quantisation (n, c, h / f, w / f); with gradients."""
@@ -137,7 +138,8 @@ class Autoencoder(nn.Module):
         Weights are float32 in memory.
 
         Raises:
-            PalpateError: if there is no VQModel, its weights do not match ``palpate.json``, or the hub cannot be reached.
+            PalpateError: if there is no VQModel, ``palpate.json`` is of another kind or does not match the weights, or the hub cannot be
+                reached.
         """
         place = shipped_folder(source, "autoencoder") or Path(source)
         fix = f"Name {', '.join(SHIPPED)}, a folder with config.json and plain weights, or a hub id that can be reached"
@@ -149,10 +151,17 @@ class Autoencoder(nn.Module):
             vq = VQModel.from_pretrained(
                 str(source) if remote else str(place), low_cpu_mem_usage=False, local_files_only=not remote
             ).float()
-        except (OSError, ValueError, RuntimeError) as error:
-            raise PalpateError("The autoencoder must be a diffusers VQModel", f"{source}: {str(error).splitlines()[0]}", fix) from None
-        about = read_json(note, "autoencoder card") if note.is_file() else {}
-        model = cls(vq, int(about.get("patch", 1)), about.get("card"))
-        if about and model.digest != about.get("digest"):
+        except (*UNREADABLE, AttributeError) as error:
+            got = (str(error).splitlines() or [type(error).__name__])[0]
+            raise PalpateError("The autoencoder must be a diffusers VQModel", f"{source}: {got}", fix) from None
+        if not note.is_file():
+            return cls(vq).eval().requires_grad_(requires_grad=False)
+        about = read_record(note, "autoencoder card", form=FORMAT, keys=("patch", "digest", "card"))
+        patch, card = about["patch"], about["card"]
+        if type(patch) is not int or patch < 1 or not isinstance(card, dict):
+            must = f"In {note}, patch must be a whole number from 1 on and card an object"
+            raise PalpateError(must, f"{patch!r} and a {type(card).__name__}", "Copy the whole folder again")
+        model = cls(vq, patch, card)
+        if model.digest != about["digest"]:
             raise PalpateError(f"The weights in {source} must match palpate.json", "other weights", "Copy the whole folder again")
         return model.eval().requires_grad_(requires_grad=False)

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for, seed_for
 from palpate.diffusion.autoencoder import Autoencoder
-from palpate.diffusion.pixels import to_unit
+from palpate.diffusion.pixels import to_bytes, to_unit
 from palpate.encoders.loop import LoopOptions, fit
 
 
@@ -235,7 +235,8 @@ def measure_reconstruction(autoencoder: Autoencoder, images: np.ndarray, batch: 
     for k in range(0, len(images), batch):
         x = to_unit(images[k : k + batch]).to(device)
         z = autoencoder.latents(x)
-        y, free = autoencoder.image(z)[0].clamp(-1, 1), autoencoder.image(z, quantise=False)[0].clamp(-1, 1)
+        # Rounded to bytes first: what is scored is the picture that anybody gets.
+        y, free = (to_unit(to_bytes(autoencoder.image(z, quantise=q)[0])).to(device) for q in (True, False))
         rows["psnr"].append(10 * torch.log10(4 / (y - x).square().mean((1, 2, 3)).clamp_min(1e-12)))
         rows["psnr_free"].append(10 * torch.log10(4 / (free - x).square().mean((1, 2, 3)).clamp_min(1e-12)))
         rows["ssim"].append(_ssim((x + 1) / 2, (y + 1) / 2))

@@ -29,6 +29,7 @@ from torch import Tensor, nn
 
 from palpate.core import PalpateError, atomic_path
 from palpate.encoders.half import Rounding, half_copy, round_to_half
+from palpate.encoders.weights import UNREADABLE
 
 Source = Literal["text", "vision"]
 SOURCES: tuple[Source, ...] = ("text", "vision")
@@ -211,15 +212,22 @@ class Denoiser(nn.Module):
 
     @classmethod
     def load(cls, folder: Path, policy: ConditionPolicy) -> Denoiser:
-        """Reads what :meth:`save` wrote."""
+        """Reads what :meth:`save` wrote.
+
+        Raises:
+            PalpateError: if a file is missing, unreadable, incomplete, or of another policy.
+        """
         try:
             unet = UNet2DConditionModel.from_pretrained(str(folder), low_cpu_mem_usage=False, use_safetensors=True, local_files_only=True)
             extra = load_file(Path(folder) / "condition.safetensors")
-        except (OSError, ValueError, RuntimeError) as error:
+            model = cls(unet.float(), policy)
+            wanted = {"means": model.means} | ({} if model.null is None else {"null": model.null.data})
+            for name, place in wanted.items():
+                if (shape := tuple(extra[name].shape) if name in extra else None) != place.shape:
+                    raise ValueError(f"condition.safetensors has {name} of shape {shape}, not {tuple(place.shape)}")
+                place.copy_(extra[name])
+        except (*UNREADABLE, AttributeError) as error:
+            got = (str(error).splitlines() or [type(error).__name__])[0]
             fix = "Copy the whole pipeline folder again"
-            raise PalpateError("The denoiser must be a folder written by palpate", f"{folder}: {str(error).splitlines()[0]}", fix) from None
-        model = cls(unet.float(), policy)
-        model.means.copy_(extra["means"])
-        if model.null is not None:
-            model.null.data.copy_(extra["null"])
+            raise PalpateError("The denoiser must be a folder written by palpate", f"{folder}: {got}", fix) from None
         return model.eval().requires_grad_(requires_grad=False)

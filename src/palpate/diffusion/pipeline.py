@@ -30,19 +30,21 @@ import torch
 from torch import Tensor
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, atomic_folder, digest_json, quiet, read_json, write_json
+from palpate.core import PalpateError, Progress, atomic_folder, digest_json, quiet, read_record, told_of, write_json
 from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_shipped
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Source
 from palpate.diffusion.latents import LatentStats
-from palpate.diffusion.pixels import digest_tensors, to_unit
+from palpate.diffusion.pixels import architecture, digest_tensors, to_unit
 from palpate.diffusion.sampling import SamplerOptions, build_scheduler, require_sampling, sample_latents
 from palpate.diffusion.training import Schedule
 from palpate.encoders.hub import find_model
 from palpate.encoders.towers import Towers, load_clip
 
 FORMAT = "palpate-pipeline/1"
+#: What the card must have beside the format.
+KEYS = ("digest", "preset", "size", "condition", "schedule", "sampler", "latents", "autoencoder", "towers", "training")
 SYNTHETIC = "Made by a generator that was trained on synthetic data alone (palpate's procedural world), not on a real sensor."
 #: Photos embedded at once, always: an embedding does not depend on its neighbours.
 EMBED = 32
@@ -77,6 +79,7 @@ class Pipeline:
     def digest(self) -> str:
         """SHA-256 of all that the pictures depend on beside seed, sampler and input."""
         parts = [asdict(self.stats), asdict(self.schedule), asdict(self.denoiser.policy), self.size, self.autoencoder.digest]
+        parts.append(architecture(self.denoiser.unet.config))
         return digest_json(
             [FORMAT, *parts, digest_tensors(self.denoiser.state_dict()), self.towers.digest("vision") if self.towers else None]
         )
@@ -266,10 +269,9 @@ class Pipeline:
                 hub cannot be reached.
         """
         folder = find_model(source, "generator", "pipeline", "Make one with: palpate train")
-        about = read_json(folder / "palpate.json", "pipeline")
-        if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise PalpateError(f"{folder} must be a pipeline ({FORMAT})", "another kind of folder", "Make one with: palpate train")
-        stats = about["latents"]
+        note = folder / "palpate.json"
+        about = read_record(note, "card of the pipeline", form=FORMAT, keys=KEYS)
+        settings = _settings(note, about)
         if "shared" in about:
             autoencoder, towers = _shared_parts(str(about["shared"]))
             if (autoencoder.digest, towers.digest("vision")) != (about["autoencoder"], about["towers"]):
@@ -278,20 +280,34 @@ class Pipeline:
         else:
             autoencoder = Autoencoder.load(folder / "autoencoder")
             towers = Towers.load(folder / "towers") if about["towers"] else None
-        pipeline = cls(
-            autoencoder=autoencoder,
-            denoiser=Denoiser.load(folder / "unet", ConditionPolicy(**about["condition"])),
-            stats=LatentStats(tuple(stats["mean"]), tuple(stats["std"]), stats["scale"]),
-            schedule=Schedule(**about["schedule"]),
-            sampler=SamplerOptions(**about["sampler"]),
-            size=int(about["size"]),
-            towers=towers,
-            preset=about["preset"],
-            training=about["training"],
-        )
+        with told_of(note, "condition"):
+            policy = ConditionPolicy(**about["condition"])
+        pipeline = cls(autoencoder=autoencoder, denoiser=Denoiser.load(folder / "unet", policy), towers=towers, **settings)
         if pipeline.digest != about["digest"]:
             raise PalpateError(f"The weights in {folder} must match its palpate.json", "other weights", "Copy the whole folder again")
         return pipeline
+
+
+def _settings(note: Path, about: Mapping[str, Any]) -> dict[str, Any]:
+    """The pipeline's settings in a card; those that the digest covers are only read, the others must make sense.
+
+    Raises:
+        PalpateError: naming the entry that cannot be used.
+    """
+    settings: dict[str, Any] = {}
+    with told_of(note, "latents"):
+        stats = about["latents"]
+        settings["stats"] = LatentStats(tuple(map(float, stats["mean"])), tuple(map(float, stats["std"])), stats["scale"])
+    with told_of(note, "schedule"):
+        settings["schedule"] = Schedule(**about["schedule"])
+    with told_of(note, "sampler"):
+        settings["sampler"] = SamplerOptions(**about["sampler"])
+        require_sampling(settings["sampler"], settings["schedule"])
+    with told_of(note, "size"):
+        settings["size"] = int(about["size"])
+    with told_of(note, "training"):
+        settings["training"] = dict(about["training"].items())
+    return settings | {"preset": str(about["preset"])}
 
 
 def _shared_parts(name: str) -> tuple[Autoencoder, Towers]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,3 +44,18 @@ def digest_tensors(tensors: Mapping[str, Tensor]) -> str:
         state.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
         state.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
     return state.hexdigest()
+
+
+#: The settings of a diffusers model that decide what it computes; others name files, versions, or what only other kinds of model read.
+ARCHITECTURE = (
+    "act_fn", "attention_head_dim", "block_out_channels", "class_embed_type", "cross_attention_dim", "down_block_types", "downsample_padding",
+    "flip_sin_to_cos", "freq_shift", "in_channels", "latent_channels", "layers_per_block", "lookup_from_codebook", "mid_block_add_attention",
+    "mid_block_scale_factor", "mid_block_type", "norm_eps", "norm_num_groups", "norm_type", "num_attention_heads", "num_vq_embeddings",
+    "only_cross_attention", "out_channels", "resnet_time_scale_shift", "scaling_factor", "time_embedding_type", "timestep_post_act",
+    "transformer_layers_per_block", "up_block_types", "use_linear_projection", "vq_embed_dim",
+)  # fmt: skip
+
+
+def architecture(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a diffusers configuration that belongs into a digest; unset entries are left out, as versions differ in them."""
+    return {name: config[name] for name in ARCHITECTURE if config.get(name) is not None}

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from palpate.core import PalpateError, Progress, quiet, rng_for
 from palpate.diffusion.denoiser import Denoiser
 from palpate.diffusion.training import Schedule
 
+Method = Literal["ddim", "dpm"]
 #: (z_t (n, c, h, w), t (n,), tokens (n, k, d), background or None) -> prediction (n, c, h, w).
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 
@@ -43,7 +44,7 @@ class SamplerOptions:
             prediction back to that of the conditional one; 0 is the plain formula.
     """
 
-    method: Literal["ddim", "dpm"] = "ddim"
+    method: Method = "ddim"
     steps: int = 200
     guidance: float = 7.5
     batch: int = 16
@@ -54,15 +55,17 @@ def require_sampling(options: SamplerOptions, schedule: Schedule, denoiser: Deno
     """Refuses settings that cannot be sampled with, before any work is done.
 
     Raises:
-        PalpateError: on steps, batch or guidance out of range, or guidance for a denoiser that never saw the unconditional token.
+        PalpateError: on an unknown method, on steps, batch or guidance out of range, or guidance for a denoiser that never saw the unconditional token.
     """
     if options.steps < 1 or options.batch < 1 or options.steps > schedule.steps:
         got = f"steps {options.steps}, batch {options.batch}"
         raise PalpateError(
             f"Sampling needs 1 to {schedule.steps} steps and a batch of at least 1", got, "Choose e.g. 50 steps and batch 16"
         )
-    if not math.isfinite(options.guidance):
-        raise PalpateError("Guidance must be a finite number", str(options.guidance), "Choose e.g. 2; 1 is none")
+    if options.method not in get_args(Method):
+        raise PalpateError(f"The sampling method must be {' or '.join(get_args(Method))}", repr(options.method), "Choose one of these")
+    if not (math.isfinite(options.guidance) and options.guidance >= 0):
+        raise PalpateError("Guidance must be a finite number from 0 on", str(options.guidance), "Choose e.g. 2; 1 is none")
     if denoiser is not None and options.guidance != 1 and not denoiser.policy.dropout:
         raise PalpateError(
             "Guidance needs a generator trained with condition dropout",
@@ -71,7 +74,7 @@ def require_sampling(options: SamplerOptions, schedule: Schedule, denoiser: Deno
         )
 
 
-def build_scheduler(schedule: Schedule, method: Literal["ddim", "dpm"]) -> DDIMScheduler | DPMSolverMultistepScheduler:
+def build_scheduler(schedule: Schedule, method: Method) -> DDIMScheduler | DPMSolverMultistepScheduler:
     """The diffusers scheduler for a trained model; latents are not clipped."""
     if method == "ddim":
         # Trailing steps start at t = T, where the starting noise belongs, for any number of steps.

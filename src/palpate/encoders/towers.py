@@ -16,6 +16,7 @@ saved in 16 bits (:mod:`palpate.encoders.half`); they are rounded before the dig
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -28,7 +29,7 @@ from torch import Tensor, nn
 from transformers import AutoTokenizer, CLIPModel, CLIPVisionConfig, CLIPVisionModelWithProjection
 from transformers.utils.hub import cached_file
 
-from palpate.core import PalpateError, atomic_folder, read_json, seed_for, write_json
+from palpate.core import PalpateError, atomic_folder, read_record, seed_for, told_of, write_json
 from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
 from palpate.encoders.half import Rounding, round_to_half
@@ -161,12 +162,13 @@ def load_clip(name_or_folder: str | Path, *, device: str = "cpu") -> FrozenClip:
         must = f"{name} must be a CLIP model" if local else f"The CLIP {name} must be a local folder, or a hub id within reach"
         fix = f"Pass a folder that holds {', '.join(CLIP_FILES)}"
         raise PalpateError(must, (str(error).splitlines() or [type(error).__name__])[0], fix) from None
-    config = read_json(Path(str(processor)), "image processor")
-    preprocess = Preprocess.from_config(config, int(_config(model).vision_config.image_size))
-    about = read_json(note, "CLIP card") if note.is_file() else {}
-    called = str(name_or_folder) if shipped else about.get("name", name)
-    clip = FrozenClip(model.float().eval().requires_grad_(False), tokenizer, preprocess, called, about.get("card", {}))
-    _require_digests(clip.digest, about.get("digests", {}), name)
+    preprocess = _preprocess(Path(str(processor)), int(_config(model).vision_config.image_size))
+    digests, card, called = {}, {}, name
+    if note.is_file():
+        about = read_record(note, "card of the CLIP", form=CLIP_FORMAT, keys=("name", "digests", "card"))
+        (digests, card), called = _card(note, about), str(about["name"])
+    clip = FrozenClip(model.float().eval().requires_grad_(False), tokenizer, preprocess, str(name_or_folder) if shipped else called, card)
+    _require_digests(clip.digest, digests, name)
     move(clip.model, pick_device(device))
     return clip
 
@@ -277,17 +279,16 @@ class Towers:
             PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub cannot be reached.
         """
         folder = find_model(source, "towers", "set of towers", "Train one with: palpate encoder")
-        card = read_json(folder / "palpate.json", "card of the towers")
-        if not isinstance(card, Mapping) or card.get("format") != FORMAT:
-            raise PalpateError(f"{folder} must hold towers ({FORMAT})", "another kind of folder", "Train with: palpate encoder")
+        note = folder / "palpate.json"
+        digests, card = _card(note, read_record(note, "card of the towers", form=FORMAT, keys=("digests", "card")))
         # A shipped CLIP keeps its name, so that cards of what is trained beside it say it.
         clip = load_clip(source) if str(source) in SHIPPED and isinstance(source, str) else load_clip(folder / "clip")
-        towers = cls(clip, card=dict(card["card"]))
-        if "touch" in card["digests"]:
+        towers = cls(clip, card=card)
+        if "touch" in digests:
             towers.touch = _load_touch(folder / "touch")
-            config = read_json(folder / "touch" / "preprocessor_config.json", "touch preprocessing")
-            towers.touch_preprocess = Preprocess.from_config(config, int(_config(towers.touch).image_size))
-        _require_digests(towers.digest, card["digests"], str(folder))
+            place = folder / "touch" / "preprocessor_config.json"
+            towers.touch_preprocess = _preprocess(place, int(_config(towers.touch).image_size))
+        _require_digests(towers.digest, digests, str(folder))
         return towers.to(device)
 
     def _touch(self, tower: str) -> tuple[CLIPVisionModelWithProjection, Preprocess]:
@@ -337,6 +338,26 @@ def move(module: nn.Module, device: torch.device) -> None:
 def _config(model: nn.Module) -> Any:
     """The model's configuration, whose fields transformers types too loosely."""
     return model.config
+
+
+def _card(note: Path, about: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
+    """The digests by tower and the card that a ``palpate.json`` holds.
+
+    Raises:
+        PalpateError: if one of them is no object, or there is no digest of vision or text.
+    """
+    digests, card = about["digests"], about["card"]
+    if not isinstance(digests, dict) or not isinstance(card, dict) or not {"vision", "text"} <= set(digests) <= set(TOWERS):
+        must = f"In {note}, digests must be an object with vision and text, and card an object"
+        got = f"digests {json.dumps(digests)[:80]} and a card of type {type(card).__name__}"
+        raise PalpateError(must, got, "Save the towers again")
+    return digests, card
+
+
+def _preprocess(path: Path, size: int) -> Preprocess:
+    config = read_record(path, "image processor")
+    with told_of(path, "An entry"):
+        return Preprocess.from_config(config, size)
 
 
 def _require_digests(digest: Callable[[str], str], wanted: Mapping[str, str], place: str) -> None:

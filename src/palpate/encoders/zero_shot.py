@@ -36,7 +36,9 @@ def zero_shot_accuracy(
     """
     labels = list(images.labels or ())
     if not labels or "" in labels:
-        raise PalpateError("Zero-shot classification needs a label for every image", f"{labels.count('') or 'all'} without", "Leave these out")
+        raise PalpateError(
+            "Zero-shot classification needs a label for every image", f"{labels.count('') or 'all'} without", "Leave these out"
+        )
     classes = sorted(prompts)
     if len(classes) < 2 or any(not prompts[name] for name in classes):
         raise PalpateError("There must be at least two classes, each with a text", f"{len(classes)} classes", "Pass more prompts")

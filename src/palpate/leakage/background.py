@@ -2,8 +2,10 @@
 
 Untouched gel (its colours, its markers) makes all frames of one sensor look alike, so a tactile thumbnail t is compared by what is left after its background b:
 
-1. *Registration.* b is moved by the offset of at most 2 of 32 pixels, in quarters, at which the luminance of both, band-passed, correlates best: a
-   picture that was cropped elsewhere than its background would keep every marker twice.
+1. *Registration.* b is moved by the offset of at most 2 of 32 pixels at which the luminance of both, band-passed, correlates best (quarters, then the
+   peak of a parabola, to a sixteenth): a picture that was cropped elsewhere than its background would keep every marker twice. Markers are about a pixel
+   wide, so the move is a cubic spline; linear interpolation would flatten them by up to a third, and what is left of them outweighs a faint print. Rows
+   and columns that b does not reach are unknown: they have no weight, and are filled with the blurred difference beside them.
 2. *Gain.* For each channel r = (t - mean) - g (b - mean) with g in [0.85, 1.15] by least squares, pixels weighted by 1 / (1 + e / 4 median e), e the
    squared residual of the round before: the contact itself must not set the gain.
 
@@ -18,9 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.leakage.verify import SIDE, Floats, Ints, Shifts, band_pass, best_offset
+from palpate.leakage.verify import REACH, SIDE, Floats, Ints, Shifts, band_pass, best_offset
 
 QUARTERS = Shifts.of(0.25)
+#: Moves to a pixel, and by how much a move may reach beyond the background's outermost pixels.
+FINEST, BEYOND = 16, 0.3
 GAIN = (0.85, 1.15)
 ROUNDS = 3
 #: Frames that a median needs, and how many it takes at most.
@@ -30,13 +34,14 @@ _RIDGE = 0.05
 
 
 def _moves() -> Floats:
-    """(17, 32, 32): matrices that move a column of pixels by each offset, linear between pixels, edges repeated."""
+    """(65, 32, 32): matrices that move a column of pixels by -2 ... 2 in sixteenths, cubic between pixels, edges repeated."""
     eye = np.eye(SIDE)
-    moved = [ndimage.shift(eye, (-float(d), 0), order=1, mode="nearest") for d in QUARTERS.offsets]
+    moved = [ndimage.shift(eye, (-d / FINEST, 0), order=3, mode="nearest") for d in range(-REACH * FINEST, REACH * FINEST + 1)]
     return np.stack(moved).astype(np.float32)
 
 
 _MOVES = _moves()
+_BESIDE = ndimage.gaussian_filter1d(np.eye(SIDE), 1.5, axis=0, mode="nearest").astype(np.float32)
 
 
 def planar(pixels: NDArray[np.uint8]) -> Floats:
@@ -55,10 +60,11 @@ def remove_background(touch: Floats, background: Floats) -> Floats:
         (n, 3, 32, 32) signed grey levels, each channel's weighted mean near 0.
     """
     luma = [band_pass(np.concatenate([x[:, :1], np.zeros_like(x[:, 1:])], axis=1)) for x in (touch, background)]
-    _, place = best_offset(luma[0], luma[1], QUARTERS)
-    down, right = _MOVES[place[:, 0]], _MOVES[place[:, 1]]
+    steps = np.round(best_offset(luma[0], luma[1], QUARTERS) * FINEST).astype(np.int64)
+    down, right = _MOVES[steps[:, 0] + REACH * FINEST], _MOVES[steps[:, 1] + REACH * FINEST]
     moved = down[:, None] @ background @ right.transpose(0, 2, 1)[:, None]
-    weight = np.ones((len(touch), 1, SIDE, SIDE), np.float32)
+    known = _known((steps / FINEST).astype(np.float32))
+    weight = known
     left = touch - moved
     for _ in range(ROUNDS):
         total = weight.sum(axis=(2, 3), keepdims=True)
@@ -69,8 +75,16 @@ def remove_background(touch: Floats, background: Floats) -> Floats:
         gain = np.clip(across / ((weighted * b).sum(axis=(2, 3), keepdims=True) + _RIDGE * total), *GAIN)
         left = t - gain * b
         error = np.square(left).sum(axis=1, keepdims=True)
-        weight = 1 / (1 + error / (4 * np.median(error, axis=(2, 3), keepdims=True) + 1e-3))
-    return left.astype(np.float32, copy=False)
+        weight = known / (1 + error / (4 * np.median(error, axis=(2, 3), keepdims=True) + 1e-3))
+    beside = (_BESIDE @ (known * left) @ _BESIDE.T) / (_BESIDE @ known @ _BESIDE.T + np.float32(1e-6))
+    return np.where(known > 0, left, beside).astype(np.float32, copy=False)
+
+
+def _known(offsets: Floats) -> Floats:
+    """(n, 1, 32, 32): 1 where a background that is read ``offsets`` (n, 2) pixels further down and right reaches, else 0."""
+    at = np.arange(SIDE) + offsets[:, :, None]
+    inside = (at >= -BEYOND) & (at <= SIDE - 1 + BEYOND)
+    return (inside[:, 0, :, None] & inside[:, 1, None, :])[:, None].astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +34,7 @@ from PIL import Image, ImageOps
 from scipy import fft, ndimage
 
 from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
+from palpate.core.processes import follow_parent
 from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, read_image
 from palpate.leakage.verify import BLOCK, SIDE, Floats, Ints
 
@@ -207,7 +207,7 @@ def _chunks(chunks: list[Chunk], processes: int, count: int) -> Iterator[tuple[P
     if processes > 1 and count >= FEW:
         context = multiprocessing.get_context("spawn")  # a forked copy of a process with threads may hang
         try:
-            with ProcessPoolExecutor(processes, context, initializer=_follow_parent) as pool:
+            with ProcessPoolExecutor(processes, context, initializer=follow_parent) as pool:
                 try:
                     for (place, _), decoded in zip(chunks, _started(pool, [files for _, files in chunks]), strict=True):
                         del left[place]
@@ -219,18 +219,6 @@ def _chunks(chunks: list[Chunk], processes: int, count: int) -> Iterator[tuple[P
             pass  # called from a script without a main guard, or a worker was killed: the threads below take what is left
     for (place, _), decoded in in_threads(_decode_chunk_at, left.items(), processes):
         yield place, decoded
-
-
-def _follow_parent() -> None:
-    """Ends this process when its parent is gone, be it killed: nobody else would stop it."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-
-        def watch() -> None:
-            wait([parent.sentinel])
-            os._exit(1)
-
-        threading.Thread(target=watch, daemon=True).start()
 
 
 def _started(pool: ProcessPoolExecutor, chunks: list[list[Path]]) -> Iterator[Decoded]:

@@ -59,13 +59,14 @@ class Entries:
 
 @dataclass(frozen=True)
 class Found:
-    """Results for the entries of test."""
+    """Results for the entries of test; ``by_videos``: scores are above the level of unrelated pictures."""
 
     score: Floats
     place: Ints
     similarity: Floats
     cause: NDArray[np.str_]
     calibration: Calibration
+    by_videos: bool
 
 
 def match(comparer: Comparer, base: Entries, queries: Entries, rate: float, pictures: Pool | None, progress: Progress) -> Found:
@@ -81,7 +82,7 @@ def match(comparer: Comparer, base: Entries, queries: Entries, rate: float, pict
     cause = np.where(score >= calibration.threshold, "content", "").astype("<U15")
     if pictures is not None:
         score, place, cause = blank_matches(pictures, queries.item, base.item, score, place, cause, calibration.threshold)
-    return Found(score, place, similarity, cause, calibration)
+    return Found(score, place, similarity, cause, calibration, by_videos)
 
 
 def calibrated(

@@ -8,7 +8,8 @@ cause              when
 content            the pictures themselves are alike (touch: what the contact adds to the passive gel); only this is a leak
 nothing touched    both show nothing: blank photos, or tactile images that are no more than untouched gel (``pool``)
 sensor drift       touches alike only in what varies slowly over the picture, or in what the passive gel shows at another time
-                   (other backgrounds of the same video): light, gel and residue, not contact
+                   (other backgrounds of the same video): light, gel and residue, not contact. With videos known, a touch whose score is near
+                   the threshold (0.8 of it as z) is content if what varies slowly finds the same train touch: then both speak for a copy
 =================  ========================================================================================================
 
 Steps: thumbnails and background (``descriptors``, ``background``), candidates by nearest neighbours (``search``), similarity (``verify``), score and threshold (``calibrate``).
@@ -38,6 +39,9 @@ from palpate.leakage.verify import Floats, Ints
 
 #: Share of a pair's similarity that the passive gel must reach to be the reason for it.
 GEL_SHARE = 0.65
+#: Share of the threshold, as z, from which a touch that is no copy by its fine structure alone is one if what varies slowly finds
+#: the same train touch.
+AGREED = 0.8
 #: Nearest pictures that a picture may be linked to in a cluster.
 LINKS = 16
 
@@ -166,8 +170,11 @@ def near_groups(
     level = np.zeros(len(entries), np.float32)
     if by_videos:
         level = levels_of(comparer, entries, entries, _best_elsewhere(entries, i, j, similarity), progress)
-    linked = calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j])) >= calibration.threshold
-    linked |= similarity >= comparer.same
+    score = calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j]))
+    linked = (score >= calibration.threshold) | (similarity >= comparer.same)
+    if by_videos and pictures is not None and modality == "touch":
+        close = np.flatnonzero(~linked & (score >= _least(calibration.threshold)))
+        linked[close] = _slow_agrees(pictures, entries, i[close], j[close], false_positives, progress)
     i, j, similarity = i[linked], j[linked], similarity[linked]
     if pictures is not None and modality == "touch" and len(i):
         some = np.unique(np.concatenate([i, j]))
@@ -209,16 +216,40 @@ def _name_drift(
     found: Found, pictures: Pool, comparer: Comparer, base: Entries, queries: Entries, rate: float, progress: Progress
 ) -> Found:
     """Tells touches that are alike through the state of the sensor from those alike in content."""
-    cause = found.cause.copy()
+    cause, score = found.cause.copy(), found.score
+    slow = match(Plates(plates(pictures, slow=True)[0]), base, queries, rate, None, progress)
+    only = (slow.cause == "content") & (cause == "") & ~pictures.blank[queries.item]
+    if found.by_videos:
+        # Touches that share no more than the gel are as alike in fine structure as any two: a score near the threshold tells of more.
+        agreed = only & (slow.place == found.place) & (score >= _least(found.calibration.threshold))
+        cause[agreed], only = "content", only & ~agreed
+        score = np.where(agreed, np.maximum(score, found.calibration.threshold), score)
     content = np.flatnonzero(cause == "content")
     if len(content):
         gel = gel_at_other_times(pictures, queries.item[content], queries.videos[content])
         cause[content[gel >= found.similarity[content] * GEL_SHARE]] = "sensor drift"
-    slow = match(Plates(plates(pictures, slow=True)[0]), base, queries, rate, None, progress)
-    only = (slow.cause == "content") & (found.cause == "") & ~pictures.blank[queries.item]
-    score = np.where(only, np.maximum(slow.score, found.calibration.threshold), found.score).astype(np.float32)
+    score = np.where(only, np.maximum(slow.score, found.calibration.threshold), score).astype(np.float32)
     cause[only] = "sensor drift"
     return replace(found, cause=cause, score=score, place=np.where(only, slow.place, found.place))
+
+
+def _least(threshold: float) -> float:
+    """The score from which what varies slowly may decide."""
+    return float(np.tanh(AGREED * np.arctanh(threshold)))
+
+
+def _slow_agrees(pictures: Pool, entries: Entries, i: Ints, j: Ints, rate: float, progress: Progress) -> NDArray[np.bool_]:
+    """Whether the pairs (i, j) of entries are alike in what varies slowly, by a threshold of its own."""
+    if not len(i):
+        return np.zeros(0, bool)
+    comparer = Plates(plates(pictures, slow=True)[0])
+    calibration, by_videos = calibrated(comparer, entries, entries, rate, None, progress)
+    similarity, level = comparer.pairs(entries.item[i], entries.item[j], progress), np.zeros(len(entries), np.float32)
+    if by_videos:
+        some = np.zeros(len(entries), bool)
+        some[i], some[j] = True, True
+        level[some] = levels_of(comparer, entries, entries.only(some), _best_elsewhere(entries, i, j, similarity)[some], progress)
+    return calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j])) >= calibration.threshold
 
 
 def _spread(

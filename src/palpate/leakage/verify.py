@@ -142,11 +142,23 @@ def correlations(
     return peaks / (query[1][:, None, None] * base[1] + np.float32(1e-6))
 
 
-def best_offset(x: Floats, y: Floats, shifts: Shifts) -> tuple[Floats, Ints]:
-    """For each pair the highest correlation (n,), and the number of its offset along both axes (n, 2)."""
-    values = correlations(query_spectra(x), base_spectra(y, shifts), shifts).reshape(len(x), -1)
-    place = values.argmax(axis=1)
-    return values[np.arange(len(x)), place], np.stack(np.divmod(place, len(shifts.offsets)), axis=1)
+def best_offset(x: Floats, y: Floats, shifts: Shifts) -> Floats:
+    """For each pair the offset (n, 2), down and right in pixels, at which they correlate best.
+
+    Between the offsets of ``shifts`` it is the peak of the parabola through the highest value and its two neighbours along each axis.
+    """
+    values = correlations(query_spectra(x), base_spectra(y, shifts), shifts)
+    rows, last = np.arange(len(x)), len(shifts.offsets) - 1
+    place = np.stack(np.divmod(values.reshape(len(x), -1).argmax(axis=1), last + 1), axis=1)
+    out = shifts.offsets[place]
+    for axis in (0, 1):
+        lines = values[rows, :, place[:, 1]] if axis == 0 else values[rows, place[:, 0]]
+        at = place[:, axis]
+        before, top, after = (lines[rows, np.clip(at + d, 0, last)] for d in (-1, 0, 1))
+        bend = before - 2 * top + after
+        curved = (at > 0) & (at < last) & (bend < -1e-6)
+        out[:, axis] += np.where(curved, (before - after) / np.where(curved, 2 * bend, 1), 0) * (shifts.offsets[1] - shifts.offsets[0])
+    return out
 
 
 def similarities(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progress = quiet) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,26 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
+from palpate.sim.presets import MINI_SEEDS
 
 
-def require_unseen(source: Path) -> None:
+def require_unseen(source: Path, facts: Mapping[str, str] | None = None) -> None:
     """The shipped models were trained on worlds of reserved seeds; what they have seen cannot judge them.
 
+    Args:
+        source: what was named, or where its images lie: a world, or any file or folder of one. The nearest ``world.json`` there or
+            above tells.
+        facts: of the manifest that was made of it; they name the world's seed where the world's own files are out of sight.
+
     Raises:
-        PalpateError: if ``source`` is such a world, by its ``world.json``.
+        PalpateError: if it is, or belongs to, such a world.
     """
-    mark = source / "world.json"
-    if mark.is_file() and read_json(mark, "world record").get("seen_by_shipped_models"):
+    place = Path(source).resolve()
+    mark = next((m for folder in (place, *place.parents) if (m := folder / "world.json").is_file()), None)
+    record = read_json(mark, "world record") if mark is not None else {}
+    seen = isinstance(record, dict) and bool(record.get("seen_by_shipped_models"))
+    seed = (facts or {}).get("world_seed", "")
+    if seen or (seed.isdecimal() and int(seed) in MINI_SEEDS):
         fix = "Write a world of another --seed, or pass --from-scratch"
         raise PalpateError("The shipped models must not have been trained on the data that they are judged on", f"{source}", fix)
 

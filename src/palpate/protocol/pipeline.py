@@ -196,7 +196,7 @@ class _Pipeline:
     def data(self) -> Manifest:
         """The manifest of the given data, or of the embedded world."""
         source = self.options.data if self.options.data is not None else self._world("world", self.preset.world)
-        if any(map(is_shipped, filter(None, self.ready.values()))):
+        if judged := any(map(is_shipped, filter(None, self.ready.values()))):
             require_unseen(source)
         size = None if self.options.data is None else 4 * self.diffusion.size
 
@@ -210,7 +210,10 @@ class _Pipeline:
 
         inputs = {"source": str(source.resolve()), "stamp": stamp_of(source), "skip_bad": self.options.skip_bad, "size": size}
         stage = self.run.stage("data", inputs | self._digest("world"), build)
-        return Manifest.load(stage.folder)
+        manifest = Manifest.load(stage.folder)
+        if judged:
+            require_unseen(manifest.root, manifest.facts)  # images may lie elsewhere than what was named
+        return manifest
 
     def split(self, manifest: Manifest) -> tuple[Split, list[Audit]]:
         """The leak-free split, and the audits of it and of the data set's own."""
@@ -283,15 +286,11 @@ class _Pipeline:
             model.save(fresh(folder / "autoencoder"))
             return {"digest": model.digest, "images": len(images), "on test touches": model.card["held_out"]}
 
-        inputs = {
-            "options": options,
-            "size": self.diffusion.size,
-            "train": pretraining.digest,
-            "own": own.digest,
-            "seed": self.options.seed,
-        }
+        inputs = {"options": options, "size": self.diffusion.size, "train": pretraining.digest, "own": own.digest}
         stage = self.run.stage(
-            "autoencoder", inputs | {"repeat": self.preset.repeat} | self._digest("pretraining-data", "split", "data"), build
+            "autoencoder",
+            inputs | {"seed": self.options.seed, "repeat": self.preset.repeat} | self._digest("pretraining-data", "split", "data"),
+            build,
         )
         return str(stage.folder / "autoencoder")
 

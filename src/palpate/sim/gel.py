@@ -16,7 +16,6 @@ The numbers of the look ``gelsight`` are fitted to the real clips, see ``benchma
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -117,7 +116,7 @@ class Sensor:
 
 def make_sensor(options: WorldOptions, unit: int) -> Sensor:
     """A unit of the family ``options.look``; the family is the same product in every world, the unit depends on the seed."""
-    return _make(dataclasses.replace(WorldOptions(), **{name: getattr(options, name) for name in _ASKED}), unit)
+    return _make(WorldOptions(materials=options.materials, **{name: getattr(options, name) for name in _ASKED}), unit)
 
 
 #: The options that a unit depends on.

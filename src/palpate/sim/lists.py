@@ -46,8 +46,10 @@ def cut(options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]) 
         order.sort(key=lambda unit: main[unit])
     # Error diffusion: unit k goes to test where the running share passes a whole number, so that every stretch has its share.
     chosen = {u for k, u in enumerate(order) if int((k + 1) * options.test + 0.5) > int(k * options.test + 0.5)}
-    if not chosen or len(chosen) == len(order):
+    if not chosen:  # the share is too small for one unit, or too large to leave one: both lists have one at least
         chosen = {order[0]}
+    elif len(chosen) == len(order):
+        chosen.discard(order[-1])
     shuffled = [rows[k] for k in rng.permutation(len(rows))]
     return [r for r in shuffled if unit_of(r) not in chosen], [r for r in shuffled if unit_of(r) in chosen]
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from palpate.core import PalpateError, Problem, ProblemsError, digest_json, rng_for
 from palpate.sim.materials import MATERIALS
-from palpate.sim.ranges import BACKGROUND_OFFSET, CHOICES, PAIRS, RANGES, SERIES, out_of_range
+from palpate.sim.materials.entries import bad_entries
+from palpate.sim.ranges import BACKGROUND_OFFSET, CHOICES, PAIRS, RANGES, SERIES, out_of_range, shown
 
 __all__ = ["BACKGROUND_OFFSET", "CHOICES", "PAIRS", "RANGES", "SERIES", "VERSION", "WorldOptions"]
 
@@ -121,10 +122,10 @@ class WorldOptions:
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in (*PAIRS, *SERIES):
             if isinstance(value := getattr(self, name), tuple):  # 26 and 26.0 are one option, with one digest
-                object.__setattr__(self, name, tuple(float(v) if type(v) is int else v for v in value))
+                object.__setattr__(self, name, tuple(map(_real, value)))
         for name, (low, _) in RANGES.items():
             if isinstance(low, float) and type(value := getattr(self, name)) is int:
-                object.__setattr__(self, name, float(value))
+                object.__setattr__(self, name, _real(value))
         found = [*out_of_range({f.name: getattr(self, f.name) for f in dataclasses.fields(self)})]
         found += self._materials()
         found += [] if found else self._inconsistent()
@@ -139,13 +140,13 @@ class WorldOptions:
             count = self.materials
             if isinstance(count, bool) or not 1 <= count <= len(MATERIALS):
                 must = f"materials must be 1 to {len(MATERIALS)}"
-                return [PalpateError(must, str(count), "Pass a smaller count, or names")]
+                return [PalpateError(must, shown(count), "Pass a smaller count, or names")]
             names = list(MATERIALS)
             object.__setattr__(self, "materials", tuple(names[k * len(names) // count] for k in range(count)))
-            return []
+            return [*bad_entries(self.names)]
         if not isinstance(self.materials, tuple) or not all(isinstance(name, str) for name in self.materials):
-            return [PalpateError("materials must be names or a count", repr(self.materials), "Pass e.g. materials=('Wood', 'Grass')")]
-        return _unknown_materials(self.materials)
+            return [PalpateError("materials must be names or a count", shown(self.materials), "Pass e.g. materials=('Wood', 'Grass')")]
+        return _unknown_materials(self.materials) or [*bad_entries(self.materials)]
 
     def _inconsistent(self) -> Iterator[PalpateError]:
         """What is wrong between options that are each in range."""
@@ -186,6 +187,14 @@ class WorldOptions:
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
         """The generator for one purpose; depends on VERSION, the seed, the purpose and the ids alone."""
         return rng_for(self.seed, "world", VERSION, purpose, *ids)
+
+
+def _real(value: object) -> object:
+    """A whole number as a float if it can be one; anything else as it is."""
+    try:
+        return float(value) if type(value) is int else value
+    except OverflowError:
+        return value
 
 
 def _unknown_materials(names: tuple[str, ...]) -> list[PalpateError]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from palpate.core import seed_for
 from palpate.sim.balance import objects_of
+from palpate.sim.materials.entries import object_prefix
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
 
 
@@ -24,7 +25,7 @@ class ObjectRef:
     @property
     def name(self) -> str:
         """As in ``objects.csv``, e.g. ``natural_fabric_003``."""
-        return f"{self.material.lower().replace(' ', '_')}_{self.number:03d}"
+        return f"{object_prefix(self.material)}_{self.number:03d}"
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,15 @@ def is_number(value: Any, whole: bool = False) -> bool:
     return isinstance(value, int) or math.isfinite(value)
 
 
+def shown(value: Any) -> str:
+    """``value`` in a message: its repr in one line, not longer than 120 characters."""
+    try:
+        said = " ".join(repr(value).split())
+    except ValueError:  # Python writes no whole number of more than some thousand digits
+        said = "a number of too many digits"
+    return said if len(said) <= 120 else f"{said[:100]}... ({len(said)} characters)"
+
+
 def out_of_range(values: dict[str, Any]) -> Iterator[PalpateError]:
     """What is wrong with the values of the options in these tables, each by itself.
 
@@ -94,20 +103,20 @@ def out_of_range(values: dict[str, Any]) -> Iterator[PalpateError]:
         value, whole = values[name], isinstance(low, int)
         if not is_number(value, whole) or not low <= value <= high:
             kind = "a whole number" if whole else "a number"
-            yield PalpateError(f"{name} must be {kind} from {low:g} to {high:g}", repr(value), f"Pass e.g. {name}={low:g}")
+            yield PalpateError(f"{name} must be {kind} from {low:g} to {high:g}", shown(value), f"Pass e.g. {name}={low:g}")
     for name, (low, high) in PAIRS.items():
         value = values[name]
         fix = f"Pass e.g. {name}=({low:g}, {high:g})"
         if not isinstance(value, tuple) or len(value) != 2 or not all(is_number(v) and low <= v <= high for v in value):
-            yield PalpateError(f"{name} must be two numbers from {low:g} to {high:g}", repr(value), fix)
+            yield PalpateError(f"{name} must be two numbers from {low:g} to {high:g}", shown(value), fix)
         elif value[0] > value[1]:
-            yield PalpateError(f"{name} must be a range, the lower end first", repr(value), f"Pass {name}=({value[1]:g}, {value[0]:g})")
+            yield PalpateError(f"{name} must be a range, the lower end first", shown(value), f"Pass {name}=({value[1]:g}, {value[0]:g})")
     for name, (low, high, least) in SERIES.items():
         value = values[name]
         if not isinstance(value, tuple) or not least <= len(value) <= LONGEST or not all(is_number(v) and low <= v <= high for v in value):
             many = f"{least} to {LONGEST} numbers from {low:g} to {high:g}"
-            yield PalpateError(f"{name} must be {many}", repr(value), f"Pass e.g. {name}=({low:g}, {high:g})")
+            yield PalpateError(f"{name} must be {many}", shown(value), f"Pass e.g. {name}=({low:g}, {high:g})")
     for name, choices in CHOICES.items():
-        if values[name] not in choices:
+        if not isinstance(values[name], str) or values[name] not in choices:
             listed = ", ".join(map(repr, choices))
-            yield PalpateError(f"{name} must be one of {listed}", repr(values[name]), f"Pass {name}={choices[0]!r}")
+            yield PalpateError(f"{name} must be one of {listed}", shown(values[name]), f"Pass {name}={choices[0]!r}")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from palpate.core import atomic_path
+from palpate.core import PalpateError, atomic_path
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import WorldOptions
 from palpate.sim.plan import ObjectRef, VideoPlan, first_contact
@@ -15,6 +16,28 @@ from palpate.sim.video import Video
 
 SHOWN = 3
 _LABEL = 104
+
+
+def require_sheet_path(path: Path, world: Path) -> None:
+    """Refuses a path that no sheet could be written to, before a world is rendered.
+
+    Args:
+        path: of the sheet.
+        world: the folder of the world.
+
+    Raises:
+        PalpateError: if it is a folder or will be one, or its place is a file or may not be written to.
+    """
+    path, fix = Path(path), "Name a file such as sheet.png"
+    if path.is_dir() or path.absolute() == Path(world).absolute():
+        raise PalpateError(f"The contact sheet {path} must be a file", "a folder", fix)
+    place = next(p for p in path.absolute().parents if p.exists())
+    if not place.is_dir():
+        raise PalpateError(f"The contact sheet {path} must lie in a folder", f"the file {place}", fix)
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise PalpateError(
+            f"The folder of the contact sheet {path} must be writable", f"no right to write to {place}", "Choose another path"
+        )
 
 
 def render_contact_sheet(options: WorldOptions, path: Path) -> None:

@@ -21,8 +21,13 @@ from palpate.sim.materials import MATERIALS
 from palpate.sim.naming import Row, contact_row, contact_rows, sample_id, touch_id, video_id
 from palpate.sim.options import WorldOptions
 from palpate.sim.plan import VideoPlan, plan_world
+from palpate.sim.ranges import is_number, shown
 from palpate.sim.table import world_manifest, world_split
 from palpate.sim.video import Video
+
+
+class NoSampleError(PalpateError, IndexError):
+    """There is no sample of that number; also an IndexError, as sequences raise."""
 
 
 class World:
@@ -33,12 +38,12 @@ class World:
         cache: videos kept ready (about 1 MB each at 64 px, 4 MB at 128 px).
 
     Raises:
-        PalpateError: if ``cache`` is below 1.
+        PalpateError: if ``cache`` is no whole number from 1.
     """
 
     def __init__(self, options: WorldOptions | None = None, *, cache: int = 4) -> None:
-        if cache < 1:
-            raise PalpateError("cache must be at least 1", str(cache), "Pass cache=4")
+        if not is_number(cache, whole=True) or cache < 1:
+            raise PalpateError("cache must be a whole number, at least 1", shown(cache), "Pass cache=4")
         self.options, self.cache = options or WorldOptions(), cache
         self._videos: OrderedDict[int, Video] = OrderedDict()
 
@@ -72,11 +77,11 @@ class World:
         """Video, touch and frame of sample ``k``; negative numbers count from the end.
 
         Raises:
-            PalpateError: if there is no such sample.
+            NoSampleError: if there is no such sample.
         """
         number = operator.index(k)
         if not -len(self) <= number < len(self):
-            raise PalpateError(f"A sample of this world must be 0 to {len(self) - 1}", str(number), "Choose another sample")
+            raise NoSampleError(f"A sample of this world must be 0 to {len(self) - 1}", shown(number), "Choose another sample")
         return contact_row(self.options, self.plans, number % len(self))
 
     def sample(self, k: SupportsIndex) -> dict[str, Any]:
@@ -87,7 +92,8 @@ class World:
             text; ``frame``, ``label``: integers. The columns mean what they mean in the manifest; ``label`` is the material's number.
 
         Raises:
-            PalpateError: if there is no such sample, or a material draws something invalid.
+            NoSampleError: if there is no such sample.
+            PalpateError: if a material draws something invalid.
         """
         row = self.row(k)
         video = self._video(row.video)

@@ -12,7 +12,7 @@
     hct/data1/ ...                                  (layout="hct", see palpate.sim.lists_hct and palpate.sim.naming)
     vision.npy  tactile.npy  background.npy  ids.txt             (layout="raw", see palpate.sim.raw)
 
-The tree grows in the hidden sibling ``.<name>.<digest>.part``, one finished video after another, and is renamed when whole. A run that was
+The tree grows in the hidden sibling ``.<name>.<digest>.part``, one finished video after another, and is renamed when whole; one run at a time. A run that was
 killed, or stopped by a full disk, is continued by the same call; the result is the same as without the interruption.
 """
 
@@ -26,18 +26,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, digest_json, digest_lines, quiet, read_json, short, write_json, write_text
+from palpate.core import PalpateError, Progress, digest_json, digest_lines, quiet, read_json, write_json, write_text
 from palpate.sim.encode import require_av
 from palpate.sim.lists import cut, leak_counts, leak_file, list_files
 from palpate.sim.lists_hct import hct_list_files
+from palpate.sim.materials.entries import added_materials
 from palpate.sim.naming import contact_rows, manifest_root
 from palpate.sim.options import VERSION, WorldOptions
 from palpate.sim.plan import VideoPlan, plan_world, written_frames
 from palpate.sim.presets import SEEN, seen_by_mini
+from palpate.sim.ranges import is_number, shown
 from palpate.sim.raw import ARRAYS, allocate_arrays
 from palpate.sim.saved import WORLD_FORMAT, require_version
 from palpate.sim.table import world_manifest, world_split
 from palpate.sim.trees import WORK, captions_path, disk_error, is_written, place, write_video
+from palpate.sim.unfinished import locked, part_of, real_folder, require_free, require_same_version
 from palpate.sim.workers import render_all
 
 NOTE = "Synthetic: procedural surfaces and a simulated sensor. Shows mechanisms; never compare its numbers with those of real data sets."
@@ -72,35 +75,40 @@ def write_world(out: Path, options: WorldOptions | None = None, *, workers: int 
         progress: told after each video.
 
     Raises:
-        PalpateError: if ``out`` holds something else or a world of another version, a material draws something invalid, the world is too small
+        PalpateError: if ``out`` holds something else, is the working folder, is being written by another run, or holds a world of another version, a material draws something invalid, the world is too small
             for its cut, or the disk is full; what was finished by then is kept, and the same call goes on.
         MissingExtraError: if videos are asked for and PyAV is not installed.
     """
     options, out = options or WorldOptions(), Path(out)
-    if workers < 1:
-        raise PalpateError("workers must be at least 1", str(workers), "Pass workers=1")
+    if not is_number(workers, whole=True) or workers < 1:
+        raise PalpateError("workers must be a whole number, at least 1", shown(workers), "Pass workers=1")
     if options.layout == "videos":
         require_av()
-    if (out / "world.json").is_file():
+    folder = real_folder(out)
+    if (folder / "world.json").is_file():
         return _finished(out, options)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise PalpateError(f"{out} must be absent, empty or a finished world", "something else there", "Choose another folder or remove it")
+    require_free(out, folder)
     plans = plan_world(options)
     cut(options, plans, list(contact_rows(options, plans)))  # refuses a world that is too small before anything is rendered
-    part = out.absolute().parent / f".{out.absolute().name}.{short(options.digest)}.part"
-    _require_same_version(part)
+    part = part_of(folder, options)
+    require_same_version(part)
     try:
-        return _write(part, out, options, plans, workers, progress)
+        with locked(part, out):
+            if (folder / "world.json").is_file():  # an equal run ended meanwhile
+                shutil.rmtree(part, ignore_errors=True)
+                return _finished(out, options)
+            rendered = _write(part, folder, options, plans, workers, progress)
+        return dataclasses.replace(_finished(out, options), rendered=rendered)
     except OSError as error:
-        raise disk_error(error, out.absolute().parent) from error
+        raise disk_error(error, folder.parent) from error
 
 
-def _write(part: Path, out: Path, options: WorldOptions, plans: list[VideoPlan], workers: int, progress: Progress) -> WorldRecord:
-    """Fills ``part`` and renames it to ``out``."""
+def _write(part: Path, folder: Path, options: WorldOptions, plans: list[VideoPlan], workers: int, progress: Progress) -> int:
+    """Fills ``part`` and renames it to ``folder``; returns how many videos were rendered."""
     todo: list[VideoPlan] = []
     if not (part / "world.json").is_file():
-        part.mkdir(parents=True, exist_ok=True)
-        write_json(part / WORK / "state.json", {"version": VERSION, "options_digest": options.digest})
+        state = {"version": VERSION, "options_digest": options.digest, **_materials(options)}
+        write_json(part / WORK / "state.json", state)
         if options.layout == "raw":
             allocate_arrays(part, options, len(plans) * options.touches_per_video * options.frames_per_touch)
         todo = [plan for plan in plans if not is_written(options, part, plan)]
@@ -110,17 +118,23 @@ def _write(part: Path, out: Path, options: WorldOptions, plans: list[VideoPlan],
             progress("rendering videos", count, len(plans), name)
         _finish(part, options, plans)
     shutil.rmtree(part / WORK, ignore_errors=True)
-    if out.exists():
-        out.rmdir()
-    part.replace(out)
-    return dataclasses.replace(_finished(out, options), rendered=len(todo))
+    if folder.exists():
+        folder.rmdir()
+    part.replace(folder)
+    return len(todo)
+
+
+def _materials(options: WorldOptions) -> dict[str, Any]:
+    """What the record tells of materials that were added; nothing in a world of built-in ones."""
+    added = added_materials(options.names)
+    return {"materials": added} if added else {}
 
 
 def _finished(out: Path, options: WorldOptions) -> WorldRecord:
     """The record of the finished world in ``out``.
 
     Raises:
-        PalpateError: if it is of another version, or of other options.
+        PalpateError: if it is of another version, of other options, or of added materials whose functions were edited since.
     """
     data = read_json(out / "world.json", "world record")
     if not isinstance(data, dict) or not str(data.get("format", "")).startswith("palpate-world/"):
@@ -129,24 +143,10 @@ def _finished(out: Path, options: WorldOptions) -> WorldRecord:
     if data.get("format") != WORLD_FORMAT or data.get("options_digest") != options.digest:
         must = f"{out} must hold the world that was asked for"
         raise PalpateError(must, "a world of other options", "Choose another folder or remove it")
+    if data.get("materials", {}) != _materials(options).get("materials", {}):
+        must = f"{out} must hold the world that was asked for"
+        raise PalpateError(must, "a world of materials that were edited since", "Choose another folder or remove it")
     return WorldRecord(out, data["digest"], data["counts"], data["leak"], 0)
-
-
-def _require_same_version(part: Path) -> None:
-    """Refuses to start beside an unfinished world of the same name that another version of palpate began.
-
-    Raises:
-        PalpateError: naming its folder.
-    """
-    begin = part.name.rsplit(".", 2)[0]
-    for other in sorted(part.parent.glob("*.part")) if part.parent.is_dir() else []:
-        if other.name.rsplit(".", 2)[0] != begin or not other.is_dir() or not any(other.iterdir()):
-            continue
-        state = other / WORK / "state.json"
-        data = read_json(state, "state of an unfinished world") if state.is_file() else {}
-        if (other / "world.json").is_file():
-            data = read_json(other / "world.json", "world record")
-        require_version(data if isinstance(data, dict) else {}, f"The unfinished world {other} (remove it to begin anew)")
 
 
 def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
@@ -181,7 +181,7 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
             "version": VERSION,
             "note": NOTE,
             **({"seen_by_shipped_models": SEEN} if seen_by_mini(options) else {}),
-            "digest": digest_json({"version": VERSION, "options": settings, "lists": lists}),
+            "digest": digest_json({"version": VERSION, "options": settings, "lists": lists, **_materials(options)}),
             "options_digest": options.digest,
             "manifest_digest": manifest.digest,
             "manifest_root": manifest_root(options, Path()).as_posix(),
@@ -189,6 +189,7 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
             "leak": {"rule": options.leak, **leak_counts(train, test)},
             **({"arrays": arrays} if options.layout == "raw" else {}),
             "options": settings,
+            **_materials(options),
         },
     )
 

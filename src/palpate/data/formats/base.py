@@ -75,6 +75,8 @@ def world_facts(folder: Path) -> dict[str, str]:
     if not isinstance(about, dict) or not str(about.get("format", "")).startswith("palpate-world/"):
         return {}
     named = {"dataset": "palpate's procedural world", "synthetic": "yes", "digest": str(about.get("digest", ""))}
+    options = about.get("options")
+    named |= {"world_seed": str(options["seed"])} if isinstance(options, dict) and "seed" in options else {}
     return named | dict.fromkeys(("licence", "citation", "url"), "")
 
 

@@ -6,9 +6,13 @@ A material of your own is one function ``(tile, rng) -> Surface`` in one file, a
     MATERIALS["Cork"] = Material(20, "cork", cork, ("pressed", "natural"))
 
 Its name then works in ``WorldOptions(materials=...)``. With more than one worker the function must be importable (not defined in ``__main__``).
+A world of added materials records what their functions are, and is not gone on with after they were edited.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
 
 from palpate.sim.materials.made import glass, metal, other, paper, plastic, rubber
 from palpate.sim.materials.mineral import brick, ceramic_tile, concrete, gravel, rock, sand, soil
@@ -40,4 +44,7 @@ MATERIALS: dict[str, Material] = {
     "Others":           Material(19, "material", other, ("sponge", "carpet", "stud mat", "rope")),
 }  # fmt: skip
 
-__all__ = ["MATERIALS", "Material", "Surface", "draw_surface"]
+#: The table as it comes with palpate: these are known by their name and VERSION, others by their function too.
+BUILT_IN: Mapping[str, Material] = MappingProxyType(dict(MATERIALS))
+
+__all__ = ["BUILT_IN", "MATERIALS", "Material", "Surface", "draw_surface"]
