@@ -47,6 +47,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Generates and prints where the images are, and what the generator cannot know."""
     require_extra("palpate generate")
     single = _check(options)
+    terminal.say(f"Loading {options.model} ...")  # torch and its friends take seconds to import
     from palpate.core import Split
     from palpate.data.manifest import Manifest
     from palpate.diffusion.pipeline import Pipeline
@@ -98,6 +99,17 @@ def _check(options: Options) -> bool:
     if len(options.photos) != 1 or options.photos[0].is_dir():
         got = "a manifest" if options.manifest else "a folder" if len(options.photos) == 1 else f"{len(options.photos)} photos"
         raise PalpateError("-o with .png takes the touch of one photo", got, f"Name a folder, e.g. -o {options.output.stem}/")
+    _require_whole(options.photos[0])  # a second now, instead of after the model is loaded
     # Every touch bears this mark near its head: an earlier one may be replaced, a photo may not.
     guard_output(options.output, options.photos, (b"palpate.settings",))
     return True
+
+
+def _require_whole(photo: Path) -> None:
+    """Refuses a photo that cannot be decoded."""
+    from palpate.data.images import read_image
+
+    try:
+        read_image(photo)
+    except PalpateError as error:
+        raise ProblemsError([Problem(str(photo), "bad-image", error.got)], "Choose another photo, or mend this one") from None

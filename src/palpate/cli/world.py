@@ -179,7 +179,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             render_contact_sheet(world, options.sheet)
     facts = {"folder": str(record.folder), "digest": record.digest, **record.counts, "leak": record.leak}
     facts |= {"seen_by_shipped_models": SEEN} if seen_by_mini(world) else {}
-    terminal.facts(f"World {options.output} (synthetic)", facts)
+    shown = {k: v for k, v in facts.items() if k != "leak"} | {f"leak: {k}": v for k, v in record.leak.items()}
+    terminal.facts(f"World {options.output} (synthetic)", shown)
     return facts
 
 
