@@ -1,16 +1,17 @@
 """One world, several ways to cut it: how much of a touch probe's accuracy is leakage.
 
     python benchmarks/split_protocols.py --seeds 0 1 2 --write docs/world_protocols.md
-    python benchmarks/split_protocols.py --seeds 0 --modalities touch          # a first look, about two minutes
+    python benchmarks/split_protocols.py --seeds 0 --modalities touch          # a first look, about five minutes
 
 The contact frames of a preset are cut into train and test by random frame (as HCT-Orig), by random whole touch (as the Touch and Go lists), by whole
-video, and by whole object (a video counts with its first object; the other objects of a mixed video are in no other); every protocol trains on the same
-number of frames. Features are patch words: small patches of contact minus background (touch; the background is the frame that the background rule
+video, and by whole object (a video counts with its first object; the other objects of a mixed video are in no other). A split seed deals the units into
+four folds, material by material; each fold is tested once by what trained on the other three, so that every video is tested in every protocol and the
+protocols of a seed differ in nothing but the split; every training run has the same number of frames. Features are patch words: small patches of contact minus background (touch; the background is the frame that the background rule
 names, and printed markers are filled in first in both, since their shift tells more about drag than about material) or of the photo (vision), projected
 on their leading principal components, words by k-means, the square root of each image's word frequencies; components and words are learnt on the train
 side alone. Classifiers: logistic regression on standardised features, whose penalty is chosen by leaving out whole videos of the train side in every
 protocol, and the nearest neighbour by cosine. Retrieval: a ridge regression from vision to touch words, cosine among 100 samples of the test side.
-Intervals are robust to whole videos deviating together, Student's t. Rows are not weighted (not balanced); chance is one in the number of materials, and
+Intervals are robust to whole videos deviating together, Student's t (retrieval: folds combined as independent). Rows are not weighted (not balanced); chance is one in the number of materials, and
 the share of the largest class is printed. Frames are rendered into memory without JPEG; only the table is written.
 """
 
@@ -37,9 +38,9 @@ from palpate.sim.options import BACKGROUND_OFFSET
 from palpate.sim.plan import contact_frames, first_contact
 
 PROTOCOLS = {"frame": "random frame", "touch": "random whole touch", "video": "by video", "object": "by object"}
-TEST_SHARE = 0.25
+FOLDS = 4  # every unit is tested once
 PATCH, STRIDE, COMPONENTS, WORDS, SAMPLED = 8, 4, 32, 1024, 60_000
-PENALTIES, FOLDS = (1e-3, 3e-3, 1e-2), 3  # C of scikit-learn, strongest first
+PENALTIES, INNER_FOLDS = (1e-3, 3e-3, 1e-2), 3  # C of scikit-learn, strongest first
 POOL, RIDGE = 100, 0.1
 
 
@@ -114,24 +115,24 @@ def render(options, processes=2):
     )
 
 
-def cut(frames, protocol, seed, share=TEST_SHARE):
-    """Rows of train and test: a random ``share`` of the units, drawn material by material so that each has its part."""
+def cut(frames, protocol, seed, fold, folds=FOLDS):
+    """Rows of train and test: the units dealt into ``folds`` at random, material by material so that each has its part; one fold is tested."""
     unit = {"frame": frames.ids, "touch": frames.contact, "video": frames.video, "object": frames.thing}[protocol]
     names, first, inverse = np.unique(unit, return_index=True, return_inverse=True)
     order = rng_for(seed, "split protocols", protocol).permutation(len(names))
     order = order[np.argsort(frames.material[first][order], kind="stable")]
-    at = np.arange(len(order))
-    tested = np.zeros(len(names), bool)
-    tested[order] = np.floor((at + 1) * share + 0.5) > np.floor(at * share + 0.5)
-    return np.flatnonzero(~tested[inverse]), np.flatnonzero(tested[inverse])
+    dealt = np.empty(len(names), int)
+    dealt[order] = np.arange(len(order)) % folds
+    tested = dealt[inverse] == fold
+    return np.flatnonzero(~tested), np.flatnonzero(tested)
 
 
 def equal_cuts(frames, seed):
-    """Protocol -> rows of train and test, the train sides thinned at random to one size."""
-    cuts = {protocol: cut(frames, protocol, seed) for protocol in PROTOCOLS}
+    """(Protocol, fold) -> rows of train and test, the train sides thinned at random to one size."""
+    cuts = {(protocol, fold): cut(frames, protocol, seed, fold) for protocol in PROTOCOLS for fold in range(FOLDS)}
     size = min(len(train) for train, _ in cuts.values())
-    thin = lambda rows, protocol: np.sort(rng_for(seed, "thinning", protocol).permutation(rows)[:size])  # noqa: E731
-    return {protocol: (thin(train, protocol), test) for protocol, (train, test) in cuts.items()}
+    thin = lambda rows, *where: np.sort(rng_for(seed, "thinning", *where).permutation(rows)[:size])  # noqa: E731
+    return {(protocol, fold): (thin(train, f"{protocol} {fold}"), test) for (protocol, fold), (train, test) in cuts.items()}
 
 
 def patches_of(images):
@@ -166,30 +167,24 @@ def feature_set(features, frames, rows, encoder):
     return FeatureSet(list(frames.ids[rows]), features[rows], list(frames.material[rows]), list(frames.video[rows]), encoder)
 
 
-def accuracy(hit, groups):
-    """The mean of ``hit`` and its interval over groups."""
-    return float(hit.mean()), mean_interval(hit.astype(float), groups, 0.95)[0]
-
-
 def nearest(train, test):
-    """Accuracy of the material of the most similar training row."""
+    """(n,) whether the material of the most similar training row is right."""
     labels, best = np.array(train.labels), []
     for k in range(0, len(test.ids), 500):
         best.append((test.features[k : k + 500] @ train.features.T).argmax(axis=1))
-    return accuracy(labels[np.concatenate(best)] == np.array(test.labels), test.groups)
+    return labels[np.concatenate(best)] == np.array(test.labels)
 
 
 def logistic(train, test, seed):
-    """Accuracy of a logistic regression, and the penalty C that leaving out whole videos of train chose (the stronger on a tie)."""
+    """(n,) whether a logistic regression is right, and the penalty C that leaving out whole videos of train chose (the stronger on a tie)."""
     mean, sd = train.features.mean(axis=0), train.features.std(axis=0) + 1e-6
     x, y, groups = (train.features - mean) / sd, np.array(train.labels), np.array(train.groups)
     names = np.unique(groups)
-    fold = (rng_for(seed, "folds").permutation(len(names)) % FOLDS)[np.searchsorted(names, groups)]
+    fold = (rng_for(seed, "folds").permutation(len(names)) % INNER_FOLDS)[np.searchsorted(names, groups)]
     fit = lambda rows, c: LogisticRegression(C=c, max_iter=200, tol=1e-3).fit(x[rows], y[rows])  # noqa: E731
-    right = {c: sum((fit(fold != f, c).predict(x[fold == f]) == y[fold == f]).sum() for f in range(FOLDS)) for c in PENALTIES}
+    right = {c: sum((fit(fold != f, c).predict(x[fold == f]) == y[fold == f]).sum() for f in range(INNER_FOLDS)) for c in PENALTIES}
     chosen = max(PENALTIES, key=right.__getitem__)
-    hit = fit(slice(None), chosen).predict((test.features - mean) / sd) == np.array(test.labels)
-    return accuracy(hit, test.groups), chosen
+    return fit(slice(None), chosen).predict((test.features - mean) / sd) == np.array(test.labels), chosen
 
 
 def across(vision, touch):
@@ -206,20 +201,35 @@ def across(vision, touch):
     return [(s.value, s.interval, s.details["chance"]) for s in retrieval(guess, centred, pool=pool)]
 
 
-def measure(frames, images, protocol, seed):
-    """For ``images`` by modality: measure -> (value, interval, chance) of one protocol, the number of train and test frames under "frames", and the penalties chosen under "C"."""
-    train, test = equal_cuts(frames, seed)[protocol]
-    chance, sides = 1 / len(set(frames.material)), {}
-    row = {"frames": (len(train), len(test)), "C": {}}
+def measure(frames, images, protocol, fold, seed):
+    """One fold of one protocol: hits (n,) by measure under "hits", their videos, retrieval as (value, interval, chance), sizes and penalties."""
+    train, test = equal_cuts(frames, seed)[protocol, fold]
+    found, sides = {"hits": {}, "across": {}, "C": {}, "videos": frames.video[test], "frames": (len(train), len(test))}, {}
     for modality in images:
         features = patch_words(images[modality], train, seed)
         sides[modality] = tuple(feature_set(features, frames, rows, "patch words") for rows in (train, test))
-        (value, interval), row["C"][modality] = logistic(*sides[modality], seed)
-        row[f"{modality}, logistic regression"] = (value, interval, chance)
-        row[f"{modality}, nearest neighbour"] = (*nearest(*sides[modality]), chance)
+        found["hits"][f"{modality}, logistic regression"], found["C"][modality] = logistic(*sides[modality], seed)
+        found["hits"][f"{modality}, nearest neighbour"] = nearest(*sides[modality])
     if len(images) == 2:
-        for k, found in zip((1, 5), across(sides["vision"], sides["touch"]), strict=True):
-            row[f"vision to touch, top {k} of {POOL}"] = found
+        for k, score in zip((1, 5), across(sides["vision"], sides["touch"]), strict=True):
+            found["across"][f"vision to touch, top {k} of {POOL}"] = score
+    return found
+
+
+def combine(folds, chance):
+    """Measure -> (value, interval, chance) over all folds of one protocol and seed; "frames" (train, tested) and the penalties "C" beside them."""
+    videos = np.concatenate([f["videos"] for f in folds])
+    row = {"frames": (folds[0]["frames"][0], len(videos)), "C": {m: sorted({f["C"][m] for f in folds}) for m in folds[0]["C"]}}
+    for name in folds[0]["hits"]:
+        hit = np.concatenate([f["hits"][name] for f in folds]).astype(float)
+        row[name] = (float(hit.mean()), mean_interval(hit, videos, 0.95)[0], chance)
+    for name in folds[0]["across"]:
+        values, intervals, chances = zip(*(f["across"][name] for f in folds), strict=True)
+        value, interval = float(np.mean(values)), None
+        if all(intervals):
+            half = float(np.sqrt(sum((b - a) ** 2 for a, b in intervals))) / 2 / len(folds)
+            interval = (value - half, value + half)
+        row[name] = (value, interval, float(np.mean(chances)))
     return row
 
 
@@ -233,17 +243,21 @@ def keep(frames, modalities):
 
 
 def job(task):
-    """Measures one (protocol, seed) in a worker process."""
+    """Measures one (protocol, fold, seed) in a worker process."""
     return task, measure(_KEPT["frames"], _KEPT["images"], *task)
 
 
 def measure_all(frames, seeds, modalities, processes):
     """A list with one dictionary a seed: protocol -> measures."""
-    tasks = [(protocol, seed) for seed in seeds for protocol in PROTOCOLS]
-    found = {seed: {} for seed in seeds}
+    tasks = [(protocol, fold, seed) for seed in seeds for protocol in PROTOCOLS for fold in range(FOLDS)]
+    found, folds, chance = {seed: {} for seed in seeds}, [], 1 / len(set(frames.material))
     with multiprocessing.get_context("spawn").Pool(processes, keep, (frames, modalities)) as pool:
-        for (protocol, seed), row in pool.imap(job, tasks):
-            found[seed][protocol] = row
+        for (protocol, fold, seed), one in pool.imap(job, tasks):
+            folds.append(one)
+            if fold < FOLDS - 1:
+                continue
+            row = found[seed][protocol] = combine(folds, chance)
+            folds = []
             values = ", ".join(f"{name} {100 * v[0]:.1f}" for name, v in row.items() if name not in ("frames", "C"))
             print(f"seed {seed} {PROTOCOLS[protocol]:18s} C {row['C']}: {values}", flush=True)
     return [found[seed] for seed in seeds]
@@ -283,8 +297,7 @@ def page(results, seeds, preset, options, frames, command):
         if np.min(steps) >= 5
         else f"The smallest step is {np.min(steps):+.1f} points, below 5."
     )
-    sizes = "; ".join(f"{PROTOCOLS[p]} {results[0][p]['frames'][1]}" for p in PROTOCOLS)
-    chosen = sorted({c for r in results for p in PROTOCOLS for c in r[p]["C"].values()})
+    chosen = sorted({c for r in results for p in PROTOCOLS for cs in r[p]["C"].values() for c in cs})
     counts = np.unique(frames.material, return_counts=True)[1]
     return f"""# Ways to cut one world
 
@@ -302,7 +315,7 @@ A cell: mean over split seeds ± half width of the 95 % interval over videos (me
 Steps of the touch probe (logistic regression) in points, random frame to whole touch and whole touch to video: {each}; mean {means[0]:+.1f} and {means[1]:+.1f}.
 {met}
 
-Train: {results[0]["frame"]["frames"][0]} frames in every protocol. Test (first seed): {sizes}. Rows are not weighted: the materials have {counts.min()} to
+{FOLDS} folds a seed, each tested once: {results[0]["frame"]["frames"][0]} frames to train on in every run, all {len(frames.ids)} tested. Rows are not weighted: the materials have {counts.min()} to
 {counts.max()} frames, so always naming the most frequent one is right in {100 * counts.max() / counts.sum():.1f} %. Penalties chosen (C): {", ".join(f"{c:g}" for c in chosen)}.
 Features, classifiers and intervals are described at the head of `benchmarks/split_protocols.py`.
 """

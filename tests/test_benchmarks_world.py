@@ -42,7 +42,9 @@ def test_rendered_frames_are_the_worlds_in_order(frames):
 
 @pytest.mark.parametrize("protocol", protocols.PROTOCOLS)
 def test_a_cut_keeps_its_units_whole_and_only_its_units(frames, protocol):
-    train, test = protocols.cut(frames, protocol, seed=3)
+    folds = [protocols.cut(frames, protocol, 3, fold) for fold in range(protocols.FOLDS)]
+    assert sorted(row for _, test in folds for row in test) == list(range(len(frames.ids)))  # every frame is tested once
+    train, test = folds[1]
     assert sorted([*train, *test]) == list(range(len(frames.ids)))
     assert 0.1 < len(test) / len(frames.ids) < 0.45
     units = {"frame": frames.ids, "touch": frames.contact, "video": frames.video, "object": frames.thing}
@@ -50,11 +52,12 @@ def test_a_cut_keeps_its_units_whole_and_only_its_units(frames, protocol):
     shared = {name: set(column[train]) & set(column[test]) for name, column in units.items()}
     for name in order:
         assert (not shared[name]) if order.index(name) <= order.index(protocol) else shared[name]
-    assert not np.array_equal(test, protocols.cut(frames, protocol, seed=4)[1])
+    assert not np.array_equal(test, protocols.cut(frames, protocol, 4, 1)[1])
 
 
 def test_equal_cuts_train_on_equally_many_frames_and_never_on_a_test_frame(frames):
     cuts = protocols.equal_cuts(frames, seed=0)
+    assert len(cuts) == len(protocols.PROTOCOLS) * protocols.FOLDS
     assert len({len(train) for train, _ in cuts.values()}) == 1
     assert all(not set(train) & set(test) for train, test in cuts.values())
 
@@ -92,19 +95,30 @@ def test_classifiers_find_a_planted_class_and_not_noise():
     planted[:, 0] += 6 * (labels == "a")
     side = lambda x, rows: protocols.FeatureSet([str(k) for k in rows], x[rows], list(labels[rows]), list(groups[rows]), "e")  # noqa: E731
     train, test = np.arange(0, 120, 2), np.arange(1, 120, 2)
-    (value, interval), penalty = protocols.logistic(side(planted, train), side(planted, test), seed=0)
-    assert value > 0.95
-    assert interval is None or interval[0] <= value <= interval[1]
+    hit, penalty = protocols.logistic(side(planted, train), side(planted, test), seed=0)
+    assert hit.mean() > 0.95
     assert penalty in protocols.PENALTIES
     noise = rng.standard_normal((120, 6)).astype(np.float32)
-    assert protocols.logistic(side(noise, train), side(noise, test), seed=0)[0][0] < 0.75
+    assert protocols.logistic(side(noise, train), side(noise, test), seed=0)[0].mean() < 0.75
     unit = noise / np.linalg.norm(noise, axis=1, keepdims=True)  # as patch words are
     best = [int(np.argmin(((unit[train] - row) ** 2).sum(axis=1))) for row in unit[test]]
-    assert protocols.nearest(side(unit, train), side(unit, test))[0] == np.mean(labels[train][best] == labels[test])
+    np.testing.assert_array_equal(protocols.nearest(side(unit, train), side(unit, test)), labels[train][best] == labels[test])
+
+
+def test_folds_are_combined_over_their_frames_and_videos():
+    fold = lambda hits, videos, top: {  # noqa: E731
+        "hits": {"touch": np.array(hits)}, "videos": np.array(videos), "frames": (9, len(hits)), "C": {"touch": 0.01}, "across": {"top": top},
+    }  # fmt: skip
+    row = protocols.combine([fold([1, 1, 0], ["a", "a", "b"], (0.2, (0.1, 0.3), 0.01)), fold([0], ["c"], (0.4, (0.3, 0.5), 0.01))], 0.25)
+    value, interval, chance = row["touch"]
+    assert (value, chance, row["frames"], row["C"]) == (0.5, 0.25, (9, 4), {"touch": [0.01]})
+    assert interval == protocols.mean_interval(np.array([1.0, 1, 0, 0]), ["a", "a", "b", "c"], 0.95)[0]
+    np.testing.assert_allclose(row["top"][0], 0.3)
+    np.testing.assert_allclose(row["top"][1], (0.3 - 0.1 / np.sqrt(2), 0.3 + 0.1 / np.sqrt(2)))  # two equal errors
 
 
 def test_the_table_holds_means_ranges_and_steps():
-    row = lambda v: {"frames": (6, 2), "C": {"touch": 0.01}, "touch, logistic regression": (v, (v - 0.1, v + 0.1), 0.25)}  # noqa: E731
+    row = lambda v: {"frames": (6, 2), "C": {"touch": [0.01]}, "touch, logistic regression": (v, (v - 0.1, v + 0.1), 0.25)}  # noqa: E731
     first = dict(zip(protocols.PROTOCOLS, map(row, (0.8, 0.6, 0.5, 0.4)), strict=True))
     second = dict(zip(protocols.PROTOCOLS, map(row, (0.9, 0.7, 0.68, 0.4)), strict=True))
     np.testing.assert_allclose(protocols.steps_of([first, second]), [(20, 10), (20, 2)])

@@ -103,6 +103,20 @@ def test_what_cannot_be_done_is_one_line_and_writes_nothing(place, capsys):
     assert {p: p.read_bytes() for p in place.rglob("*") if p.is_file()} == before
 
 
+def test_a_broken_photo_is_refused_before_the_model_is_loaded(place, capsys, monkeypatch):
+    from palpate.diffusion.pipeline import Pipeline
+
+    loads = []
+    load = Pipeline.load
+    monkeypatch.setattr(Pipeline, "load", lambda *args: loads.append(args) or load(*args))
+    (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
+    for photo in ("cut.jpg", "gone.jpg"):
+        status, _, err = call(capsys, photo, "-o", "t.png")
+        assert (status, photo in err, loads) == (2, True, [])
+    assert call(capsys, "photo.jpg", "-o", "t.png")[0] == 0
+    assert len(loads) == 1
+
+
 def test_bad_photos_may_be_left_out(place, capsys):
     (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
     status, out, err = call(capsys, "photo.jpg", "cut.jpg", "gone.jpg", "-o", "t", "--skip-bad", "--json")

@@ -86,6 +86,10 @@ def test_no_absolute_paths_no_pickles_no_forbidden_packages():
         assert not re.search(r"\bpickle\.(loads?|Unpickler|dumps?)\b|from pickle import (?!UnpicklingError)", text), path
         assert "torch.load(" not in text or "weights_only=True" in text, path
         assert "allow_pickle=True" not in text, path
+    for path in (TOP / "src").rglob("*"):
+        if path.suffix in (".json", ".md"):  # what ships beside the weights
+            text = path.read_text(encoding="utf-8")
+            assert not re.search(r"[\s\"'`(](/home|/work|/root|/nfs|/mnt|/Users|/tmp)/", text), path
 
 
 def test_importing_a_room_has_no_effects():

@@ -27,9 +27,9 @@ from palpate.core import PalpateError, digest_json, read_record, write_json
 from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
 from palpate.diffusion.pixels import architecture, digest_tensors, to_bytes, to_unit
-from palpate.encoders.half import Rounding, half_copy, round_to_half
+from palpate.encoders.half import Rounding, round_to_half
 from palpate.encoders.hub import fetch
-from palpate.encoders.weights import UNREADABLE
+from palpate.encoders.weights import UNREADABLE, save_weights
 
 FORMAT = "palpate-autoencoder/1"
 
@@ -126,7 +126,7 @@ class Autoencoder(nn.Module):
         """
         if half:
             self.halve()
-        (half_copy(self.vq) if half else self.vq).save_pretrained(folder, safe_serialization=True)
+        save_weights(self.vq, folder, half=half)
         write_json(Path(folder) / "palpate.json", {"format": FORMAT, "patch": self.patch, "digest": self.digest, "card": self.card})
         write_model_cards(Path(folder))
 

@@ -28,8 +28,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from palpate.core import PalpateError, atomic_path
-from palpate.encoders.half import Rounding, half_copy, round_to_half
-from palpate.encoders.weights import UNREADABLE
+from palpate.encoders.half import Rounding, round_to_half
+from palpate.encoders.weights import UNREADABLE, save_weights
 
 Source = Literal["text", "vision"]
 SOURCES: tuple[Source, ...] = ("text", "vision")
@@ -205,7 +205,7 @@ class Denoiser(nn.Module):
         """
         if half:
             self.halve()
-        (half_copy(self.unet) if half else self.unet).save_pretrained(folder, safe_serialization=True)
+        save_weights(self.unet, folder, half=half)
         extra = {"means": self.means.cpu().contiguous()} | ({} if self.null is None else {"null": self.null.detach().cpu().contiguous()})
         with atomic_path(Path(folder) / "condition.safetensors") as part:
             save_file(extra, part)

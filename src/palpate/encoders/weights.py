@@ -1,4 +1,4 @@
-"""transformers' models on disk: read whole or refused, written without noise, named by a digest of what they compute."""
+"""Models of transformers and diffusers on disk: read whole or refused, written without noise, named by a digest of what they compute."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError
 from torch import nn
-from transformers import PreTrainedModel
 from transformers.utils import logging as hf_logging
 
 from palpate.core import digest_json
@@ -29,10 +28,18 @@ ARCHITECTURE = (
 )  # fmt: skip
 
 
-def save_weights(model: PreTrainedModel, folder: Path, *, half: bool) -> None:
-    """``save_pretrained``, of a 16-bit copy if asked for; the weights must have been rounded before."""
+def save_weights(model: Any, folder: Path, *, half: bool) -> None:
+    """A model's ``save_pretrained``, of a 16-bit copy if asked for; the weights must have been rounded before.
+
+    Where the model was loaded from is left out of ``config.json``: a path on the machine that wrote it tells a reader nothing, and
+    would make equal models differ.
+    """
     with silent():
         (half_copy(model) if half else model).save_pretrained(folder)
+    place = Path(folder) / "config.json"
+    config = json.loads(place.read_text(encoding="utf-8"))
+    if config.pop("_name_or_path", None) is not None:
+        place.write_text(json.dumps(config, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def load_weights(kind: Any, name: str, **how: bool) -> Any:
