@@ -5,13 +5,16 @@
 
 The contact frames of a preset are cut into train and test by random frame (as HCT-Orig), by random whole touch (as the Touch and Go lists), by whole
 video, and by whole object (a video counts with its first object; the other objects of a mixed video are in no other). A split seed deals the units into
-four folds, material by material; each fold is tested once by what trained on the other three, so that every video is tested in every protocol and the
-protocols of a seed differ in nothing but the split; every training run has the same number of frames. Features are patch words: small patches of contact minus background (touch; the background is the frame that the background rule
+four folds, material by material; each fold is tested once by what trained on the other three, so that every video is tested in every protocol and, for
+the classifiers, the protocols of a seed differ in nothing but the split; every training run has the same number of frames. For retrieval they differ in
+the pools too: 100 samples of about 2,000 test frames of nearly all 500 videos by random frame, but of only 125 videos by video, so that pools by video
+hold more near-twins and are harder; part of the step is that. Features are patch words: small patches of contact minus background (touch; the background is the frame that the background rule
 names, and printed markers are filled in first in both, since their shift tells more about drag than about material) or of the photo (vision), projected
 on their leading principal components, words by k-means, the square root of each image's word frequencies; components and words are learnt on the train
 side alone. Classifiers: logistic regression on standardised features, whose penalty is chosen by leaving out whole videos of the train side in every
 protocol, and the nearest neighbour by cosine. Retrieval: a ridge regression from vision to touch words, cosine among 100 samples of the test side.
-Intervals are robust to whole videos deviating together, Student's t (retrieval: folds combined as independent). Rows are not weighted (not balanced); chance is one in the number of materials, and
+Intervals are robust to whole videos deviating together, Student's t (retrieval: folds combined as independent, which is too narrow where the
+same videos lie in all folds: by random frame and by random touch). Rows are not weighted (not balanced); chance is one in the number of materials, and
 the share of the largest class is printed. Frames are rendered into memory without JPEG; only the table is written.
 """
 

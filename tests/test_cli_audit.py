@@ -8,6 +8,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
+from forges import FORGES
 from palpate.cli import main
 from palpate.core import Split
 
@@ -182,3 +183,12 @@ def test_plain_folders_of_pictures_are_photos(folders, capsys):
     assert any("Only one side has pictures of touch" in note for note in data["notes"])
     (folders / "empty").mkdir()
     assert run(capsys, folders / "a", folders / "empty")[0] == 2
+
+
+def test_a_small_tree_whose_backgrounds_are_all_unlike_is_audited(tmp_path, capsys):
+    source = FORGES["touch-and-go"](tmp_path / "forged").source
+    assert main(["import", str(source), "-o", str(tmp_path / "m"), "-q"]) == 0
+    capsys.readouterr()
+    status, found, err = run(capsys, tmp_path / "m", "--split", tmp_path / "m" / "splits" / "Orig.json")
+    assert (status, "Traceback" in err) == (0, False)
+    assert found

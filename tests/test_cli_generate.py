@@ -1,6 +1,8 @@
 """``palpate generate``: a photo in, a picture out, with the generator that ships; and every way to hold it wrong."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -104,17 +106,57 @@ def test_what_cannot_be_done_is_one_line_and_writes_nothing(place, capsys):
 
 
 def test_a_broken_photo_is_refused_before_the_model_is_loaded(place, capsys, monkeypatch):
+    """And whatever else needs no model: settings, device, output and the model's name."""
     from palpate.diffusion.pipeline import Pipeline
 
     loads = []
     load = Pipeline.load
     monkeypatch.setattr(Pipeline, "load", lambda *args: loads.append(args) or load(*args))
     (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
-    for photo in ("cut.jpg", "gone.jpg"):
-        status, _, err = call(capsys, photo, "-o", "t.png")
-        assert (status, photo in err, loads) == (2, True, [])
+    (place / "full").mkdir()
+    (place / "full" / "notes.txt").write_text("mine")
+    (place / "other").mkdir()
+    (place / "other" / "index.json").write_text("{}")
+    Image.new("RGB", (9, 9)).save(place / "photos" / "c.jpg")
+    (place / "photos" / "c.jpg").write_bytes((place / "photos" / "c.jpg").read_bytes()[:300])
+    for args, word in (
+        (["cut.jpg", "-o", "t.png"], "cut.jpg"),
+        (["gone.jpg", "-o", "t.png"], "gone.jpg"),
+        (["cut.jpg", "photo.jpg", "-o", "t"], "pass --skip-bad"),
+        (["photos", "-o", "t"], "c.jpg"),
+        (["photo.jpg", "photos/../photo.jpg", "-o", "t"], "'photo.jpg' twice"),
+        (["photo.jpg", "photos/../photo.jpg", "-o", "t", "--skip-bad"], "'photo.jpg' twice"),
+        (["photo.jpg", "-o", "t.png", "--steps", "0"], "1 to 1000 steps"),
+        (["photo.jpg", "-o", "t.png", "--steps", "1001"], "1 to 1000 steps"),
+        (["photo.jpg", "-o", "t", "--batch", "0"], "batch of at least 1"),
+        (["photo.jpg", "-o", "t.png", "--guidance", "-1"], "finite number from 0 on"),
+        (["photo.jpg", "-o", "t.png", "--device", "gpu"], "Got 'gpu'. Choose auto, cpu"),
+        (["photo.jpg", "-o", "t.png", "--device", "cpu:x"], "Got 'cpu:x'"),
+        (["photo.jpg", "-o", "cut.jpg/"], "written as PNG"),
+        (["photo.jpg", "-o", "full/notes.txt"], "Got a file"),
+        (["photo.jpg", "-o", "full"], "Got other files"),
+        (["photo.jpg", "-o", "other"], "another kind of folder"),
+        (["photo.jpg", "-o", "t", "--model", "palpate/maxi"], "must be one of palpate/mini"),
+        (["photo.jpg", "-o", "t", "--model", "nowhere"], "no folder nowhere"),
+        (["photo.jpg", "-o", "t", "--model", ""], "no folder ''"),
+        (["photo.jpg", "-o", "t", "--model", "./photos"], "must exist"),
+        (["--manifest", "gone", "-o", "t"], "The manifest must exist"),
+    ):
+        status, _, err = call(capsys, *args)
+        assert (status, word in err, loads, "Loading" in err) == (2, True, [], False), (args, err)
     assert call(capsys, "photo.jpg", "-o", "t.png")[0] == 0
     assert len(loads) == 1
+
+
+def test_what_is_refused_first_needs_no_torch(place):
+    code = (
+        "import sys; from palpate.cli import main; status = main(sys.argv[1:]);"
+        "sys.exit(9 if {'torch', 'transformers', 'diffusers'} & set(sys.modules) else status)"
+    )
+    (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
+    for args in (["cut.jpg"], ["photo.jpg", "--steps", "0"], ["photo.jpg", "--device", "gpu"], ["photo.jpg", "--model", "palpate/maxi"]):
+        done = subprocess.run([sys.executable, "-c", code, "generate", *args, "-o", "t.png"], capture_output=True, text=True, check=False)
+        assert done.returncode == 2, (args, done.stderr)
 
 
 def test_bad_photos_may_be_left_out(place, capsys):

@@ -1,8 +1,11 @@
 """The verbs import, validate and export: options of every format, statuses, JSON, and what is told."""
 
+import errno
 import json
+import os
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 
@@ -173,3 +176,36 @@ def test_export_to_hugging_face_and_back(capsys, small_manifest, tmp_path):
     assert (status, json.loads(out)["samples"]) == (0, 48)
     assert call(capsys, "import", tmp_path / "e", "-o", tmp_path / "again")[0] == 0
     assert Manifest.load(tmp_path / "again").digest == small_manifest.digest
+
+
+def test_a_full_disk_is_told_in_a_line_and_leaves_nothing(capsys, tag, tmp_path, monkeypatch):
+    assert call(capsys, "import", tag, "-o", tmp_path / "m", "-q")[0] == 0
+    real = Path.write_bytes
+
+    def full(path, data):
+        if path.suffix == ".parquet":
+            real(path, bytes(data)[:9])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    for args in (
+        ["import", tag, "-o", tmp_path / "full"],
+        ["export", tmp_path / "m", "--to", "parquet", "-o", tmp_path / "full"],
+        ["audit", tag / "train.txt", tag / "test.txt", "--table", tmp_path / "full" / "t.parquet"],
+    ):
+        status, _, err = call(capsys, *args, "-q")
+        assert status == 2, err
+        assert err.startswith(f"palpate {args[0]}: The disk must have room for ")
+        assert "Got No space left on device. Free some space" in err
+        assert "Traceback" not in err
+        assert not [p for p in tmp_path.rglob("*.parquet") if "full" in p.parts or p.name.startswith(".")]
+
+
+def test_a_place_without_room_for_a_new_file_is_told_by_its_own_name(tmp_path, monkeypatch, capsys, tag):
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "somewhere")
+
+    monkeypatch.setattr("tempfile.mkstemp", full)
+    status, _, err = call(capsys, "import", tag, "-o", tmp_path / "m", "-q")
+    assert (status, f"must have room for {tmp_path / 'm'}" in err, "somewhere" in err) == (2, True, False)

@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 
 from diffusion_forge import make_pipeline
 from mini_forge import make_towers, write_shipped
-from palpate.core import PalpateError, shipped
+from palpate.core import PalpateError, digest_folder, shipped
 from palpate.core.cards import model_card, write_model_cards
 from palpate.core.shipped import PARTS, SHIPPED, is_hub_id, shipped_folder, shipped_root
 from palpate.diffusion.autoencoder import Autoencoder
@@ -301,3 +301,31 @@ def test_a_fresh_process_with_the_hub_switched_off(tmp_path):
     for more in ({}, {"HF_HUB_OFFLINE": "1"}):
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env | more, check=False, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_equal_towers_are_equal_files(half, tmp_path):
+    made = make_towers()
+    made.save(tmp_path / "a", half=half)
+    loaded = Towers.load(tmp_path / "a")
+    loaded.clip.name = made.clip.name
+    loaded.encode("text", ["a rough wall", "a soft cloth"])  # using it changes nothing
+    loaded.save(tmp_path / "b", half=half)
+    assert digest_folder(tmp_path / "a") == digest_folder(tmp_path / "b")
+    config = json.loads((tmp_path / "a" / "clip" / "config.json").read_text())
+    kinds = {part["dtype"] for part in (config, config["text_config"], config["vision_config"])}
+    assert kinds == {"float16" if half else "float32"}
+    other = Towers.load(tmp_path / "b")  # 16 bits on disk, saved in 32: nothing of where it came from is left
+    other.clip.name = made.clip.name
+    other.save(tmp_path / "c")
+    made.save(tmp_path / "d")
+    assert digest_folder(tmp_path / "c") == digest_folder(tmp_path / "d")
+
+
+@pytest.mark.parametrize("load", [load_clip, Towers.load, Autoencoder.load, Pipeline.load])
+@pytest.mark.parametrize("name", ["", "./palpate/mini"])
+def test_names_of_no_folder_are_told_as_such(load, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PalpateError) as error:
+        load(name)
+    assert error.value.got == f"no folder {name or repr('')}"

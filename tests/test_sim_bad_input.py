@@ -8,6 +8,7 @@ import pickle
 import resource
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -155,6 +156,29 @@ def test_a_limit_on_file_sizes_is_told_as_a_full_disk(tmp_path):
     assert not left_behind(tmp_path)
 
 
+def test_a_disk_that_is_full_by_the_manifest_is_told_and_a_rerun_goes_on(tmp_path, monkeypatch, capsys):
+    size = ["--size", "16", "--tile", "64", "--workers", "1", "-q"]
+    args = ["world", "--preset", "tiny", *size, "-o"]
+    real = Path.write_bytes
+
+    def full(path, data):
+        if "manifest.parquet" in path.name:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        assert main([*args, str(tmp_path / "w")]) == 2
+    said = capsys.readouterr().err
+    assert f"The disk of {tmp_path} must have room for the world. Got No space left on device" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "w").exists()
+    assert not left_behind(tmp_path)
+    assert main([*args, str(tmp_path / "w")]) == 0
+    assert main([*args, str(tmp_path / "whole")]) == 0
+    assert digest_folder(tmp_path / "w") == digest_folder(tmp_path / "whole")
+
+
 @pytest.fixture
 def small_disk(tmp_path):
     """A file system of 256 KB and a function that makes it large; only where one may be mounted."""
@@ -210,6 +234,18 @@ def test_a_world_of_another_version_is_refused(version, tmp_path):
             call()
 
 
+def test_a_world_of_another_format_is_not_called_one_of_other_options(tmp_path):
+    write_world(tmp_path / "w", TINY)
+    changed(tmp_path / "w" / "world.json", format="palpate-world/3")
+    with pytest.raises(PalpateError, match=r"must hold a world of the format palpate-world/2\. Got 'palpate-world/3'"):
+        write_world(tmp_path / "w", TINY)
+    with pytest.raises(PalpateError, match="Got 'palpate-world/3'"):
+        load_options(tmp_path / "w")
+    changed(tmp_path / "w" / "world.json", format="palpate-world/2")
+    with pytest.raises(PalpateError, match="a world of other options"):
+        write_world(tmp_path / "w", dataclasses.replace(TINY, hard=0.25))
+
+
 def test_an_unfinished_world_of_another_version_is_refused_by_name(tmp_path):
     def stop(what, done, total, remark=""):
         raise KeyboardInterrupt
@@ -246,6 +282,9 @@ def test_options_survive_a_file_and_repeat_a_world(tmp_path):
         ({"options": {"seed": 6}}, "digest in .* must match"),
         ({"options": [1]}, "must be a world.json"),
         ({"format": "palpate-split/1"}, "must be a world.json.*Got 'palpate-split/1'"),
+        ({"format": "palpate-world-options/9"}, "have the format palpate-world-options/1.*Got 'palpate-world-options/9'"),
+        ({"format": "palpate-world/3"}, "format palpate-world/2.*Got 'palpate-world/3'"),
+        ({"format": "palpate-world/3", "version": VERSION + 1}, f"must be of version {VERSION}"),
         ({"options": {"size": 5}}, "size must be a whole number"),
         ({"options": {"view_mm": [40, 30]}}, "lower end first"),
     ],
@@ -268,7 +307,7 @@ def test_options_that_are_not_there_or_no_json_are_refused(tmp_path):
         load_options(tmp_path / "o.json")
     save_options(WorldOptions(), tmp_path / "o.json")
     changed(tmp_path / "o.json", options={"size": 5, "hard": 7.0})
-    with pytest.raises(ProblemsError):
+    with pytest.raises(ProblemsError, match="Every option of the world must lie in its range"):
         load_options(tmp_path / "o.json")
 
 

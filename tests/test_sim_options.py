@@ -1,6 +1,7 @@
 """Options, presets and plans."""
 
 import dataclasses
+import pickle
 import re
 
 import numpy as np
@@ -243,3 +244,32 @@ def test_pretrain_and_demo_share_no_object():
     first, second = (make_object(dataclasses.replace(PRESETS[name], tile=64), ObjectRef("Rock", 0)) for name in ("demo", "pretrain"))
     assert first.ref == second.ref
     assert np.abs(np.corrcoef(first.surface.height.ravel(), second.surface.height.ravel())[0, 1]) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("given", "must", "fix"),
+    [
+        ({"seed": -1}, "from 0 to 2147483647", "seed=0."),
+        ({"seed": 2**31}, "from 0 to 2147483647", "seed=2147483647."),
+        ({"size": 257}, "from 16 to 256", "size=256."),
+        ({"size": 3}, "from 16 to 256", "size=16."),
+        ({"size": 64.4}, "whole number", "size=64."),
+        ({"size": "large"}, "whole number", "size=16."),
+        ({"hard": 1.5}, "from 0 to 1", "hard=1."),
+        ({"view_mm": (30.0, 50.0)}, "from 15 to 45.25", "view_mm=(30, 45.25)."),
+        ({"view_mm": 30.0}, "two numbers", "view_mm=(15, 45.25)."),
+    ],
+)
+def test_a_value_out_of_range_is_told_the_nearest_that_is_in_it(given, must, fix):
+    with pytest.raises(PalpateError) as error:
+        WorldOptions(**given)
+    assert must in error.value.must
+    assert str(error.value).endswith(f"Pass e.g. {fix}")
+
+
+def test_several_wrong_options_are_told_as_options():
+    with pytest.raises(ProblemsError) as error:
+        WorldOptions(size=3, hard=2.0)
+    assert error.value.must == "Every option of the world must lie in its range and fit the others"
+    assert [p.kind for p in error.value.problems] == ["bad-option"] * 2
+    assert pickle.loads(pickle.dumps(error.value)).to_json() == error.value.to_json()

@@ -18,12 +18,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from PIL import Image, PngImagePlugin
-from torch import Tensor
 
 from palpate.core import (
     PalpateError,
@@ -40,10 +38,15 @@ from palpate.core import (
     write_json,
 )  # fmt: skip
 from palpate.core.digest import canonical_json
-from palpate.data.images import SUFFIXES, load_images, read_image, square
+from palpate.data.images import load_images, read_image, square
 from palpate.data.manifest import Manifest
-from palpate.diffusion.pipeline import EMBED, Pipeline
-from palpate.diffusion.sampling import SamplerOptions
+from palpate.data.photos import MEND, photo_ids, require_some
+from palpate.diffusion.card import SamplerOptions
+
+if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
+    from torch import Tensor
+
+    from palpate.diffusion.pipeline import Pipeline
 
 FORMAT = "palpate-generated/1"
 
@@ -153,6 +156,8 @@ def generate(
         PalpateError: on wrong arguments, or if the folder was made with other settings.
         ProblemsError: naming every unreadable photo, before any picture is made, unless ``skip_bad``.
     """
+    import torch
+
     inputs = _inputs(pipeline, manifest, photos, ids)
     sampler = pipeline.sampler_with(guidance=guidance, steps=steps, batch=batch)
     settings = _settings(pipeline, sampler, seed)
@@ -165,7 +170,7 @@ def generate(
     conditions, broken = _embed(pipeline, todo, progress)
     bad |= broken
     if bad and not skip_bad:
-        raise ProblemsError(list(bad.values()), "Mend or remove these photos, or pass --skip-bad")
+        raise ProblemsError(list(bad.values()), MEND)
     todo = [i for i in todo if i.sample in conditions]
     index["complete"] = False
     write_json(out / "index.json", index)
@@ -266,36 +271,10 @@ def _inputs(
         if ids is not None and (missing := [i for i in ids if i not in table]):
             raise PalpateError("Every id must be among the photos", f"{len(missing)} that are not, first {missing[0]!r}", "Check the names")
         found = [_Input(i, table[i], None) for i in (table if ids is None else ids)]
-    if not found:
-        raise PalpateError("There must be at least one photo", "none", "Check the folder, the split or the ids")
+    require_some(found)
     if len({i.sample for i in found}) < len(found):
         raise PalpateError("Ids must be unique", "an id that stands twice", "Name each id once")
     return found
-
-
-def photo_ids(photos: Path | Sequence[Path] | Mapping[str, Path]) -> dict[str, Path]:
-    """Ids of photos: paths below a folder (sorted), or file names of a list.
-
-    Raises:
-        PalpateError: if a folder is missing or two files have one name.
-    """
-    if isinstance(photos, Mapping):
-        return {i: Path(p) for i, p in photos.items()}
-    if isinstance(photos, Path):
-        if photos.is_file():
-            return {photos.name: photos}
-        if not photos.is_dir():
-            raise PalpateError("The photos must be a folder or files", f"no such path {photos}", "Check the path")
-        if (photos / "palpate.json").is_file():
-            raise PalpateError("The photos must be a folder of images", f"{photos}, a saved model", "Pass models with --model")
-        files = sorted(p for p in photos.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        return {p.relative_to(photos).as_posix(): p for p in files}
-    table: dict[str, Path] = {}
-    for path in map(Path, photos):
-        if path.name in table:
-            raise PalpateError("Photos in a list must differ in name", f"{path.name!r} twice", "Pass their common folder instead")
-        table[path.name] = path
-    return table
 
 
 def _read_index(folder: Path) -> dict[str, Any]:
@@ -305,17 +284,30 @@ def _read_index(folder: Path) -> dict[str, Any]:
     return index
 
 
+def require_place(out: Path) -> dict[str, Any] | None:
+    """The index of touches that were generated into ``out`` before; None where the folder is absent or empty.
+
+    Raises:
+        PalpateError: if something else is there.
+    """
+    if (out / "index.json").is_file():
+        return _read_index(out)
+    if out.exists() and not out.is_dir():
+        raise PalpateError(f"{out} must be a folder, empty or with generated touches", "a file", "Choose another name")
+    if out.exists() and any(out.iterdir()):
+        raise PalpateError(f"{out} must be empty or hold generated touches", "other files", "Choose another folder")
+    return None
+
+
 def _open_index(out: Path, settings: Mapping[str, Any], digest: str) -> dict[str, Any]:
     """The index in ``out`` if it has these settings, else a new one for an empty folder."""
-    if (out / "index.json").is_file():
-        index = _read_index(out)
+    index = require_place(out)
+    if index is not None:
         if index["digest"] != digest:
             differ = [k for k, v in settings.items() if index["settings"].get(k) != v]
             got = f"another {', another '.join(differ)} there"
             raise PalpateError(f"{out} must hold touches of the same settings or nothing", got, "Choose another folder")
         return index
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise PalpateError(f"{out} must be empty or hold generated touches", "other files", "Choose another folder")
     return {"format": FORMAT, "complete": False, "settings": dict(settings), "digest": digest, "images": {}, "skipped": []}
 
 
@@ -356,6 +348,8 @@ def _write(file: Path, touch: np.ndarray, text: PngImagePlugin.PngInfo) -> None:
 
 def _embed(pipeline: Pipeline, inputs: Sequence[_Input], progress: Progress) -> tuple[dict[str, Tensor], dict[str, Problem]]:
     """By id: the vision embedding of each input whose files decode, and what is wrong with the others."""
+    from palpate.diffusion.pipeline import EMBED
+
     found: dict[str, Tensor] = {}
     bad: dict[str, Problem] = {}
     for start in range(0, len(inputs), EMBED):

@@ -14,7 +14,20 @@ import tyro
 
 from palpate import __version__
 from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output, require_extra
-from palpate.core import Audit, FeatureSet, Impact, ImpactRow, PalpateError, Problem, ProblemsError, Progress, Results, Split, write_json
+from palpate.core import (
+    Audit,
+    FeatureSet,
+    Impact,
+    ImpactRow,
+    PalpateError,
+    Problem,
+    ProblemsError,
+    Progress,
+    Results,
+    Split,
+    write_json,
+    write_text,
+)
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
@@ -310,10 +323,12 @@ def _write(
     if options.output:
         write_json(options.output, data)
     if options.table:
-        from palpate.core import atomic_path
+        if options.table.suffix.lower() == ".csv":
+            write_text(options.table, found.table.write_csv())
+        else:
+            from palpate.data.manifest import write_parquet
 
-        with atomic_path(options.table) as part:
-            (found.table.write_csv if options.table.suffix.lower() == ".csv" else found.table.write_parquet)(part)
+            write_parquet(found.table, options.table)
     if options.page:
         from palpate.report import write_report
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal, guard_output, require_extra
 from palpate.core import PalpateError, Problem, ProblemsError
+
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,24 +50,21 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Generates and prints where the images are, and what the generator cannot know."""
     require_extra("palpate generate")
     single = _check(options)
+    manifest = _manifest(options)
     terminal.say(f"Loading {options.model} ...")  # torch and its friends take seconds to import
-    from palpate.core import Split
-    from palpate.data.manifest import Manifest
     from palpate.diffusion.pipeline import Pipeline
     from palpate.encoders.towers import pick_device
     from palpate.generate import generate, generate_one
 
-    manifest = None if options.manifest is None else Manifest.load(options.manifest)
-    if manifest is not None and options.split is not None:
-        manifest = manifest.part(Split.load(options.split), options.part)
-    pipeline = Pipeline.load(options.model).to(pick_device(options.device))
+    device = pick_device(options.device)
+    pipeline = Pipeline.load(options.model).to(device)
     sampling: dict[str, Any] = {"seed": options.seed, "guidance": options.guidance, "steps": options.steps}
     skipped: Sequence[Problem] = ()
     if single:
         new = generate_one(pipeline, options.photos[0], options.output, **sampling)
         facts: dict[str, Any] = {"image": str(options.output), "images": 1, "made_now": int(new)}
     else:
-        photos = None if manifest is not None else options.photos[0] if len(options.photos) == 1 else list(options.photos)
+        photos = None if manifest is not None else _photos(options)
         with terminal.progress() as progress:
             made = generate(
                 pipeline, out=options.output, manifest=manifest, photos=photos, batch=options.batch, skip_bad=options.skip_bad,
@@ -83,13 +83,30 @@ def _check(options: Options) -> bool:
     if bool(options.photos) == (options.manifest is not None):
         given = "both" if options.photos else "neither"
         raise PalpateError("Generating takes photos or --manifest", given, "E.g. palpate generate photo.jpg -o touch.png")
-    from palpate.data.images import SUFFIXES
-
     if not options.skip_bad and (missing := [p for p in options.photos if not p.exists()]):
         problems = [Problem(str(p), "missing-file", "no such file or folder") for p in missing]
         raise ProblemsError(problems, "Check the names, or pass --skip-bad")
+    single = _check_output(options)
+    _check_model(options)
+    from palpate.data.photos import photo_ids, require_readable
+
+    if single:
+        require_readable(options.photos[0], "Choose another photo, or mend this one")
+    elif options.photos and options.skip_bad:
+        photo_ids(_photos(options))
+    elif options.photos:
+        require_readable(_photos(options))
+    return single
+
+
+def _check_output(options: Options) -> bool:
+    """Refuses an output that cannot be written or must not be; returns whether one PNG is asked for."""
+    from palpate.data.images import SUFFIXES
+    from palpate.generate import require_place
+
     suffix = options.output.suffix.lower()
     if suffix not in SUFFIXES:
+        require_place(options.output)
         return False
     if options.output.is_dir():
         must = f"-o with {options.output.suffix} takes the touch of one photo, as a file"
@@ -99,17 +116,36 @@ def _check(options: Options) -> bool:
     if len(options.photos) != 1 or options.photos[0].is_dir():
         got = "a manifest" if options.manifest else "a folder" if len(options.photos) == 1 else f"{len(options.photos)} photos"
         raise PalpateError("-o with .png takes the touch of one photo", got, f"Name a folder, e.g. -o {options.output.stem}/")
-    _require_whole(options.photos[0])  # a second now, instead of after the model is loaded
     # Every touch bears this mark near its head: an earlier one may be replaced, a photo may not.
     guard_output(options.output, options.photos, (b"palpate.settings",))
     return True
 
 
-def _require_whole(photo: Path) -> None:
-    """Refuses a photo that cannot be decoded."""
-    from palpate.data.images import read_image
+def _check_model(options: Options) -> None:
+    """Refuses a device by its name, and a model and settings of sampling by the model's card; one on the hub is not asked for here."""
+    from palpate.core.shipped import is_hub_id
+    from palpate.diffusion.card import require_sampler
+    from palpate.encoders.device import require_device_name
 
-    try:
-        read_image(photo)
-    except PalpateError as error:
-        raise ProblemsError([Problem(str(photo), "bad-image", error.got)], "Choose another photo, or mend this one") from None
+    require_device_name(options.device)
+    if not is_hub_id(options.model):
+        from palpate.encoders.hub import find_model
+
+        folder = find_model(options.model, "generator", "pipeline", "Make one with: palpate train")
+        require_sampler(folder, guidance=options.guidance, steps=options.steps, batch=options.batch)
+
+
+def _photos(options: Options) -> Path | list[Path]:
+    """One photo or folder, or several photos."""
+    return options.photos[0] if len(options.photos) == 1 else list(options.photos)
+
+
+def _manifest(options: Options) -> Manifest | None:
+    """The samples that are asked for, if they are those of a manifest."""
+    from palpate.core import Split
+    from palpate.data.manifest import Manifest
+
+    if options.manifest is None:
+        return None
+    manifest = Manifest.load(options.manifest)
+    return manifest if options.split is None else manifest.part(Split.load(options.split), options.part)

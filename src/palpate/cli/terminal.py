@@ -31,6 +31,7 @@ from rich.table import Table
 
 from palpate.cli import BUG, FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
 from palpate.core import MissingExtraError, PalpateError, Problem, ProblemsError, Progress, quiet
+from palpate.core.files import NO_ROOM
 
 #: Lines of problems shown in the terminal; ``--json`` gives all.
 SHOWN_PROBLEMS = 40
@@ -229,6 +230,10 @@ def _set_threads() -> None:
 def _file_error(error: OSError) -> PalpateError:
     """A file or folder that cannot be read or written, as must / got / fix."""
     place = error.filename or "the files of this command"
+    if error.errno in NO_ROOM:
+        return PalpateError(
+            f"The disk must have room for {place}", error.strerror or str(error), "Free some space and run the same command again"
+        )
     return PalpateError(
         f"{place} must be readable and writable as asked", error.strerror or str(error), "Check the path, its rights and the free space"
     )

@@ -53,18 +53,24 @@ class Problem:
 
 
 class ProblemsError(PalpateError):
-    """Several bad things in one input, all told at once (``.problems``)."""
+    """Several bad things in one input, all told at once (``.problems``).
 
-    def __init__(self, problems: Sequence[Problem], fix: str) -> None:
+    Args:
+        problems: what is wrong.
+        fix: what to do next.
+        must: what has to hold, where the input is neither rows nor files.
+    """
+
+    def __init__(self, problems: Sequence[Problem], fix: str, must: str = "") -> None:
         self.problems = list(problems)
         kinds = Counter(p.kind for p in self.problems)
         got = f"{len(self.problems)} problem{'s' * (len(self.problems) != 1)}: " + ", ".join(
             f"{n} {kind}" for kind, n in sorted(kinds.items())
         )
-        super().__init__("Every row and file of the input must be readable and consistent", got, fix)
+        super().__init__(must or "Every row and file of the input must be readable and consistent", got, fix)
 
     def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
-        return type(self), (self.problems, self.fix)
+        return type(self), (self.problems, self.fix, self.must)
 
     def to_json(self) -> dict[str, object]:
         """The error as a JSON object, with the list ``problems``."""

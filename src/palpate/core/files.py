@@ -14,10 +14,18 @@ from typing import Any
 
 from palpate.core.errors import PalpateError
 
+#: What a disk answers on which no room is left, or a quota or limit on file sizes.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
 
 @contextmanager
 def atomic_path(path: Path) -> Generator[Path]:
-    """A temporary sibling of ``path`` to write to; renamed to ``path`` on success, removed on failure."""
+    """A temporary sibling of ``path`` to write to; renamed to ``path`` on success, removed on failure.
+
+    Raises:
+        OSError: if the disk is full.
+        PalpateError: if nothing can be written there.
+    """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,6 +33,8 @@ def atomic_path(path: Path) -> Generator[Path]:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
     except OSError as error:  # told with the user's path, not with that of the temporary file
+        if error.errno in NO_ROOM:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
         raise PalpateError(f"{path} must be writable", error.strerror or str(error), "Choose another path, or check its rights") from None
     os.close(handle)
     part = Path(name)

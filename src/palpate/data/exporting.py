@@ -26,7 +26,7 @@ import polars as pl
 from palpate.core import MissingExtraError, Progress, Split, atomic_folder, quiet, write_text
 from palpate.data.formats.huggingface_source import MARK, ROW
 from palpate.data.importing import write_lists
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest
+from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, write_parquet
 
 Form = Literal["hf", "csv", "jsonl", "parquet"]
 #: What Hugging Face calls our parts.
@@ -74,7 +74,7 @@ def _write_table(manifest: Manifest, folder: Path, to: Form, split: Split | None
         lines = (json.dumps({k: v for k, v in row.items() if v is not None}, ensure_ascii=False) for row in table.iter_rows(named=True))
         write_text(folder / "manifest.jsonl", "".join(f"{line}\n" for line in lines))
     else:
-        table.write_parquet(folder / "samples.parquet")
+        write_parquet(table, folder / "samples.parquet")
 
 
 def _save_to_disk(manifest: Manifest, folder: Path, split: Split | None, progress: Progress) -> None:

@@ -24,6 +24,7 @@ depend on the root, so a data set has one digest on every disk.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -45,6 +46,21 @@ MODALITIES = {"vision": "vision", "touch": "tactile"}
 FORMAT = "palpate-manifest/2"
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
+
+
+def write_parquet(table: pl.DataFrame, path: Path, metadata: Mapping[str, str] | None = None) -> None:
+    """Writes a table as Parquet, whole or not at all.
+
+    polars encodes in memory and Python writes, so that a full disk is the OSError that it is, not an error of polars.
+
+    Raises:
+        OSError: if the disk is full.
+        PalpateError: if the path cannot be written to.
+    """
+    data = io.BytesIO()
+    table.write_parquet(data, metadata=dict(metadata) if metadata else None)
+    with atomic_path(path) as part:
+        part.write_bytes(data.getbuffer())
 
 
 @dataclass(frozen=True)
@@ -207,11 +223,8 @@ class Manifest:
         """Writes Parquet, atomically, with format, digest and root (relative to the file) as metadata."""
         path = Path(path)
         root = os.path.relpath(self.root.resolve(), path.parent.resolve())
-        with atomic_path(path) as part:
-            facts = {f"palpate.fact.{k}": v for k, v in self.facts.items()}
-            self.table.write_parquet(
-                part, metadata={"palpate.format": FORMAT, "palpate.digest": self.digest, "palpate.root": root, **facts}
-            )
+        facts = {f"palpate.fact.{k}": v for k, v in self.facts.items()}
+        write_parquet(self.table, path, {"palpate.format": FORMAT, "palpate.digest": self.digest, "palpate.root": root, **facts})
 
     @classmethod
     def load(cls, path: Path, root: Path | None = None) -> Manifest:

@@ -144,8 +144,8 @@ class Autoencoder(nn.Module):
         place = shipped_folder(source, "autoencoder") or Path(source)
         fix = f"Name {', '.join(SHIPPED)}, a folder with config.json and plain weights, or a hub id that can be reached"
         remote = is_hub_id(source)
-        if not remote and not place.is_dir():
-            raise PalpateError("The autoencoder must be a diffusers VQModel", f"no folder {place}", fix)
+        if not remote and (not str(source) or not place.is_dir()):  # an empty name is not the folder that one is in
+            raise PalpateError("The autoencoder must be a diffusers VQModel", f"no folder {source or repr('')}", fix)
         note = (fetch(str(source), ("config.json", "palpate.json"), "autoencoder", fix) if remote else place) / "palpate.json"
         try:
             vq = VQModel.from_pretrained(

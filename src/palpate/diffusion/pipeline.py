@@ -30,21 +30,19 @@ import torch
 from torch import Tensor
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, atomic_folder, digest_json, quiet, read_record, told_of, write_json
+from palpate.core import PalpateError, Progress, atomic_folder, digest_json, quiet, told_of, write_json
 from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_shipped
 from palpate.diffusion.autoencoder import Autoencoder
+from palpate.diffusion.card import FORMAT, SamplerOptions, read_card
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Source
 from palpate.diffusion.latents import LatentStats
 from palpate.diffusion.pixels import architecture, digest_tensors, to_unit
-from palpate.diffusion.sampling import SamplerOptions, build_scheduler, require_sampling, sample_latents
+from palpate.diffusion.sampling import build_scheduler, require_sampling, sample_latents
 from palpate.diffusion.training import Schedule
 from palpate.encoders.hub import find_model
 from palpate.encoders.towers import Towers, load_clip
 
-FORMAT = "palpate-pipeline/1"
-#: What the card must have beside the format.
-KEYS = ("digest", "preset", "size", "condition", "schedule", "sampler", "latents", "autoencoder", "towers", "training")
 SYNTHETIC = "Made by a generator that was trained on synthetic data alone (palpate's procedural world), not on a real sensor."
 #: Photos embedded at once, always: an embedding does not depend on its neighbours.
 EMBED = 32
@@ -270,7 +268,7 @@ class Pipeline:
         """
         folder = find_model(source, "generator", "pipeline", "Make one with: palpate train")
         note = folder / "palpate.json"
-        about = read_record(note, "card of the pipeline", form=FORMAT, keys=KEYS)
+        about = read_card(folder)
         settings = _settings(note, about)
         if "shared" in about:
             autoencoder, towers = _shared_parts(str(about["shared"]))

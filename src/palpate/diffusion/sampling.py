@@ -11,10 +11,8 @@ is filled up), so that an image depends on (seed, id) and not on what else is ge
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import cast
 
 import numpy as np
 import torch
@@ -23,32 +21,12 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 from torch import Tensor
 
 from palpate.core import PalpateError, Progress, quiet, rng_for
+from palpate.diffusion.card import Method, SamplerOptions, require_settings
 from palpate.diffusion.denoiser import Denoiser
 from palpate.diffusion.training import Schedule
 
-Method = Literal["ddim", "dpm"]
 #: (z_t (n, c, h, w), t (n,), tokens (n, k, d), background or None) -> prediction (n, c, h, w).
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
-
-
-@dataclass(frozen=True)
-class SamplerOptions:
-    """How to sample.
-
-    Attributes:
-        method: ``ddim`` (eta 0) or ``dpm`` (DPM-Solver++ of order 2).
-        steps: network evaluations a sample (two each under guidance).
-        guidance: s; 1 means none.
-        batch: samples at once; results do not depend on it (up to rounding).
-        rescale: share phi of the guidance rescaling of Lin et al. (2024), which pulls the spread of the guided
-            prediction back to that of the conditional one; 0 is the plain formula.
-    """
-
-    method: Method = "ddim"
-    steps: int = 200
-    guidance: float = 7.5
-    batch: int = 16
-    rescale: float = 0.0
 
 
 def require_sampling(options: SamplerOptions, schedule: Schedule, denoiser: Denoiser | None = None) -> None:
@@ -57,21 +35,7 @@ def require_sampling(options: SamplerOptions, schedule: Schedule, denoiser: Deno
     Raises:
         PalpateError: on an unknown method, on steps, batch or guidance out of range, or guidance for a denoiser that never saw the unconditional token.
     """
-    if options.steps < 1 or options.batch < 1 or options.steps > schedule.steps:
-        got = f"steps {options.steps}, batch {options.batch}"
-        raise PalpateError(
-            f"Sampling needs 1 to {schedule.steps} steps and a batch of at least 1", got, "Choose e.g. 50 steps and batch 16"
-        )
-    if options.method not in get_args(Method):
-        raise PalpateError(f"The sampling method must be {' or '.join(get_args(Method))}", repr(options.method), "Choose one of these")
-    if not (math.isfinite(options.guidance) and options.guidance >= 0):
-        raise PalpateError("Guidance must be a finite number from 0 on", str(options.guidance), "Choose e.g. 2; 1 is none")
-    if denoiser is not None and options.guidance != 1 and not denoiser.policy.dropout:
-        raise PalpateError(
-            "Guidance needs a generator trained with condition dropout",
-            f"guidance {options.guidance:g} and dropout 0 in the checkpoint",
-            "Pass guidance 1, or train with dropout 0.1",
-        )
+    require_settings(options, most=schedule.steps, dropout=None if denoiser is None else denoiser.policy.dropout)
 
 
 def build_scheduler(schedule: Schedule, method: Method) -> DDIMScheduler | DPMSolverMultistepScheduler:

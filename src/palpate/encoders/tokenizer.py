@@ -56,10 +56,17 @@ def train_tokenizer(texts: Iterable[str], *, vocabulary: int = 1024, context: in
 
 
 def save_tokenizer(tokenizer: Any, folder: Path) -> None:
-    """Writes the tokenizer beside a model, so that ``AutoTokenizer`` of transformers 4 and 5 reads it."""
+    """Writes the tokenizer beside a model, so that ``AutoTokenizer`` of transformers 4 and 5 reads it.
+
+    How it was loaded, and how its last call cut and padded, is no part of it, and would make equal tokenizers differ.
+    """
+    if (backend := getattr(tokenizer, "backend_tokenizer", None)) is not None:  # every call sets these anew
+        backend.no_truncation()
+        backend.no_padding()
     tokenizer.save_pretrained(folder)
     path = Path(folder) / "tokenizer_config.json"
     config = json.loads(path.read_text(encoding="utf-8"))
     if config.get("tokenizer_class") == "TokenizersBackend":  # transformers 5's name, unknown to 4, which 5 still accepts
         config["tokenizer_class"] = "PreTrainedTokenizerFast"
-        path.write_text(json.dumps(config, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    config = {k: v for k, v in config.items() if k not in ("is_local", "local_files_only")}
+    path.write_text(json.dumps(config, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

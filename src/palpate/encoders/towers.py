@@ -32,6 +32,7 @@ from transformers.utils.hub import cached_file
 from palpate.core import PalpateError, atomic_folder, read_record, seed_for, told_of, write_json
 from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
+from palpate.encoders.device import require_device_name
 from palpate.encoders.half import Rounding, round_to_half
 from palpate.encoders.hub import fetch, find_model
 from palpate.encoders.preprocess import Preprocess
@@ -145,6 +146,9 @@ def load_clip(name_or_folder: str | Path, *, device: str = "cpu") -> FrozenClip:
     name = str(folder) if shipped else str(name_or_folder)
     local = not is_hub_id(name_or_folder)
     note = folder / "palpate.json"
+    if local and (not str(name_or_folder) or not folder.is_dir()):
+        must = f"The CLIP must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
+        raise PalpateError(must, f"no folder {name_or_folder or repr('')}", f"Pass a folder that holds {', '.join(CLIP_FILES)}")
     if local:
         missing = [what for what, choices in CLIP_FILES.items() if not any((folder / c).is_file() for c in choices)]
         if missing:
@@ -312,6 +316,7 @@ def pick_device(device: str) -> torch.device:
     Raises:
         PalpateError: for a name that torch does not know or a device that is not there.
     """
+    require_device_name(device)
     if device == "auto":
         mps = torch.backends.mps.is_available()
         device = "cuda" if torch.cuda.is_available() else "mps" if mps else "cpu"

@@ -31,14 +31,20 @@ ARCHITECTURE = (
 def save_weights(model: Any, folder: Path, *, half: bool) -> None:
     """A model's ``save_pretrained``, of a 16-bit copy if asked for; the weights must have been rounded before.
 
-    Where the model was loaded from is left out of ``config.json``: a path on the machine that wrote it tells a reader nothing, and
-    would make equal models differ.
+    Two entries of ``config.json`` would make equal models differ: where the model was loaded from, a path on the machine that wrote
+    it, is left out; and ``dtype``, which the parts of a CLIP have only from the file that they were loaded from, is that of the weights
+    in this file in every part.
     """
     with silent():
         (half_copy(model) if half else model).save_pretrained(folder)
     place = Path(folder) / "config.json"
     config = json.loads(place.read_text(encoding="utf-8"))
-    if config.pop("_name_or_path", None) is not None:
+    before = json.dumps(config)
+    config.pop("_name_or_path", None)
+    if "dtype" in config:  # diffusers has none
+        for part in (config, *(v for k, v in config.items() if k.endswith("_config") and isinstance(v, dict))):
+            part["dtype"] = "float16" if half else str(model.dtype).removeprefix("torch.")
+    if json.dumps(config) != before:
         place.write_text(json.dumps(config, indent=2, sort_keys=True) + "\n", encoding="utf-8")
 
 

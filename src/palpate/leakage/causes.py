@@ -75,6 +75,8 @@ def gel_at_other_times(pool: Pool, items: Ints, videos: Ints) -> Floats:
         mine = row[block[at]]
         near = np.linalg.norm(small_pictures(found.pixels, other) - small_pictures(found.pixels, mine), axis=1) <= ONE_GEL
         at, other = at[near], other[near]
+        if not len(at):  # the camera or the light changed: no other background shows this gel
+            continue
         touches = band_pass(pool.planes(block))
         gel = band_pass(remove_background(planar(found.pixels[other]), planar(found.pixels[row[block[at]]])))
         both = quantised(np.concatenate([touches, gel]))

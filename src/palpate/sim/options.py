@@ -132,7 +132,8 @@ class WorldOptions:
         if len(found) == 1:
             raise found[0]
         if found:
-            raise ProblemsError([Problem("WorldOptions", "bad-option", str(e)) for e in found], str(found[0]))
+            problems = [Problem("WorldOptions", "bad-option", str(e)) for e in found]
+            raise ProblemsError(problems, str(found[0]), "Every option of the world must lie in its range and fit the others")
 
     def _materials(self) -> list[PalpateError]:
         """Turns a count into names; what is wrong with the names."""

@@ -93,6 +93,16 @@ def shown(value: Any) -> str:
     return said if len(said) <= 120 else f"{said[:100]}... ({len(said)} characters)"
 
 
+def _nearest(value: float, low: float, high: float) -> float:
+    """The number in the range that is nearest to ``value``."""
+    return min(max(value, low), high)
+
+
+def _written(number: float) -> str:
+    """A number in a message: whole ones with all digits."""
+    return str(number) if isinstance(number, int) else f"{number:g}"
+
+
 def out_of_range(values: dict[str, Any]) -> Iterator[PalpateError]:
     """What is wrong with the values of the options in these tables, each by itself.
 
@@ -103,11 +113,15 @@ def out_of_range(values: dict[str, Any]) -> Iterator[PalpateError]:
         value, whole = values[name], isinstance(low, int)
         if not is_number(value, whole) or not low <= value <= high:
             kind = "a whole number" if whole else "a number"
-            yield PalpateError(f"{name} must be {kind} from {low:g} to {high:g}", shown(value), f"Pass e.g. {name}={low:g}")
+            near = _nearest(value, low, high) if is_number(value) else low
+            must = f"{name} must be {kind} from {_written(low)} to {_written(high)}"
+            yield PalpateError(must, shown(value), f"Pass e.g. {name}={_written(round(near) if whole else near)}")
     for name, (low, high) in PAIRS.items():
         value = values[name]
-        fix = f"Pass e.g. {name}=({low:g}, {high:g})"
         if not isinstance(value, tuple) or len(value) != 2 or not all(is_number(v) and low <= v <= high for v in value):
+            numbers = isinstance(value, tuple) and len(value) == 2 and all(map(is_number, value))
+            near = [_nearest(v, low, high) for v in sorted(value)] if numbers else [low, high]
+            fix = f"Pass e.g. {name}=({near[0]:g}, {near[1]:g})"
             yield PalpateError(f"{name} must be two numbers from {low:g} to {high:g}", shown(value), fix)
         elif value[0] > value[1]:
             yield PalpateError(f"{name} must be a range, the lower end first", shown(value), f"Pass {name}=({value[1]:g}, {value[0]:g})")

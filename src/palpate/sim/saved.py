@@ -39,12 +39,12 @@ def load_options(path: Path) -> WorldOptions:
     path = Path(path)
     path = path / "world.json" if path.is_dir() else path
     data = read_json(path, "file of a world's options")
-    if not isinstance(data, dict) or not _known_format(data) or not isinstance(data.get("options"), dict):
+    if isinstance(data, dict) and str(data.get("format", "")).startswith("palpate-world"):
+        require_version(data, str(path))  # first: another version may have another format, and the version says more
+    if not isinstance(data, dict) or data.get("format") not in (WORLD_FORMAT, OPTIONS_FORMAT) or not isinstance(data.get("options"), dict):
         got = repr(data.get("format")) if isinstance(data, dict) and "format" in data else "something else"
-        raise PalpateError(
-            f"{path} must be a world.json or have the format {OPTIONS_FORMAT}", got, "Name the world.json of a finished world"
-        )
-    require_version(data, str(path))
+        must = f"{path} must be a world.json (format {WORLD_FORMAT}) or have the format {OPTIONS_FORMAT}"
+        raise PalpateError(must, got, "Name the world.json of a finished world")
     known = [field.name for field in dataclasses.fields(WorldOptions)]
     for name in data["options"]:
         if name not in known:
@@ -73,7 +73,3 @@ def require_version(data: Mapping[str, Any], what: str) -> None:
         told = f"version {version}" if version is not None else "no version"
         fix = "The same options give other pictures in another version, so digests would lie: use the palpate that made it, or make it anew"
         raise PalpateError(f"{what} must be of version {VERSION} of the world, which this palpate makes", told, fix)
-
-
-def _known_format(data: Mapping[str, Any]) -> bool:
-    return str(data.get("format", "")).startswith(("palpate-world/", "palpate-world-options/"))

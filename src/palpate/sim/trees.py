@@ -7,10 +7,10 @@
 
 from __future__ import annotations
 
-import errno
 from pathlib import Path
 
 from palpate.core import PalpateError, atomic_folder, write_json
+from palpate.core.files import NO_ROOM
 from palpate.sim.encode import write_jpeg, write_mp4, write_png
 from palpate.sim.naming import frame_name, manifest_root, sides, video_folder
 from palpate.sim.options import WorldOptions
@@ -78,7 +78,7 @@ def _fill(options: WorldOptions, plan: VideoPlan, video: Video, folder: Path) ->
 def disk_error(error: OSError, folder: Path) -> PalpateError:
     """What the disk refused, in words. The world's finished videos stay, and the same call goes on with the others."""
     got = error.strerror or str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    if error.errno in NO_ROOM:
         fix = "Free some space and run the same command again: it goes on where it stopped"
         return PalpateError(f"The disk of {folder} must have room for the world", got, fix)
     fix = "Mend that and run the same command again: it goes on where it stopped"

@@ -134,13 +134,17 @@ def _finished(out: Path, options: WorldOptions) -> WorldRecord:
     """The record of the finished world in ``out``.
 
     Raises:
-        PalpateError: if it is of another version, of other options, or of added materials whose functions were edited since.
+        PalpateError: if it is of another version or format, of other options, or of added materials whose functions were edited since.
     """
     data = read_json(out / "world.json", "world record")
     if not isinstance(data, dict) or not str(data.get("format", "")).startswith("palpate-world/"):
         raise PalpateError(f"{out} must hold a world", "another world.json", "Choose another folder or remove it")
     require_version(data, f"The world in {out}")
-    if data.get("format") != WORLD_FORMAT or data.get("options_digest") != options.digest:
+    if data["format"] != WORLD_FORMAT:
+        raise PalpateError(
+            f"{out} must hold a world of the format {WORLD_FORMAT}", repr(data["format"]), "Choose another folder or remove it"
+        )
+    if data.get("options_digest") != options.digest:
         must = f"{out} must hold the world that was asked for"
         raise PalpateError(must, "a world of other options", "Choose another folder or remove it")
     if data.get("materials", {}) != _materials(options).get("materials", {}):
