@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core import PalpateError
-from palpate.metrics import kernels, mmd2
+from palpate.metrics import blocked, mmd2
+from palpate.metrics.blocked import blocked_sums
 from palpate.metrics.intervals import random_halves_sd
-from palpate.metrics.kernels import pair_sums
+from palpate.metrics.kernels import Gaussian
 
 
 def unit_rows(seed, n, d, spread=1.0):
@@ -77,11 +78,11 @@ def test_small_float32_sets_are_computed_in_float64(seed, m, n):
 @pytest.mark.parametrize(("sigma", "m", "n", "spread"), [(10.0, 700, 600, 0.5), (10.0, 1100, 300, 3.0), (4.0, 800, 700, 0.5)])
 def test_float32_error_is_below_1e_minus_6(sigma, m, n, spread, monkeypatch):
     x, y = unit_rows(1, m, 256, spread).astype(np.float32), unit_rows(2, n, 256, spread).astype(np.float32)
-    assert m + n > kernels.FLOAT64_BELOW
+    assert m + n > blocked.FLOAT64_BELOW
     dtypes = []
-    sweep = kernels._sweep
-    monkeypatch.setattr(kernels, "_sweep", lambda z, *rest: (dtypes.append(z.dtype), sweep(z, *rest))[1])
-    got = mmd2(x, y, sigma=sigma, block=512)
+    centred = blocked.centred
+    monkeypatch.setattr(blocked, "centred", lambda *args: (z := centred(*args), dtypes.append(z.dtype))[0])
+    got = mmd2(x, y, sigma=sigma, block=512, backend="blocked")
     assert dtypes == [np.float32]
     truth = cdist_mmd(x, y, sigma)
     assert abs(got - truth) < 1e-6
@@ -90,9 +91,13 @@ def test_float32_error_is_below_1e_minus_6(sigma, m, n, spread, monkeypatch):
     assert abs(plain - truth) > 10 * abs(got - truth)  # the usual float32 route is worse: the test can tell
 
 
+def row_sums(x, segment, segments, block=1024):
+    return blocked_sums(x, segment, np.arange(len(x)), segments=segments, kernel=Gaussian(), block=block).sums
+
+
 def test_float32_row_sums_keep_their_digits_when_k_is_almost_one():
     x = unit_rows(3, 1100, 64, spread=0.02).astype(np.float32)  # k - 1 is about -4e-6: exp() in float32 has 5 % error here
-    sums = pair_sums(x, np.zeros(1100, dtype=int), np.arange(1100), segments=1, sigma=10.0, block=300)
+    sums = row_sums(x, np.zeros(1100, dtype=int), 1, block=300)
     wide = x.astype(np.float64)
     expected = [np.expm1(-((row - wide) ** 2).sum(axis=1) / 200).sum() for row in wide]
     np.testing.assert_allclose(sums.rows[:, 0], expected, rtol=1e-6)
@@ -101,7 +106,7 @@ def test_float32_row_sums_keep_their_digits_when_k_is_almost_one():
 def test_a_sample_adds_exactly_nothing_against_itself():
     x = unit_rows(4, 1100, 64).astype(np.float32)
     alone = np.minimum(np.arange(1100), 8)  # eight segments of one sample each
-    rows = pair_sums(x, alone, np.arange(1100), segments=9, sigma=10.0).rows
+    rows = row_sums(x, alone, 9).rows
     assert not rows[np.arange(8), np.arange(8)].any()
 
 
@@ -135,8 +140,9 @@ def test_closed_form_sd_of_random_halves(estimator):
     for _ in range(600):
         p = rng.permutation(n)
         draws.append(mmd2(x[p[:30]], x[p[30:]], estimator=estimator))
-    sums = pair_sums(x, np.zeros(n, dtype=int), np.arange(n), segments=1, sigma=10.0, squares=True, block=7)
-    assert random_halves_sd(sums, estimator, 1000.0)[0] == pytest.approx(np.std(draws), rel=0.12)
+    one = np.zeros(n, dtype=int)
+    spread = blocked_sums(x, one, np.arange(n), segments=1, kernel=Gaussian(), block=7, spread=[np.arange(1)]).spread
+    assert random_halves_sd(spread, np.array([n]), estimator, 1000.0)[0] == pytest.approx(np.std(draws), rel=0.12)
 
 
 def test_is_about_ten_times_the_squared_distance_of_the_means():
@@ -214,9 +220,11 @@ def test_refuses_bad_input_and_says_where(x, y, options, words):
 
 def test_cpu_tensors_are_taken():
     torch = pytest.importorskip("torch")
-    assert mmd2(torch.from_numpy(X), torch.from_numpy(X[:5])) == mmd2(X, X[:5])
-    with pytest.raises(PalpateError, match="detach"):
-        mmd2(torch.from_numpy(X).requires_grad_(), X)
+    x = torch.from_numpy(X)
+    assert mmd2(x, torch.from_numpy(X[:5])) == mmd2(X, X[:5])
+    assert mmd2(x.requires_grad_(), X[:5]) == mmd2(X, X[:5])
+    with pytest.warns(UserWarning, match="bfloat16"):
+        assert mmd2(x.bfloat16(), X[:5], normalize=True) == pytest.approx(mmd2(X, X[:5]), abs=0.5)
 
 
 def test_import_needs_no_torch():

@@ -154,13 +154,40 @@ def test_tmmd_jackknife_equals_leaving_each_group_out(preset, shared):
     assert score.interval_method == f"leave-one-group-out jackknife, t, {len(names) - 1} df"
 
 
-@pytest.mark.parametrize("metric", [i_tmmd, ci_tmmd, d_tmmd])
-def test_free_jackknife_equals_leaving_each_group_out(metric):
+def share(of, name=None):
+    """(s_A + s_B) of halves of whole groups: what E is multiplied by, from the sizes of the groups."""
+    sizes = np.unique([v for v, c in zip(of.groups, of.labels, strict=True) if name in (None, c)], return_counts=True)[1]
+    m = sizes.sum() / 2
+    return (sizes * (sizes - 1)).sum() / (m * (m - 1))
+
+
+def test_free_jackknife_equals_leaving_each_group_out():
+    """E without each group is computed anew; the sizes of the groups stay those of the whole set."""
     s = world(5, classes=3, videos=(3, 4), frames=(2, 4, 3))
-    score = metric(s)
-    replicates = [metric(keep(s, np.array(s.groups) != v)).value for v in sorted(set(s.groups))]
-    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(replicates)), abs=1e-9)
-    assert "leave-one-group-out" in score.interval_method
+    out = [keep(s, np.array(s.groups) != v) for v in sorted(set(s.groups))]
+    names = ["m0", "m1", "m2"]
+
+    def ci(of):
+        return np.mean([share(s, c) * e["E"] for c, e in ci_tmmd(of).details["per_class"].items()])
+
+    def d(of):
+        score = d_tmmd(of)
+        matrix = np.array(score.details["matrix"])
+        np.fill_diagonal(matrix, [share(s, c) * ci_tmmd(of).details["per_class"][c]["E"] for c in names])
+        return np.diagonal(matrix).mean() / matrix.sum(axis=1).mean()
+
+    for metric, value in ((i_tmmd, lambda of: share(s) * i_tmmd(of).details["E"]), (ci_tmmd, ci), (d_tmmd, d)):
+        score = metric(s)
+        assert value(s) == pytest.approx(score.value, abs=1e-9)
+        assert score.interval == pytest.approx(recomputed_interval(score.value, np.array([value(of) for of in out])), abs=1e-9)
+        assert "leave-one-group-out" in score.interval_method
+
+
+@pytest.mark.parametrize("metric", [i_tmmd, ci_tmmd])
+def test_intervals_of_halves_and_of_their_excess_are_one(metric):
+    score = metric(world(5, classes=3, videos=4, frames=3))
+    factor = score.value / score.details["E"]  # groups of one size: the same in all classes
+    assert score.interval == pytest.approx([factor * v for v in score.details["E_interval"]], abs=1e-9)
 
 
 def test_jackknife_of_random_halves_keeps_the_halves():
@@ -189,7 +216,7 @@ def test_many_samples_are_left_out_in_blocks(monkeypatch):
     exact = tmmd(g, r)
     monkeypatch.setattr("palpate.metrics.halves.BLOCKS", 40)
     blocks = tmmd(g, r)
-    assert blocks.value == exact.value
+    assert blocks.value == pytest.approx(exact.value, rel=1e-12)
     assert "leave-one-random-block-out" in blocks.interval_method
     width = lambda s: s.interval[1] - s.interval[0]  # noqa: E731
     assert width(blocks) == pytest.approx(width(exact), rel=0.35)

@@ -138,6 +138,8 @@ class FeatureSet:
     encoder: str | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.features, np.ndarray):  # a tensor on the CPU, or a list of rows
+            object.__setattr__(self, "features", np.asarray(self.features))
         shape = self.features.shape
         if len(shape) != 2 or shape[0] != len(self.ids):
             raise PalpateError(f"Features must have shape ({len(self.ids)}, d), one row an id", f"shape {shape}", "Pass one row per id")

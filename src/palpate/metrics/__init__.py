@@ -1,10 +1,20 @@
-"""How good are generated touches: the TMMD family, SSIM and PSNR. Arrays in, :class:`palpate.core.Score` out; NumPy and SciPy only."""
+"""How good are generated touches: the TMMD family and its companions. Arrays in, :class:`palpate.core.Score` out; NumPy and SciPy only."""
 
-from palpate.metrics.mmd import mmd2
-from palpate.metrics.pairwise import psnr, psnr_per_image, ssim, ssim_per_image
+from palpate.metrics.contact import contact_iou, contact_mask, contact_psnr, contact_residual, contact_scores, contact_ssim
+from palpate.metrics.frechet import fid, frechet_distance
+from palpate.metrics.kernels import Gaussian, Linear, Polynomial
+from palpate.metrics.mmd import Distance, distance, mmd2
+from palpate.metrics.multiscale import ms_ssim, ms_ssim_per_image
+from palpate.metrics.neighbours import prdc
+from palpate.metrics.paired import Comparison, compare
+from palpate.metrics.pairwise import mean_score, paired_by_id, psnr, psnr_per_image, ssim, ssim_per_image
 from palpate.metrics.presets import PRESETS, Options
+from palpate.metrics.streaming import CITMMD, DTMMD, ITMMD, TMMD
 from palpate.metrics.tactile import ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
 
 __all__ = [
-    "PRESETS", "Options", "ci_tmmd", "d_tmmd", "four_scores", "i_tmmd", "mmd2", "psnr", "psnr_per_image", "ssim", "ssim_per_image", "tmmd",
+    "CITMMD", "DTMMD", "ITMMD", "PRESETS", "TMMD", "Comparison", "Distance", "Gaussian", "Linear", "Options", "Polynomial", "ci_tmmd", "compare", "contact_iou", "contact_mask",
+    "contact_psnr", "contact_residual", "contact_scores", "contact_ssim", "d_tmmd", "distance", "fid", "four_scores", "frechet_distance",
+    "i_tmmd", "mean_score", "mmd2", "ms_ssim", "ms_ssim_per_image", "paired_by_id", "prdc", "psnr", "psnr_per_image", "ssim",
+    "ssim_per_image", "tmmd",
 ]  # fmt: skip

@@ -15,12 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError
+from palpate.metrics.arrays import is_foreign, ops_of, release
 
 Normalize = Literal["check"] | bool
 Floats = NDArray[np.floating[Any]]
 
 #: Rows may differ from unit length by this much before ``normalize="check"`` refuses them.
 NORM_TOLERANCE = 1e-3
+SLAB = 8192
+#: Copies are looked for in sets of up to this size together; the look-up holds the reference's bytes once more.
+COPIES_BYTES = 256 << 20
 
 
 def rows_text(bad: NDArray[np.bool_]) -> str:
@@ -30,64 +34,100 @@ def rows_text(bad: NDArray[np.bool_]) -> str:
     return f"{at.size} row{'s' * (at.size != 1)} ({first}{', ...' * (at.size > 5)})"
 
 
-def as_array(name: str, x: Any) -> NDArray[Any]:
-    """``np.asarray``, with a user's error for ragged lists and for tensors that are on a device or track gradients."""
+def as_array(name: str, x: Any) -> Any:
+    """``np.asarray``; arrays of other libraries stay what they are on their device, but tensors on the CPU share their memory with NumPy.
+
+    Raises:
+        PalpateError: for ragged lists and what else has no array.
+    """
+    if is_foreign(x):
+        x = x.detach() if getattr(x, "requires_grad", False) else x
+        if getattr(getattr(x, "device", None), "type", "") != "cpu":
+            return x
+        if str(x.dtype).endswith("bfloat16"):  # NumPy has none
+            warnings.warn(f"{name}: bfloat16 features were widened to float32; their rounding stays", stacklevel=4)
+            x = x.float()
+    if isinstance(x, np.memmap):  # np.asarray would forget where it comes from
+        return x
     try:
         return np.asarray(x)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise PalpateError(
-            f"{name} must turn into a NumPy array", str(error).splitlines()[0], "Pass an array, or tensor.detach().cpu()"
-        ) from None
+        raise PalpateError(f"{name} must turn into a NumPy array", str(error).splitlines()[0], "Pass an array of one width") from None
 
 
-def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Floats:
+def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Any:
     """``x`` as a float32 or float64 array (n, d) that a kernel may be evaluated on.
+
+    Looked at in slabs, so that an array on disk (``np.memmap``) is read but never held.
 
     Args:
         name: what the error calls it.
-        x: anything ``np.asarray`` takes, (n, d).
+        x: anything ``np.asarray`` takes, (n, d), or an array of a library of the array-API standard, which stays on its device.
         normalize: ``"check"`` refuses rows whose L2 norm is not 1 within 1e-3; ``True`` divides by the norm; ``False`` takes rows as they are.
         least: the fewest rows that the estimator can use.
 
     Raises:
         PalpateError: on integers, a wrong shape, too few rows, NaN or infinity, zero or un-normalised rows (their numbers are named).
     """
+    if normalize is not True and normalize is not False and normalize != "check":
+        raise PalpateError('normalize must be "check", True or False', repr(normalize), "Leave it out for the default")
     x = as_array(name, x)
-    if x.dtype.kind != "f":
+    kind = str(x.dtype).rsplit(".", maxsplit=1)[-1]
+    if not kind.startswith(("float", "bfloat", "longdouble")):
         raise PalpateError(
             f"{name} must be floating-point features", f"dtype {x.dtype}", "Pass the encoder's float output, not pixels or codes"
         )
     if x.ndim != 2 or x.shape[1] == 0:
-        raise PalpateError(f"{name} must have shape (n, d), one row a sample", f"shape {x.shape}", "Stack one feature vector a row")
+        raise PalpateError(f"{name} must have shape (n, d), one row a sample", f"shape {tuple(x.shape)}", "Stack one feature vector a row")
     if len(x) < least:
         raise PalpateError(f"{name} must have at least {least} rows for this estimator", f"{len(x)}", "Pass more samples")
-    if x.dtype == np.float16:
-        warnings.warn(f"{name}: float16 features were widened to float32; their rounding stays", stacklevel=3)
-    x = x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)
-    if (bad := ~np.isfinite(x).all(axis=1)).any():
+    if kind in ("float16", "bfloat16"):
+        warnings.warn(f"{name}: {kind} features were widened to float32; their rounding stays", stacklevel=3)
+    ops = ops_of(x)
+    x = ops.at_least_float32(x)
+    norms = np.empty(len(x))
+    for k in range(0, len(x), SLAB):
+        norms[k : k + SLAB] = np.sqrt(ops.numpy(ops.squares(x[k : k + SLAB])))
+        release(x)
+    if (bad := ~np.isfinite(norms)).any():
         raise PalpateError(f"{name} must be finite", f"NaN or infinity in {rows_text(bad)}", "Check the images of those rows")
-    norms = np.sqrt(np.einsum("ij,ij->i", x, x, dtype=np.float64))
     if normalize is not False and (bad := norms == 0).any():
         raise PalpateError(f"{name} must have no zero vector", f"zeros in {rows_text(bad)}", "Check the images of those rows")
     if normalize is True:
-        return (x / norms[:, None]).astype(x.dtype)
+        return ops.divide_rows(x, norms)
     if normalize == "check" and (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
         got = f"norm {norms[np.flatnonzero(bad)[0]]:.4g} in {rows_text(bad)}"
         raise PalpateError(f"{name} must be L2-normalised", got, "Pass normalize=True to divide by the norm, or normalize=False to keep it")
-    if normalize not in ("check", False):
-        raise PalpateError('normalize must be "check", True or False', repr(normalize), "Leave it out for the default")
     return x
 
 
-def checked_pair(x: Any, y: Any, *, normalize: Normalize, least: int, names: tuple[str, str] = ("x", "y")) -> tuple[Floats, Floats]:
-    """Both feature arrays, checked, of one width and promoted to one dtype."""
+def checked_pair(x: Any, y: Any, *, normalize: Normalize, least: int, names: tuple[str, str] = ("x", "y")) -> tuple[Any, Any]:
+    """Both feature arrays, checked, of one width, one library and one dtype.
+
+    Raises:
+        PalpateError: as :func:`checked_features`, and if widths or libraries differ.
+    """
     x, y = as_array(names[0], x), as_array(names[1], y)
     if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
         got = f"{x.shape[1]} and {y.shape[1]}"
         raise PalpateError(f"{names[0]} and {names[1]} must have the same width", got, "Embed both with the same encoder")
+    homes = [f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}".strip() if is_foreign(v) else "numpy" for v in (x, y)]
+    if homes[0] != homes[1]:
+        must = f"{names[0]} and {names[1]} must be arrays of one library on one device"
+        raise PalpateError(must, " and ".join(homes), "Move one of them")
     a, b = (checked_features(name, v, normalize=normalize, least=least) for name, v in zip(names, (x, y), strict=True))
-    dtype = np.result_type(a, b)
-    return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
+    return ops_of(a).one_type(a, b)
+
+
+def copies_across(x: Any, y: Any) -> int:
+    """How many rows of ``x`` are also rows of ``y``, bit for bit. A copy is not a generator.
+
+    Arrays on disk or on a device are not looked through: 0.
+    """
+    if any(is_foreign(v) or isinstance(v, np.memmap) for v in (x, y)):
+        return 0
+    seen = {row.tobytes() for row in np.ascontiguousarray(y)} if x.nbytes + y.nbytes <= COPIES_BYTES else set()
+    return sum(row.tobytes() in seen for row in np.ascontiguousarray(x)) if seen else 0
 
 
 def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] | None:
@@ -126,7 +166,7 @@ def checked_images(generated: Any, reference: Any) -> tuple[NDArray[Any], NDArra
     Raises:
         PalpateError: on other shapes, dtypes or ranges; image numbers are named.
     """
-    pair = [as_array("The generated images", generated), as_array("The reference images", reference)]
+    pair = [np.asarray(as_array(f"The {name} images", v)) for name, v in (("generated", generated), ("reference", reference))]
     for name, images in zip(("generated", "reference"), pair, strict=True):
         if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
             raise PalpateError(

@@ -15,13 +15,15 @@ These closed forms need no seed, and equal the mean over all halvings exactly wh
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from palpate.core import seed_for
-from palpate.metrics.kernels import Array, Index, Totals
-from palpate.metrics.mmd import mmd_matrix
+from palpate.metrics.kernels import Array, Index
+from palpate.metrics.mmd import mmd_bound, mmd_matrix
 from palpate.metrics.presets import Plan
+from palpate.metrics.sums import Totals
 
 #: More leave-one-out units than this are joined into random blocks where samples count as independent.
 BLOCKS = 1000
@@ -44,56 +46,84 @@ def half_of(ids: Sequence[str], within: Index, plan: Plan) -> Index:
     return half
 
 
-def sample_units(ids: Sequence[str], seed: int) -> tuple[Index, str]:
+def sample_units(ids: Sequence[str], seed: int) -> tuple[Index, str, list[str]]:
     """Jackknife units where no groups are known: equal ids are one unit; above ``BLOCKS`` ids, random blocks of ids.
 
     Returns:
-        (n,) units, and what a unit is called.
+        (n,) units, what a unit is called, and the name of each.
     """
     names = sorted(set(ids))
     if len(names) <= BLOCKS:
         number = {name: k for k, name in enumerate(names)}
-        return np.array([number[i] for i in ids], dtype=np.intp), "sample"
+        return np.array([number[i] for i in ids], dtype=np.intp), "sample", names
     names.sort(key=lambda name: (seed_for(seed, "block", name), name))
     number = {name: k * BLOCKS // len(names) for k, name in enumerate(names)}
-    return np.array([number[i] for i in ids], dtype=np.intp), "random-block"
+    return np.array([number[i] for i in ids], dtype=np.intp), "random-block", [f"block {k}" for k in range(BLOCKS)]
 
 
-def group_halves(t: Totals, biased: bool, scale: float) -> tuple[Array, Array]:
-    """dist^2 between halves made of whole groups, averaged over halvings, and the excess E, for each segment.
+@dataclass(frozen=True)
+class Design:
+    """How E turns into dist^2 between halves, by the sizes of the groups alone: ``dist^2 = own * E + rest * (mean diagonal k - b)``.
 
-    Returns:
-        (S,) dist^2 and (S,) E; NaN where a segment has one group, or no group has two samples.
+    Attributes:
+        own: (K,) ``sum s_g(s_g-1) / (m(m-1))``, or with m^2 below for the biased form.
+        rest: (K,) 0, or n / m^2 for the biased form.
     """
-    total, inside, pairs = np.diagonal(t.sums), np.diagonal(t.same), np.diagonal(t.pairs)
-    m = t.n / 2
+
+    own: Array
+    rest: Array
+
+
+def design_of(t: Totals, plan: Plan) -> Design:
+    """The design of K sets, given 2K segments."""
+    t = whole_sets(t)
+    inner, m, biased = np.diagonal(t.pairs) - t.n, t.n / 2, plan.estimator == "biased"
     with np.errstate(divide="ignore", invalid="ignore"):
-        between = (total - inside) / (t.n**2 - pairs)
-        excess = inside / (pairs - t.n) - between  # E = w - b
-        unbiased = (inside - (pairs - t.n) * between) / (m * (m - 1))
-        value = (inside - pairs * between) / m**2 if biased else unbiased
-    bad = ~np.isfinite(excess) | (t.n < 4)
-    return np.where(bad, np.nan, scale * value), np.where(bad, np.nan, scale * excess)
+        return Design(inner / (m**2 if biased else m * (m - 1)), t.n / m**2 if biased else np.zeros(len(t.n)))
 
 
-def self_distances(t: Totals, plan: Plan) -> tuple[Array, Array]:
-    """dist^2 between the halves of each of K sets (Eq. 3, Eq. 5), and E.
+def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple[Array, Array]:
+    """dist^2 between the halves of each of K sets (Eq. 3, Eq. 5), and E; halves of whole groups by the closed form above.
 
     Args:
         t: 2K segments; 2c and 2c + 1 are the halves of set c (for ``group`` halves 2c + 1 is empty).
         plan: halves, estimator, scale. ``"grouped"`` acts as ``"unbiased"`` here: halves of whole groups share no group already,
             and without same-group pairs inside the halves the expectation would be 0 again.
+        design: sizes of the groups to take instead of those of ``t``. dist^2 falls as the number of groups grows, so values without each group in
+            turn must be those of the full design: else a jackknife takes the smaller number for noise (its intervals then covered 100 %
+            with three videos a class). Ignored where it is of another number of sets.
 
     Returns:
-        (K,) dist^2 and (K,) E, NaN where undefined.
+        (K,) dist^2 and (K,) E, NaN where undefined: a set of one group, no group with two samples, or fewer than 4 samples.
     """
-    sets = len(t.n) // 2
-    closed, excess = group_halves(whole_sets(t), plan.estimator == "biased", plan.scale)
+    whole, sets = whole_sets(t), len(t.n) // 2
+    total, inside, pairs = np.diagonal(whole.sums), np.diagonal(whole.same), np.diagonal(whole.pairs)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = (total - inside) / (whole.n**2 - pairs)
+        excess = inside / (pairs - whole.n) - between  # E = w - b
+        beside = whole.own / whole.n - between
+    bad = ~np.isfinite(excess) | (whole.n < 4)
+    excess = np.where(bad, np.nan, plan.scale * excess)
     if plan.halves == "group":
-        return closed, excess
+        used = design if design is not None and len(design.own) == sets else design_of(t, plan)
+        return used.own * excess + used.rest * np.where(bad, np.nan, plan.scale * beside), excess
     matrix = mmd_matrix(t, "biased" if plan.estimator == "biased" else "unbiased", plan.scale)
     first = 2 * np.arange(sets)
     return matrix[first, first + 1], excess
+
+
+def halves_bound(rest: Totals, plan: Plan) -> Array:
+    """(K,) what :func:`self_distances` may be off by, where the sums of its 2K segments may be off by ``rest``."""
+    if plan.halves != "group":
+        matrix = mmd_bound(rest, "biased" if plan.estimator == "biased" else "unbiased", plan.scale)
+        first = 2 * np.arange(len(rest.n) // 2)
+        return matrix[first, first + 1]
+    t = whole_sets(rest)
+    total, inside, pairs = np.diagonal(t.sums), np.diagonal(t.same), np.diagonal(t.pairs)
+    m = t.n / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = (total - inside) / (t.n**2 - pairs)
+        return plan.scale * (inside + pairs * between) / (m**2 if plan.estimator == "biased" else m * (m - 1))
 
 
 def whole_sets(t: Totals) -> Totals:

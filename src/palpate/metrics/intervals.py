@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from scipy import special
 
-from palpate.metrics.kernels import Array, PairSums, Totals
+from palpate.metrics.kernels import Array
+from palpate.metrics.sums import Totals
 
 Interval = tuple[float, float]
 
@@ -55,23 +56,20 @@ def mean_interval(values: Array, groups: Sequence[str] | None, level: float) -> 
     return t_interval(float(values.mean()), error, g - 1, level), f"{method}, t, {g - 1} df ({g} {what}s)"
 
 
-def random_halves_sd(sums: PairSums, estimator: str, scale: float) -> Array:
-    """Standard deviation (S,) of dist^2 between two random halves of each segment, by closed form.
+def random_halves_sd(spread: Array, n: Array, estimator: str, scale: float) -> Array:
+    """Standard deviation (K,) of dist^2 between two random halves of each of K sets, by closed form.
 
     Let z = +-1 mark the halves of n = 2m samples and Kc be the doubly centred kernel matrix. Then biased = z'Kc z / m^2 and
     unbiased = const + z'Kc z (2m-1) / (2m^2 (m-1)), and the variance of z'Kc z over halvings is about 2 sum_{i != j} Kc_ij^2. The
     mean over all halvings is exactly 0 for unbiased (for any data), and (2/m) (1 - mean off-diagonal k) for biased.
+
+    Args:
+        spread: (K,) sum over i != j of Kc_ij^2.
+        n: (K,) samples.
+        estimator: ``"biased"``, or any other for unbiased.
+        scale: factor on the result.
     """
-    sd = np.full(sums.segments, np.nan)
-    for s in range(sums.segments):
-        own = sums.segment == s
-        n = int(own.sum())
-        if n < 4 or sums.squares is None:
-            continue
-        r, m = sums.rows[own, s] / n, n / 2
-        mean = r.mean()
-        centred = sums.squares[own, s].sum() - 2 * n * (r**2).sum() + n**2 * mean**2  # sum of Kc_ij^2 over all i, j
-        off = max(centred - ((mean - 2 * r) ** 2).sum(), 0.0)  # Kc_ii = 0 - 2 r_i + mean, as k - 1 is 0 there
+    m = n / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
         factor = 1 / m**2 if estimator == "biased" else (2 * m - 1) / (2 * m**2 * (m - 1))
-        sd[s] = scale * factor * np.sqrt(2 * off)
-    return sd
+        return np.where(n < 4, np.nan, scale * factor * np.sqrt(2 * spread))

@@ -1,4 +1,4 @@
-"""Squared maximum mean discrepancy with the Gaussian kernel, in three estimators, from blocked sums.
+"""Squared maximum mean discrepancy in three estimators, from kernel sums.
 
 For sets X (m rows) and Y (n rows), with mean kernels XX, YY inside the sets and XY across:
 
@@ -14,14 +14,18 @@ The kernel is linear in x.y to one per cent on unit-norm features with sigma = 1
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import Normalize, checked_choice, checked_names, checked_pair, checked_positive
-from palpate.metrics.kernels import Array, Index, Totals, pair_sums
+from palpate.metrics.checks import Normalize, checked_choice, checked_names, checked_pair, checked_positive, copies_across
+from palpate.metrics.engine import BACKENDS, Backend, kernel_sums
+from palpate.metrics.kernels import Array, Index, Kernel, Sigma, gaussian
+from palpate.metrics.sums import PairSums, Totals
 
 Estimator = Literal["unbiased", "biased", "grouped"]
 ESTIMATORS = ("unbiased", "biased", "grouped")
@@ -30,17 +34,40 @@ ESTIMATORS = ("unbiased", "biased", "grouped")
 def mmd_matrix(t: Totals, estimator: Estimator, scale: float) -> Array:
     """Eq. 2 between every two segments, (S, S); NaN where an estimator has no pairs to average. The diagonal has no meaning.
 
-    k - 1 stands for k everywhere: the constant cancels, as XX + YY - 2 XY weighs it 1 + 1 - 2.
+    A constant in k cancels, as XX + YY - 2 XY weighs it 1 + 1 - 2: k - 1 serves for k.
     """
+    inner, cross = _means(t, estimator)
+    with np.errstate(invalid="ignore"):
+        return scale * (inner[:, None] + inner[None, :] - 2 * cross)  # Eq. 2
+
+
+def mmd_bound(rest: Totals, estimator: Estimator, scale: float) -> Array:
+    """What :func:`mmd_matrix` may be off by, where sums may be off by ``rest`` in either direction."""
+    inner, cross = _means(rest, estimator)
+    return scale * (inner[:, None] + inner[None, :] + 2 * cross)
+
+
+def _means(t: Totals, estimator: Estimator) -> tuple[Array, Array]:
+    """Mean kernel inside each segment (S,) and between segments (S, S), over the pairs of an estimator."""
     cross_sums, cross_pairs = t.sums, np.outer(t.n, t.n)
     if estimator == "grouped":
         cross_sums, cross_pairs = t.sums - t.same, cross_pairs - t.pairs
     inner_sums, inner_pairs = np.diagonal(cross_sums), np.diagonal(cross_pairs)
     if estimator == "unbiased":
         inner_pairs = t.n * (t.n - 1)
+    if estimator == "biased":
+        inner_sums = inner_sums + t.own
     with np.errstate(divide="ignore", invalid="ignore"):
-        inner, cross = inner_sums / inner_pairs, cross_sums / cross_pairs
-        return scale * (inner[:, None] + inner[None, :] - 2 * cross)  # Eq. 2
+        return inner_sums / inner_pairs, cross_sums / cross_pairs
+
+
+def largest_bound(sums: PairSums, estimator: Estimator, scale: float) -> float:
+    """The largest :func:`mmd_bound` between two segments; 0 where sums are exact."""
+    if sums.bound is None:
+        return 0.0
+    matrix = mmd_bound(sums.bound.totals, estimator, scale)
+    off = matrix[~np.eye(len(matrix), dtype=bool) & np.isfinite(matrix)]
+    return float(off.max(initial=0.0))
 
 
 def unit_index(*columns: Sequence[str]) -> list[Index]:
@@ -49,51 +76,103 @@ def unit_index(*columns: Sequence[str]) -> list[Index]:
     return list(np.split(inverse.astype(np.intp), np.cumsum([len(c) for c in columns])[:-1]))
 
 
-def mmd2(
+@dataclass(frozen=True)
+class Distance:
+    """A squared MMD and how it was computed.
+
+    Attributes:
+        value: times ``scale``; negative values are possible for ``unbiased`` and ``grouped``.
+        bound: the value is within this of the exact one (rounding aside); 0 for the blocked back end.
+        backend: ``"blocked"`` or ``"moments"``.
+        estimator: which pairs were averaged.
+        kernel: the kernel's settings.
+        bandwidth: sigma, or None where there are several or none.
+        scale: factor on the raw value.
+        m: rows of x.
+        n: rows of y.
+    """
+
+    value: float
+    bound: float
+    backend: str
+    estimator: Estimator
+    kernel: dict[str, Any]
+    bandwidth: float | None
+    scale: float
+    m: int
+    n: int
+
+    def __float__(self) -> float:
+        """The value."""
+        return self.value
+
+
+def distance(
     x: Any,
     y: Any,
     *,
-    sigma: float = 10.0,
+    sigma: Sigma = 10.0,
+    kernel: Kernel | None = None,
     scale: float = 1000.0,
     estimator: Estimator = "unbiased",
     groups_x: Sequence[str] | None = None,
     groups_y: Sequence[str] | None = None,
     normalize: Normalize = "check",
-    block: int = 2048,
-) -> float:
-    """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``.
+    backend: Backend = "auto",
+    tolerance: float = 1e-4,
+    block: int = 1024,
+) -> Distance:
+    """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``, with back end and bound.
 
     Args:
-        x: (m, d) features; anything ``np.asarray`` takes.
-        y: (n, d) features; m and n may differ.
-        sigma: bandwidth of the Gaussian kernel.
+        x: (m, d) features: anything ``np.asarray`` takes, an array on disk (``np.memmap``), or an array of a library of the
+            array-API standard (torch on CPU or CUDA), which is worked on where it is.
+        y: (n, d) features of the same library; m and n may differ.
+        sigma: bandwidth of the Gaussian kernel; several are averaged; ``"median"`` and ``"multi"`` take the median distance of ``y``.
+        kernel: instead of the Gaussian, e.g. :class:`palpate.metrics.kernels.Polynomial`.
         scale: factor on the result; 1000 as in CMMD.
         estimator: ``"unbiased"``, ``"biased"`` or ``"grouped"``, see the module.
         groups_x: m group names, for ``"grouped"``; the same name in both sets is the same group.
         groups_y: n group names.
         normalize: ``"check"`` refuses rows not of unit length (1e-3), ``True`` normalises, ``False`` takes them as they are.
-        block: rows of a kernel block; memory is about ``block^2`` numbers.
+        backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
+        tolerance: largest bound that ``auto`` accepts.
+        block: rows of a kernel block; memory is about ``block^2`` numbers a thread.
 
     Returns:
-        The value; float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9.
+        The value; blocked: float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9.
 
     Raises:
         PalpateError: on features that :func:`palpate.metrics.checks.checked_features` refuses, fewer than two rows for
             ``"unbiased"``, missing groups, or fewer than two groups a set for ``"grouped"``.
     """
     checked_choice("estimator", estimator, ESTIMATORS)
-    checked_positive(sigma=sigma, scale=scale, block=block)
+    checked_choice("backend", backend, BACKENDS)
+    checked_positive(scale=scale, block=block)
     x, y = checked_pair(x, y, normalize=normalize, least=1 if estimator == "biased" else 2)
-    units = np.arange(len(x) + len(y))
+    if copies := copies_across(x, y):
+        warnings.warn(f"{copies} rows of x are bit for bit rows of y: a copy is not a generator", stacklevel=2)
+    sets = np.repeat(np.arange(2), [len(x), len(y)])
+    units = sets  # no pair is left out: a set is one item
     if estimator == "grouped":
         gx, gy = checked_names("groups_x", groups_x, len(x)), checked_names("groups_y", groups_y, len(y))
         if gx is None or gy is None:
             raise PalpateError('estimator="grouped" must know the groups of both sets', "none", "Pass groups_x and groups_y")
         units = np.concatenate(unit_index(gx, gy))
-    sets = np.repeat(np.arange(2), [len(x), len(y)])
-    sums = pair_sums(np.concatenate([x, y]), sets, units, segments=2, sigma=sigma, block=block)
-    value = float(mmd_matrix(sums.totals, estimator, scale)[0, 1])
+    kernel = gaussian(sigma, y, groups_y) if kernel is None else kernel
+    found = kernel_sums(
+        [x, y], sets, units, segments=2, kernel=kernel, backend=backend, tolerance=tolerance, block=block,
+        bound=lambda sums: largest_bound(sums, estimator, scale),
+    ).sums  # fmt: skip
+    value = float(mmd_matrix(found.totals, estimator, scale)[0, 1])
     if not np.isfinite(value):
         got = f"{len(set(groups_x or ()))} and {len(set(groups_y or ()))} groups"
         raise PalpateError("Each set must have at least two groups, not all shared", got, 'Use estimator="unbiased", or more groups')
-    return value
+    return Distance(
+        value, largest_bound(found, estimator, scale), found.backend, estimator, kernel.settings(), kernel.bandwidth, scale, len(x), len(y)
+    )
+
+
+def mmd2(x: Any, y: Any, **options: Any) -> float:
+    """The value of :func:`distance`, with the same options."""
+    return distance(x, y, **options).value

@@ -17,6 +17,8 @@ from typing import Any, Literal, TypedDict
 
 from palpate.core import PalpateError
 from palpate.metrics.checks import Normalize, checked_choice, checked_positive
+from palpate.metrics.engine import BACKENDS, Backend
+from palpate.metrics.kernels import Sigma
 from palpate.metrics.mmd import ESTIMATORS, Estimator
 
 Halves = Literal["group", "random", "ordered"]
@@ -33,10 +35,14 @@ class Options(TypedDict, total=False):
     Keys:
         preset: one of ``PRESETS``; default ``"grouped"`` where groups are known, else ``"paper"``.
         estimator, halves, denominator, aggregate: override one entry of the preset.
-        sigma: kernel bandwidth, default 10.
+        sigma: kernel bandwidth, default 10; several are averaged; ``"median"``: the median distance of the reference; ``"multi"``: five
+            bandwidths around it (:mod:`palpate.metrics.kernels`).
         scale: factor on the result, default 1000.
         normalize: ``"check"`` (default), True or False, see :func:`palpate.metrics.checks.checked_features`.
-        block: rows of a kernel block, default 2048.
+        backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
+        tolerance: largest bound with which ``auto`` takes moments, default 1e-4 at scale 1000.
+        block: rows of a kernel block, default 1024.
+        permutations: relabellings of the permutation test of TMMD, default 999; 0 for none.
         level: coverage of intervals, default 0.95.
         min_samples: a class with fewer is excluded, at least 4, default 4.
         seed: seed of random halves, default 0.
@@ -49,10 +55,13 @@ class Options(TypedDict, total=False):
     halves: Halves
     denominator: Denominator
     aggregate: Aggregate
-    sigma: float
+    sigma: Sigma
     scale: float
     normalize: Normalize
+    backend: Backend
+    tolerance: float
     block: int
+    permutations: int
     level: float
     min_samples: int
     seed: int
@@ -69,10 +78,13 @@ class Plan:
     halves: Halves
     denominator: Denominator
     aggregate: Aggregate
-    sigma: float = 10.0
+    sigma: Sigma = 10.0
     scale: float = 1000.0
     normalize: Normalize = "check"
-    block: int = 2048
+    backend: Backend = "auto"
+    tolerance: float = 1e-4
+    block: int = 1024
+    permutations: int = 999
     level: float = 0.95
     min_samples: int = 4
     seed: int = 0
@@ -106,7 +118,11 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     checked_choice("halves", plan.halves, HALVES)
     checked_choice("denominator", plan.denominator, DENOMINATORS)
     checked_choice("aggregate", plan.aggregate, AGGREGATES)
-    checked_positive(sigma=plan.sigma, scale=plan.scale, block=plan.block)
+    checked_choice("backend", plan.backend, BACKENDS)
+    checked_positive(scale=plan.scale, block=plan.block)
+    if not plan.tolerance >= 0 or plan.permutations < 0:
+        got = f"{plan.tolerance!r} and {plan.permutations!r}"
+        raise PalpateError("tolerance and permutations must not be negative", got, "Leave them out for the defaults")
     if not 0 < plan.level < 1:
         raise PalpateError("level must lie in (0, 1)", f"{plan.level!r}", "Pass e.g. level=0.95")
     if plan.min_samples < 4:

@@ -1,23 +1,26 @@
 """One table of kernel sums for one generated set and its reference, and what is estimated from it.
 
-The sweep over the pairs is done once (:func:`build_table`); a metric merges segments and computes its statistic on the totals, and
+The pass over the pairs is made once (:func:`build_table`); a metric merges segments and computes its statistic on the totals, and
 the jackknife computes the same statistic on the totals without each unit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from palpate.core import FeatureSet
-from palpate.metrics.checks import checked_features, checked_names, checked_pair
-from palpate.metrics.halves import half_of, sample_units, take_sets
+from palpate.metrics.checks import checked_features, checked_names, checked_pair, copies_across
+from palpate.metrics.engine import kernel_sums
+from palpate.metrics.halves import half_of, halves_bound, sample_units, take_sets
 from palpate.metrics.intervals import Interval, jackknife_errors, leave_one_out, t_interval
-from palpate.metrics.kernels import Array, Index, PairSums, Totals, pair_sums
-from palpate.metrics.mmd import unit_index
+from palpate.metrics.kernels import Array, Index, Kernel, gaussian
+from palpate.metrics.mmd import largest_bound, unit_index
 from palpate.metrics.presets import Plan
+from palpate.metrics.sums import PairSums, Totals
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,19 @@ class Table:
         sums: segment ``4 c + 2 (half of the class) + (half of the set)`` for class number c; the last segment is the reference.
         classes: label of each class number; ``""`` holds samples without a label.
         unit: what the jackknife leaves out: ``"group"``, ``"sample"`` or ``"random-block"``.
+        names: the name of each unit number.
+        kernel: what was summed.
+        spread: (1 + C,) centred squares (:mod:`palpate.metrics.blocked`) of the generated set and of each class.
+        copies: generated rows that are bit for bit rows of the reference.
     """
 
     sums: PairSums
     classes: Sequence[str]
     unit: str
+    names: Sequence[str]
+    kernel: Kernel
+    spread: Array
+    copies: int = 0
 
     @property
     def grouped(self) -> bool:
@@ -54,50 +65,80 @@ class Table:
             to[4 * c : 4 * c + 4] = [2 * k, 2 * k, 2 * k + 1, 2 * k + 1]
         return self.sums.merge(to, 2 * len(kept))
 
+    def whole_classes(self) -> PairSums:
+        """Segment c: class number c, whole."""
+        return self.sums.merge(np.append(np.repeat(np.arange(len(self.classes)), 4), -1), len(self.classes))
 
-def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan, *, grouped: bool) -> Table:
-    """Checks the sets and sweeps over all their pairs.
+
+def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan, *, grouped: bool, median_of: Any = None) -> Table:
+    """Checks the sets and passes once over all their pairs.
 
     Args:
         generated: the set that is halved and divided into classes.
         reference: real touches, or None where no metric needs them.
-        plan: halves, seed, bandwidth, block size, normalisation.
+        plan: halves, seed, bandwidth, back end, normalisation.
         grouped: whether the groups of the sets are the jackknife's units; else samples are.
+        median_of: the set whose median distance ``sigma="median"`` takes; else the reference, or the generated set without one.
 
     Raises:
         PalpateError: on features or groups that are refused.
     """
+    copies = 0
     if reference is None:
-        x = checked_features("The generated features", generated.features, normalize=plan.normalize)
+        parts = [checked_features("The generated features", generated.features, normalize=plan.normalize)]
         sets = [generated]
     else:
         names = ("The generated features", "The reference features")
-        x = np.concatenate(checked_pair(generated.features, reference.features, normalize=plan.normalize, least=1, names=names))
-        sets = [generated, reference]
+        parts = list(checked_pair(generated.features, reference.features, normalize=plan.normalize, least=1, names=names))
+        sets, copies = [generated, reference], copies_across(*parts)
     if grouped:
         groups = [checked_names("groups", s.groups, len(s.ids)) or [] for s in sets]
         units, unit = np.concatenate(unit_index(*groups)), "group"
+        names = sorted({name for column in groups for name in column})
     else:
-        units, unit = sample_units([str(i) for s in sets for i in s.ids], plan.seed)
+        units, unit, names = sample_units([str(i) for s in sets for i in s.ids], plan.seed)
     labels = ["" if v is None else str(v) for v in (generated.labels if generated.labels is not None else [None] * len(generated.ids))]
     classes = sorted(set(labels))
     number = {name: k for k, name in enumerate(classes)}
     label = np.array([number[v] for v in labels], dtype=np.intp)
     ids = [str(i) for i in generated.ids]
     own = 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
-    segment = np.concatenate([own, np.full(len(x) - len(own), 4 * len(classes))])
-    sums = pair_sums(x, segment, units, segments=4 * len(classes) + 1, sigma=plan.sigma, block=plan.block, squares=True)
-    return Table(sums, classes, unit)
+    segment = np.concatenate([own, np.full(len(units) - len(own), 4 * len(classes), dtype=np.intp)])
+    whole = median_of if median_of is not None else sets[-1]
+    kernel = gaussian(plan.sigma, np.asarray(whole.features), whole.groups)
+    rest = [np.arange(4 * len(classes)), *(np.arange(4 * c, 4 * c + 4) for c in range(len(classes)))]
+    found = kernel_sums(
+        parts, segment, units, segments=4 * len(classes) + 1, kernel=kernel, backend=plan.backend, tolerance=plan.tolerance,
+        bound=lambda sums: _bound(Table(sums, classes, unit, names, kernel, np.zeros(0)), plan), block=plan.block, spread=rest,
+    )  # fmt: skip
+    return Table(found.sums, classes, unit, names, kernel, found.spread, copies)
+
+
+def _bound(table: Table, plan: Plan) -> float:
+    """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most; classes too small to be scored are left out."""
+    own = table.set_halves().bound
+    joint = (
+        0.0
+        if not table.sums.n[table.sums.segment == table.sums.segments - 1].sum()
+        else largest_bound(table.tmmd(), plan.estimator, plan.scale)
+    )
+    halves = halves_bound(own.totals, plan) if own is not None else np.zeros(1)
+    return max(joint, largest_bound(table.whole_classes(), plan.estimator, plan.scale), float(np.nanmax(halves, initial=0.0)))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A statistic with its jackknife: values (K,), standard errors (K,), their degrees of freedom, the method in words."""
+    """A statistic with its jackknife: values (K,), standard errors (K,), their degrees of freedom, the method in words.
+
+    ``replicates`` (G, K) are the values without each unit, ``units`` (G,) the units; empty where classes were left out instead.
+    """
 
     values: Array
     errors: Array
     df: int
     method: str
+    replicates: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    units: Index = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
 
     def interval(self, k: int, level: float) -> Interval | None:
         """Interval of value k, or None where it has none."""
@@ -111,20 +152,22 @@ def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) ->
     replicates = leave_one_out(sums.leave_one_out(), statistic)
     df = sums.units - 1
     tail = "" if unit == "group" else ", samples taken as independent"
-    return Estimate(statistic(sums.totals), jackknife_errors(replicates), df, f"leave-one-{unit}-out jackknife, t, {df} df{tail}")
+    method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
+    return Estimate(statistic(sums.totals), jackknife_errors(replicates), df, method, replicates, sums.unit_order)
 
 
 def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
     """As :func:`estimate`, for 2C segments; where a class cannot spare a unit (two groups), the jackknife leaves out classes.
 
-    The interval over classes also holds the differences between classes, so it errs on the wide side. The first two values of the
+    The interval over classes also holds the differences between classes, so it errs on the wide side. The first three values of the
     statistic must be defined for fewer classes; only they get errors then.
     """
     over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
     if np.isfinite(over_units.errors[0]) or classes < 3:
         return over_units
     rest = np.arange(classes)
-    replicates = leave_one_out((take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:2])
-    errors = np.concatenate([jackknife_errors(replicates), np.full(len(over_units.values) - 2, np.nan)])
+    replicates = leave_one_out((take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:3])
+    first = jackknife_errors(replicates)
+    errors = np.concatenate([first, np.full(len(over_units.values) - len(first), np.nan)])
     method = f"leave-one-class-out jackknife, t, {classes - 1} df (a class has too few {unit}s to leave one out)"
     return Estimate(over_units.values, errors, classes - 1, method)

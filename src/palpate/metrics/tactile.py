@@ -14,60 +14,21 @@ defined has value None and a note; samples and classes left out are listed in ``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Unpack
 
 import numpy as np
 
-from palpate import __version__
 from palpate.core import FeatureSet, PalpateError, Score
-from palpate.metrics.halves import self_distances, whole_sets
-from palpate.metrics.intervals import Interval, random_halves_sd
-from palpate.metrics.kernels import Array, Index, PairSums, Totals
-from palpate.metrics.mmd import mmd_matrix
+from palpate.metrics.halves import Design, design_of, halves_bound, self_distances, whole_sets
+from palpate.metrics.intervals import random_halves_sd
+from palpate.metrics.kernels import Array, Index
+from palpate.metrics.mmd import largest_bound, mmd_bound, mmd_matrix
+from palpate.metrics.permutation import permutation_test
 from palpate.metrics.presets import AGGREGATES, DENOMINATORS, Options, Plan, plan_for
+from palpate.metrics.scored import Scored, halves_fields, halves_note, null_band, require_one_encoder, scored, unfit, units_of
+from palpate.metrics.sums import PairSums, Totals
 from palpate.metrics.tables import Table, build_table, class_estimate, estimate
-
-RANDOM_NOTE = (
-    "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; give groups for halves of whole videos"
-)
-
-
-def _score(metric: str, generated: FeatureSet, plan: Plan, settings: Sequence[str], **rest: Any) -> Score:
-    """A score with everything that the plan and the set fix; NaN becomes None, and an undefined value loses its interval."""
-    rest = {k: _plain(v) for k, v in rest.items()}
-    if rest["value"] is None:
-        rest |= {"interval": None, "interval_method": "", "null": None}
-        rest["note"] = rest.get("note") or "Undefined: an average over no pairs"
-    elif rest.get("interval") is None:
-        rest["interval_method"] = ""
-        rest["note"] = ". ".join(filter(None, [rest.get("note"), "No interval: too few groups or samples to leave one out"]))
-    return Score(
-        metric, plan.subject, level=plan.level, bandwidth=plan.sigma, scale=plan.scale, n=len(generated.ids), encoder=generated.encoder,
-        split=plan.split, settings={"kernel": "gaussian", **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)}}, **rest,
-    )  # fmt: skip
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(_plain(v) for v in value)
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def _same_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
-    if a.encoder is not None and b.encoder is not None and a.encoder != b.encoder:
-        raise PalpateError(
-            f"Generated and {what} features must come from one encoder",
-            f"digests {a.encoder[:12]} and {b.encoder[:12]}",
-            "Embed both with the same encoder",
-        )
 
 
 def tmmd(generated: FeatureSet, reference: FeatureSet, **options: Unpack[Options]) -> Score:
@@ -79,49 +40,46 @@ def tmmd(generated: FeatureSet, reference: FeatureSet, **options: Unpack[Options
         **options: see :class:`Options`. Groups count only if both sets have them; the same name is the same group in both.
 
     Returns:
-        Value with a leave-one-group-out interval; ``details`` holds the counts of groups.
+        Value with a leave-one-group-out interval; ``details``: counts of groups, the p-value of a permutation of whole groups
+        (:mod:`palpate.metrics.permutation`), rows that are copies of reference rows.
 
     Raises:
         PalpateError: on features that are refused, unequal widths, or encoders of different digests.
     """
-    _same_encoder(generated, reference, "reference")
+    require_one_encoder(generated, reference, "reference")
     grouped = generated.groups is not None and reference.groups is not None
     plan = plan_for(options, grouped=grouped)
-    return _tmmd(build_table(generated, reference, plan, grouped=grouped), generated, reference, plan)
+    return tmmd_of(build_table(generated, reference, plan, grouped=grouped), generated, reference, plan).score
 
 
-def _tmmd(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Plan) -> Score:
+def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Plan) -> Scored:
+    """TMMD from a table."""
     sums = table.tmmd()
     found = estimate(sums, lambda t: mmd_matrix(t, plan.estimator, plan.scale)[:1, 1], table.unit)
-    note = ""
+    notes = []
     if not np.isfinite(found.values[0]):
-        note = "Undefined: " + (
-            "each set needs two groups, not all shared, for the grouped estimator"
-            if plan.estimator == "grouped"
-            else "each set needs two samples"
+        needs = "two groups, not all shared, for the grouped estimator" if plan.estimator == "grouped" else "two samples"
+        notes.append(f"Undefined: each set needs {needs}")
+    if table.copies:
+        notes.append(
+            f"{table.copies} of {len(generated.ids)} generated rows are bit for bit rows of the reference: a copy is not a generator"
         )
-    details = {"unit": table.unit, "units": sums.units, "version": __version__}
-    return _score(
-        "TMMD", generated, plan, (), value=found.values[0], interval=found.interval(0, plan.level), interval_method=found.method,
-        estimator=plan.estimator, m=len(reference.ids), details=details, note=note,
-    )  # fmt: skip
-
-
-def _halves_fields(plan: Plan) -> dict[str, Any]:
-    return {
-        "estimator": "biased" if plan.estimator == "biased" else "unbiased",
-        "seed": plan.seed if plan.halves == "random" else None,
+    if not table.grouped:
+        notes.append("The interval takes samples as independent; frames of one video are not: give groups")
+    test = permutation_test(sums, plan.estimator, plan.scale, count=plan.permutations, seed=plan.seed)
+    details = {
+        "units": sums.units,
+        "copies": table.copies,
+        "p_value": test.p if test else None,
+        "permutations": None
+        if test is None
+        else {"count": len(test.null), "swapped": test.swapped, "dealt": test.dealt, "seed": plan.seed},
     }
-
-
-def _halves_note(plan: Plan, sums: PairSums) -> str:
-    if not sums.rows.any():
-        return "All features are equal: complete collapse, which this metric calls perfect"
-    return RANDOM_NOTE if plan.halves == "random" and plan.estimator != "biased" else ""
-
-
-def _null(centre: float, sd: float) -> Interval | None:
-    return (centre - 1.96 * sd, centre + 1.96 * sd) if np.isfinite(sd) and np.isfinite(centre) else None
+    null = None if test is None else (float(np.quantile(test.null, 0.025)), float(np.quantile(test.null, 0.975)))
+    return scored(
+        "TMMD", table, generated, plan, (), found=found, bound=largest_bound(sums, plan.estimator, plan.scale), estimator=plan.estimator,
+        m=len(reference.ids), details=details, note=". ".join(notes), null=null,
+    )  # fmt: skip
 
 
 def i_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
@@ -137,56 +95,48 @@ def i_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
     plan = plan_for(options, grouped=generated.groups is not None)
-    return _i_tmmd(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan)
+    return i_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan).score
 
 
-def _i_tmmd(table: Table, generated: FeatureSet, plan: Plan) -> Score:
+def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
+    """I-TMMD from a table."""
     sums = table.set_halves()
-    found = estimate(sums, lambda t: np.concatenate(self_distances(t, plan)), table.unit)
+    design = design_of(sums.totals, plan)
+    found = estimate(sums, lambda t: np.concatenate(self_distances(t, plan, design)), table.unit)
     whole = sums.merge(np.zeros(2, dtype=np.intp), 1)
-    sd, n = float(random_halves_sd(whole, plan.estimator, plan.scale)[0]), len(generated.ids)
+    sd, n = float(random_halves_sd(table.spread[:1], whole.totals.n, plan.estimator, plan.scale)[0]), len(generated.ids)
     dispersion = _dispersion(whole.totals, plan)[0]
     centre = dispersion if plan.estimator == "biased" else 0.0
-    value = found.values[0]
-    reason = _unfit(whole, 0, plan)
+    reason = unfit(whole, 0, plan)
     details = {
         "E": found.values[1] if table.grouped else None,
         "E_interval": found.interval(1, plan.level) if table.grouped else None,
-        "z": (value - centre) / sd if sd > 0 else None,
+        "z": (found.values[0] - centre) / sd if sd > 0 else None,
         "dispersion": dispersion,
-        "unit": table.unit,
         "units": sums.units,
-        "version": __version__,
     }
-    return _score(
-        "I-TMMD", generated, plan, ("halves",), value=None if reason else value, interval=found.interval(0, plan.level),
-        interval_method=found.method, null=_null(centre, sd), details=details,
-        note=f"Undefined: {reason} (n = {n})" if reason else _halves_note(plan, sums), **_halves_fields(plan),
+    note = f"Undefined: {reason} (n = {n})" if reason else halves_note(plan, sums, grouped=table.grouped)
+    return scored(
+        "I-TMMD", table, generated, plan, ("halves",), found=None if reason else found, bound=_halves_bound(sums, plan)[0],
+        null=null_band(centre, sd), details=details, note=note, **halves_fields(plan),
     )  # fmt: skip
 
 
+def _halves_bound(sums: PairSums, plan: Plan) -> Array:
+    """(K,) bounds of the distances between halves; zeros where sums are exact."""
+    return np.zeros(sums.segments // 2) if sums.bound is None else halves_bound(sums.bound.totals, plan)
+
+
 def _dispersion(t: Totals, plan: Plan) -> Array:
-    """What biased dist^2 averages over random halves: (4/n) scale (1 - mean off-diagonal k), for each segment."""
+    """What biased dist^2 averages over random halves: (4/n) scale (mean diagonal k - mean off-diagonal k), for each segment."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return -4 / t.n * plan.scale * np.diagonal(t.sums) / (t.n * (t.n - 1))
-
-
-def _unfit(sums: PairSums, c: int, plan: Plan) -> str:
-    """Why segment c cannot be cut into halves; '' if it can."""
-    units = np.unique(sums.unit[sums.segment == c], return_counts=True)[1]
-    if units.sum() < plan.min_samples:
-        return f"fewer than {plan.min_samples} samples"
-    if plan.halves == "group" and len(units) < 2:
-        return "all samples are of one group"
-    if plan.halves == "group" and units.max() < 2:
-        return "no group has two samples"
-    return ""
+        return 4 / t.n * plan.scale * (t.own / t.n - np.diagonal(t.sums) / (t.n * (t.n - 1)))
 
 
 def _usable(table: Table, plan: Plan) -> tuple[Index, dict[str, str]]:
     """Class numbers that can be cut into halves, and why the others cannot."""
-    whole = table.sums.merge(np.append(np.repeat(np.arange(len(table.classes)), 4), -1), len(table.classes))
-    reasons = {name or "(no label)": _unfit(whole, c, plan) if name else "no label" for c, name in enumerate(table.classes)}
+    whole = table.whole_classes()
+    reasons = {name or "(no label)": unfit(whole, c, plan) if name else "no label" for c, name in enumerate(table.classes)}
     kept = np.array([c for c, reason in enumerate(reasons.values()) if not reason], dtype=np.intp)
     return kept, {name: reason for name, reason in reasons.items() if reason}
 
@@ -203,25 +153,23 @@ def ci_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
     plan = plan_for(options, grouped=generated.groups is not None)
-    return _ci_tmmd(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan)
+    return ci_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan).score
 
 
-def _ci_tmmd(table: Table, generated: FeatureSet, plan: Plan) -> Score:
+def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
+    """CI-TMMD from a table."""
     kept, excluded = _usable(table, plan)
-    details: dict[str, Any] = {
-        "classes": [table.classes[c] for c in kept],
-        "excluded": excluded,
-        "unit": table.unit,
-        "version": __version__,
-    }
+    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "excluded": excluded}
     if not len(kept):
         note = "Undefined: no class can be cut into halves" + ("" if generated.labels is not None else " (the samples have no labels)")
-        return _score("CI-TMMD", generated, plan, ("halves",), value=None, details=details, note=note, **_halves_fields(plan))
+        return scored("CI-TMMD", table, generated, plan, ("halves",), details=details, note=note, **halves_fields(plan))
     sums = table.class_halves(kept)
-    found = class_estimate(sums, lambda t: np.array([v.mean() for v in self_distances(t, plan)]), table.unit)  # Eq. 4
+    design = design_of(sums.totals, plan)
+    found = class_estimate(sums, lambda t: np.array([v.mean() for v in self_distances(t, plan, design)]), table.unit)  # Eq. 4
     each, excess = self_distances(sums.totals, plan)
     whole = sums.merge(np.repeat(np.arange(len(kept)), 2), len(kept))
-    sd = float(np.sqrt((random_halves_sd(whole, plan.estimator, plan.scale) ** 2).sum())) / len(kept)
+    spread = random_halves_sd(table.spread[1 + kept], whole.totals.n, plan.estimator, plan.scale)
+    sd = float(np.sqrt((spread**2).sum())) / len(kept)
     dispersion = float(_dispersion(whole.totals, plan).mean())
     centre = dispersion if plan.estimator == "biased" else 0.0
     details |= {
@@ -230,19 +178,15 @@ def _ci_tmmd(table: Table, generated: FeatureSet, plan: Plan) -> Score:
         "z": (found.values[0] - centre) / sd if sd > 0 else None,
         "dispersion": dispersion,
         "per_class": {
-            name: {"value": each[k], "E": excess[k] if table.grouped else None, "n": int(whole.totals.n[k]), "units": _units(whole, k)}
+            name: {"value": each[k], "E": excess[k] if table.grouped else None, "n": int(whole.totals.n[k]), "units": units_of(whole, k)}
             for k, name in enumerate(details["classes"])
         },
         "units": sums.units,
     }
-    return _score(
-        "CI-TMMD", generated, plan, ("halves",), value=found.values[0], interval=found.interval(0, plan.level),
-        interval_method=found.method, null=_null(centre, sd), details=details, note=_halves_note(plan, sums), **_halves_fields(plan),
+    return scored(
+        "CI-TMMD", table, generated, plan, ("halves",), found=found, bound=float(_halves_bound(sums, plan).mean()),
+        null=null_band(centre, sd), details=details, note=halves_note(plan, sums, grouped=table.grouped), **halves_fields(plan),
     )  # fmt: skip
-
-
-def _units(sums: PairSums, c: int) -> int:
-    return len(np.unique(sums.unit[sums.segment == c]))
 
 
 def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
@@ -253,19 +197,19 @@ def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
 
     Returns:
         Value and interval; ``details``: ``matrix`` (D, classes in the order of ``classes``), ``variants`` (all denominators and
-        aggregates), ``unstable`` (classes whose denominator is not two standard errors above 0), ``excluded``.
+        aggregates), ``ratio_of_means`` with its interval (the mean of ratios has heavy tails), ``unstable`` (classes whose denominator is not two standard errors above 0), ``excluded``.
 
     Raises:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
     plan = plan_for(options, grouped=generated.groups is not None)
-    return _d_tmmd(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan)
+    return d_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan).score
 
 
-def d_matrix(t: Totals, plan: Plan) -> Array:
+def d_matrix(t: Totals, plan: Plan, design: Design | None = None) -> Array:
     """D (C, C) from 2C segments: halves of a class on the diagonal (Eq. 5), whole classes off it (Eq. 6)."""
     matrix = mmd_matrix(whole_sets(t), plan.estimator, plan.scale)
-    np.fill_diagonal(matrix, self_distances(t, plan)[0])
+    np.fill_diagonal(matrix, self_distances(t, plan, design)[0])
     return matrix
 
 
@@ -287,33 +231,33 @@ def denominators(matrix: Array, denominator: str) -> Array:
     return matrix.sum(axis=1) / (1 if denominator == "sum" else len(matrix))
 
 
-def _d_tmmd(table: Table, generated: FeatureSet, plan: Plan) -> Score:
+def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
+    """D-TMMD from a table."""
     kept, excluded = _usable(table, plan)
-    details: dict[str, Any] = {
-        "classes": [table.classes[c] for c in kept],
-        "excluded": excluded,
-        "unit": table.unit,
-        "version": __version__,
-    }
-    fields = _halves_fields(plan) | {"estimator": plan.estimator}
+    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "excluded": excluded}
+    fields: dict[str, Any] = halves_fields(plan) | {"estimator": plan.estimator}
     settings = ("halves", "denominator", "aggregate")
     if len(kept) < 2:
         note = f"Undefined: needs two classes that can be cut into halves, has {len(kept)}"
         note += "" if generated.labels is not None else " (the samples have no labels)"
-        return _score("D-TMMD", generated, plan, settings, value=None, details=details, note=note, **fields)
+        return scored("D-TMMD", table, generated, plan, settings, details=details, note=note, **fields)
     sums = table.class_halves(kept)
 
+    design = design_of(sums.totals, plan)
+
     def statistic(t: Totals) -> Array:
-        matrix = d_matrix(t, plan)
+        matrix = d_matrix(t, plan, design)
         excess = float(self_distances(t, plan)[1].mean()) / float(denominators(matrix, "mean_off_diagonal").mean() or np.nan)
-        return np.array([d_ratio(matrix, plan.denominator, plan.aggregate), excess, *denominators(matrix, plan.denominator)])
+        pooled = d_ratio(matrix, plan.denominator, "ratio_of_means")
+        return np.array([d_ratio(matrix, plan.denominator, plan.aggregate), excess, pooled, *denominators(matrix, plan.denominator)])
 
     found = class_estimate(sums, statistic, table.unit)
-    matrix, below, errors = d_matrix(sums.totals, plan), found.values[2:], found.errors[2:]
+    matrix, below, errors = d_matrix(sums.totals, plan), found.values[3:], found.errors[3:]
     unstable = [name for k, name in enumerate(details["classes"]) if below[k] <= (2 * errors[k] if np.isfinite(errors[k]) else 0.0)]
     details |= {
         "matrix": matrix,
         "variants": {f"{d}/{a}": d_ratio(matrix, d, a) for d in DENOMINATORS for a in AGGREGATES},
+        "ratio_of_means": {"value": found.values[2], "interval": found.interval(2, plan.level)},
         "unstable": unstable,
         "E_ratio": found.values[1] if table.grouped else None,
         "E_ratio_interval": found.interval(1, plan.level) if table.grouped else None,
@@ -322,10 +266,22 @@ def _d_tmmd(table: Table, generated: FeatureSet, plan: Plan) -> Score:
     note = "Undefined: the classes do not separate (a denominator is not positive)" if not np.isfinite(found.values[0]) else ""
     if not note and unstable:
         note = f"Denominators within two standard errors of 0, so the ratio is unreliable: {', '.join(unstable)}"
-    return _score(
-        "D-TMMD", generated, plan, settings, value=found.values[0], interval=found.interval(0, plan.level), interval_method=found.method,
-        details=details, note=note, **fields,
+    return scored(
+        "D-TMMD", table, generated, plan, settings, found=found, bound=_d_bound(sums, matrix, plan), details=details, note=note, **fields,
     )  # fmt: skip
+
+
+def _d_bound(sums: PairSums, matrix: Array, plan: Plan) -> float:
+    """How far the ratio may be from the exact one: numerators and denominators moved apart as far as their bounds allow."""
+    if sums.bound is None:
+        return 0.0
+    rest = mmd_bound(whole_sets(sums.bound.totals), plan.estimator, plan.scale)
+    np.fill_diagonal(rest, _halves_bound(sums, plan))
+    own, off = np.diagonal(matrix), denominators(matrix, plan.denominator)
+    more, less = np.abs(own) + np.diagonal(rest), off - denominators(rest, plan.denominator)
+    if plan.aggregate == "ratio_of_means":
+        own, off, more, less = (np.array([v.mean()]) for v in (np.abs(own), off, more, less))
+    return float((more / less - np.abs(own) / off).mean()) if (less > 0).all() else float("inf")
 
 
 def four_scores(
@@ -346,20 +302,27 @@ def four_scores(
     Raises:
         PalpateError: as the single metrics do.
     """
-    _same_encoder(generated, reference, "reference")
+    require_one_encoder(generated, reference, "reference")
+    if floor is not None:
+        require_one_encoder(generated, floor, "floor")
+        if (floor.groups is None) != (generated.groups is None):
+            raise PalpateError(
+                "The floor must be scored like the generated touches", "groups in one of the two", "Give groups to both, or to none"
+            )
+    plan = plan_for(options, grouped=generated.groups is not None)
+    found = [one.score for one in four_of(generated, reference, options)]
+    if floor is None:
+        return found
+    real = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference)
+    floors = [f(real, floor, plan).score.value for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
+    return [found[0], *(replace(s, floor=v) for s, v in zip(found[1:], floors, strict=True))]
+
+
+def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> list[Scored]:
+    """The four metrics with their leave-one-unit-out values."""
     own = generated.groups is not None
     both = own and reference.groups is not None
     plan, joint = plan_for(options, grouped=own), plan_for(options, grouped=both)
     table = build_table(generated, reference, joint, grouped=both)
-    alone = table if own == both else build_table(generated, None, plan, grouped=own)
-    scores = [_tmmd(table, generated, reference, joint)] + [f(alone, generated, plan) for f in (_i_tmmd, _ci_tmmd, _d_tmmd)]
-    if floor is None:
-        return scores
-    _same_encoder(generated, floor, "floor")
-    if (floor.groups is None) != (generated.groups is None):
-        raise PalpateError(
-            "The floor must be scored like the generated touches", "groups in one of the two", "Give groups to both, or to none"
-        )
-    real = build_table(floor, None, plan, grouped=own)
-    floors = [f(real, floor, plan).value for f in (_i_tmmd, _ci_tmmd, _d_tmmd)]
-    return [scores[0], *(replace(s, floor=v) for s, v in zip(scores[1:], floors, strict=True))]
+    alone = table if own == both else build_table(generated, None, plan, grouped=own, median_of=reference)
+    return [tmmd_of(table, generated, reference, joint), *(f(alone, generated, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of))]

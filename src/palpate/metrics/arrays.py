@@ -1,0 +1,223 @@
+"""Where numbers live: NumPy, or any library of the array-API standard (torch on CPU or CUDA, CuPy), behind one handful of operations.
+
+The blocked sums need a matrix product, ``expm1`` and products with indicator columns; all else is bookkeeping in NumPy. NumPy works in
+place and in several threads; other libraries run the same blocks on their own device, and only sums of blocks come back.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import sys
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Ops:
+    """Operations on NumPy arrays."""
+
+    in_threads = True
+
+    def columns(self, x: Any, *extra: Any) -> Any:
+        """``x`` (n, d) with further columns (n,) behind, contiguous."""
+        out = np.empty((len(x), x.shape[1] + len(extra)), dtype=x.dtype)
+        out[:, : x.shape[1]] = x
+        for k, column in enumerate(extra):
+            out[:, x.shape[1] + k] = column
+        return out
+
+    def squares(self, x: Any) -> Any:
+        """(n,) squared norms, summed in float64."""
+        return np.einsum("ij,ij->i", x, x, dtype=np.float64)
+
+    def ones(self, n: int, like: Any) -> Any:
+        """(n,) ones of the type of ``like``."""
+        return np.ones(n, dtype=like.dtype)
+
+    def expm1_(self, x: Any) -> Any:
+        """``expm1``, in place."""
+        return np.expm1(x, out=x)
+
+    def scale_(self, x: Any, factor: float) -> Any:
+        """``x * factor``, in place; nothing to do for a factor of one."""
+        if factor != 1:
+            x *= x.dtype.type(factor)
+        return x
+
+    def clear_diagonal(self, k: Any) -> Any:
+        """A square block without its diagonal, in place."""
+        np.fill_diagonal(k, 0)
+        return k
+
+    def indicator(self, cell: NDArray[np.intp], cells: int, like: Any) -> Any:
+        """(n, cells) one-hot columns of the type of ``like``."""
+        out = np.zeros((len(cell), cells), dtype=like.dtype)
+        out[np.arange(len(cell)), cell] = 1
+        return out
+
+    def row_squares(self, k: Any) -> NDArray[np.float64]:
+        """(n,) sums of squares of the rows of a block."""
+        return np.einsum("ij,ij->i", k, k).astype(np.float64)
+
+    def numpy(self, x: Any) -> NDArray[np.float64]:
+        """As a float64 NumPy array."""
+        return np.asarray(x, dtype=np.float64)
+
+    def at_least_float32(self, x: Any) -> Any:
+        """As float32 or float64."""
+        return x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)
+
+    def divide_rows(self, x: Any, norms: NDArray[np.float64]) -> Any:
+        """Rows divided by (n,) numbers, in the type of ``x``."""
+        return (x / norms[:, None]).astype(x.dtype)
+
+    def one_type(self, a: Any, b: Any) -> tuple[Any, Any]:
+        """Both in the wider of their types."""
+        dtype = np.result_type(a.dtype, b.dtype)
+        return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
+
+    def join(self, parts: list[Any]) -> Any:
+        """Rows of all parts."""
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def each(self, job: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """``map(job, items)`` in the same order, in as many threads as BLAS would use, one BLAS thread each.
+
+        A block is a product, an ``expm1`` and a sum; letting BLAS alone use both cores would leave the rest to one of them.
+        """
+        from threadpoolctl import threadpool_limits
+
+        workers = blas_threads()
+        if workers < 2:
+            yield from map(job, items)
+            return
+        with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
+            waiting: list[Any] = []
+            for item in items:  # a few ahead: finished blocks must not pile up
+                waiting.append(pool.submit(job, item))
+                if len(waiting) > 2 * workers:
+                    yield waiting.pop(0).result()
+            while waiting:
+                yield waiting.pop(0).result()
+
+
+class ArrayApiOps(Ops):
+    """The same on another library's arrays, by the functions that the array-API standard names."""
+
+    in_threads = False
+
+    def __init__(self, xp: Any, device: Any) -> None:
+        self.xp, self.device = xp, device
+
+    def columns(self, x: Any, *extra: Any) -> Any:
+        """``x`` (n, d) with further columns (n,) behind."""
+        return self.xp.concat([x, *(self.xp.reshape(self.xp.astype(e, x.dtype), (-1, 1)) for e in extra)], axis=1)
+
+    def squares(self, x: Any) -> Any:
+        """(n,) squared norms, in float64 where the device has it."""
+        wide = self.xp.astype(x, self.xp.float64)
+        return self.xp.sum(wide * wide, axis=1)
+
+    def ones(self, n: int, like: Any) -> Any:
+        """(n,) ones of the type of ``like``."""
+        return self.xp.ones(n, dtype=like.dtype, device=self.device)
+
+    def expm1_(self, x: Any) -> Any:
+        """``expm1``."""
+        return self.xp.expm1(x)
+
+    def scale_(self, x: Any, factor: float) -> Any:
+        """``x * factor``."""
+        return x if factor == 1 else x * factor
+
+    def clear_diagonal(self, k: Any) -> Any:
+        """A square block without its diagonal."""
+        return k * (1 - self.xp.eye(k.shape[0], dtype=k.dtype, device=self.device))
+
+    def indicator(self, cell: NDArray[np.intp], cells: int, like: Any) -> Any:
+        """(n, cells) one-hot columns of the type of ``like``."""
+        return self.xp.astype(self.xp.asarray(super().indicator(cell, cells, np.empty(0, np.float32)), device=self.device), like.dtype)
+
+    def row_squares(self, k: Any) -> NDArray[np.float64]:
+        """(n,) sums of squares of the rows of a block."""
+        return self.numpy(self.xp.sum(k * k, axis=1))
+
+    def numpy(self, x: Any) -> NDArray[np.float64]:
+        """As a float64 NumPy array on the host."""
+        x = self.xp.astype(x, self.xp.float64)
+        return np.asarray(x.cpu() if hasattr(x, "cpu") else x, dtype=np.float64)
+
+    def at_least_float32(self, x: Any) -> Any:
+        """As float32 or float64."""
+        return x if x.dtype == self.xp.float64 else self.xp.astype(x, self.xp.float32)
+
+    def divide_rows(self, x: Any, norms: NDArray[np.float64]) -> Any:
+        """Rows divided by (n,) numbers, in the type of ``x``."""
+        return x / self.xp.asarray(norms, dtype=x.dtype, device=self.device)[:, None]
+
+    def one_type(self, a: Any, b: Any) -> tuple[Any, Any]:
+        """Both in the wider of their types."""
+        dtype = self.xp.result_type(a.dtype, b.dtype)
+        return self.xp.astype(a, dtype), self.xp.astype(b, dtype)
+
+    def join(self, parts: list[Any]) -> Any:
+        """Rows of all parts."""
+        return parts[0] if len(parts) == 1 else self.xp.concat(parts)
+
+    def each(self, job: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """One after the other: the device is the parallel part."""
+        with full_products():
+            yield from map(job, items)
+
+
+def blas_threads() -> int:
+    """How many threads BLAS may use here: what ``threadpoolctl`` reports, at most the cores this process has."""
+    from threadpoolctl import threadpool_info
+
+    allowed = [int(pool["num_threads"]) for pool in threadpool_info() if pool["user_api"] == "blas"]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min([cores, *allowed]))
+
+
+@contextmanager
+def full_products() -> Generator[None]:
+    """No TensorFloat-32 in torch's products inside: training loops switch it on, and its ten bits are a thousand times too coarse here."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def release(x: Any) -> None:
+    """Lets the system forget the pages of an array on disk that were read: they would count as this process's memory."""
+    held = getattr(x, "_mmap", None)
+    if isinstance(x, np.memmap) and held is not None and hasattr(held, "madvise"):
+        held.madvise(mmap.MADV_DONTNEED)
+
+
+def is_foreign(x: Any) -> bool:
+    """Whether ``x`` is an array of a library other than NumPy: a torch tensor, say."""
+    return not isinstance(x, np.ndarray) and (hasattr(x, "__array_namespace__") or type(x).__module__.split(".")[0] == "torch")
+
+
+def ops_of(x: Any) -> Ops:
+    """The operations for an array: NumPy's own, or those of the array-API standard on the array's device."""
+    if not is_foreign(x):
+        return Ops()
+    from array_api_compat import array_namespace, device
+
+    return ArrayApiOps(array_namespace(x), device(x))

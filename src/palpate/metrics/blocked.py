@@ -1,0 +1,192 @@
+"""Kernel sums from blocks of pairs, each block once; the N x N matrix never exists.
+
+* Rows are centred and rounded *once*; ``z`` is what came out. One product of augmented rows gives the exponent of the Gaussian, with
+  norms of the same rounded ``z``; ``expm1`` in place.
+* Samples are sorted so that items are contiguous; a block is summed by products with indicator columns, and the sums are added up in
+  float64. A sum in float32 thus never runs over more than one block, and its rounding errors average out over the rows.
+* Blocks below the diagonal are the transposes of those above. They are worked off in threads, and added up in a fixed order: the result does
+  not depend on how many threads there are.
+
+Memory: ``block^2`` numbers a thread, N x S for the row sums, and one sorted copy of the features.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.metrics.arrays import Ops, ops_of
+from palpate.metrics.kernels import Array, Gaussian, Index, Kernel
+from palpate.metrics.sums import PairSums, split_by
+
+#: Up to this many rows float64 costs nothing; few pairs would not average float32 rounding away.
+FLOAT64_BELOW = 1024
+#: Blocks are not made smaller than this for speed; the caller may ask for less.
+SMALL_BLOCK = 256
+#: Up to this many items their sums with one another are kept (34 MB).
+MOST_ITEMS = 2048
+SLAB = 4096
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What one pass over the pairs found.
+
+    Attributes:
+        sums: by item and segment.
+        spread: (K,) sum of the squares of the doubly centred kernel over i != j for each of the sets asked for; see :func:`centred_squares`.
+    """
+
+    sums: PairSums
+    spread: Array
+
+
+def blocked_sums(
+    x: Any,
+    segment: Index,
+    unit: Index,
+    *,
+    segments: int,
+    kernel: Kernel,
+    block: int = 1024,
+    spread: list[Index] | None = None,
+) -> Sweep:
+    """Kernel sums of all samples with all segments.
+
+    Args:
+        x: (N, d) float32 or float64; NumPy, or another library's array on any device.
+        segment: (N,) in [0, segments).
+        unit: (N,) any integers.
+        segments: S.
+        kernel: what is summed.
+        block: most rows of a block; a block holds block^2 kernel values.
+        spread: sets of segments for ``Sweep.spread``, each ascending and without gaps; ``[]`` or None for none.
+    """
+    ops = ops_of(x)
+    order = np.lexsort((unit, segment))
+    z = centred(x, order, kernel, ops)
+    segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
+    start = np.flatnonzero(np.r_[True, (np.diff(segment) != 0) | (np.diff(unit) != 0)]) if len(order) else np.zeros(0, np.intp)
+    own = kernel.diagonal(z, ops)
+    joined = len(start) <= MOST_ITEMS
+    wanted = [np.isin(segment, s) for s in spread or []]
+    if joined:  # (unit, segment) items: sums of items with items
+        cell = np.repeat(np.arange(len(start)), np.diff(np.r_[start, len(order)]))
+        run = _Run(z, cell, len(start), kernel, block, ops, wanted)
+        n, diagonal = (np.bincount(cell, weights, len(start)).astype(np.float64) for weights in (None, own))
+        sums = PairSums.from_block(run.items, n, diagonal, segment[start], unit[start], segments)
+        return Sweep(sums, run.spread)
+    run = _Run(z, segment, segments, kernel, block, ops, wanted, by_row=True)
+    same = np.zeros_like(run.rows)
+    _, number, size = np.unique(unit, return_inverse=True, return_counts=True)
+    shared = np.flatnonzero(size[number] > 1)
+    for part in split_by(unit[shared]):
+        at = shared[part]  # ascending, so segments stay sorted
+        same[at] = _Run(z[at], segment[at], segments, kernel, block, ops, [], by_row=True).rows
+    sums = PairSums(np.ones(len(order)), run.rows, same, own, segment, unit)
+    return Sweep(sums, run.spread)
+
+
+def centred(x: Any, order: Index, kernel: Kernel, ops: Ops) -> Any:
+    """Rows of ``x`` in this order, formed in float64 and rounded once to the type that the sums need.
+
+    The Gaussian's are centred, which changes no distance; other kernels take rows as they are, in float64.
+    """
+    if type(ops) is not Ops:  # on a device: one expression
+        wide = ops.xp.astype(ops.xp.take(x, ops.xp.asarray(order, device=ops.device), axis=0), ops.xp.float64)  # type: ignore[attr-defined]
+        z = wide - ops.xp.mean(wide, axis=0) if isinstance(kernel, Gaussian) else wide  # type: ignore[attr-defined]
+        radius = float(ops.xp.max(ops.squares(z))) if len(order) else 0.0  # type: ignore[attr-defined]
+        single = x.dtype != ops.xp.float64 and len(order) > FLOAT64_BELOW and radius <= kernel.radius_limit  # type: ignore[attr-defined]
+        return ops.xp.astype(z, ops.xp.float32) if single else z  # type: ignore[attr-defined]
+    slabs = [slice(i, i + SLAB) for i in range(0, len(order), SLAB)]
+    if not isinstance(kernel, Gaussian):
+        return x[order].astype(np.float64)
+    mean = x.mean(axis=0, dtype=np.float64)
+    radius = max((float(((x[at] - mean) ** 2).sum(axis=1).max()) for at in slabs), default=0.0)
+    wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or radius > kernel.radius_limit
+    z = np.empty(x.shape, dtype=np.float64 if wide else np.float32)
+    for at in slabs:
+        z[at] = x[order[at]] - mean
+    return z
+
+
+class _Run:
+    """One sweep over the blocks on and above the diagonal."""
+
+    def __init__(
+        self, z: Any, cell: Index, cells: int, kernel: Kernel, block: int, ops: Ops, sets: list[NDArray[np.bool_]], *, by_row: bool = False
+    ) -> None:
+        self.kernel, self.ops, self.cell, n = kernel, ops, cell, len(cell)
+        self.left, self.right = kernel.augment(z, ops)
+        block = max(1, min(block, max(SMALL_BLOCK, -(-n // 8))))  # an eighth of the rows: little of the diagonal blocks is done twice
+        self.blocks = [slice(i, min(i + block, n)) for i in range(0, n, block)]
+        self.ends = [(int(cell[at.start]), int(cell[at.stop - 1]) + 1) for at in self.blocks]
+        self.marks = [ops.indicator(cell[at] - a, b - a, z) for at, (a, b) in zip(self.blocks, self.ends, strict=True)]
+        self.rows = np.zeros((n, cells)) if by_row else np.zeros((0, cells))
+        self.items = np.zeros((0, 0)) if by_row else np.zeros((cells, cells))
+        self.sets = sets
+        edges = [(int(np.argmax(s)), int(s.sum())) if s.any() else (0, 0) for s in sets]
+        self.ranges = [slice(a, a + b) for a, b in edges]  # each set is one run of sorted rows
+        self.row_sums, self.squares = [np.zeros(r.stop - r.start) for r in self.ranges], np.zeros(len(sets))
+        pairs = [(i, j) for i in range(len(self.blocks)) for j in range(i, len(self.blocks))]
+        for (i, j), found in zip(pairs, ops.each(self._block, pairs), strict=True):
+            self._add(i, j, *found)
+        self.spread = np.array(
+            [centred_squares(q, r) for q, r in zip(self.squares, self.row_sums, strict=True)] if sets else [], dtype=np.float64
+        )
+
+    def _block(self, pair: tuple[int, int]) -> tuple[Array, Array | None, list[tuple[int, Array, Array | None, float]]]:
+        i, j = pair
+        rows, columns = self.blocks[i], self.blocks[j]
+        k = self.kernel.values(self.left[rows] @ self.right[columns].T, self.ops)
+        if i == j:
+            k = self.ops.clear_diagonal(k)
+        across = self.ops.numpy(k @ self.marks[j])  # (rows, cells of j)
+        back = self.ops.numpy(k.T @ self.marks[i]) if i != j and len(self.rows) else None
+        inside: list[tuple[int, Array, Array | None, float]] = []
+        for s, run in enumerate(self.ranges):
+            a, b = (slice(max(run.start, at.start) - at.start, min(run.stop, at.stop) - at.start) for at in (rows, columns))
+            if a.start < a.stop and b.start < b.stop:
+                part = k[a, b]
+                ones = self.ops.ones(part.shape[1], part), self.ops.ones(part.shape[0], part)
+                sums = self.ops.numpy(part @ ones[0]), None if i == j else self.ops.numpy(ones[1] @ part)
+                inside.append((s, *sums, float(self.ops.row_squares(part).sum()) * (1 if i == j else 2)))
+        if len(self.rows):
+            return across, back, inside
+        starts = np.flatnonzero(np.r_[True, np.diff(self.cell[rows]) != 0])
+        return np.add.reduceat(across, starts, axis=0), None, inside
+
+    def _add(self, i: int, j: int, across: Array, back: Array | None, inside: list[tuple[int, Array, Array | None, float]]) -> None:
+        (a, b), (c, d) = self.ends[i], self.ends[j]
+        if len(self.rows):
+            self.rows[self.blocks[i], c:d] += across
+            if back is not None:
+                self.rows[self.blocks[j], a:b] += back
+        else:
+            self.items[a:b, c:d] += across
+            if i != j:
+                self.items[c:d, a:b] += across.T
+        for s, right, down, squares in inside:
+            start = self.ranges[s].start
+            for at, sums in ((self.blocks[i], right), (self.blocks[j], down)):
+                if sums is not None:
+                    first = max(at.start, start) - start
+                    self.row_sums[s][first : first + len(sums)] += sums
+            self.squares[s] += squares
+
+
+def centred_squares(squares: float, row_sums: Array) -> float:
+    """Sum over i != j of the squared doubly centred kernel, from sum_ij k^2 and row sums of a matrix whose diagonal is 0.
+
+    ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means; its diagonal, ``r - 2 r_i``, is taken off at the end.
+    """
+    n = len(row_sums)
+    if n < 2:
+        return float("nan")
+    r = row_sums / n
+    mean = r.mean()
+    centred = squares - 2 * n * (r**2).sum() + n**2 * mean**2
+    return max(float(centred - ((mean - 2 * r) ** 2).sum()), 0.0)

@@ -1,0 +1,157 @@
+"""From an estimate to a :class:`palpate.core.Score`: settings, sizes, digests, notes, and nothing that JSON cannot hold.
+
+:class:`Scored` keeps the leave-one-unit-out values beside the score: the difference of two generators on the same videos is estimated
+from them (:mod:`palpate.metrics.paired`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from palpate import __version__
+from palpate.core import FeatureSet, PalpateError, Score
+from palpate.metrics.intervals import Interval
+from palpate.metrics.kernels import Array
+from palpate.metrics.presets import Plan
+from palpate.metrics.sums import PairSums
+from palpate.metrics.tables import Estimate, Table
+
+RANDOM_NOTE = (
+    "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; give groups for halves of whole videos"
+)
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A score and how it moves.
+
+    Attributes:
+        score: the score.
+        replicates: (G,) the value without each unit.
+        units: (G,) names of the units; empty where classes were left out instead.
+    """
+
+    score: Score
+    replicates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    units: Sequence[str] = ()
+
+
+def scored(
+    metric: str,
+    table: Table,
+    generated: FeatureSet,
+    plan: Plan,
+    settings: Sequence[str],
+    *,
+    found: Estimate | None = None,
+    bound: float = 0.0,
+    details: dict[str, Any],
+    note: str = "",
+    **rest: Any,
+) -> Scored:
+    """A score with everything that the plan and the set fix; NaN becomes None, and an undefined value loses its interval.
+
+    Args:
+        metric: its name.
+        table: for kernel, back end, units.
+        generated: for sizes and digests.
+        plan: for subject, split, level, scale, and the options named in ``settings``.
+        settings: options that bear on this metric.
+        found: its first value is the score's; None for an undefined one.
+        bound: the value is within this of the exact one, rounding aside.
+        details: kept with the score.
+        note: for people.
+        **rest: further fields of the score.
+    """
+    value = plain(found.values[0]) if found else None
+    interval = found.interval(0, plan.level) if found and value is not None else None
+    method = found.method if found and interval else ""
+    if value is None:
+        rest["null"] = None
+        note = note or "Undefined: an average over no pairs"
+    elif interval is None:
+        note = ". ".join(filter(None, [note, "No interval: too few groups or samples to leave one out"]))
+    details = plain(details) | {
+        "unit": table.unit, "backend": table.sums.backend, "bound": plain(bound) if value is not None else None, "version": __version__,
+    }  # fmt: skip
+    score = Score(
+        metric, plan.subject, value, interval, plan.level, method, bandwidth=table.kernel.bandwidth, scale=plan.scale,
+        n=len(generated.ids), encoder=generated.encoder, split=plan.split, details=details, note=note,
+        settings={**table.kernel.settings(), **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)}},
+        **{k: plain(v) for k, v in rest.items()},
+    )  # fmt: skip
+    if found is None or not len(found.units):
+        return Scored(score)
+    return Scored(score, found.replicates[:, 0], [table.names[int(u)] for u in found.units])
+
+
+def plain(value: Any) -> Any:
+    """The same of JSON's types; NaN and infinity become None."""
+    if isinstance(value, dict):
+        return {k: plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(plain(v) for v in value)
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
+    """Refuses features of different encoders.
+
+    Raises:
+        PalpateError: with both digests.
+    """
+    if a.encoder is not None and b.encoder is not None and a.encoder != b.encoder:
+        raise PalpateError(
+            f"Generated and {what} features must come from one encoder",
+            f"digests {a.encoder[:12]} and {b.encoder[:12]}",
+            "Embed both with the same encoder",
+        )
+
+
+def halves_fields(plan: Plan) -> dict[str, Any]:
+    """Estimator and seed of a metric of halves."""
+    return {
+        "estimator": "biased" if plan.estimator == "biased" else "unbiased",
+        "seed": plan.seed if plan.halves == "random" else None,
+    }
+
+
+def halves_note(plan: Plan, sums: PairSums, *, grouped: bool) -> str:
+    """What a reader of a metric of halves must know."""
+    if not sums.rows.any() and not sums.own.any():
+        return "All features are equal: complete collapse, which this metric calls perfect"
+    found = [RANDOM_NOTE] if plan.halves == "random" and plan.estimator != "biased" else []
+    if not grouped:
+        found.append("The interval takes samples as independent; frames of one video are not: give groups")
+    return ". ".join(found)
+
+
+def null_band(centre: float, sd: float) -> Interval | None:
+    """95 % of random halves."""
+    return (centre - 1.96 * sd, centre + 1.96 * sd) if np.isfinite(sd) and np.isfinite(centre) else None
+
+
+def unfit(sums: PairSums, c: int, plan: Plan) -> str:
+    """Why segment c cannot be cut into halves; '' if it can."""
+    own = sums.segment == c
+    sizes = np.bincount(np.unique(sums.unit[own], return_inverse=True)[1], weights=sums.n[own]) if own.any() else np.zeros(0)
+    if sizes.sum() < plan.min_samples:
+        return f"fewer than {plan.min_samples} samples"
+    if plan.halves == "group" and len(sizes) < 2:
+        return "all samples are of one group"
+    if plan.halves == "group" and sizes.max() < 2:
+        return "no group has two samples"
+    return ""
+
+
+def units_of(sums: PairSums, c: int) -> int:
+    """How many units segment c has."""
+    return len(np.unique(sums.unit[sums.segment == c]))

@@ -1,0 +1,250 @@
+"""FID: against the definition by other routes, at every rank; moments in parts; intervals; refusals."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import linalg, stats
+
+from palpate.core import FeatureSet, PalpateError, Score
+from palpate.metrics import frechet
+from palpate.metrics.frechet import Moments, fid, frechet_distance
+
+
+def features(x, groups=None, encoder=None):
+    return FeatureSet([str(i) for i in range(len(x))], x, None, groups, encoder)
+
+
+def definition(x, y):
+    """Gaussians in full, and the root of the product's eigenvalues, which are real and not negative but for rounding."""
+    x, y = x.astype(np.float64), y.astype(np.float64)
+    one, two = np.cov(x.T).reshape(x.shape[1], -1), np.cov(y.T).reshape(y.shape[1], -1)
+    values = linalg.eigvals(one @ two).real
+    roots = np.sqrt(np.where(values > 1e-12 * np.abs(values).max(), values, 0)).sum()
+    return ((x.mean(axis=0) - y.mean(axis=0)) ** 2).sum() + np.trace(one) + np.trace(two) - 2 * roots
+
+
+@settings(max_examples=40, deadline=None)
+@given(n=st.integers(2, 40), m=st.integers(2, 40), d=st.integers(1, 20), seed=st.integers(0, 99), shift=st.sampled_from([0.0, 3.0, 100.0]))
+def test_fid_is_the_definition_at_every_rank(n, m, d, seed, shift):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(n, d)) @ rng.normal(size=(d, d)) + shift, 2 * rng.normal(size=(m, d))
+    score = fid(features(x), features(y), interval=False)
+    scale = shift**2 * d + np.trace(np.atleast_2d(np.cov(x.T))) + np.trace(np.atleast_2d(np.cov(y.T)))
+    assert score.value == pytest.approx(definition(x, y), abs=1e-6 * scale)
+    assert score.value >= 0
+    assert ("Not meaningful" in score.note) == (min(n, m) <= d)
+
+
+def test_one_dimension_and_commuting_covariances_have_closed_forms():
+    assert frechet_distance([1.0], [[4.0]], [3.0], [[9.0]]) == pytest.approx(4 + 1)
+    a, b = np.array([1.0, 4.0, 9.0]), np.array([4.0, 1.0, 0.0])
+    assert frechet_distance(np.zeros(3), np.diag(a), np.ones(3), np.diag(b)) == pytest.approx(3 + ((np.sqrt(a) - np.sqrt(b)) ** 2).sum())
+    assert frechet_distance(np.zeros(2), np.zeros((2, 2)), np.zeros(2), np.eye(2)) == pytest.approx(2)  # a point against a ball
+
+
+def test_singular_covariances_agree_with_the_thin_route_and_are_never_complex():
+    rng = np.random.default_rng(3)
+    x, y = rng.normal(size=(12, 64)), rng.normal(size=(300, 64))
+    y[:, 7] = 0.5  # a dead feature
+    by_matrix = frechet_distance(x.mean(axis=0), np.cov(x.T), y.mean(axis=0), np.cov(y.T))
+    assert by_matrix == pytest.approx(fid(features(x), features(y), interval=False).value, rel=1e-7)
+    assert fid(features(y), features(y), interval=False).value == pytest.approx(0, abs=1e-9)
+
+
+def test_float32_and_a_common_mean_far_away_cost_nothing():
+    rng = np.random.default_rng(4)
+    x, y = rng.normal(size=(400, 6)).astype(np.float32), (1.1 * rng.normal(size=(500, 6))).astype(np.float32)
+    near = fid(features(x), features(y), interval=False).value
+    far = fid(features(x.astype(np.float64) + 1e6), features(y.astype(np.float64) + 1e6), interval=False).value
+    assert near == pytest.approx(definition(x, y), rel=1e-10)
+    assert far == pytest.approx(near, rel=1e-6)
+
+
+def test_normalize_divides_rows_first():
+    rng = np.random.default_rng(5)
+    x, y = rng.normal(size=(60, 5)), 7 * rng.normal(size=(60, 5))
+    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (x, y)]
+    score = fid(features(x), features(y), normalize=True, interval=False)
+    assert score.value == pytest.approx(definition(*unit))
+    assert score.settings["normalize"] is True
+
+
+@settings(max_examples=25, deadline=None)
+@given(sizes=st.lists(st.integers(0, 9), min_size=1, max_size=6), seed=st.integers(0, 99), shift=st.sampled_from([0.0, 1e5]))
+def test_moments_in_any_parts_are_those_of_the_whole_and_parts_can_be_taken_away(sizes, seed, shift):
+    rng = np.random.default_rng(seed)
+    parts = [rng.normal(size=(k, 4)) + shift for k in sizes]
+    streamed, merged = Moments(), Moments()
+    for part in parts:
+        streamed.add(part)
+        merged.merge(pickle.loads(pickle.dumps(Moments.of(part))))
+    x = np.concatenate(parts)
+    for found in (streamed, merged):
+        assert found.n == len(x)
+        if len(x) > 1:
+            np.testing.assert_allclose(found.mean, x.mean(axis=0), rtol=1e-12)
+            np.testing.assert_allclose(found.covariance, np.cov(x.T), rtol=1e-7, atol=1e-9)
+    rest = np.concatenate([*parts[1:], np.empty((0, 4))])
+    left = streamed.without(Moments.of(parts[0]))
+    assert left.n == len(rest)
+    if len(rest) > 1:
+        np.testing.assert_allclose(left.covariance, np.cov(rest.T), rtol=1e-6, atol=1e-8)
+
+
+def test_moments_refuse_other_widths_and_more_than_was_added():
+    whole = Moments.of(np.ones((3, 2)))
+    with pytest.raises(PalpateError, match="same width"):
+        whole.add(np.ones((3, 4)))
+    with pytest.raises(PalpateError, match="same width"):
+        whole.without(Moments.of(np.ones((2, 4))))
+    with pytest.raises(PalpateError, match="at most as many rows"):
+        whole.without(Moments.of(np.ones((4, 2))))
+    with pytest.raises(PalpateError, match="at least 2 rows"):
+        _ = Moments.of(np.ones((1, 2))).covariance
+
+
+@pytest.mark.parametrize("width", [3, 40])
+def test_the_interval_is_the_leave_one_group_out_jackknife_over_both_sets(width):
+    rng = np.random.default_rng(6)
+    x, y = rng.normal(size=(60, width)), 1.5 * rng.normal(size=(48, width))
+    a, b = [f"v{i % 7}" for i in range(60)], [f"v{i % 6}" for i in range(48)]
+    score = fid(features(x, a), features(y, b))
+    names = sorted({*a, *b})
+    out = [definition(x[np.array(a) != g], y[np.array(b) != g]) for g in names]
+    reach = stats.t.ppf(0.975, 6) * np.sqrt(6 / 7 * ((np.array(out) - np.mean(out)) ** 2).sum())
+    assert score.interval == pytest.approx((score.value - reach, score.value + reach), rel=1e-6)
+    assert score.interval_method == "leave-one-group-out jackknife, t, 6 df"
+    assert (score.details["units"], score.details["unit"]) == (7, "group")
+
+
+def test_many_groups_are_left_out_in_blocks_of_whole_groups_of_about_equal_size():
+    rng = np.random.default_rng(7)
+    x = rng.normal(size=(400, 3))
+    groups = [f"v{int(g)}" for g in np.sort(rng.integers(0, 50, 400))]
+    parts = frechet._draw_parts(features(x, groups), features(x, groups), (x, x), 20, 0)
+    assert parts.count == 20
+    assert all(len({int(parts.block[0][i]) for i in range(400) if groups[i] == g}) == 1 for g in set(groups))
+    sizes = np.bincount(parts.block[0])
+    assert len(sizes) == 20
+    assert sizes.max() - sizes.min() <= 10
+    score = fid(features(x, groups), features(1.2 * x[::-1], groups))
+    assert score.interval_method == f"leave-one-block-out jackknife, 20 random blocks of whole groups ({len(set(groups))} groups), t, 19 df"
+    again = fid(features(x, groups), features(1.2 * x[::-1], groups))
+    assert score == again
+    assert Score.from_json(score.to_json()) == score
+
+
+def test_without_groups_the_interval_says_that_rows_are_taken_as_independent():
+    rng = np.random.default_rng(8)
+    one, two = rng.normal(size=(2, 90, 3))
+    for a, b in [(None, None), (["v"] * 90, None)]:
+        score = fid(features(one, a), features(two, b))
+        assert score.interval is not None
+        assert "rows, taken as independent" in score.interval_method
+    small = fid(features(one[:2]), features(two[:2]))
+    assert small.interval is None  # one row is left
+    assert "No interval" in small.note
+
+
+def test_one_group_gives_no_interval():
+    rng = np.random.default_rng(9)
+    one, two = rng.normal(size=(2, 30, 3))
+    score = fid(features(one, ["v"] * 30), features(two, ["v"] * 30))
+    assert score.interval is None
+    assert score.interval_method == ""
+    assert "No interval" in score.note
+
+
+def test_infinity_takes_the_bias_away():
+    rng = np.random.default_rng(10)
+    d, n = 24, 600
+    raw, limit = [], []
+    for _ in range(12):
+        score = fid(features(rng.normal(size=(n, d))), features(rng.normal(size=(n, d))))
+        raw.append(score.value)
+        limit.append(score.details["infinity"])
+    assert np.mean(raw) > 0.3  # truth is 0
+    assert abs(np.mean(limit)) < 0.05 * np.mean(raw)
+    assert "extrapolates to" in score.note
+    assert fid(features(rng.normal(size=(2 * d, d))), features(rng.normal(size=(n, d)))).details["infinity"] is None
+
+
+@pytest.mark.slow
+def test_the_interval_covers_what_is_expected_at_this_size():
+    """Groups deviate as a whole: intervals over groups hold the mean over replicates, intervals over rows do not."""
+    rng = np.random.default_rng(11)
+    by_group, by_row, values = [], [], []
+    for _ in range(300):
+        sets = [
+            (s * (rng.normal(size=(30, 1, 3)) + 0.7 * rng.normal(size=(30, 10, 3))) + mu).reshape(-1, 3) for s, mu in ((1, 0.0), (1.3, 1.0))
+        ]
+        names = [[f"{s}{i // 10}" for i in range(300)] for s in "ab"]
+        score = fid(features(sets[0], names[0]), features(sets[1], names[1]))
+        values.append(score.value)
+        by_group.append(score.interval)
+        by_row.append(fid(features(sets[0]), features(sets[1])).interval)
+    cover = [np.mean([low <= np.mean(values) <= high for low, high in found]) for found in (by_group, by_row)]
+    assert 0.90 <= cover[0] <= 0.99
+    assert cover[1] < 0.7
+
+
+def test_bad_input_is_refused_by_name():
+    rng = np.random.default_rng(12)
+    good = rng.normal(size=(9, 4))
+    for bad, match in [
+        (good[:1], "at least 2 rows"),
+        (good[:0], "at least 2 rows"),
+        (good[:, :3], "same width"),
+        ((good * 10).astype(np.int64), "floating-point"),
+    ]:
+        with pytest.raises(PalpateError, match=match):
+            fid(features(good), features(bad))
+    broken = good.copy()
+    broken[5, 2] = np.nan
+    with pytest.raises(PalpateError, match=r"1 row \(5\)"):
+        Moments.of(broken)
+    with pytest.raises(PalpateError, match="first '5'"):
+        fid(features(good), features(broken))
+    zero = good.copy()
+    zero[2] = 0
+    with pytest.raises(PalpateError, match=r"zeros in 1 row \(2\)"):
+        fid(features(zero), features(good), normalize=True)
+    with pytest.raises(PalpateError, match="one encoder"):
+        fid(features(good, encoder="a" * 64), features(good, encoder="b" * 64))
+    with pytest.raises(PalpateError, match="blocks must be at least 2"):
+        fid(features(good), features(good), blocks=1)
+    with pytest.raises(PalpateError, match="known for every row"):
+        fid(features(good, ["v", *[None] * 8]), features(good, ["v"] * 9))
+    with pytest.raises(PalpateError, match="symmetric"):
+        frechet_distance(np.zeros(2), np.array([[1.0, 0.5], [0.0, 1.0]]), np.zeros(2), np.eye(2))
+    with pytest.raises(PalpateError, match=r"finite matrix \(2, 2\)"):
+        frechet_distance(np.zeros(2), np.eye(3), np.zeros(2), np.eye(2))
+    with pytest.raises(PalpateError, match="finite vector"):
+        frechet_distance([np.nan, 0.0], np.eye(2), np.zeros(2), np.eye(2))
+
+
+def test_half_precision_is_widened_and_said_and_copies_are_named():
+    rng = np.random.default_rng(13)
+    x, y = rng.normal(size=(2, 50, 4)).astype(np.float16)
+    with pytest.warns(UserWarning, match="float16 features were widened"):
+        score = fid(features(x), features(y), interval=False)
+    assert score.value == pytest.approx(definition(x, y), rel=1e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        strided = fid(features(np.asfortranarray(x.astype(np.float32))[::2]), features(y.astype(np.float32)[::-1]), interval=False)
+    assert strided.value == pytest.approx(definition(x[::2], y), rel=1e-6)
+    both = np.concatenate([y[:3], x]).astype(np.float32)
+    assert "3 of 53 generated rows equal a real row" in fid(features(both), features(y.astype(np.float32)), interval=False).note
+
+
+def test_moments_take_torch_tensors():
+    torch = pytest.importorskip("torch")
+    x = np.random.default_rng(14).normal(size=(40, 4)).astype(np.float32)
+    np.testing.assert_array_equal(Moments.of(torch.tensor(x, requires_grad=True)).scatter, Moments.of(x).scatter)
+    np.testing.assert_allclose(Moments.of(torch.tensor(x).bfloat16()).mean, x.mean(axis=0), atol=0.01)
+    with pytest.raises(PalpateError, match="floating-point"):
+        Moments.of(torch.ones(3, 2, dtype=torch.int64))

@@ -1,0 +1,181 @@
+"""Permutations of whole videos, paired differences, and copies of reference rows."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from palpate.core import PalpateError
+from palpate.metrics import compare, four_scores, mmd2, tmmd
+from palpate.metrics.blocked import blocked_sums
+from palpate.metrics.kernels import Gaussian
+from palpate.metrics.paired import holm
+from palpate.metrics.permutation import permutation_test
+from test_metrics_mmd import loop_mmd, unit_rows
+from test_metrics_tactile import change, keep, world
+
+ESTIMATORS = ["unbiased", "biased", "grouped"]
+
+
+def relabelled(x, label, unit, estimator):
+    names = unit.astype(str)
+    return loop_mmd(x[~label], x[label], estimator, list(names[~label]), list(names[label]))
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("shared", [True, False])
+def test_relabelling_items_is_relabelling_samples(estimator, shared):
+    """Every value of the test is that of the loop on samples of some relabelling of whole units, and all relabellings occur."""
+    frames = np.repeat(np.arange(4), [3, 2, 2, 4])
+    unit = np.r_[frames, frames] if shared else np.r_[frames, frames + 4][:16]
+    label = np.r_[np.zeros(11, bool), np.ones(11, bool)][: len(unit)]
+    x = unit_rows(3, len(unit), 4)
+    sums = blocked_sums(x, label.astype(int), unit, segments=2, kernel=Gaussian()).sums
+    found = permutation_test(sums, estimator, 1000.0, count=400, seed=1)
+    allowed = set()
+    units = np.unique(unit)
+    if shared:
+        assert (found.swapped, found.dealt) == (4, 0)
+        for flips in itertools.product([False, True], repeat=4):
+            allowed.add(round(relabelled(x, label ^ np.array(flips)[unit], unit, estimator), 7))
+    else:
+        assert (found.swapped, found.dealt) == (0, len(units))
+        second = len(np.unique(unit[label]))
+        for chosen in itertools.combinations(units, second):
+            allowed.add(round(relabelled(x, np.isin(unit, chosen), unit, estimator), 7))
+    seen = {round(v, 7) for v in found.null}
+    defined = {v for v in allowed if np.isfinite(v)}
+    assert seen == defined or (seen <= defined and len(seen) > 0.8 * len(defined))
+    observed = relabelled(x, label, unit, estimator)
+    assert found.p == pytest.approx((1 + sum(v >= observed - 1e-9 for v in found.null)) / (1 + len(found.null)))
+
+
+def test_the_test_sees_a_shift_and_keeps_quiet_without_one(monkeypatch):
+    g, r = world(0, classes=1, videos=12, frames=3, draw=1), world(0, classes=1, videos=12, frames=3)
+    quiet = tmmd(g, r)
+    moved = g.features + 0.2
+    loud = tmmd(change(g, features=moved / np.linalg.norm(moved, axis=1, keepdims=True)), r)
+    assert quiet.details["p_value"] > 0.05
+    assert loud.details["p_value"] == pytest.approx(1 / 1000)
+    assert loud.details["permutations"] == {"count": 999, "swapped": 12, "dealt": 0, "seed": 0}
+    assert quiet.null[0] < quiet.value < quiet.null[1] < loud.value
+    assert tmmd(g, r, permutations=0).details["p_value"] is None
+    assert tmmd(g, r, permutations=0).null is None
+    assert tmmd(g, r, seed=1).details["p_value"] != quiet.details["p_value"]
+    monkeypatch.setattr("palpate.metrics.blocked.MOST_ITEMS", 20)
+    assert tmmd(g, r).details["p_value"] is None  # sums of items with items were not kept
+
+
+def test_nothing_to_exchange_is_no_test():
+    s = world(0, classes=1, videos=3, frames=2)
+    one = blocked_sums(s.features, np.zeros(6, int), np.arange(6) // 2, segments=2, kernel=Gaussian()).sums
+    assert permutation_test(one, "unbiased", 1.0) is None
+
+
+def shifted(s, by):
+    x = s.features.copy()
+    x[:, 0] += by
+    return change(s, features=x / np.linalg.norm(x, axis=1, keepdims=True))
+
+
+@pytest.fixture(scope="module")
+def three():
+    r = world(0, classes=3, videos=5, frames=4)
+    near = world(0, classes=3, videos=5, frames=4, draw=1)
+    return r, {"near": near, "far": shifted(world(0, classes=3, videos=5, frames=4, draw=2), 0.3), "mid": shifted(near, 0.1)}
+
+
+def test_differences_are_the_jackknife_of_the_difference(three):
+    r, generators = three
+    found = compare(generators, r, floor=r)
+    assert [s.subject for s in found.scores[::4]] == ["near", "far", "mid"]
+    for name, of in generators.items():
+        single = four_scores(of, r, floor=r, subject=name)
+        assert [s for s in found.scores if s.subject == name] == single
+    assert len(found.differences) == 12
+    groups = sorted(set(r.groups))
+    for d in found.differences:
+        a, b = generators[d.details["a"]], generators[d.details["b"]]
+        metric = d.metric.removesuffix(" difference")
+        value = lambda s, ref: {x.metric: x.value for x in four_scores(s, ref, permutations=0)}[metric]  # noqa: B023, E731
+        assert d.value == pytest.approx(value(a, r) - value(b, r), abs=1e-12)
+        if metric == "TMMD":
+            out = [[keep(s, np.array(s.groups) != g) for s in (a, b, r)] for g in groups]
+            gaps = np.array([value(x, z) - value(y, z) for x, y, z in out])
+            error = np.sqrt((len(gaps) - 1) / len(gaps) * ((gaps - gaps.mean()) ** 2).sum())
+            reach = stats.t.ppf(0.975, len(gaps) - 1) * error
+            assert d.interval == pytest.approx((d.value - reach, d.value + reach), abs=1e-9)
+            assert d.details["p_better"] == pytest.approx(stats.t.cdf(-d.value / error, len(gaps) - 1), abs=1e-9)
+            assert d.interval_method == "paired leave-one-group-out jackknife, t, 14 df"
+    first = found.differences[0]
+    assert (first.subject, first.details["better"]) == ("near - far", "near")
+    assert first.details["p_better"] > 0.99
+    width = lambda s: s.interval[1] - s.interval[0]  # noqa: E731
+    ci = [s for s in found.scores if s.metric == "CI-TMMD"]
+    paired = next(d for d in found.differences if d.metric.startswith("CI") and d.subject == "near - mid")
+    assert width(paired) < 0.5 * min(width(s) for s in ci)  # what the videos have in common is gone
+
+
+def test_order_of_ids_does_not_matter_and_other_samples_are_refused(three):
+    r, generators = three
+    near, far = generators["near"], generators["far"]
+    turned = far.take(list(far.ids)[::-1])
+    assert compare({"a": near, "b": turned}, r).differences[0].value == pytest.approx(
+        compare({"a": near, "b": far}, r).differences[0].value
+    )
+    with pytest.raises(PalpateError, match="1 missing and 0 surplus ids, first 'c0v0/000'"):
+        compare({"a": near, "b": far.take(list(far.ids)[1:])}, r)
+    with pytest.raises(PalpateError, match="same groups"):
+        compare({"a": near, "b": change(far, groups=list(far.groups)[::-1])}, r)
+    with pytest.raises(PalpateError, match="same labels"):
+        compare({"a": near, "b": change(far, labels=None)}, r)
+    with pytest.raises(PalpateError, match="one encoder"):
+        compare({"a": near, "b": change(far, encoder="f" * 64)}, r)
+    with pytest.raises(PalpateError, match="There must be a generator"):
+        compare({}, r)
+    assert compare({"a": near}, r).differences == []
+
+
+def test_undefined_scores_have_no_difference(three):
+    r, generators = three
+    no_labels = {name: change(s, labels=None) for name, s in generators.items()}
+    found = {d.metric: d for d in compare(no_labels, r).differences}
+    assert found["D-TMMD difference"].value is None
+    assert "Undefined" in found["D-TMMD difference"].note
+    same = compare({"a": generators["near"], "b": generators["near"]}, r).differences[0]
+    assert (same.value, same.interval, same.details["better"]) == (0, None, None)
+
+
+def test_holm_by_hand(three):
+    r, generators = three
+    found = compare(generators, r).differences[:3]
+    p = [d.details["p_value"] for d in found]
+    order = np.argsort(p)
+    by_hand = np.maximum.accumulate(np.minimum(1, np.array(p)[order] * [3, 2, 1]))
+    np.testing.assert_allclose(np.array([d.details["p_adjusted"] for d in holm(found)])[order], by_hand)
+
+
+def test_copies_of_reference_rows_are_told():
+    r = world(0, classes=2, videos=3, frames=3)
+    x = world(0, classes=2, videos=3, frames=3, draw=1)
+    features = x.features.copy()
+    features[[2, 5]] = r.features[[7, 7]]
+    score = tmmd(change(x, features=features), r)
+    assert score.details["copies"] == 2
+    assert "2 of 18 generated rows are bit for bit rows of the reference" in score.note
+    assert tmmd(x, r).details["copies"] == 0
+    assert "copy" not in tmmd(x, r).note
+
+
+def test_one_bandwidth_for_all_generators(three):
+    r, generators = three
+    found = compare(generators, r, floor=r, sigma="median", permutations=0)
+    assert len({s.bandwidth for s in found.scores}) == 1
+    near = generators["near"]
+    assert found.scores[0].value == pytest.approx(
+        mmd2(near.features, r.features, sigma="median", estimator="grouped", groups_x=near.groups, groups_y=r.groups)
+    )
+    several = compare(generators, r, sigma="multi", permutations=0).scores[0]
+    assert several.bandwidth is None
+    assert len(several.settings["sigmas"]) == 5

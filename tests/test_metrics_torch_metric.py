@@ -1,0 +1,282 @@
+"""The streaming metrics as torchmetrics.Metric: two gloo processes, collections, forward, copies, devices, state dicts."""
+
+import copy
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+torchmetrics = pytest.importorskip("torchmetrics")
+
+from palpate.core import PalpateError  # noqa: E402
+from palpate.metrics import four_scores, streaming, tmmd, torch_metric  # noqa: E402
+from test_metrics_streaming import CLASSES, MODES, both, close, feed, sets  # noqa: E402
+
+NAMES = ("TMMD", "ITMMD", "CITMMD", "DTMMD")
+
+
+def made(name, mode="features", of=torch_metric, **options):
+    return getattr(of, name)(**MODES[mode], **options)
+
+
+def plain_score(name, mode, g, r, **options):
+    return both(made(name, mode, streaming), g, r, **options).compute()
+
+
+def same(tensor, score):
+    return tensor.item() == pytest.approx(score.value, abs=1e-9)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_true_metric_with_the_same_score(name, mode):
+    g, r = sets()
+    metric = both(made(name, mode), g, r)
+    want = plain_score(name, mode, g, r)
+    assert isinstance(metric, torchmetrics.Metric)
+    assert (metric.higher_is_better, metric.is_differentiable, metric.full_state_update) == (False, False, False)
+    value = metric.compute()
+    assert (value.dtype, value.ndim) == (torch.float64, 0)
+    assert same(value, want)
+    assert close(metric.score().to_json(), want.to_json())
+    before = metric.update_count
+    metric.update(np.zeros((0, 6)))
+    assert metric.update_count == before + 1
+    assert same(metric.compute(), want)
+
+
+def rank(number, where, out, mode):
+    """One of two processes; the second gets a quarter of the rows, and no real ones."""
+    torch.distributed.init_process_group("gloo", init_method=f"file://{where}", rank=number, world_size=2)
+    g, r = sets()
+    cut = 3 * len(g.ids) // 4
+    found = {}
+    for name in NAMES:
+        metric = made(name, mode)
+        feed(metric, g, order=np.arange(cut) if number == 0 else np.arange(cut, len(g.ids)), step=5 + number)
+        if number == 0:
+            feed(metric, r, real=True)
+        synced = metric.compute().item(), metric.score().to_json()
+        rows = metric.plain.score_of(metric._state()).n if number == 0 else None  # unsynchronised again
+        metric.update(g.features[:0])
+        found[name] = (*synced, rows, metric.compute().item())
+    alone = made("ITMMD", mode)  # one process has seen nothing
+    if number == 0:
+        feed(alone, g)
+    collection = torchmetrics.MetricCollection([made(name, mode) for name in NAMES])
+    part = np.arange(number, len(g.ids), 2)
+    both(collection, g, r, order=part, step=8)
+    together = {k: v.item() for k, v in collection.compute().items()}
+    again = both(collection, g, r, order=part[:0]).compute()
+    found["alone"], found["collection"], found["again"] = alone.compute().item(), together, {k: v.item() for k, v in again.items()}
+    with open(f"{out}.{number}", "wb") as file:
+        pickle.dump(found, file)
+    torch.distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+def test_two_gloo_processes_give_what_one_gives(tmp_path, mode):
+    torch.multiprocessing.spawn(rank, (str(tmp_path / "meet"), str(tmp_path / "out"), mode), nprocs=2)
+    found = [pickle.loads((tmp_path / f"out.{k}").read_bytes()) for k in range(2)]
+    g, r = sets()
+    for name in NAMES:
+        want = plain_score(name, mode, g, r)
+        for one in found:
+            value, score, _, later = one[name]
+            assert value == pytest.approx(want.value, abs=1e-9)
+            assert later == value
+            assert close(score, want.to_json())
+            assert one["collection"][name] == pytest.approx(want.value, abs=1e-9)
+            assert one["again"] == one["collection"]
+        assert found[0][name][2] == 3 * len(g.ids) // 4
+    alone = feed(made("ITMMD", mode, streaming), g).compute()
+    assert [one["alone"] for one in found] == pytest.approx([alone.value] * 2, abs=1e-9)
+
+
+def other_settings(number, where, out):
+    torch.distributed.init_process_group("gloo", init_method=f"file://{where}", rank=number, world_size=2)
+    metric = feed(torch_metric.ITMMD(keep="sums", centre=np.zeros(6), sigma=10.0 + number), sets()[0])
+    try:
+        metric.compute()
+        said = ""
+    except PalpateError as error:
+        said = str(error)
+    with open(f"{out}.{number}", "w") as file:
+        file.write(said)
+    torch.distributed.destroy_process_group()
+
+
+@pytest.mark.slow
+def test_processes_of_different_settings_are_refused(tmp_path):
+    torch.multiprocessing.spawn(other_settings, (str(tmp_path / "meet"), str(tmp_path / "out")), nprocs=2)
+    assert any("same settings" in (tmp_path / f"out.{k}").read_text() for k in range(2))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_collections_share_what_they_hold(mode):
+    g, r = sets()
+    collection = torchmetrics.MetricCollection([made(name, mode) for name in NAMES])
+    both(collection, g, r)
+    groups = sorted(map(sorted, collection.compute_groups.values()))
+    assert groups == ([sorted(NAMES)] if mode == "features" else [["CITMMD", "DTMMD"], ["ITMMD"], ["TMMD"]])
+    if mode == "features":
+        lists = [m.records for m in collection.values(copy_state=False)]
+        assert all(x is lists[0] for x in lists)
+    for name, value in collection.compute().items():
+        assert same(value, plain_score(name, mode, g, r))
+    collection.reset()
+    both(collection, r, g)
+    for name, value in collection.compute().items():
+        assert same(value, plain_score(name, mode, r, g))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_collection_may_be_called_and_may_keep_real_touches(mode):
+    g, r = sets()
+    collection = torchmetrics.MetricCollection([made(name, mode, reset_real_features=False) for name in NAMES])
+    feed(collection, r, real=True)
+    for _ in range(2):
+        for k in range(0, len(g.ids), 30):
+            at = slice(k, k + 30)
+            values = collection(g.features[at], ids=g.ids[at], labels=g.labels[at], groups=g.groups[at])
+            assert set(values) == set(NAMES)
+        for name, value in collection.compute().items():
+            assert same(value, plain_score(name, mode, g, r))
+        collection.reset()
+
+
+def test_metrics_of_different_settings_are_not_one_group():
+    g, r = sets()
+    options = {"centre": np.full(6, 0.4), "keep": "sums"}
+    collection = torchmetrics.MetricCollection(
+        {"a": torch_metric.CITMMD(classes=CLASSES, **options), "b": torch_metric.CITMMD(classes=CLASSES[::-1], **options)}
+    )
+    feed(collection, g)
+    assert len(collection.compute_groups) == 2
+    kept = torchmetrics.MetricCollection({"a": torch_metric.TMMD(reset_real_features=False), "b": torch_metric.ITMMD()})
+    both(kept, g, r)
+    kept.reset()
+    feed(kept, g)
+    assert same(kept["a"].compute(), tmmd(g, r))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_forward_gives_the_batch_and_adds_it_once(mode):
+    g, r = sets()
+    metric = made("TMMD", mode, reset_real_features=False)
+    assert metric(r.features, real=True, groups=r.groups, ids=r.ids).isnan()
+    half = np.arange(40)
+    columns = lambda at: {"ids": [g.ids[k] for k in at], "groups": [g.groups[k] for k in at]}  # noqa: E731
+    first = metric(g.features[half], **columns(half))
+    want = both(made("TMMD", mode, streaming), g, r, order=half).compute()
+    alone = made("TMMD", mode, streaming)
+    feed(feed(alone, g, order=half), r, real=True)
+    assert same(first, alone.compute())
+    assert not same(first, want)  # fewer real ones
+    rest = np.arange(40, len(g.ids))
+    metric(g.features[rest], **columns(rest))
+    assert same(metric.compute(), plain_score("TMMD", mode, g, r))
+    metric.reset()
+    assert metric(r.features[:0]).isnan()
+    metric(features=g.features, **columns(range(len(g.ids))))
+    assert same(metric.compute(), plain_score("TMMD", mode, g, r))
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", NAMES)
+def test_copies_pickles_and_merges(name, mode):
+    g, r = sets()
+    want = plain_score(name, mode, g, r)
+    first, second = np.arange(0, 40), np.arange(40, len(g.ids))
+    a, b = both(made(name, mode), g, r, order=first), both(made(name, mode), g, r, order=second)
+    a.compute()
+    for other in (copy.deepcopy(a), a.clone(), pickle.loads(pickle.dumps(a))):
+        both(other, g, r, order=second)
+        assert same(other.compute(), want)
+        assert other.score().n == want.n
+    assert a.score().n == 40
+    assert same(a.merge(b).compute(), want)
+    a.merge_state(b)
+    assert same(a.compute(), want)
+    c = made(name, mode)
+    for m in (b, both(made(name, mode), g, r, order=first)):
+        c.merge_state(m.metric_state)
+    assert same(c.compute(), want)
+    with pytest.raises(PalpateError, match="same settings"):
+        a.merge_state(made(name, mode, normalize=False))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_state_dicts(mode):
+    g, r = sets()
+    metric = both(made("CITMMD", mode), g, r)
+    assert not metric.state_dict()
+    metric.persistent(True)
+    fresh = made("CITMMD", mode)
+    fresh.persistent(True)
+    fresh.load_state_dict(metric.state_dict())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torchmetrics: compute before update
+        assert same(fresh.compute(), plain_score("CITMMD", mode, g, r))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_neither_device_nor_type_harms(mode):
+    g, r = sets()
+    for move in (lambda m: m.to("cpu"), lambda m: m.half(), lambda m: m.to(torch.float16), lambda m: m.set_dtype(torch.float16)):
+        metric = move(both(made("DTMMD", mode), g, r, order=np.arange(40)))
+        both(metric, g, r, order=np.arange(40, len(g.ids)))
+        assert same(metric.compute(), plain_score("DTMMD", mode, g, r))
+    moved = both(made("DTMMD", mode), g, r).to("meta")
+    assert moved.settings.device.type == "meta"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sums_that_numpy_cannot_reach(name, monkeypatch):
+    g, r = sets()
+    monkeypatch.setattr(torch_metric, "on_host", lambda tensor: False)
+    metric = both(made(name, "sums"), g, r)
+    want = plain_score(name, "sums", g, r)
+    assert close(metric.score().to_json(), want.to_json())
+    if name != "TMMD":
+        with pytest.raises(PalpateError, match="Give groups"):
+            metric.update(g.features[:2], ids=g.ids[:2], labels=g.labels[:2])
+    assert close(metric.score().to_json(), want.to_json())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("mode", MODES)
+def test_on_a_gpu(mode):
+    g, r = sets()
+    want = [both(made(name, mode, streaming), g, r).compute().value for name in NAMES]
+    collection = torchmetrics.MetricCollection([made(name, mode) for name in NAMES]).to("cuda")
+    for s, real in ((g, False), (r, True)):
+        for k in range(0, len(s.ids), 7):
+            at = slice(k, k + 7)
+            x = torch.tensor(s.features[at], device="cuda")
+            collection.update(x, real=real, ids=s.ids[at], labels=s.labels[at], groups=s.groups[at])
+    found = collection.compute()
+    assert all(v.device.type == "cuda" for v in found.values())
+    assert [found[name].item() for name in NAMES] == pytest.approx(want, abs=1e-9)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_refusals(mode):
+    with pytest.raises(PalpateError, match="must have seen"), pytest.warns(UserWarning, match="before the ``update``"):
+        made("TMMD", mode).compute()
+    with pytest.raises(PalpateError, match="centre"):
+        torch_metric.TMMD(keep="sums")
+    with pytest.raises(TypeError):
+        torch_metric.TMMD(nonsense=1)
+    metric = torch_metric.TMMD(sync_on_compute=False, compute_with_cache=False)
+    assert not metric.sync_on_compute
+    g, r = sets()
+    both(metric, g, r)
+    bad = g.features[:4].copy()
+    bad[2] = np.inf
+    with pytest.raises(PalpateError, match=r"1 row \(2\)"):
+        metric.update(bad, ids=g.ids[:4], labels=g.labels[:4], groups=g.groups[:4])
+    assert close(metric.score().to_json(), four_scores(g, r)[0].to_json() | {"encoder": None})
