@@ -32,7 +32,7 @@ VERBS: dict[str, Verb] = {
     "encoder": Verb("encoder", "Train the touch tower against frozen vision and text towers", "palpate encoder tag/ --split noleak.json -o towers/"),
     "train": Verb("train", "Train a generator of tactile images", "palpate train tag/ --split noleak.json --towers towers/ -o model/"),
     "generate": Verb("generate", "Make tactile images for photos", "palpate generate photo.jpg -o touch.png"),
-    "score": Verb("score", "Score generated tactile images", "palpate score tag/ --generated out/ --split noleak.json --towers towers/"),
+    "score": Verb("score", "Score generated tactile images", "palpate score --generated out/ --reference real/ --encoder palpate/mini"),
     "report": Verb("report", "Write the page: audit, gallery, scores, settings", "palpate report audit.json scores.json -o page.html"),
     "demo": Verb("demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"),
 }  # fmt: skip

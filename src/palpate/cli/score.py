@@ -1,97 +1,165 @@
-"""``palpate score``: how good are these tactile images?"""
+"""``palpate score``: how good are these tactile images, or their embeddings?"""
 
 from __future__ import annotations
 
+import math
+import warnings
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, Terminal, guard_output, require_extra
-from palpate.core import Results, Score
+from palpate.cli.terminal import Common, Terminal, guard_output
+from palpate.core import PalpateError
+
+Companion = Literal["fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Score generated tactile images on the test part of a split: TMMD family, SSIM, PSNR, material accuracy, with intervals."""
+    """Score tactile images, or embeddings, against real touches, or on the test part of a split beside controls; several generators side by side."""
 
-    manifest: Annotated[Path, tyro.conf.Positional]
-    """Manifest file or the folder of an import, with the real touches."""
+    manifest: Annotated[Path | None, tyro.conf.Positional] = None
+    """Manifest file or the folder of an import, with the real touches; needs --split."""
     generated: tuple[Path, ...]
-    """Folders of `palpate generate`; several are scored side by side under their folder names."""
-    split: Path
-    """Split file; its test part is scored."""
-    towers: str
-    """Folder of `palpate encoder`, a hub id, or palpate/mini; the touch tower gives the features."""
+    """What to score, one entry a generator: folders of images or of `palpate generate`, manifests, or embeddings (.npy, .npz, .safetensors, .parquet)."""
+    reference: Path | None = None
+    """The real touches, instead of a manifest and a split: of the same kinds. Ids are relative file names."""
+    encoder: Annotated[str | None, tyro.conf.arg(aliases=["--towers"])] = None
+    """Folder of `palpate encoder`, a hub id, or palpate/mini; the touch tower gives the features. Embeddings need none."""
+    split: Path | None = None
+    """Split file; its test part is scored. With --reference, its train part gives the floor of TMMD."""
+    names: tuple[str, ...] = ()
+    """Names of the generators in the tables, instead of those of their folders and files."""
+    labels: Path | None = None
+    """CSV or Parquet file with the columns id, material, video, for inputs that lack them."""
+    groups: Path | None = None
+    """The same, for groups alone: where labels and groups lie in two files."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
-    presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ("grouped", "paper")
-    """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole videos together."""
+    latex: Path | None = None
+    """Write the tables as LaTeX (booktabs)."""
+    presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ()
+    """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole videos together. Default: both, or `paper` without groups."""
+    sigma: tuple[str, ...] = ("10",)
+    """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it)."""
+    estimator: Literal["unbiased", "biased", "grouped"] | None = None
+    """Instead of the presets' own."""
+    backend: Literal["auto", "blocked", "moments"] = "auto"
+    """How kernel sums are made; `auto` is right."""
+    normalize: Literal["check", "yes", "no"] = "check"
+    """Embeddings that are not of unit length: refuse, divide by the norm, or take as they are."""
+    permutations: int = 999
+    """Relabellings of the permutation test of TMMD; 0 for none."""
+    companions: tuple[Companion, ...] | None = None
+    """Scores beside the TMMD family. Default: all that need no further weights and whose inputs are there; `none` for none."""
+    inception: Path | None = None
+    """TorchScript file of Inception: FID and KID are then of its features, as published."""
+    clip: str | None = None
+    """Folder or hub id of a CLIP: CMMD is then of its features, as published."""
+    lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
+    """The two files of LPIPS: AlexNet's weights and the heads."""
     group: Literal["auto", "video", "touch", "object"] = "auto"
-    """What stays together in halves and intervals; `auto` takes what the split kept whole."""
+    """What stays together in halves and intervals; `auto` takes what the split kept whole, else the video."""
     controls: Annotated[bool, tyro.conf.FlagConversionOff] = True
-    """Score the empty gel and real touches of the same material as well (True or False)."""
+    """With MANIFEST and --split: score the empty gel and real touches of the same material as well (True or False)."""
     seed: int = 0
-    """Of random halves and of the control touches."""
+    """Of random halves, permutations and the control touches."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
-    """Scores, prints one line a score, writes the JSON."""
-    require_extra("palpate score")
-    from palpate.core import PalpateError, Split
-    from palpate.data.manifest import Manifest
-    from palpate.encoders.towers import Towers
-    from palpate.generate import Generated
-    from palpate.protocol.scoring import score_generated
-    from palpate.protocol.summary import gallery
+    """Scores, prints the tables, writes JSON and LaTeX."""
+    from palpate.cli import scoring_runs
+    from palpate.cli.scoring_tables import show
 
-    if not options.presets:
-        raise PalpateError("--presets must name at least one preset", "none", "E.g. --presets grouped paper")
-    split = Split.load(options.split)
-    group = str(split.rule.get("group", "video")) if options.group == "auto" else options.group
-    names = [p.name if p.name != "touches" else p.resolve().parent.name for p in options.generated]
-    if len(set(names)) < len(names):
-        raise PalpateError("Folders of generated touches must differ in name", ", ".join(names), "Rename one: the name stands in the table")
-    folders = {name: Generated.load(path) for name, path in zip(names, options.generated, strict=True)}
+    _check(options)
+    inputs = [p for p in (options.manifest, options.reference, options.split, options.labels, options.groups, *options.generated) if p]
     if options.output:
-        guard_output(options.output, [options.manifest, options.split])
-    manifest, towers = Manifest.load(options.manifest), Towers.load(options.towers)
-    with terminal.progress() as progress:
-        scores = score_generated(
-            manifest, split, folders, towers, group=group, presets=options.presets,
-            controls=options.controls, seed=options.seed, progress=progress,
-        )  # fmt: skip
-    digests = {"manifest": manifest.digest, "split": split.digest, "touch tower": towers.digest("touch")}
-    results = Results(
-        title=f"Scores of {', '.join(names)}", scores=scores, gallery=gallery(manifest, folders[names[0]], options.seed),
-        settings={"digests": digests, "split rule": dict(split.rule), "generated": {name: dict(f.settings) for name, f in folders.items()}},
-        commands=[terminal.command],
-    )  # fmt: skip
+        guard_output(options.output, inputs)
+    if options.latex:
+        guard_output(options.latex, inputs, (b"% palpate",))
+    with _told(terminal), terminal.progress() as progress:
+        results = scoring_runs.score(options, terminal, progress)
     if options.output:
         results.save(options.output)
-    show(scores, terminal)
+    if options.latex:
+        from palpate.core import write_text
+        from palpate.report.latex import latex_tables
+
+        write_text(options.latex, latex_tables(results))
+    show(results, terminal)
     return results.to_json()
 
 
-def show(scores: list[Score], terminal: Terminal) -> None:
-    """A table in the terminal, one row a score."""
-    from rich.table import Table
+def sigmas(options: Options) -> tuple[float | str, ...]:
+    """The bandwidths as numbers and words.
 
-    table = Table("metric", "preset", "subject", "value", "95 % interval", "floor", "n", box=None, pad_edge=False)
-    for s in scores:
-        value = "undefined" if s.value is None else f"{s.value:.4g}"
-        around = f"[{s.interval[0]:.4g}, {s.interval[1]:.4g}]" if s.interval else "-"
-        floor = f"{s.floor:.4g}" if s.floor is not None else "-"
-        table.add_row(
-            f"{s.metric} {'↑' if s.higher_is_better else '↓'}",
-            s.settings.get("preset", ""),
-            s.subject,
-            value,
-            around.replace("[", "\\["),
-            floor,
-            str(s.n),
+    Raises:
+        PalpateError: for another word, or a number that is not positive.
+    """
+    found: list[float | str] = []
+    for text in options.sigma:
+        if text in ("median", "multi"):
+            found.append(text)
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not 0 < value < math.inf:
+            raise PalpateError("--sigma must be positive numbers, median or multi", repr(text), "E.g. --sigma 10 median")
+        found.append(value)
+    return tuple(dict.fromkeys(found))
+
+
+def _check(options: Options) -> None:
+    """Refuses options that do not go together, before anything is read."""
+    if not options.generated:
+        raise PalpateError(
+            "There must be something to score", "no --generated", "E.g. --generated out/ --reference real/ --encoder palpate/mini"
         )
-    terminal.out.print(table)
-    for note in dict.fromkeys(f"{s.metric}, {s.subject}: {s.note}" for s in scores if s.note and s.value is None):
-        terminal.say(note)
+    if (options.manifest is None) == (options.reference is None):
+        got = "neither" if options.manifest is None else "both"
+        fix = "Pass --reference R, or MANIFEST with --split and --towers"
+        raise PalpateError("The real touches must be given once: as --reference, or as a manifest", got, fix)
+    if options.manifest is not None and (options.split is None or options.encoder is None):
+        lacking = " and ".join(name for name, v in (("--split", options.split), ("--towers", options.encoder)) if v is None)
+        raise PalpateError("Scoring a manifest must have a split and towers", f"no {lacking}", "Or pass the real touches as --reference")
+    if options.names and len(options.names) != len(options.generated):
+        got = f"{len(options.names)} names for {len(options.generated)}"
+        raise PalpateError("--names must name every generator", got, "One name for each entry of --generated")
+    if options.permutations < 0:
+        raise PalpateError("--permutations must not be negative", str(options.permutations), "0 makes none")
+    if not options.sigma:
+        raise PalpateError("--sigma must name at least one bandwidth", "none", "E.g. --sigma 10 median")
+    sigmas(options)
+
+
+@contextmanager
+def _told(terminal: Terminal) -> Generator[None]:
+    """Warnings of the metrics as remarks, and their advice in this command's words."""
+    flags = {
+        "normalize=True": "Pass --normalize yes to divide by the norm, or --normalize no to keep it",
+        'preset="paper"': "Pass --groups FILE, or --presets paper",
+        'estimator="unbiased"': "Pass --estimator unbiased, or more groups",
+        'backend="blocked"': "Pass --backend blocked",
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        said: set[str] = set()
+
+        def say(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+            if issubclass(category, UserWarning) and str(message) not in said:
+                said.add(str(message))
+                terminal.say(f"Note: {message}")
+
+        warnings.showwarning = say
+        try:
+            yield
+        except PalpateError as error:
+            if type(error) is not PalpateError or (fix := next((v for k, v in flags.items() if k in error.fix), None)) is None:
+                raise
+            raise PalpateError(error.must, error.got, fix) from None

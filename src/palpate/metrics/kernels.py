@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, rng_for
-from palpate.metrics.arrays import Ops
+from palpate.metrics.arrays import Ops, ops_of, release
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -205,7 +205,11 @@ def median_distance(x: Any, groups: Sequence[str] | Index | None = None, rows: i
     """
     n = len(x)
     at = np.sort(rng_for(0, "median distance").permutation(n)[:rows])
-    some = np.asarray(x[at] if n else x, dtype=np.float64)
+    ops, picked = ops_of(x), [np.zeros((0, x.shape[1]))]
+    for k in range(0, len(at), 32):  # an array on disk is mapped by large pages: a few rows of it at a time
+        picked.append(ops.numpy(x[at[k : k + 32].tolist()]))
+        release(x)
+    some = np.concatenate(picked)
     squares = (some**2).sum(axis=1)
     distance = np.sqrt(np.maximum(squares[:, None] + squares[None] - 2 * some @ some.T, 0))
     wanted = np.triu(np.ones(distance.shape, dtype=bool), 1)

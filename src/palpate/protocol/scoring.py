@@ -17,14 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.core import PalpateError, Progress, Score, Split, quiet, rng_for
+from palpate.core import FeatureSet, PalpateError, Progress, Score, Split, quiet, rng_for
 from palpate.data.images import load_images, read_image
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.probe import fit_probe, material_accuracy
 from palpate.encoders.towers import Towers
 from palpate.generate import Generated
-from palpate.metrics import four_scores, psnr, ssim, tmmd
+from palpate.protocol.companions import Weights, picture_companions, split_off, standard_companions
+from palpate.protocol.comparing import Asked, Outcome, compare_features, feature_companions
+from palpate.protocol.touches import TOUCH, Wanted
 
 BACKGROUND, SAME_MATERIAL = "background only", "real, same material"
 
@@ -62,36 +64,105 @@ def score_generated(
     Raises:
         PalpateError: if id sets differ, images are unreadable, or there is no touch tower.
     """
+    asked = Asked(presets=presets, seed=seed, split=split.digest)
+    return compare_generated(
+        manifest,
+        split,
+        generated,
+        towers,
+        asked,
+        group=group,
+        controls=controls,
+        companions=("ssim", "psnr"),
+        cache=cache,
+        progress=progress,
+    ).scores
+
+
+def compare_generated(
+    manifest: Manifest,
+    split: Split,
+    generated: Mapping[str, Generated],
+    towers: Towers,
+    asked: Asked,
+    *,
+    group: str = "video",
+    controls: bool = True,
+    companions: Sequence[str] | None = None,
+    weights: Weights | None = None,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> Outcome:
+    """As :func:`score_generated`, with paired differences of the generators, and every option of the metrics.
+
+    Args:
+        manifest: samples with real touches.
+        split: its test part is scored.
+        generated: name -> folder; each must hold exactly the ids of the test part.
+        towers: their touch tower gives the features.
+        asked: presets, bandwidths, seed; its split becomes this one.
+        group: column whose values stay together in halves and intervals.
+        controls: score the controls as well.
+        companions: see :meth:`palpate.protocol.touches.Wanted.of`.
+        weights: of encoders that are not ours.
+        cache: folder for embeddings.
+        progress: told what is being done.
+
+    Raises:
+        PalpateError: as :func:`score_generated`, and for companions whose weights are missing.
+    """
+    asked, weights = replace(asked, split=split.digest), weights or Weights()
     test, train = manifest.part(split, "test"), manifest.part(split, "train")
     for name, folder in generated.items():
         require_same_ids(name, folder.ids, test.ids)
     if not generated:
         raise PalpateError("There must be generated touches to score", "none", "Pass --generated")
+    gel = not test.table["background"].null_count()
+    wanted = Wanted.of(companions, weights, encoder=True, background=gel)
     size = read_image(next(iter(generated.values())).paths[0]).size[0]
     real = load_images(test.paths("tactile"), size, progress=progress)
     features = embed(test, towers, "touch", groups=group, cache=cache, progress=progress)
     train_features = embed(train, towers, "touch", groups=group, cache=cache, progress=progress)
     pictures = {name: load_images([folder.path(i) for i in test.ids], size, progress=progress) for name, folder in generated.items()}
     if controls:
-        pictures |= _controls(test, train, size, seed, progress)
-    known = train_features.labels is not None and len(set(train_features.labels) - {""}) > 1
-    probe = fit_probe(train_features) if known else None
-    accuracy = lambda of, name: [material_accuracy(train_features, of, probe=probe, subject=name, split=split.digest)] if probe else []  # noqa: E731
-    # What TMMD gives for real touches of other places: the train part's.
-    floors = {preset: tmmd(train_features, features, preset=preset).value for preset in presets}
-    scores: list[Score] = []
-    for name, images in pictures.items():
-        made = replace(features, features=embed_images(images, towers, "touch", progress=progress))
-        for preset in presets:
-            first, *alone = four_scores(made, features, floor=features, preset=preset, subject=name, split=split.digest, seed=seed)
-            scores += [replace(first, floor=floors[preset]), *alone]
-        groups = features.groups
-        scores.append(ssim(images, real, ids=test.ids, groups=groups, subject=name, split=split.digest))
-        scores.append(psnr(images, real, ids=test.ids, groups=groups, subject=name, split=split.digest))
-        if name != SAME_MATERIAL:  # these are train touches, which the probe was fitted to
-            scores += accuracy(made, name)
-    scores += accuracy(features, "real")
-    return [replace(s, note=". ".join(filter(None, [s.note, *_doubts(s, split, generated, towers)]))) for s in scores]
+        pictures |= _controls(test, train, size, asked.seed, progress)
+    made = {name: replace(features, features=embed_images(v, towers, "touch", progress=progress)) for name, v in pictures.items()}
+    out, compared, groups = Outcome(), list(generated), features.groups
+    for sets in split_off(made, compared):
+        # What TMMD gives for real touches of other places: the train part's.
+        out.add(compare_features(sets, features, asked, train=train_features, progress=progress))
+    for sets in split_off(made, compared):
+        out.add(feature_companions(wanted.features, sets, features, asked, what=TOUCH, default=wanted.default, progress=progress))
+    out.add(standard_companions(wanted.standard, made, pictures, features, real, weights, asked, compared=compared, progress=progress))
+    empty = load_images(test.paths("background"), size, progress=progress) if gel and "contact" in wanted.pairs else None
+    out.add(
+        picture_companions(
+            wanted.pairs,
+            pictures,
+            real,
+            ids=test.ids,
+            groups=groups,
+            compared=compared,
+            background=empty,
+            weights=weights,
+            split=split.digest,
+            default=wanted.default,
+            progress=progress,
+        )
+    )
+    out.scores += _accuracies(train_features, features, made, split)
+    noted = [replace(s, note=". ".join(filter(None, [s.note, *_doubts(s, split, generated, towers)]))) for s in out.scores]
+    return replace(out, scores=noted)
+
+
+def _accuracies(train: FeatureSet, test: FeatureSet, made: Mapping[str, FeatureSet], split: Split) -> list[Score]:
+    """What a material probe fitted to real train touches reads from every subject, and from the real test touches."""
+    if train.labels is None or len(set(train.labels) - {""}) < 2:
+        return []
+    probe = fit_probe(train)
+    # The real touches of the same material are train touches, which the probe was fitted to.
+    subjects = {name: one for name, one in made.items() if name != SAME_MATERIAL} | {"real": test}
+    return [material_accuracy(train, one, probe=probe, subject=name, split=split.digest) for name, one in subjects.items()]
 
 
 def _doubts(score: Score, split: Split, generated: Mapping[str, Generated], towers: Towers) -> list[str]:

@@ -24,12 +24,18 @@ FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
         "Image distributions",
         "Are the sets of images alike to a general image encoder?",
-        ("cmmd", "fid", "kid", "mmd", "density", "coverage"),
+        ("cmmd", "fid", "kid", "mmd", "precision", "recall (", "density", "coverage"),
     ),
     ("Image by image", "Does each generated touch match its own real touch, pixel by pixel or patch by patch?", ("ssim", "psnr", "lpips", "l1", "mse")),
     ("Recognition", "What can be read from the touch: its material, or the text and photo that belong to it?", ("acc", "top", "retriev", "probe", "@")),
 )  # fmt: skip
 OTHER = ("Other metrics", "")
+#: What a metric's name ends in where a score is the difference of two generators, and the family of such scores.
+TAIL = " difference"
+DIFFERENCES = (
+    "Paired differences",
+    "Which of two generators is better on the same samples? Values are a - b; where the interval leaves out 0 the difference is more than chance.",
+)
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,9 @@ class Heat:
 def family_of(metric: str) -> tuple[str, str]:
     """Title and question of the family that a metric belongs to."""
     name = metric.lower()
-    return next(((title, question) for title, question, pieces in FAMILIES if any(p in name for p in pieces)), OTHER)
+    if name.endswith(TAIL):
+        return DIFFERENCES
+    return next(((title, question) for title, question, pieces in FAMILIES if any(p in f"{name} (" for p in pieces)), OTHER)
 
 
 def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
@@ -154,7 +162,7 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
     Raises:
         PalpateError: if two scores that share a column were not made alike.
     """
-    order = [title for title, _, _ in FAMILIES] + [OTHER[0]]
+    order = [title for title, _, _ in FAMILIES] + [OTHER[0], DIFFERENCES[0]]
     parts: dict[tuple[int, str, str], list[Score]] = {}
     for score in scores:
         key = (order.index(family_of(score.metric)[0]), *setting_of(score))

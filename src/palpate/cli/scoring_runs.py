@@ -1,0 +1,243 @@
+"""The three ways of ``palpate score``: a split of a manifest, pictures of touches, embeddings. The last loads no torch."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from palpate.cli.terminal import Terminal, require_extra
+from palpate.core import MissingExtraError, PalpateError, Progress, Results, Split
+from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, compare_features, feature_companions, require_one_encoder, stream_tmmd
+from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, read_columns, read_embeddings
+
+if TYPE_CHECKING:
+    from palpate.cli.score import Options
+
+#: What a companion's features are called where they came as a file.
+GIVEN = "embeddings"
+
+
+def score(options: Options, terminal: Terminal, progress: Progress) -> Results:
+    """Everything that was asked for, as results.
+
+    Raises:
+        PalpateError: on anything that cannot be scored or compared.
+    """
+    from palpate.cli.score import sigmas
+
+    split = None if options.split is None else Split.load(options.split)
+    asked = Asked(
+        presets=options.presets or None, sigmas=sigmas(options), estimator=options.estimator, backend=options.backend,
+        permutations=options.permutations, normalize={"check": "check", "yes": True, "no": False}[options.normalize], seed=options.seed,
+        split=split.digest if split else None,
+    )  # fmt: skip
+    paths = _named(options)
+    group = options.group if options.group != "auto" else str(split.rule.get("group", "video")) if split else "video"
+    if options.manifest is not None and split is not None:
+        return _of_split(options, split, asked, paths, group, terminal, progress)
+    assert options.reference is not None
+    kinds = {path: is_embeddings(path) for path in (*paths.values(), options.reference)}
+    if len(set(kinds.values())) > 1:
+        got = ", ".join(f"{path} ({'embeddings' if kind else 'pictures'})" for path, kind in kinds.items())
+        raise PalpateError(
+            "Generated and reference must both be pictures, or both embeddings", got, "Embed the pictures first, or pass them all"
+        )
+    columns = _columns(options, group)
+    if kinds[options.reference]:
+        return _of_embeddings(options, split, asked, paths, columns, terminal, progress)
+    return _of_pictures(options, split, asked, paths, columns, group, terminal, progress)
+
+
+def _named(options: Options) -> dict[str, Path]:
+    """Name -> path of every generator."""
+    own = [p.stem if p.is_file() else p.name if p.name != "touches" else p.resolve().parent.name for p in options.generated]
+    names = list(options.names) or [name or p.resolve().name for name, p in zip(own, options.generated, strict=True)]
+    if len(set(names)) < len(names) or "" in names:
+        fix = "Pass --names, one for each entry of --generated: they stand in the tables"
+        raise PalpateError("Generators must differ in name", ", ".join(map(repr, names)), fix)
+    return dict(zip(names, options.generated, strict=True))
+
+
+def _columns(options: Options, group: str) -> Columns | None:
+    """Labels and groups from one or two files."""
+    labels = read_columns(options.labels, group) if options.labels else None
+    groups = read_columns(options.groups, group) if options.groups else None
+    if labels is None or groups is None or options.labels == options.groups:
+        return labels or groups
+    if groups.groups is None:
+        raise PalpateError(f"{options.groups} must have a column {group}", "only labels", "Pass it as --labels")
+    return replace(labels, groups=groups.of(labels.ids)[1])
+
+
+def _of_split(
+    options: Options, split: Split, asked: Asked, paths: Mapping[str, Path], group: str, terminal: Terminal, progress: Progress
+) -> Results:
+    """The test part of a split, beside controls."""
+    require_extra("palpate score")
+    from palpate.data.manifest import Manifest
+    from palpate.encoders.towers import Towers
+    from palpate.generate import Generated
+    from palpate.protocol.scoring import compare_generated
+    from palpate.protocol.summary import gallery
+
+    assert options.manifest is not None
+    assert options.encoder is not None
+    folders = {name: Generated.load(path) for name, path in paths.items()}
+    manifest, towers = Manifest.load(options.manifest), Towers.load(options.encoder)
+    found = compare_generated(
+        manifest, split, folders, towers, replace(asked, presets=asked.presets or ("grouped", "paper")), group=group,
+        controls=options.controls, companions=options.companions, weights=_weights(options), progress=progress,
+    )  # fmt: skip
+    digests = {"manifest": manifest.digest, "split": split.digest, "touch tower": towers.digest("touch")}
+    settings = {"digests": digests, "split rule": dict(split.rule), "generated": {name: dict(f.settings) for name, f in folders.items()}}
+    pictures = gallery(manifest, next(iter(folders.values())), options.seed)
+    return _results(found, paths, settings | {"options": _said(asked, group)}, terminal, pictures)
+
+
+def _of_pictures(
+    options: Options,
+    split: Split | None,
+    asked: Asked,
+    paths: Mapping[str, Path],
+    columns: Columns | None,
+    group: str,
+    terminal: Terminal,
+    progress: Progress,
+) -> Results:
+    """Folders of images, manifests, folders of ``palpate generate``."""
+    from palpate.protocol.score_inputs import completed, is_generated, read_touches, touch_gallery
+
+    assert options.reference is not None
+    if options.encoder is None and (options.companions is None or set(options.companions) <= {"none"}):
+        fix = "Pass --encoder palpate/mini, a folder of palpate encoder or a hub id; or ask for scores of pixels alone: --companions ssim psnr"
+        raise PalpateError("Pictures must have an encoder to be scored with", "no --encoder", fix)
+    if options.encoder is not None or set(options.companions or ()) & {*ON_FEATURES, "lpips"}:
+        require_extra("palpate score with an encoder")
+    elif any(is_generated(p) for p in (*paths.values(), options.reference)) and importlib.util.find_spec("torch") is None:
+        raise MissingExtraError("torch", "all", "Reading a folder of palpate generate")
+    whole = completed(read_touches(options.reference), group=group, columns=columns)
+    reference, train = (whole, None) if split is None else (whole.part(split, "test"), whole.part(split, "train"))
+    if not len(reference):
+        raise PalpateError("There must be reference touches", "none in the test part", "Check the split")
+    made = {name: completed(read_touches(p), group=group, columns=columns, like=reference) for name, p in paths.items()}
+    towers, digests = None, {"reference": reference.digest, **({"split": split.digest} if split else {})}
+    if options.encoder is not None:
+        from palpate.encoders.towers import Towers
+
+        towers = Towers.load(options.encoder)
+        digests["touch tower"] = towers.digest("touch")
+    from palpate.protocol.touches import compare_touches
+
+    found = compare_touches(
+        made,
+        reference,
+        towers,
+        asked,
+        group=group,
+        companions=options.companions,
+        weights=_weights(options),
+        train=train,
+        progress=progress,
+    )
+    settings = {"digests": digests, "encoder": options.encoder or "none", "options": _said(asked, group)}
+    return _results(found, paths, settings, terminal, touch_gallery(reference, next(iter(made.values())), options.seed))
+
+
+def _of_embeddings(
+    options: Options,
+    split: Split | None,
+    asked: Asked,
+    paths: Mapping[str, Path],
+    columns: Columns | None,
+    terminal: Terminal,
+    progress: Progress,
+) -> Results:
+    """Files of embeddings."""
+    assert options.reference is not None
+    _refuse(options)
+    reference = read_embeddings(options.reference, columns)
+    made = {name: read_embeddings(path, columns) for name, path in paths.items()}
+    for name, one in made.items():
+        if one.features.shape[1] != reference.features.shape[1]:
+            got = f"{one.features.shape[1]} and {reference.features.shape[1]}"
+            raise PalpateError(f"{name!r} and the reference must have features of one width", got, "Embed both with the same encoder")
+    if any(one.streamed for one in (*made.values(), reference)):
+        if split is not None or options.companions not in (None, ("none",)):
+            got = "--split" if split else "--companions"
+            raise PalpateError("So many rows without groups are streamed, for TMMD alone", got, "Pass --groups, or leave it out")
+        found = stream_tmmd({name: one.features for name, one in made.items()}, reference.features, asked, progress=progress)
+    else:
+        found = _compare_embeddings(options, split, asked, made, reference, progress)
+    encoder = reference.encoder or next((one.encoder for one in made.values() if one.encoder), None)
+    digests = {name: v for name, v in (("encoder", encoder), ("split", split.digest if split else None)) if v}
+    files = {name: {"file": str(one.path), "rows": len(one.features)} for name, one in {**made, "reference": reference}.items()}
+    return _results(found, paths, {"digests": digests, "embeddings": files, "options": _said(asked, "video")}, terminal, [])
+
+
+def _compare_embeddings(
+    options: Options, split: Split | None, asked: Asked, made: Mapping[str, Embeddings], reference: Embeddings, progress: Progress
+) -> Outcome:
+    # Rows without ids are numbered; a generated and a real row of one number are not taken for partners.
+    real, train = reference.feature_set("reference "), None
+    sets = {name: one.feature_set() for name, one in made.items()}
+    if split is not None:
+        if reference.ids is None:
+            raise PalpateError(
+                "A split must go with a reference that has ids", f"{reference.path}", "Save it with ids, or leave --split out"
+            )
+        known, whole = set(real.ids), real
+        real = whole.take(split.ids("test"))
+        train = whole.take(split.ids("train")) if known.issuperset(split.ids("train")) and split.ids("train") else None
+    for name, one in sets.items():
+        require_one_encoder(name, one, real)
+        row = {i: k for k, i in enumerate(real.ids)} if made[name].ids is not None else {}
+        if row and row.keys() >= set(one.ids):  # what the reference knows of a sample holds for the generated one
+            theirs = {c: (v := getattr(real, c)) and [v[row[i]] for i in one.ids] for c in ("labels", "groups")}
+            sets[name] = replace(one, labels=one.labels or theirs["labels"], groups=one.groups or theirs["groups"])
+    numbered = all(one.ids is None for one in made.values())
+    paired = not numbered or len({len(one.ids) for one in sets.values()}) == 1
+    found = compare_features(sets, real, asked, train=train, paired=paired, progress=progress)
+    if len(sets) > 1:
+        why = "their files have no ids, and differ in rows" if not paired else ""
+        found.remarks += [f"No differences between generators: {why}"] if why else []
+        found.remarks += ["Row k of every generator is taken for the same sample: their files have no ids"] if paired and numbered else []
+    kinds = options.companions if options.companions is not None else ("fid", "kid", "prdc")
+    default = options.companions is None
+    found.add(feature_companions(kinds, sets, real, asked, what=GIVEN, default=default, paired=paired, progress=progress))
+    return found
+
+
+def _refuse(options: Options) -> None:
+    """Options that embeddings have no use for."""
+    pixels = [c for c in options.companions or () if c not in (*ON_FEATURES, "none")]
+    if pixels:
+        raise PalpateError(f"{pixels[0]} must have pictures", "embeddings", "Pass folders of images, or leave it out")
+    for name in ("encoder", "inception", "clip", "lpips"):
+        if getattr(options, name) is not None:
+            raise PalpateError(f"--{name} must go with pictures", "embeddings, which were made already", "Leave it out")
+
+
+def _weights(options: Options) -> Any:
+    from palpate.protocol.companions import Weights
+
+    return Weights(inception=options.inception, clip=options.clip, lpips=options.lpips)
+
+
+def _said(asked: Asked, group: str) -> dict[str, Any]:
+    """The options that every table shares."""
+    normalize = {"check": "check", True: "yes", False: "no"}[asked.normalize]
+    return {
+        "group": group, "sigma": list(asked.sigmas), "backend": asked.backend, "permutations": asked.permutations, "normalize": normalize,
+        "seed": asked.seed,
+    }  # fmt: skip
+
+
+def _results(found: Outcome, paths: Mapping[str, Path], settings: dict[str, Any], terminal: Terminal, gallery: Any) -> Results:
+    found = found.said()
+    return Results(
+        title=f"Scores of {', '.join(paths)}", scores=[*found.scores, *found.differences], gallery=gallery, settings=settings,
+        notes=found.remarks, commands=[terminal.command],
+    )  # fmt: skip

@@ -1,0 +1,377 @@
+"""Generators side by side on features: every preset and bandwidth that was asked for, companions, floors, and paired differences. No torch.
+
+Metrics of one name but of other features or another bandwidth get names of their own (``FID (Inception)``, ``TMMD (σ median)``), so that no
+two of them share a column.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from palpate import __version__
+from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet, require_comparable
+from palpate.metrics import PRESETS, Polynomial, compare, distance, tmmd
+from palpate.metrics.frechet import fid
+from palpate.metrics.intervals import mean_interval
+from palpate.metrics.neighbours import prdc
+from palpate.metrics.paired import holm
+
+#: Companions on features; the first three need nothing further.
+ON_FEATURES = ("fid", "kid", "prdc", "cmmd")
+#: Bandwidth of the paper, and of CMMD; the name of a metric says any other one where several are asked for.
+SIGMA = 10.0
+#: From so many rows on the companions that form all pairs must be asked for.
+MANY = 50_000
+KID_NOTE = "No interval: the spread over random subsets that others print with KID is not one"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asked:
+    """How the TMMD family is to be computed.
+
+    Attributes:
+        presets: see :data:`palpate.metrics.PRESETS`; None: ``grouped`` and ``paper`` where groups are known, else ``paper``.
+        sigmas: bandwidths: numbers, ``"median"``, ``"multi"``.
+        estimator: instead of every preset's own.
+        backend, permutations, normalize, seed: see :class:`palpate.metrics.Options`.
+        split: digest that scores keep.
+    """
+
+    presets: Sequence[str] | None = None
+    sigmas: Sequence[float | str] = (SIGMA,)
+    estimator: str | None = None
+    backend: str = "auto"
+    permutations: int = 999
+    normalize: Any = "check"
+    seed: int = 0
+    split: str | None = None
+
+    def presets_for(self, *, grouped: bool) -> Sequence[str]:
+        """The presets, chosen by whether groups are known where none were asked for."""
+        return self.presets if self.presets is not None else ("grouped", "paper") if grouped else ("paper",)
+
+    def options(self, preset: str, sigma: float | str) -> dict[str, Any]:
+        """Options of one column of the TMMD family."""
+        own = {"estimator": self.estimator} if self.estimator else {}
+        return own | {
+            "preset": preset, "sigma": sigma, "backend": self.backend, "permutations": self.permutations, "normalize": self.normalize,
+            "seed": self.seed, "split": self.split,
+        }  # fmt: skip
+
+
+@dataclass
+class Outcome:
+    """What was scored.
+
+    Attributes:
+        scores: of every subject.
+        differences: of pairs of generators on the same samples.
+        remarks: what was left out, and why.
+    """
+
+    scores: list[Score] = field(default_factory=list)
+    differences: list[Score] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+    def add(self, other: Outcome) -> None:
+        """Puts another outcome behind this one."""
+        self.scores += other.scores
+        self.differences += other.differences
+        self.remarks += [r for r in other.remarks if r not in self.remarks]
+
+    def attempt(self, what: str, make: Callable[[], Outcome], *, asked: bool) -> None:
+        """Adds what ``make`` gives; where nobody asked for it by name, a refusal becomes a remark."""
+        try:
+            self.add(make())
+        except PalpateError as error:
+            if asked:
+                raise
+            self.remarks.append(f"{what} left out: {error.must}; got {error.got}")
+
+    def said(self) -> Outcome:
+        """The same with a note at every difference that says who is ahead, and how sure that is, and remarks on copies and on collapse."""
+        copies = {s.subject: f"{s.subject}: {s.note.split('. ')[0]}" for s in self.scores if s.details.get("copies")}
+        less = [
+            f"{s.metric}, {s.subject}: below the floor of real touches, so these vary less than real ones do; that is not better"
+            for s in self.scores
+            if s.metric.startswith(("I-TMMD", "CI-TMMD")) and s.settings.get("halves") == "group" and s.floor and s.interval
+            and s.interval[1] < s.floor
+        ]  # fmt: skip
+        return replace(
+            self,
+            remarks=[*self.remarks, *copies.values(), *less],
+            differences=[replace(d, note=". ".join(filter(None, [confidence(d), d.note]))) for d in self.differences],
+        )
+
+
+def confidence(difference: Score) -> str:
+    """``"B is better with 97.3 % confidence, Holm p = 0.054"``; '' where nothing can be said."""
+    d = difference.details
+    if d.get("p_better") is None or d.get("better") is None:
+        return ""
+    ahead = d["p_better"] if d["better"] == d["a"] else 1 - d["p_better"]
+    adjusted = f", Holm p = {d['p_adjusted']:.2g}" if d.get("p_adjusted") is not None else ""
+    return f"{d['better']} is better with {percent(ahead)} confidence{adjusted}"
+
+
+def percent(share: float) -> str:
+    """A share in [0, 1], never rounded to certainty."""
+    return "> 99.9 %" if share > 0.999 else "< 0.1 %" if share < 0.001 else f"{100 * share:.1f} %"
+
+
+def compare_features(
+    generators: Mapping[str, FeatureSet],
+    reference: FeatureSet,
+    asked: Asked,
+    *,
+    train: FeatureSet | None = None,
+    paired: bool = True,
+    progress: Progress = quiet,
+) -> Outcome:
+    """The four tactile metrics of every generator, for every preset and bandwidth, with paired differences.
+
+    Args:
+        generators: name -> features.
+        reference: features of the real test touches.
+        asked: presets, bandwidths, seed.
+        train: other real touches, whose TMMD to the reference is the floor of TMMD.
+        paired: whether the generators stand for the same samples; if not, no differences are made.
+        progress: told how many columns are done.
+
+    Raises:
+        PalpateError: as :func:`palpate.metrics.compare`.
+    """
+    require_rows(generators, reference)
+    known = [s.groups is not None for s in generators.values()]
+    presets = asked.presets_for(grouped=all(known) and reference.groups is not None)
+    floor = reference if all(k == (reference.groups is not None) for k in known) else None
+    sets = [dict(generators)] if paired else [{name: one} for name, one in generators.items()]
+    columns = [(preset, sigma) for preset in presets for sigma in asked.sigmas]
+    out = Outcome()
+    for k, (preset, sigma) in enumerate(columns):
+        options = asked.options(preset, sigma)
+        fast: dict[str, Any] = {**options, "permutations": 0}
+        least = None if train is None else tmmd(train, reference, **fast).value
+        for some in sets:
+            found = compare(some, reference, floor=floor, **options)
+            scores = [replace(s, floor=least) if s.metric == "TMMD" else s for s in found.scores]
+            out.scores += [_named(s, sigma, asked) for s in scores]
+            out.differences += [_named(d, sigma, asked) for d in found.differences]
+        progress("TMMD family", k + 1, len(columns))
+    return out
+
+
+def require_rows(generators: Mapping[str, FeatureSet], reference: FeatureSet) -> None:
+    """Refuses empty sets.
+
+    Raises:
+        PalpateError: naming the set.
+    """
+    for name, one in (*generators.items(), ("the reference", reference)):
+        if not len(one.ids):
+            raise PalpateError(f"There must be touches in {name}", "none", "Check its path, and the split: is that part empty?")
+
+
+def _named(score: Score, sigma: float | str, asked: Asked) -> Score:
+    if len(asked.sigmas) < 2 or sigma == SIGMA:
+        return score
+    tag = f"(σ {sigma})" if isinstance(sigma, str) else f"(σ = {sigma:g})"
+    base = score.metric.removesuffix(" difference")
+    return replace(score, metric=f"{base} {tag}" + score.metric[len(base) :])
+
+
+def feature_companions(
+    kinds: Sequence[str],
+    generators: Mapping[str, FeatureSet],
+    reference: FeatureSet,
+    asked: Asked,
+    *,
+    what: str,
+    default: bool = False,
+    paired: bool = True,
+    progress: Progress = quiet,
+) -> Outcome:
+    """FID, KID, precision and its kin, and CMMD on given features.
+
+    Args:
+        kinds: of :data:`ON_FEATURES`; others are passed over.
+        generators: name -> features.
+        reference: of real touches.
+        asked: for seed, split, back end and permutations; the companions have their own estimators.
+        what: where the features come from, as it stands in the metrics' names.
+        default: nobody asked for these by name: one that refuses its input, or forms too many pairs, is left out with a remark.
+        paired: whether the generators stand for the same samples.
+        progress: told about the neighbours.
+
+    Raises:
+        PalpateError: as the metrics, unless ``default``.
+    """
+    many = max(len(reference.ids), *(len(s.ids) for s in generators.values())) > MANY
+    out = Outcome()
+    for kind in (k for k in ON_FEATURES if k in kinds):
+        if default and many and kind != "fid":
+            out.remarks.append(f"{kind} left out: it forms all pairs of more than {MANY:,} rows; ask for it with --companions {kind}")
+            continue
+        make = {"fid": _fid, "kid": _kid, "prdc": _prdc, "cmmd": _cmmd}[kind]
+        out.attempt(f"{kind} on {what}", lambda make=make: make(generators, reference, asked, what, paired, progress), asked=not default)
+    return out
+
+
+def _fid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, *_: Any) -> Outcome:
+    found = [fid(one, reference, subject=name, split=asked.split, seed=asked.seed) for name, one in sets.items()]
+    return Outcome([replace(s, metric=f"FID ({what})") for s in found])
+
+
+def _kid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, *_: Any) -> Outcome:
+    out = Outcome()
+    for name, one in sets.items():
+        require_one_encoder(name, one, reference)
+        d = distance(one.features, reference.features, kernel=Polynomial(), estimator="unbiased", normalize=False, scale=1000)
+        details = {"backend": d.backend, "bound": d.bound, "version": __version__}
+        out.scores.append(
+            Score(
+                f"KID ({what})",
+                name,
+                d.value,
+                estimator=d.estimator,
+                scale=d.scale,
+                n=d.m,
+                m=d.n,
+                encoder=one.encoder,
+                split=asked.split,
+                settings={**d.kernel, "normalize": False},
+                details=details,
+                note=KID_NOTE,
+            )
+        )
+    return out
+
+
+def _prdc(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, paired: bool, progress: Progress) -> Outcome:
+    found = [s for name, one in sets.items() for s in prdc(one, reference, subject=name, split=asked.split, progress=progress)]
+    return Outcome([replace(s, metric=f"{s.metric} ({what})") for s in found])
+
+
+def _cmmd(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, paired: bool, progress: Progress) -> Outcome:
+    plain = replace(asked, presets=("cmmd",), sigmas=(SIGMA,), estimator=None)
+    bare = {name: replace(one, labels=None) for name, one in sets.items()}
+    found = compare_features(bare, replace(reference, labels=None), plain, paired=paired, progress=progress)
+    scores, differences = ([_as_cmmd(s, what) for s in some if s.metric.startswith("TMMD")] for some in (found.scores, found.differences))
+    return Outcome(scores, differences)
+
+
+def _as_cmmd(score: Score, what: str) -> Score:
+    return replace(score, metric=score.metric.replace("TMMD", f"CMMD ({what})"), floor=None)
+
+
+def require_one_encoder(name: str, one: FeatureSet, reference: FeatureSet) -> None:
+    """Refuses features of another encoder than the reference's.
+
+    Raises:
+        PalpateError: with both digests.
+    """
+    if one.encoder is not None and reference.encoder is not None and one.encoder != reference.encoder:
+        got = f"digests {one.encoder[:12]} and {reference.encoder[:12]}"
+        raise PalpateError(f"{name!r} and the reference must come from one encoder", got, "Embed both with the same encoder")
+
+
+def stream_tmmd(generators: Mapping[str, NDArray[Any]], reference: NDArray[Any], asked: Asked, *, progress: Progress = quiet) -> Outcome:
+    """TMMD of arrays that are too long to be held: rows pass by once, and only moments are kept.
+
+    Args:
+        generators: name -> (n, d), possibly mapped.
+        reference: (m, d).
+        asked: presets and bandwidths; ``backend="auto"`` is moments here.
+        progress: told how many scores are done.
+
+    Raises:
+        PalpateError: for what would need all pairs or all rows in memory, or as :func:`palpate.metrics.distance`.
+    """
+    presets = asked.presets_for(grouped=False)
+    if "grouped" in presets or asked.estimator == "grouped":
+        raise PalpateError(
+            "The grouped estimator must know the group of every row", "an array without", "Pass --groups, or --presets paper"
+        )
+    if "multi" in asked.sigmas and asked.backend != "blocked":
+        got = f"{len(reference):,} rows"
+        raise PalpateError("--sigma multi must form all pairs", got, "Pass --sigma median or a number; or --backend blocked, and wait")
+    if asked.normalize is True:
+        raise PalpateError("Rows that are streamed must be L2-normalised already", "--normalize yes", "Normalise them when saving")
+    out = Outcome(remarks=["Streamed, as there are too many rows to hold: TMMD alone, without interval, p-value or companions"])
+    todo = [(name, x, preset, sigma) for name, x in generators.items() for preset in presets for sigma in asked.sigmas]
+    for k, (name, x, preset, sigma) in enumerate(todo):
+        progress("streaming", k, len(todo))
+        backend: Any = "moments" if asked.backend == "auto" else asked.backend
+        estimator: Any = asked.estimator or PRESETS[preset].estimator
+        d = distance(x, reference, sigma=sigma, estimator=estimator, normalize=asked.normalize, backend=backend)
+        if d.bound > 1e-4:
+            words = f"sigma {sigma}" if isinstance(sigma, str) else f"sigma {sigma:g}"
+            out.remarks.append(f"TMMD of {name}, {words}: within {d.bound:.2g} of the exact value, as the bandwidth is narrow for moments")
+        score = Score(
+            "TMMD",
+            name,
+            d.value,
+            estimator=d.estimator,
+            bandwidth=d.bandwidth,
+            scale=d.scale,
+            n=d.m,
+            m=d.n,
+            split=asked.split,
+            settings={**d.kernel, "preset": preset, "normalize": asked.normalize},
+            note="No interval: neither groups nor repeats are known",
+            details={"backend": d.backend, "bound": d.bound, "version": __version__},
+        )
+        out.scores.append(_named(score, sigma, asked))
+    progress("streaming", len(todo), len(todo))
+    return out
+
+
+def mean_differences(scores: Mapping[str, Score], values: Mapping[str, NDArray[np.float64]], groups: Sequence[str] | None) -> list[Score]:
+    """Paired differences of a metric that is a mean over images.
+
+    Args:
+        scores: of the generators, of one metric.
+        values: (n,) of each generator, image by image in one order; pairs in which one is not finite are left out.
+        groups: n groups, or None.
+
+    Raises:
+        PalpateError: if the scores are of different settings.
+    """
+    return holm([_mean_difference(scores[a], scores[b], values[a] - values[b], groups) for a, b in combinations(scores, 2)])
+
+
+def _mean_difference(x: Score, y: Score, delta: NDArray[np.float64], groups: Sequence[str] | None) -> Score:
+    require_comparable([x, y])
+    finite = np.isfinite(delta)
+    kept = delta[finite]
+    names = None if groups is None else [g for g, ok in zip(groups, finite, strict=True) if ok]
+    value = float(kept.mean()) if len(kept) else None
+    interval, method = mean_interval(kept, names, x.level)
+    sign = (value or 0.0) * (1 if x.higher_is_better else -1)
+    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "p_better": None, "p_value": None, "better": None}
+    details["better"] = x.subject if sign > 0 else y.subject if sign < 0 else None
+    if interval is not None and value is not None:
+        df = (len(kept) if names is None else len(set(names))) - 1
+        error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
+        ahead = float(special.stdtr(df, sign / error))
+        details |= {"p_better": ahead, "p_value": 2 * min(ahead, 1 - ahead)}
+    note = "Undefined: no pair of images has a value" if value is None else "" if interval else "No interval: too few groups or images"
+    return replace(
+        x,
+        metric=f"{x.metric} difference",
+        subject=f"{x.subject} - {y.subject}",
+        value=value,
+        interval=interval,
+        interval_method=f"paired, {method}" if method else "",
+        null=None,
+        floor=None,
+        details=details,
+        note=note,
+    )

@@ -1,0 +1,245 @@
+"""Scoring pictures of touches without a split: whatever a user has generated, against whatever real touches there are.
+
+The TMMD family needs an encoder and no pairs. Scores of pairs need equal ids on both sides: where no id at all is shared there are no pairs,
+and they are left out with a remark; where some are missing it is taken for a mistake.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import FeatureSet, PalpateError, Progress, quiet
+from palpate.data.images import cached_images, load_images, read_image
+from palpate.data.manifest import Manifest
+from palpate.metrics.pairwise import paired_by_id
+from palpate.protocol.companions import ON_PAIRS, Weights, picture_companions, standard_companions
+from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, compare_features, feature_companions
+
+if TYPE_CHECKING:
+    from palpate.encoders.towers import Towers
+
+Images = NDArray[np.uint8]
+#: What a companion's features are called where the touch tower made them.
+TOUCH = "touch"
+#: Decoded pictures of more bytes than this lie in a temporary file.
+HELD = 1 << 30
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Companions, by what they need.
+
+    Attributes:
+        default: nobody named them.
+        features: those on the touch tower's features.
+        standard: those on features of Inception and CLIP.
+        pairs: those on pairs of pictures.
+    """
+
+    default: bool
+    features: Sequence[str]
+    standard: Sequence[str]
+    pairs: Sequence[str]
+
+    @classmethod
+    def of(cls, companions: Sequence[str] | None, weights: Weights, *, encoder: bool, background: bool) -> Wanted:
+        """Sorts the companions; None is all that need nothing that is not there.
+
+        Args:
+            companions: names among ``ON_FEATURES`` and ``ON_PAIRS``, or ``none``.
+            weights: what was given; with weights of Inception, FID and KID are of its features, with those of CLIP CMMD is.
+            encoder: whether there is a touch tower.
+            background: whether the real touches have their gel without contact.
+
+        Raises:
+            PalpateError: for a companion that nothing given can compute.
+        """
+        has = {"fid": weights.inception, "kid": weights.inception, "cmmd": weights.clip}
+        if companions is None:
+            kinds = [k for k in ON_FEATURES if has.get(k) is not None or (encoder and k != "cmmd")]
+            kinds += [k for k in ON_PAIRS if (k != "contact" or background) and (k != "lpips" or weights.lpips is not None)]
+        else:
+            kinds = [k for k in companions if k != "none"]
+            weights.require(kinds)
+        standard = [k for k in kinds if has.get(k) is not None]
+        features = [k for k in kinds if k in ON_FEATURES and k not in standard]
+        if features and not encoder:
+            missing_weights(features[0])
+        return cls(companions is None, features, standard, [k for k in kinds if k in ON_PAIRS])
+
+
+def missing_weights(kind: str) -> None:
+    """Says what a companion on features could be computed with.
+
+    Raises:
+        PalpateError: always.
+    """
+    from palpate.encoders.standard import CLIP_FIX, INCEPTION_FIX
+
+    own = {
+        "fid": f", or --inception FILE. {INCEPTION_FIX}",
+        "kid": f", or --inception FILE. {INCEPTION_FIX}",
+        "cmmd": f", or --clip. {CLIP_FIX}",
+    }
+    raise PalpateError(f"{kind} must have features", "pictures without an encoder", f"Pass --encoder NAME{own.get(kind, '')}")
+
+
+def compare_touches(
+    generators: Mapping[str, Manifest],
+    reference: Manifest,
+    towers: Towers | None,
+    asked: Asked,
+    *,
+    group: str = "video",
+    companions: Sequence[str] | None = None,
+    weights: Weights | None = None,
+    train: Manifest | None = None,
+    progress: Progress = quiet,
+) -> Outcome:
+    """Scores of one or several generators, from pictures.
+
+    Args:
+        generators: name -> touches (column ``tactile``), all with the same ids.
+        reference: real touches.
+        towers: their touch tower gives the features; None: scores of pictures only.
+        asked: presets, bandwidths, seed, split.
+        group: column whose values stay together in halves and intervals.
+        companions: see :meth:`Wanted.of`.
+        weights: of encoders that are not ours.
+        train: other real touches; their TMMD to the reference is the floor of TMMD.
+        progress: told what is being done.
+
+    Raises:
+        PalpateError: if ids differ where pairs are needed, pictures are unreadable, there is no touch tower, or weights are missing.
+    """
+    weights = weights or Weights()
+    background = not reference.table["background"].null_count()
+    wanted = Wanted.of(companions, weights, encoder=towers is not None, background=background)
+    pairs = _paired(generators, reference, wanted)
+    sets = {name: _set(made, towers, group, progress) for name, made in generators.items()}
+    real = _set(reference, towers, group, progress)
+    out = Outcome()
+    if towers is not None:
+        others = _set(train, towers, group, progress) if train is not None and len(train) else None
+        out.add(compare_features(sets, real, asked, train=others, progress=progress))
+        out.add(feature_companions(wanted.features, sets, real, asked, what=TOUCH, default=wanted.default, progress=progress))
+    if wanted.standard or (wanted.pairs and pairs):
+        with tempfile.TemporaryDirectory() as folder:
+            out.add(_of_pictures(generators, reference, (sets, real), wanted, pairs, weights, asked, Path(folder), progress))
+    if wanted.pairs and not pairs:
+        out.remarks.append("Scores of pairs of pictures left out: generated and real touches share no id")
+    return out
+
+
+def _set(touches: Manifest, towers: Towers | None, group: str, progress: Progress) -> FeatureSet:
+    """Features of touches; without an encoder a set with ids, labels and groups alone."""
+    if towers is not None:
+        from palpate.encoders.embed import embed
+
+        return embed(touches, towers, "touch", groups=group, progress=progress)
+    column = lambda name: None if touches.table[name].null_count() == len(touches) else [v or "" for v in touches.column(name)]  # noqa: E731
+    return FeatureSet(touches.ids, np.zeros((len(touches), 1), np.float32), column("material"), column(group))
+
+
+def _paired(generators: Mapping[str, Manifest], reference: Manifest, wanted: Wanted) -> bool:
+    """Whether there are pairs; some ids without a partner are a mistake."""
+    if not wanted.pairs:
+        return False
+    shared = [bool(set(made.ids) & set(reference.ids)) for made in generators.values()]
+    if wanted.default and not any(shared):
+        return False
+    for name, made in generators.items():
+        try:
+            paired_by_id(made.ids, reference.ids)
+        except PalpateError as error:
+            fix = "Score the same samples on both sides, or leave scores of pairs out: --companions fid kid prdc, or none"
+            raise PalpateError(f"{name}: {error.must}", error.got, fix) from None
+    return True
+
+
+def _of_pictures(
+    generators: Mapping[str, Manifest],
+    reference: Manifest,
+    features: tuple[Mapping[str, FeatureSet], FeatureSet],
+    wanted: Wanted,
+    pairs: bool,
+    weights: Weights,
+    asked: Asked,
+    folder: Path,
+    progress: Progress,
+) -> Outcome:
+    """Everything that looks at pixels, all at the generators' size."""
+    size = _size(generators)
+    if pairs:
+        generators = {name: made.take(reference.ids) for name, made in generators.items()}
+    pictures = {name: _load(made, "tactile", size, folder, progress) for name, made in generators.items()}
+    real, compared = _load(reference, "tactile", size, folder, progress), list(generators)
+    sets, like = features
+    if pairs:
+        sets = {name: one.take(reference.ids) for name, one in sets.items()}
+    out = Outcome()
+    if wanted.standard:
+        out.add(
+            standard_companions(
+                wanted.standard,
+                sets,
+                pictures,
+                like,
+                real,
+                weights,
+                asked,
+                compared=compared,
+                progress=progress,
+            )
+        )
+    if pairs:
+        gel = _load(reference, "background", size, folder, progress) if "contact" in wanted.pairs and _has_gel(reference) else None
+        groups = None if like.groups is None or "" in like.groups else list(like.groups)
+        out.add(
+            picture_companions(
+                wanted.pairs,
+                pictures,
+                real,
+                ids=reference.ids,
+                groups=groups,
+                compared=compared,
+                background=gel,
+                weights=weights,
+                split=asked.split,
+                default=wanted.default,
+                progress=progress,
+            )
+        )
+    return out
+
+
+def _has_gel(reference: Manifest) -> bool:
+    return not reference.table["background"].null_count()
+
+
+def _size(generators: Mapping[str, Manifest]) -> int:
+    """The shorter side of the generated pictures.
+
+    Raises:
+        PalpateError: if generators differ in it: scores of pixels at different sizes are not comparable.
+    """
+    sizes = {name: min(read_image(made.paths("tactile")[0]).size) for name, made in generators.items()}
+    if len(set(sizes.values())) > 1:
+        got = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        fix = "Resize them alike, or leave scores of pixels out: --companions fid kid prdc, or none"
+        raise PalpateError("Generators side by side must have pictures of one size", got, fix)
+    return next(iter(sizes.values()))
+
+
+def _load(touches: Manifest, column: str, size: int, folder: Path, progress: Progress) -> Images:
+    """Pictures as squares; many of them in a file."""
+    if len(touches) * size * size * 3 > HELD:
+        return cached_images(touches, column, size, folder, progress)
+    return load_images(touches.paths(column), size, progress=progress)

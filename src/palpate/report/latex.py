@@ -1,0 +1,216 @@
+r"""Scores as LaTeX tables for a paper: ``booktabs``, one table a family of metrics, and one of paired differences.
+
+Rows are subjects, columns are metrics with the arrow of the better direction; the interval stands below the value. A value is bold only where its generator
+is better than every other one by a paired difference whose interval leaves out 0: a best of overlapping values is nobody's. The caption says how the
+numbers were made. Text is escaped: no name can be a command. Needs ``\usepackage{booktabs}``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+from palpate.core import Results, Score, short
+from palpate.report.tables import score_tables
+from palpate.report.text import decimals, defined, setting_of
+
+TAIL = " difference"
+#: First line of the file: how the command knows a file of its own.
+MARK = "% palpate: tables of scores"
+#: By whether higher is better.
+ARROWS = {True: r"$\uparrow$", False: r"$\downarrow$"}
+_SPECIAL = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "`": r"\textasciigrave{}",
+    "σ": r"$\sigma$", "×": r"$\times$", "−": "$-$", "–": "--", "\u00a0": "~", "[": "{[}", "]": "{]}",
+}  # fmt: skip
+
+
+def escape(text: str) -> str:
+    """Plain text as LaTeX that prints it; control characters and line ends become spaces.
+
+    The breaks of ligatures keep ``--seed`` of a command two hyphens.
+    """
+    plain = re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", text)
+    return re.sub("-(?=-)", "-{}", "".join(_SPECIAL.get(c, c) for c in plain))
+
+
+def number(value: float | None, digits: int) -> str:
+    """A number in mathematics mode, with a true minus sign; dashes where there is none."""
+    if value is None:
+        return "--"
+    text = f"{value:.{digits}f}"
+    return f"${text if float(text) else text.lstrip('-')}$"
+
+
+def latex_tables(results: Results) -> str:
+    """Every table of the scores of ``results``.
+
+    Raises:
+        PalpateError: if two scores that would share a column were not made alike.
+    """
+    scores = [s for s in results.scores if not s.metric.endswith(TAIL)]
+    differences = [s for s in results.scores if s.metric.endswith(TAIL)]
+    lines = [MARK, *(f"% {_comment(c)}" for c in results.commands), r"% Needs \usepackage{booktabs}.", ""]
+    for table in score_tables(scores):
+        members = [cell.score for row in table.cells.values() for cells in row.values() for cell in cells]
+        for tag in dict.fromkeys(_tag(c.metric) for c in table.columns):
+            metrics = [c.metric for c in table.columns if _tag(c.metric) == tag]
+            lines += _scores(table.title, tag, metrics, [s for s in members if s.metric in metrics], differences, results)
+    for setting in dict.fromkeys(map(setting_of, differences)):
+        lines += _differences([d for d in differences if setting_of(d) == setting], results)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _comment(text: str) -> str:
+    """One line, whatever it holds."""
+    return re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", text)
+
+
+def _scores(
+    title: str, tag: str, metrics: Sequence[str], members: Sequence[Score], differences: Sequence[Score], results: Results
+) -> list[str]:
+    """One table: the metrics of a family whose names end in the same ``tag``, which goes to the caption."""
+    subjects = list(dict.fromkeys(s.subject for s in members))
+    found: dict[tuple[str, str], Score] = {}
+    for s in members:  # where seeds differ the first stands
+        found.setdefault((s.subject, s.metric), s)
+    digits = {
+        m: decimals([v for s in members if s.metric == m for v in (s.value, s.floor, *(s.interval or ())) if v is not None])
+        for m in metrics
+    }
+    floors = {m: next((s.floor for s in members if s.metric == m and s.floor is not None), None) for m in metrics}
+    better = {m: next(s.higher_is_better for s in members if s.metric == m) for m in metrics}
+    best = {m: best_of([found[key] for key in found if key[1] == m], differences) for m in metrics}
+    title += f", {tag[2:-1]}" if tag else ""
+    rows = [_row(["", *(f"{escape(m.removesuffix(tag))} {ARROWS[better[m]]}" for m in metrics)]), r"\midrule"]
+    for subject in subjects:
+        cells = [found.get((subject, m)) for m in metrics]
+        values = [_value(s, digits[m], bold=best[m] == subject) for m, s in zip(metrics, cells, strict=True)]
+        rows.append(_row([escape(subject), *values]))
+        if any(s is not None and s.interval for s in cells):
+            rows.append(_row(["", *(_interval(s, digits[m]) for m, s in zip(metrics, cells, strict=True))]))
+    if any(v is not None for v in floors.values()):
+        rows += [r"\midrule", _row(["floor (real touches)", *(number(floors[m], digits[m]) for m in metrics)])]
+    return _environment(title, f"l{'r' * len(metrics)}", rows, members, results, differences=bool(differences))
+
+
+def _tag(metric: str) -> str:
+    """What a name ends in, if that is in brackets: ``" (touch)"`` of ``"FID (touch)"``; '' otherwise."""
+    return metric[metric.rindex(" (") :] if metric.endswith(")") and " (" in metric else ""
+
+
+def _row(cells: Sequence[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _value(score: Score | None, digits: int, *, bold: bool) -> str:
+    if score is None or not defined(score):
+        return "--"
+    text = number(score.value, digits)
+    return rf"$\mathbf{{{text[1:-1]}}}$" if bold else text
+
+
+def _interval(score: Score | None, digits: int) -> str:
+    if score is None or score.interval is None:
+        return ""
+    low, high = (number(v, digits)[1:-1] for v in score.interval)
+    return rf"{{\scriptsize $[{low}, {high}]$}}"
+
+
+def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None:
+    """The subject that is better than every other generator by a paired difference whose interval leaves out 0; None where there is none.
+
+    Of a metric without reference a value below its floor is not the best: touches that vary less than real ones are no better.
+
+    Args:
+        column: scores of one metric, made alike.
+        differences: paired differences of any metrics; subjects without one (controls, real touches) take no part.
+    """
+    if not column:
+        return None
+    wins: dict[str, bool] = {}
+    for d in differences:
+        if d.metric != column[0].metric + TAIL or setting_of(d) != setting_of(column[0]):
+            continue
+        a, b = d.details["a"], d.details["b"]
+        sign = 0 if d.value is None or d.interval is None or d.interval[0] <= 0 <= d.interval[1] else (1 if d.value > 0 else -1)
+        sign *= 1 if d.higher_is_better else -1
+        wins[a] = wins.get(a, True) and sign > 0
+        wins[b] = wins.get(b, True) and sign < 0
+    winner = next((name for name, won in wins.items() if won), None)
+    if winner is not None and column[0].metric.startswith(("I-TMMD", "CI-TMMD", "D-TMMD")):
+        # These have no reference: less than real touches have is collapse, not quality.
+        own = next((s for s in column if s.subject == winner), None)
+        if own is None or own.value is None or (own.floor is not None and own.value < own.floor):
+            return None
+    return winner
+
+
+def _differences(differences: Sequence[Score], results: Results) -> list[str]:
+    rows = [_row(["metric", "$a$", "$b$", "$a - b$", "interval", "$a$ better", "Holm $p$"]), r"\midrule"]
+    for d in differences:
+        digits = decimals([v for v in (d.value, *(d.interval or ())) if v is not None])
+        sure, p = d.details.get("p_better"), d.details.get("p_adjusted")
+        low, high = (number(v, digits)[1:-1] for v in d.interval) if d.interval else ("", "")
+        rows.append(
+            _row(
+                [
+                    f"{escape(d.metric.removesuffix(TAIL))} {ARROWS[d.higher_is_better]}",
+                    escape(d.details["a"]),
+                    escape(d.details["b"]),
+                    number(d.value, digits),
+                    f"$[{low}, {high}]$" if d.interval else "--",
+                    "--" if sure is None else _percent(sure),
+                    "--" if p is None else _p(p),
+                ]
+            )
+        )
+    preset = str(differences[0].settings.get("preset", ""))
+    title = "Paired differences" + (f", {preset}" if preset else "")
+    return _environment(title, "lllrrrr", rows, differences, results, differences=False)
+
+
+def _percent(share: float) -> str:
+    return r"$> 99.9\,\%$" if share > 0.999 else r"$< 0.1\,\%$" if share < 0.001 else rf"${100 * share:.1f}\,\%$"
+
+
+def _p(p: float) -> str:
+    return "$< 0.001$" if p < 0.001 else f"${p:.3f}$"
+
+
+def _environment(
+    title: str, columns: str, rows: Sequence[str], members: Sequence[Score], results: Results, *, differences: bool
+) -> list[str]:
+    caption = ". ".join([escape(title), *_made(members, differences), *(rf"Command: \texttt{{{escape(c)}}}" for c in results.commands[:1])])
+    return [
+        r"\begin{table}", r"\centering", rf"\caption{{{caption}.}}", rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *rows, r"\bottomrule",
+        r"\end{tabular}", r"\end{table}", "",
+    ]  # fmt: skip
+
+
+def _made(members: Sequence[Score], differences: bool) -> list[str]:
+    """How the numbers were made, in a few sentences: sizes, estimator, bandwidth, intervals, digests, seed, version."""
+    one_scale = len({s.scale for s in members}) == 1
+    each: Mapping[str, list[str]] = {
+        "$n$": [f"{s.n:,}" for s in members if s.n],
+        "$m$": [f"{s.m:,}" for s in members if s.m is not None],
+        "estimator": [escape(s.estimator) for s in members if s.estimator],
+        r"$\sigma$": [f"{s.bandwidth:.4g}" for s in members if s.bandwidth is not None],
+        "values times": [f"{s.scale:g}" for s in members if s.scale != 1 and one_scale],
+        "scaled:": [f"{escape(s.metric)} times {s.scale:g}" for s in members if s.scale != 1 and not one_scale],
+        "intervals": [f"{100 * s.level:g}\\,\\% ({escape(s.interval_method)})" for s in members if s.interval],
+        "encoder": [rf"\texttt{{{short(s.encoder)}}}" for s in members if s.encoder],
+        "split": [rf"\texttt{{{short(s.split)}}}" for s in members if s.split],
+        "seed": [str(s.seed) for s in members if s.seed is not None],
+        "palpate": [escape(str(s.details["version"])) for s in members if s.details.get("version")],
+    }
+    facts = [f"{name} {', '.join(dict.fromkeys(values))}" for name, values in each.items() if values]
+    rule = (
+        [
+            "Bold: better than every other generator by a paired difference whose interval leaves out 0, and not below the floor of a metric without reference"
+        ]
+        if differences
+        else []
+    )
+    return [*(["; ".join(facts)] if facts else []), *rule]

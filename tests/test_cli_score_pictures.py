@@ -1,0 +1,188 @@
+"""``palpate score`` of pictures: folders of images, manifests and folders of generate, with an encoder and without."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import stats
+
+from palpate.cli import main
+from palpate.core import Split
+from palpate.metrics import compare, distance
+
+
+def call(capsys, *args):
+    status = main(["score", *map(str, args)])
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+def score(capsys, *args):
+    status, out, err = call(capsys, *args, "--json")
+    assert status == 0, err
+    data = json.loads(out)
+    return {(s["metric"], s["subject"], s["settings"].get("preset")): s for s in data["scores"]}, data
+
+
+def paint(folder: Path, names, seed: int, suffix: str = ".png", side: int = 32):
+    rng = np.random.default_rng(seed)
+    out = {}
+    for name in names:
+        path = folder / f"{name}{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        out[name] = rng.integers(90, 160, (side, side, 3)).astype(np.uint8)
+        Image.fromarray(out[name]).save(path)
+    return out
+
+
+def test_pictures_pair_by_relative_name_whatever_the_suffix(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = ["a/1", "a/2", "b [x]/1", "grün/\n1", "b/x.y"]
+    real = paint(tmp_path / "real", names, 0, ".bmp")
+    made = paint(tmp_path / "made", reversed(names), 1)
+    found, data = score(capsys, "--generated", "made", "--reference", "real", "--companions", "psnr", "ssim")
+    assert {m for m, _, _ in found} == {"PSNR", "SSIM"}  # without an encoder pixels alone
+    psnr = [-10 * np.log10((((made[n] / 255.0) - real[n] / 255.0) ** 2).mean()) for n in names]
+    assert found["PSNR", "made", None]["value"] == pytest.approx(np.mean(psnr), rel=1e-12)
+    assert len(data["gallery"]) == len(names)
+    item = next(g for g in data["gallery"] if g["sample"]["id"] == "b [x]/1")
+    assert (item["generated"], item["sample"]["tactile"]) == (
+        str(tmp_path / "made" / "b [x]" / "1.png"), str(tmp_path / "real" / "b [x]" / "1.bmp")
+    )  # fmt: skip
+
+
+def test_scores_of_pixels_need_no_torch(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(("real", "a", "b")):
+        paint(tmp_path / name, ["1", "2", "3"], seed)
+    code = (
+        "import sys; from palpate.cli import main\n"
+        "status = main(['score', '--generated', 'a', 'b', '--reference', 'real', '--companions', 'ssim', 'psnr', 'ms-ssim'])\n"
+        "assert 'torch' not in sys.modules, sorted(sys.modules)\n"
+        "sys.exit(status)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "MS-SSIM" in done.stdout
+
+
+def test_paired_differences_of_pixels_are_those_of_the_images(capsys, tmp_path, monkeypatch, small_manifest):
+    monkeypatch.chdir(tmp_path)
+    small_manifest.save(Path("m/manifest.parquet"))
+    a, b = (paint(tmp_path / name, small_manifest.ids, seed) for seed, name in enumerate("ab", 5))
+    found, _ = score(capsys, "--generated", "a", "b", "--reference", "m", "--companions", "psnr", "ms-ssim", "contact")
+    real = {i: np.asarray(Image.open(p)) / 255.0 for i, p in zip(small_manifest.ids, small_manifest.paths("tactile"), strict=True)}
+    delta = {i: -10 * np.log10(((a[i] / 255.0 - real[i]) ** 2).mean() / ((b[i] / 255.0 - real[i]) ** 2).mean()) for i in real}
+    d = found["PSNR difference", "a - b", None]
+    assert d["value"] == pytest.approx(np.mean(list(delta.values())), abs=1e-9)
+    per_video: dict[str, list[float]] = {}
+    for i, video in zip(small_manifest.ids, small_manifest.column("video"), strict=True):
+        per_video.setdefault(video, []).append(delta[i])
+    means = np.array([np.mean(v) for v in per_video.values()])  # equal sizes: the t interval over video means
+    error = means.std(ddof=1) / np.sqrt(len(means))
+    assert d["interval"][1] - d["interval"][0] == pytest.approx(2 * 2.570582 * error, rel=1e-5)
+    assert d["details"]["p_value"] == pytest.approx(stats.ttest_1samp(means, 0).pvalue, rel=1e-9)
+    ahead = "a" if d["value"] > 0 else "b"
+    assert d["details"]["better"] == ahead
+    assert (d["details"]["p_better"] > 0.5) == (ahead == "a")
+    assert d["interval_method"].startswith("paired, cluster-robust over groups")
+    assert {m for m, _, _ in found} >= {"MS-SSIM", "contact residual", "contact IoU difference"}
+
+
+def test_unequal_ids_are_an_error_and_disjoint_ones_leave_pairs_out(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paint(tmp_path / "real", ["1", "2", "3"], 0)
+    paint(tmp_path / "some", ["1", "2", "4"], 1)
+    paint(tmp_path / "twice", ["1"], 1)
+    paint(tmp_path / "twice", ["1"], 1, ".bmp")
+    for args, word in (
+        (("--generated", "some", "--companions", "ssim"), "1 not generated: '3'; 1 without reference: '4'"),
+        (("--generated", "twice", "--companions", "ssim"), "'1.bmp' and '1.png'"),
+        (("--generated", "real", "--companions", "contact"), "gel without contact"),
+        (("--generated", "real", "--companions", "lpips"), "alexnet-owt-7be5be79.pth"),
+        (("--generated", "real", "--companions", "fid"), "inception-2015-12-05.pt"),
+        (("--generated", "real", "--companions", "cmmd"), "openai/clip-vit-large-patch14-336"),
+        (("--generated", "real", "--companions", "fid", "--inception", "no.pt"), "no.pt"),
+    ):  # fmt: skip
+        status, _, err = call(capsys, *args, "--reference", "real", "--names", "g")
+        assert (status, word in err) == (2, True), err
+
+
+def test_generators_of_two_sizes_and_broken_pictures_are_refused(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, side in (("real", 32), ("small", 16), ("same", 32)):
+        paint(tmp_path / name, ["1", "2"], 0, side=side)
+    status, _, err = call(capsys, "--generated", "small", "same", "--reference", "real", "--companions", "psnr")
+    assert (status, "small 16, same 32" in err) == (2, True)
+    (tmp_path / "same" / "2.png").write_bytes(b"\x89PNG broken")
+    status, _, err = call(capsys, "--generated", "same", "--reference", "real", "--companions", "psnr")
+    assert (status, "2.png" in err, "Traceback" in err) == (2, True, False)
+
+
+def test_a_folder_of_generate_that_climbs_is_refused(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paint(tmp_path / "real", ["1"], 0)
+    paint(tmp_path / "out" / "images", ["1"], 1)
+    index = {"format": "palpate-generated/1", "complete": True, "settings": {}, "digest": "", "notice": "", "skipped": []}
+    for name, good in (("1.png", True), ("../../real/1.png", False), ("/etc/hostname", False)):
+        (tmp_path / "out" / "index.json").write_text(json.dumps(index | {"images": {"1": name}}))
+        status, _, err = call(capsys, "--generated", "out", "--reference", "real", "--companions", "psnr")
+        assert (status, "must lie in images/" in err) == (0 if good else 2, not good), err
+
+
+@pytest.fixture(scope="module")
+def mini():
+    """The shipped towers, loaded once."""
+    from palpate.encoders.towers import Towers
+
+    return Towers.load("palpate/mini")
+
+
+def test_pictures_with_an_encoder(capsys, tmp_path, monkeypatch, small_manifest, mini):
+    from palpate.encoders.embed import embed
+    from palpate.encoders.towers import Towers
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Towers, "load", lambda *_, **__: mini)
+    small_manifest.save(Path("m/manifest.parquet"))
+    for seed, name in enumerate("ab"):
+        paint(tmp_path / name, small_manifest.ids, seed)
+    shutil.copytree("a", "elsewhere/x")
+    found, data = score(capsys, "--generated", "a", "b", "--reference", "m", "--encoder", "palpate/mini", "--permutations", "19")
+    real = embed(small_manifest, mini, "touch")
+    made = small_manifest.from_rows(
+        [
+            {"id": i, "tactile": f"{i}.png", "material": m, "video": v}
+            for i, m, v in zip(small_manifest.ids, small_manifest.column("material"), small_manifest.column("video"), strict=True)
+        ],
+        tmp_path / "a",
+    )
+    want = compare({"a": embed(made, mini, "touch")}, real, floor=real, preset="grouped", permutations=19).scores
+    for s in want:
+        assert found[s.metric, "a", "grouped"]["value"] == pytest.approx(s.value, rel=1e-6, abs=1e-6), s.metric
+    assert found["TMMD", "a", "grouped"]["encoder"] == mini.digest("touch")
+    for metric in ("FID (touch)", "SSIM", "MS-SSIM", "contact residual", "Precision (touch)", "TMMD difference", "SSIM difference"):
+        assert [k for k in found if k[0] == metric], metric
+    assert not [k for k in found if k[0].startswith(("CMMD", "LPIPS"))]
+    assert data["settings"]["digests"]["touch tower"] == mini.digest("touch")
+    status, _, err = call(capsys, "--generated", "elsewhere", "--reference", "m", "--encoder", "palpate/mini", "--presets", "paper")
+    assert (status, "share no id" in err) == (0, True), err
+    # CMMD on a CLIP of one's own: the shipped one stands in.
+    found, _ = score(capsys, "--generated", "a", "--reference", "m", "--companions", "cmmd", "--clip", "palpate/mini")
+    assert found["CMMD (CLIP)", "a", "cmmd"]["encoder"] == mini.digest("vision")
+    # A split of the manifest: its train part is the floor.
+    ids = small_manifest.ids
+    Split.from_ids(train=ids[:16], test=ids[16:], rule={"group": "video"}, manifest=small_manifest.digest).save(Path("s.json"))
+    for i in ids[:16]:
+        (tmp_path / "a" / f"{i}.png").unlink()
+    found, _ = score(
+        capsys, "--generated", "a", "--reference", "m", "--encoder", "palpate/mini", "--split", "s.json", "--companions", "none"
+    )
+    s = found["TMMD", "a", "paper"]
+    assert s["floor"] == pytest.approx(distance(real.features[:16], real.features[16:]).value, abs=1e-6)
+    assert (s["n"], s["m"]) == (32, 32)

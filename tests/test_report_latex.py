@@ -1,0 +1,119 @@
+"""LaTeX tables: text stays text, the best is bold only where it is better, and the caption says how."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from palpate.core import Results, Score
+from palpate.report.latex import best_of, escape, latex_tables, number
+
+ODD = r"a_b & 50% $x$ #1 {\input{/etc/passwd}} ~^ <b> [c]"
+
+
+def make(metric, subject, value, interval=None, *, up=False, floor=None, preset="grouped", **rest):
+    return Score(
+        metric, subject, value, interval, higher_is_better=up, floor=floor, settings={"preset": preset} if preset else {}, n=10, m=12,
+        estimator="grouped", encoder="ab" * 32, split="cd" * 32, seed=7, bandwidth=10.0, scale=1000.0, details={"version": "1.2"}, **rest,
+    )  # fmt: skip
+
+
+def delta(metric, a, b, value, interval, *, up=False, preset="grouped"):
+    settings = {"preset": preset} if preset else {}
+    details = {"a": a, "b": b, "p_better": 0.9, "p_adjusted": 0.0001, "version": "1.2"}
+    return Score(
+        f"{metric} difference", f"{a} - {b}", value, interval, higher_is_better=up, settings=settings, split="cd" * 32, details=details
+    )
+
+
+def bold(text):
+    return re.findall(r"mathbf\{([^}]*)\}", text)
+
+
+def cells(text):
+    """The rows of all tables: lists of cells."""
+    return [line.removesuffix(r" \\").split(" & ") for line in text.splitlines() if line.endswith(r" \\")]
+
+
+@given(st.text(max_size=60))
+def test_no_text_is_a_command(text):
+    out = escape(text)
+    assert "\n" not in out
+    known = r"\\(textbackslash|textasciitilde|textasciicircum|textless|textgreater|textbar|textquotedbl|textasciigrave)\{\}|\\[{}$&#%_]"
+    rest = re.sub(r"\$(-|\\sigma|\\times)\$|\{[\[\]]\}|-\{\}", "", re.sub(known, "", out))
+    assert not re.search(r"[\\{}$&#%_~^]", rest.replace("~", "" if "\u00a0" in text else "~"))
+
+
+def test_odd_names_and_commands_stay_text():
+    scores = [make("TMMD", ODD, 1.0), make("TMMD", "σ×", 2.0)]
+    text = latex_tables(Results(title="t", scores=scores, commands=["palpate score --seed 1\n\\end{table}"]))
+    assert r"a\_b \& 50\% \$x\$ \#1 \{\textbackslash{}input\{/etc/passwd\}\} \textasciitilde{}\textasciicircum{}" in text
+    assert r"$\sigma$$\times$" in text
+    assert [line for line in text.splitlines() if r"\end{table}" in line] == [r"% palpate score --seed 1 \end{table}", r"\end{table}"]
+    assert r"palpate score -{}-seed 1 \textbackslash{}end\{table\}" in text
+    assert text.startswith("% palpate")
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "wanted"), [(-1.25, 1, "$-1.2$"), (-0.0001, 2, "$0.00$"), (1234.5, 0, "$1234$"), (None, 2, "--")]
+)
+def test_numbers(value, digits, wanted):
+    assert number(value, digits) == wanted
+
+
+def test_bold_needs_an_interval_without_zero_against_everybody():
+    column = [make("TMMD", name, v) for name, v in (("a", 1.0), ("b", 2.0), ("c", 3.0), ("real", 0.1))]
+    ab, ac, bc = delta("TMMD", "a", "b", -1, (-2, -0.1)), delta("TMMD", "a", "c", -2, (-3, -1)), delta("TMMD", "b", "c", -1, (-2, 1))
+    assert best_of(column, [ab, ac, bc]) == "a"  # a control that scores better takes no part
+    assert best_of(column, [delta("TMMD", "a", "b", -1, (-2, 0.1)), ac, bc]) is None
+    assert best_of(column, [delta("TMMD", "a", "b", -1, None), ac, bc]) is None
+    assert best_of(column, [ab, bc]) == "a"
+    assert best_of(column, [delta("TMMD", "a", "b", -1, (-2, -0.1), preset="paper")]) is None
+    assert best_of([make("SSIM", "a", 1.0, up=True)], [delta("SSIM", "a", "b", -1, (-2, -0.1), up=True)]) == "b"
+    assert best_of([], []) is None
+
+
+def test_below_the_floor_is_collapse_and_not_the_best():
+    win = [delta("I-TMMD", "a", "b", -1, (-2, -0.1))]
+    assert best_of([make("I-TMMD", "a", 1.0, floor=0.5), make("I-TMMD", "b", 2.0, floor=0.5)], win) == "a"
+    assert best_of([make("I-TMMD", "a", 0.2, floor=0.5), make("I-TMMD", "b", 1.2, floor=0.5)], win) is None
+
+
+def test_a_table_has_values_intervals_floor_and_how_they_were_made():
+    scores = [
+        make("TMMD", "a", 1.0, (0.5, 1.5), floor=0.25, interval_method="jackknife, t, 3 df"), make("TMMD", "b", 12.0, (10.0, 14.0), floor=0.25),
+        make("SSIM", "a", 0.75, up=True, preset=""), make("SSIM", "b", None, up=True, preset="", note="Undefined: why"),
+    ]  # fmt: skip
+    differences = [delta("TMMD", "a", "b", -11, (-13, -9)), delta("SSIM", "a", "b", None, None, up=True, preset="")]
+    text = latex_tables(Results(title="t", scores=[*scores, *differences], commands=["palpate score x"]))
+    rows = cells(text)
+    assert ["", r"TMMD $\downarrow$"] in rows
+    assert ["a", r"$\mathbf{1.00}$"] in rows
+    assert ["", r"{\scriptsize $[0.50, 1.50]$}"] in rows
+    assert ["b", "$12.00$"] in rows
+    assert ["floor (real touches)", "$0.25$"] in rows
+    assert ["", r"SSIM $\uparrow$"] in rows
+    assert ["b", "--"] in rows
+    assert [r"TMMD $\downarrow$", "a", "b", "$-11.00$", "$[-13.00, -9.00]$", r"$90.0\,\%$", "$< 0.001$"] in rows
+    caption = next(line for line in text.splitlines() if "caption" in line)
+    for fact in ("$n$ 10", "$m$ 12", r"$\sigma$ 10", "values times 1000", "jackknife, t, 3 df", r"encoder \texttt{abababababab}",
+                 r"split \texttt{cdcdcdcdcdcd}", "seed 7", "palpate 1.2", r"\texttt{palpate score x}"):  # fmt: skip
+        assert fact in caption, fact
+    assert bold(text) == ["1.00"]
+    for opened, closed in ((r"\begin{table}", r"\end{table}"), (r"\begin{tabular}", r"\end{tabular}"), ("{", "}")):
+        assert text.count(opened) == text.count(closed)
+    for block in text.split(r"\begin{tabular}{")[1:]:
+        width = len(block.split("}", 1)[0])
+        assert {len(row) for row in cells(block)} == {width}
+
+
+def test_metrics_of_other_features_have_tables_of_their_own():
+    scores = [make(f"{m} ({what})", "a", 1.0, preset="") for what in ("touch", "Inception") for m in ("FID", "KID")]
+    text = latex_tables(Results(title="t", scores=scores))
+    assert cells(text).count(["", r"FID $\downarrow$", r"KID $\downarrow$"]) == 2
+    captions = [line for line in text.splitlines() if "caption" in line]
+    assert [re.search("distributions, (\\w+)", c).group(1) for c in captions] == ["touch", "Inception"]
+    mixed = [make("FID (touch)", "a", 1.0, preset=""), make("KID (touch)", "a", 1.0, preset="")]
+    object.__setattr__(mixed[0], "scale", 1.0)
+    assert "scaled: KID (touch) times 1000" in latex_tables(Results(title="t", scores=mixed))
