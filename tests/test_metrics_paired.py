@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from palpate.core import PalpateError
-from palpate.metrics import compare, four_scores, mmd2, tmmd
+from palpate.metrics import compare, four_scores, i_tmmd, mmd2, tmmd
 from palpate.metrics.blocked import blocked_sums
 from palpate.metrics.kernels import Gaussian
 from palpate.metrics.paired import holm
@@ -145,6 +145,30 @@ def test_undefined_scores_have_no_difference(three):
     assert "Undefined" in found["D-TMMD difference"].note
     same = compare({"a": generators["near"], "b": generators["near"]}, r).differences[0]
     assert (same.value, same.interval, same.details["better"]) == (0, None, None)
+
+
+def test_without_a_reference_the_nearer_to_the_floor_is_better(three):
+    r, generators = three
+    near = generators["near"]
+    centre = near.features.mean(axis=0)
+    x = 0.2 * near.features + 0.8 * centre
+    collapsed = change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True))
+    sets = {"collapsed": collapsed, "near": near}
+    for d in compare(sets, r).differences[1:]:
+        assert d.value < 0
+        assert (d.details["better"], d.details["p_better"], d.details["decided"], d.higher_is_better) == (None, None, False, None)
+        assert d.details["p_value"] is not None
+    found = {d.metric: d for d in compare(sets, r, floor=r).differences}
+    one = found["I-TMMD difference"]
+    assert one.value < 0  # lower, and worse
+    assert one.details["better"] == "near"
+    assert one.details["decided"]
+    assert one.details["p_better"] < 0.01
+    value = lambda s: i_tmmd(s).value  # noqa: E731
+    assert one.details["gap"] == pytest.approx(abs(value(collapsed) - value(r)) - abs(value(near) - value(r)), abs=1e-9)
+    low, high = one.details["gap_interval"]
+    assert 0 < low < one.details["gap"] < high
+    assert "gap" not in found["TMMD difference"].details
 
 
 def test_holm_by_hand(three):

@@ -19,9 +19,11 @@ def make(metric, subject, value, interval=None, *, up=False, floor=None, preset=
     )  # fmt: skip
 
 
-def delta(metric, a, b, value, interval, *, up=False, preset="grouped"):
+def delta(metric, a, b, value, interval, *, up=False, preset="grouped", better=None):
     settings = {"preset": preset} if preset else {}
-    details = {"a": a, "b": b, "p_better": 0.9, "p_adjusted": 0.0001, "version": "1.2"}
+    better = better or (a if ((value or 0) > 0) == up else b)
+    decided = interval is not None and not interval[0] <= 0 <= interval[1]
+    details = {"a": a, "b": b, "better": better, "decided": decided, "p_better": 0.9, "p_adjusted": 0.0001, "version": "1.2"}
     return Score(
         f"{metric} difference", f"{a} - {b}", value, interval, higher_is_better=up, settings=settings, split="cd" * 32, details=details
     )
@@ -74,10 +76,12 @@ def test_bold_needs_an_interval_without_zero_against_everybody():
     assert best_of([], []) is None
 
 
-def test_below_the_floor_is_collapse_and_not_the_best():
-    win = [delta("I-TMMD", "a", "b", -1, (-2, -0.1))]
-    assert best_of([make("I-TMMD", "a", 1.0, floor=0.5), make("I-TMMD", "b", 2.0, floor=0.5)], win) == "a"
-    assert best_of([make("I-TMMD", "a", 0.2, floor=0.5), make("I-TMMD", "b", 1.2, floor=0.5)], win) is None
+def test_without_a_reference_the_best_is_nearest_the_floor():
+    column = [make("I-TMMD", "a", 0.2, floor=0.5, up=None), make("I-TMMD", "b", 0.6, floor=0.5, up=None)]
+    assert best_of(column, [delta("I-TMMD", "a", "b", -0.4, (-0.5, -0.3), up=None, better="b")]) == "b"
+    text = latex_tables(Results(title="t", scores=[*column, delta("I-TMMD", "a", "b", -0.4, (-0.5, -0.3), up=None, better="b")]))
+    assert r"I-TMMD $\rightarrow$" in text
+    assert [float(v) for v in bold(text)] == [0.6]
 
 
 def test_a_table_has_values_intervals_floor_and_how_they_were_made():

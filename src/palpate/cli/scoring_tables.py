@@ -9,6 +9,7 @@ from rich.table import Table
 
 from palpate.cli.terminal import Terminal
 from palpate.core import Results, Score
+from palpate.core.score import ARROWS
 from palpate.protocol.comparing import percent
 
 TAIL = " difference"
@@ -48,7 +49,7 @@ def _scores(scores: Sequence[Score]) -> Table:
     for s in sorted(scores, key=lambda s: order.index(_column(s))):
         p = s.details.get("p_value")
         table.add_row(
-            f"{escape(s.metric)} {'↑' if s.higher_is_better else '↓'}", s.settings.get("preset", ""), escape(s.subject), _number(s.value),
+            f"{escape(s.metric)} {ARROWS[s.higher_is_better]}", s.settings.get("preset", ""), escape(s.subject), _number(s.value),
             _interval(s.interval), _interval(s.null), _p(p), "-" if s.floor is None else _number(s.floor), str(s.n),
         )  # fmt: skip
     return table
@@ -62,7 +63,7 @@ def _differences(scores: Sequence[Score]) -> Table:
         d = s.details
         sure, p = d.get("p_better"), d.get("p_adjusted")
         table.add_row(
-            f"{escape(s.metric.removesuffix(TAIL))} {'↑' if s.higher_is_better else '↓'}", s.settings.get("preset", ""), escape(d["a"]),
+            f"{escape(s.metric.removesuffix(TAIL))} {ARROWS[s.higher_is_better]}", s.settings.get("preset", ""), escape(d["a"]),
             escape(d["b"]), _number(s.value), _interval(s.interval), "-" if sure is None else percent(sure), _p(p),
         )  # fmt: skip
     return table

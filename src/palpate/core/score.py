@@ -17,6 +17,11 @@ from palpate.core.files import atomic_path
 COMPARABLE = ("metric", "estimator", "bandwidth", "scale", "settings", "encoder", "split")
 
 
+#: Arrow and words for ``Score.higher_is_better``.
+ARROWS: Mapping[bool | None, str] = {True: "↑", False: "↓", None: "→"}
+BETTER: Mapping[bool | None, str] = {True: "higher is better", False: "lower is better", None: "closer to the floor is better"}
+
+
 @dataclass(frozen=True)
 class Score:
     """One number with its interval and its settings.
@@ -36,7 +41,7 @@ class Score:
         n: samples scored; m: reference samples, or None.
         seed: seed of any random halving, or None.
         encoder, split: digests, or None.
-        higher_is_better: direction.
+        higher_is_better: direction; None where neither is: closer to the floor is better (the metrics without reference).
         settings: further settings that must agree for a comparison.
         details: anything else worth keeping (per class values, matrices as lists); not compared.
         note: a sentence for people, or ''.
@@ -58,7 +63,7 @@ class Score:
     seed: int | None = None
     encoder: str | None = None
     split: str | None = None
-    higher_is_better: bool = False
+    higher_is_better: bool | None = False
     settings: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
     note: str = ""

@@ -6,6 +6,10 @@ itself: ``SE^2 = (G-1)/G sum_g (delta_g - mean delta)^2`` with ``delta_g = a_g -
 
 ``p_better`` is the confidence that a is the better of the two: the share of that t distribution on the side where a is ahead. It is no
 probability of a hypothesis, and it is not adjusted for the number of pairs; ``p_adjusted`` (Holm) is the two-sided p-value that is.
+
+Metrics without reference have no better direction but towards the floor, what real touches score: collapse is lowest. There a is better where
+its distance to the floor is smaller, ``gap = |a - floor| - |b - floor|`` is what p_better and ``better`` speak of, and the floor is
+left-one-out along with the generators. Without a floor neither is given.
 """
 
 from __future__ import annotations
@@ -19,7 +23,8 @@ import numpy as np
 from scipy import special
 
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
-from palpate.metrics.intervals import jackknife_errors, t_interval
+from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
+from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Options, plan_for
 from palpate.metrics.scored import Scored, require_one_encoder
 from palpate.metrics.tables import build_table
@@ -32,7 +37,7 @@ class Comparison:
 
     Attributes:
         scores: the four metrics of each generator, in the order given; ``subject`` is its name.
-        differences: one score a metric and pair, ``value`` = a - b; ``details``: ``a``, ``b``, ``better``, ``p_better``, ``p_value``, ``p_adjusted``.
+        differences: one score a metric and pair, ``value`` = a - b; ``details`` as in :func:`difference`, and ``p_adjusted``.
     """
 
     scores: list[Score]
@@ -58,11 +63,12 @@ def compare(
     first, *others = generators
     sets = {first: generators[first]} | {name: _like(generators[first], first, generators[name], name) for name in others}
     found = {name: four_of(of, reference, cast("Options", {**options, "subject": name})) for name, of in sets.items()}
+    floors: list[Scored | None] = [None]
     if floor is not None:
-        floors = _floors(floor, reference, sets[first], options)
-        found = {name: [four[0], *map(_with_floor, four[1:], floors)] for name, four in found.items()}
-    pairs = [(a, b) for a, b in combinations(found, 2)]
-    differences = [difference(x, y) for k in range(4) for x, y in ((found[a][k], found[b][k]) for a, b in pairs)]
+        floors += _floors(floor, reference, sets[first], options)
+        found = {name: [four[0], *map(_with_floor, four[1:], floors[1:])] for name, four in found.items()}
+    pairs = list(combinations(found, 2))
+    differences = [difference(found[a][k], found[b][k], floors[k] if floor is not None else None) for k in range(4) for a, b in pairs]
     scores = [one.score for four in found.values() for one in four]
     return Comparison(scores, [d for k in range(4) for d in holm(differences[k * len(pairs) : (k + 1) * len(pairs)])])
 
@@ -86,29 +92,39 @@ def _like(wanted: FeatureSet, name: str, other: FeatureSet, called: str) -> Feat
     return other
 
 
-def _floors(floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Options) -> list[float | None]:
+def _floors(floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Options) -> list[Scored]:
     require_one_encoder(like, floor, "floor")
     if (floor.groups is None) != (like.groups is None):
         must = "The floor must be scored like the generated touches"
         raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
     plan = plan_for(options, grouped=floor.groups is not None)
     table = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference)
-    return [f(table, floor, plan).score.value for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
+    return [f(table, floor, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
 
 
-def _with_floor(one: Scored, floor: float | None) -> Scored:
-    return replace(one, score=replace(one.score, floor=floor))
+def _with_floor(one: Scored, floor: Scored | None) -> Scored:
+    return replace(one, score=replace(one.score, floor=floor.score.value if floor else None))
 
 
-def difference(a: Scored, b: Scored) -> Score:
+def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     """``a - b`` of one metric, with the jackknife of the difference.
+
+    Args:
+        a: one generator.
+        b: the other.
+        floor: real touches, for a metric without a better direction of its own.
+
+    Returns:
+        ``details``: ``a``, ``b``, ``better`` (a name or None), ``p_better``, ``decided`` (whether the interval of what decides leaves out 0),
+        ``p_value``, and for metrics without reference ``gap`` and ``gap_interval``.
 
     Raises:
         PalpateError: if the two scores are of different settings.
     """
     x, y = a.score, b.score
     require_comparable([x, y])
-    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "better": None, "p_better": None, "p_value": None}
+    names = ("better", "p_better", "p_value")
+    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "decided": False} | dict.fromkeys(names)
     interval, method, note = None, "", ""
     value = None if x.value is None or y.value is None else x.value - y.value
     if value is None:
@@ -116,22 +132,46 @@ def difference(a: Scored, b: Scored) -> Score:
     elif not a.units or list(a.units) != list(b.units):
         note = "No interval: the two scores share no units to leave out"
     else:
-        error = float(jackknife_errors((a.replicates - b.replicates)[:, None])[0])
-        df = len(a.units) - 1
-        method = f"paired leave-one-{x.details['unit']}-out jackknife, t, {df} df"
-        if np.isfinite(error) and error > 0:
-            interval = t_interval(value, error, df, x.level)
-            ahead = float(special.stdtr(df, -value / error))  # lower is better
-            ahead = 1 - ahead if x.higher_is_better else ahead
-            details |= {"p_better": ahead, "p_value": 2 * min(ahead, 1 - ahead)}
-        else:
+        method = f"paired leave-one-{x.details['unit']}-out jackknife, t, {len(a.units) - 1} df"
+        interval, ahead = _interval(value, a.replicates - b.replicates, x.level)
+        if interval is None:
             note, method = "No interval: leaving out a unit is undefined, or changes nothing", ""
-        sign = value * (-1 if x.higher_is_better else 1)
-        details["better"] = x.subject if sign < 0 else y.subject if sign > 0 else None
+        else:
+            details["p_value"] = 2 * min(ahead, 1 - ahead)
+        _decide(details, value, (interval, ahead), a, b, floor)
     return replace(
         x, metric=f"{x.metric} difference", subject=f"{x.subject} - {y.subject}", value=value, interval=interval, interval_method=method,
         null=None, floor=None, details=details, note=note,
     )  # fmt: skip
+
+
+def _interval(value: float, replicates: Array, level: float) -> tuple[Interval | None, float]:
+    """The jackknife's interval of a value, and the share of its t distribution below 0."""
+    error, df = float(jackknife_errors(replicates[:, None])[0]), len(replicates) - 1
+    if not (np.isfinite(error) and error > 0):
+        return None, 0.5
+    return t_interval(value, error, df, level), float(special.stdtr(df, -value / error))
+
+
+def _decide(
+    details: dict[str, Any], value: float, found: tuple[Interval | None, float], a: Scored, b: Scored, floor: Scored | None
+) -> None:
+    """Fills in who is ahead."""
+    x, y = a.score, b.score
+    if x.higher_is_better is None:
+        if floor is None or floor.score.value is None or x.value is None or y.value is None:
+            return
+        value, found = abs(x.value - floor.score.value) - abs(y.value - floor.score.value), (None, 0.5)
+        if list(floor.units) == list(a.units):
+            gaps = np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates)
+            found = _interval(value, gaps, x.level)
+        details |= {"gap": value, "gap_interval": found[0]}
+    interval, below = found
+    sign = -value if x.higher_is_better else value
+    details["better"] = x.subject if sign < 0 else y.subject if sign > 0 else None
+    if interval is not None:
+        details["p_better"] = 1 - below if x.higher_is_better else below
+        details["decided"] = not interval[0] <= 0 <= interval[1]
 
 
 def holm(differences: Sequence[Score]) -> list[Score]:

@@ -117,8 +117,9 @@ def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
 
 
 def halves_fields(plan: Plan) -> dict[str, Any]:
-    """Estimator and seed of a metric of halves."""
+    """Estimator, seed and direction of a metric of halves."""
     return {
+        "higher_is_better": None,  # the paper says lower; a collapsed generator is lowest
         "estimator": "biased" if plan.estimator == "biased" else "unbiased",
         "seed": plan.seed if plan.halves == "random" else None,
     }

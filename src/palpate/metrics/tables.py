@@ -159,14 +159,14 @@ def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) ->
 def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
     """As :func:`estimate`, for 2C segments; where a class cannot spare a unit (two groups), the jackknife leaves out classes.
 
-    The interval over classes also holds the differences between classes, so it errs on the wide side. The first three values of the
+    The interval over classes also holds the differences between classes, so it errs on the wide side. The first four values of the
     statistic must be defined for fewer classes; only they get errors then.
     """
     over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
     if np.isfinite(over_units.errors[0]) or classes < 3:
         return over_units
     rest = np.arange(classes)
-    replicates = leave_one_out((take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:3])
+    replicates = leave_one_out((take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:4])
     first = jackknife_errors(replicates)
     errors = np.concatenate([first, np.full(len(over_units.values) - len(first), np.nan)])
     method = f"leave-one-class-out jackknife, t, {classes - 1} df (a class has too few {unit}s to leave one out)"

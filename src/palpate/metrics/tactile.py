@@ -197,7 +197,8 @@ def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
 
     Returns:
         Value and interval; ``details``: ``matrix`` (D, classes in the order of ``classes``), ``variants`` (all denominators and
-        aggregates), ``ratio_of_means`` with its interval (the mean of ratios has heavy tails), ``unstable`` (classes whose denominator is not two standard errors above 0), ``excluded``.
+        aggregates), ``ratio_of_means`` with its interval (the mean of ratios has heavy tails), ``inter`` (the mean divergence between classes) with its
+        interval, ``E_ratio`` (mean E over ``inter``; None where ``inter`` is not two standard errors above 0), ``unstable`` (classes whose denominator is not two standard errors above 0), ``excluded``.
 
     Raises:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
@@ -247,20 +248,24 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
 
     def statistic(t: Totals) -> Array:
         matrix = d_matrix(t, plan, design)
-        excess = float(self_distances(t, plan)[1].mean()) / float(denominators(matrix, "mean_off_diagonal").mean() or np.nan)
+        inter = float(denominators(matrix, "mean_off_diagonal").mean())
+        excess = float(self_distances(t, plan)[1].mean()) / (inter or np.nan)
         pooled = d_ratio(matrix, plan.denominator, "ratio_of_means")
-        return np.array([d_ratio(matrix, plan.denominator, plan.aggregate), excess, pooled, *denominators(matrix, plan.denominator)])
+        return np.array([d_ratio(matrix, plan.denominator, plan.aggregate), excess, pooled, inter, *denominators(matrix, plan.denominator)])
 
     found = class_estimate(sums, statistic, table.unit)
-    matrix, below, errors = d_matrix(sums.totals, plan), found.values[3:], found.errors[3:]
+    matrix, below, errors = d_matrix(sums.totals, plan), found.values[4:], found.errors[4:]
+    apart = found.values[3] > (2 * found.errors[3] if np.isfinite(found.errors[3]) else 0.0)
     unstable = [name for k, name in enumerate(details["classes"]) if below[k] <= (2 * errors[k] if np.isfinite(errors[k]) else 0.0)]
     details |= {
         "matrix": matrix,
         "variants": {f"{d}/{a}": d_ratio(matrix, d, a) for d in DENOMINATORS for a in AGGREGATES},
         "ratio_of_means": {"value": found.values[2], "interval": found.interval(2, plan.level)},
         "unstable": unstable,
-        "E_ratio": found.values[1] if table.grouped else None,
-        "E_ratio_interval": found.interval(1, plan.level) if table.grouped else None,
+        "inter": {"value": found.values[3], "interval": found.interval(3, plan.level)},
+        # A ratio over a mean that may well be 0 is noise.
+        "E_ratio": found.values[1] if table.grouped and apart else None,
+        "E_ratio_interval": found.interval(1, plan.level) if table.grouped and apart else None,
         "units": sums.units,
     }
     note = "Undefined: the classes do not separate (a denominator is not positive)" if not np.isfinite(found.values[0]) else ""

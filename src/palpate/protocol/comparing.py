@@ -361,7 +361,7 @@ def _mean_difference(x: Score, y: Score, delta: NDArray[np.float64], groups: Seq
         df = (len(kept) if names is None else len(set(names))) - 1
         error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
         ahead = float(special.stdtr(df, sign / error))
-        details |= {"p_better": ahead, "p_value": 2 * min(ahead, 1 - ahead)}
+        details |= {"p_better": ahead, "p_value": 2 * min(ahead, 1 - ahead), "decided": not interval[0] <= 0 <= interval[1]}
     note = "Undefined: no pair of images has a value" if value is None else "" if interval else "No interval: too few groups or images"
     return replace(
         x,

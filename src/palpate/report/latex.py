@@ -17,8 +17,8 @@ from palpate.report.text import decimals, defined, setting_of
 TAIL = " difference"
 #: First line of the file: how the command knows a file of its own.
 MARK = "% palpate: tables of scores"
-#: By whether higher is better.
-ARROWS = {True: r"$\uparrow$", False: r"$\downarrow$"}
+#: By whether higher is better; None: closer to the floor is.
+ARROWS = {True: r"$\uparrow$", False: r"$\downarrow$", None: r"$\rightarrow$"}
 _SPECIAL = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "`": r"\textasciigrave{}",
@@ -119,32 +119,19 @@ def _interval(score: Score | None, digits: int) -> str:
 
 
 def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None:
-    """The subject that is better than every other generator by a paired difference whose interval leaves out 0; None where there is none.
-
-    Of a metric without reference a value below its floor is not the best: touches that vary less than real ones are no better.
+    """The subject that is better than every other generator by a paired difference that is decided; None where there is none.
 
     Args:
         column: scores of one metric, made alike.
         differences: paired differences of any metrics; subjects without one (controls, real touches) take no part.
     """
-    if not column:
-        return None
     wins: dict[str, bool] = {}
     for d in differences:
-        if d.metric != column[0].metric + TAIL or setting_of(d) != setting_of(column[0]):
+        if not column or d.metric != column[0].metric + TAIL or setting_of(d) != setting_of(column[0]):
             continue
-        a, b = d.details["a"], d.details["b"]
-        sign = 0 if d.value is None or d.interval is None or d.interval[0] <= 0 <= d.interval[1] else (1 if d.value > 0 else -1)
-        sign *= 1 if d.higher_is_better else -1
-        wins[a] = wins.get(a, True) and sign > 0
-        wins[b] = wins.get(b, True) and sign < 0
-    winner = next((name for name, won in wins.items() if won), None)
-    if winner is not None and column[0].metric.startswith(("I-TMMD", "CI-TMMD", "D-TMMD")):
-        # These have no reference: less than real touches have is collapse, not quality.
-        own = next((s for s in column if s.subject == winner), None)
-        if own is None or own.value is None or (own.floor is not None and own.value < own.floor):
-            return None
-    return winner
+        for name in (d.details["a"], d.details["b"]):
+            wins[name] = wins.get(name, True) and bool(d.details.get("decided")) and d.details["better"] == name
+    return next((name for name, won in wins.items() if won), None)
 
 
 def _differences(differences: Sequence[Score], results: Results) -> list[str]:
@@ -208,7 +195,7 @@ def _made(members: Sequence[Score], differences: bool) -> list[str]:
     facts = [f"{name} {', '.join(dict.fromkeys(values))}" for name, values in each.items() if values]
     rule = (
         [
-            "Bold: better than every other generator by a paired difference whose interval leaves out 0, and not below the floor of a metric without reference"
+            "Bold: better than every other generator (for metrics without reference: closer to the floor) by a paired difference whose interval leaves out 0"
         ]
         if differences
         else []

@@ -67,7 +67,7 @@ def _cell(cell: Cell) -> str:
 
 
 def _scores(table: Table) -> list[str]:
-    head = ["", *(f"{esc(c.metric)} {'↑' if c.higher_is_better else '↓'}{', ' + c.size if c.size else ''}" for c in table.columns)]
+    head = ["", *(f"{esc(c.metric)} {c.arrow}{', ' + c.size if c.size else ''}" for c in table.columns)]
     rows = [
         [esc(s), *("; ".join(_cell(c) for c in table.cells[s].get(col.metric, ())) or "–" for col in table.columns)] for s in table.subjects
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate.core import Audit, Results, SampleRef, Score, Signal, columns
+from palpate.core.score import BETTER
 from palpate.report.text import count, decimals, defined, interval_text, number, percent, plural, score_text, setting_of
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {there} the other part), and how a share of the test
@@ -139,7 +140,7 @@ def score_line(scores: Sequence[Score]) -> str:
             said = ", ".join(f"{s.subject} {number(s.value, digits)}{interval_text(s, digits, before=' ')}" for s in shown[:3])
             floors = [s.floor for s in shown if s.floor is not None]
             floor = f"; floor {number(floors[0], digits)}" if floors else ""
-            return f"{metric} ({'higher' if shown[0].higher_is_better else 'lower'} is better): {said}{floor}."
+            return f"{metric} ({BETTER[shown[0].higher_is_better]}): {said}{floor}."
     return ""
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from palpate.core import Score, columns
+from palpate.core.score import ARROWS, BETTER
 from palpate.report.plots import Axis, axis_of
 from palpate.report.text import decimals, defined, interval_text, number, plain, setting_of
 
@@ -65,10 +66,20 @@ class Column:
     """One metric: its direction, its axis, the sample sizes if all of its scores share them, and how the scores were made."""
 
     metric: str
-    higher_is_better: bool
+    higher_is_better: bool | None
     axis: Axis | None
     size: str
     made: Sequence[tuple[str, str]]
+
+    @property
+    def arrow(self) -> str:
+        """The better direction."""
+        return ARROWS[self.higher_is_better]
+
+    @property
+    def better(self) -> str:
+        """The better direction in words."""
+        return BETTER[self.higher_is_better]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ HINTS: Mapping[str, tuple[str, str]] = {
 
 #: Three sentences that every reader of the scores needs.
 HOW_TO_READ = (
-    "Arrows give the better direction: for the TMMD family, FID, KID, CMMD and LPIPS lower is better; for SSIM, PSNR and accuracies higher is.",
+    "Arrows give the better direction: for TMMD, FID, KID, CMMD and LPIPS lower is better; for SSIM, PSNR and accuracies higher is; for I-, CI- and D-TMMD (→) closer to the floor is.",
     "The floor is what real touches score on the same metric: it, and not zero, is what to come near. I- and CI-TMMD far below it mean that the "
     "touches vary less than real ones do (collapse), not that they are better.",
     "The null band is where a meaningless difference would fall: a score inside it says nothing, and two scores whose intervals overlap "
