@@ -1,5 +1,6 @@
 """``palpate score`` without a split: embeddings, several generators, and every way to ask for what cannot be compared."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 
 from palpate.cli import main
 from palpate.core import FeatureSet, PalpateError, Results, Split
-from palpate.metrics import Polynomial, compare, distance
+from palpate.metrics import Polynomial, compare, distance, i_tmmd
 from palpate.protocol import comparing, embeddings
 
 VIDEOS, FRAMES, D = 8, 6, 5
@@ -296,3 +297,82 @@ def test_differences_need_comparable_scores():
     x, y = Score("SSIM", "a", 0.5, settings={"size": 32}), Score("SSIM", "b", 0.6, settings={"size": 64})
     with pytest.raises(PalpateError, match="must agree in settings"):
         comparing.mean_differences({"a": x, "b": y}, {"a": np.ones(3), "b": np.zeros(3)}, None)
+
+
+@pytest.mark.parametrize(("up", "better"), [(True, "a"), (False, "b")])
+def test_the_better_mean_is_the_one_in_the_metrics_direction(up, better):
+    from palpate.core import Score
+
+    rng = np.random.default_rng(0)
+    low, groups = rng.normal(size=40), [f"v{k % 8}" for k in range(40)]
+    values = {"a": low + 1 + 0.1 * rng.normal(size=40), "b": low}
+    scores = {name: Score("X", name, float(v.mean()), higher_is_better=up) for name, v in values.items()}
+    one = comparing.mean_differences(scores, values, groups)[0].details
+    assert (one["better"], one["decided"]) == (better, True)
+    assert (one["p_better"] > 0.99) == (better == "a")
+    assert (one["p_better"] < 0.01) == (better == "b")
+
+
+def test_what_needs_no_reference_is_shown_as_its_excess_beside_a_comparable_floor(capsys, sets):
+    found, data = score(
+        capsys, "--generated", "near.npz", "far.npz", "--reference", "real.npz", "--companions", "none", "--presets", "grouped"
+    )
+    excess, whole = found["I-TMMD E", "near", "grouped"], found["I-TMMD", "near", "grouped"]
+    assert (excess["value"], excess["interval"]) == (whole["details"]["E"], whole["details"]["E_interval"])
+    assert excess["floor"] == pytest.approx(i_tmmd(sets["real"]).details["E"], abs=1e-9)
+    assert whole["floor"] == pytest.approx(i_tmmd(sets["real"]).value, abs=1e-9)
+    assert excess["higher_is_better"] is None
+    assert ("CI-TMMD E", "far", "grouped") in found
+    few = sets["real"].take([i for i, g in zip(IDS, GROUPS, strict=True) if g in sorted(set(GROUPS))[::2]])
+    few.save(Path("few.npz"))
+    found, data = score(
+        capsys, "--generated", "near.npz", "far.npz", "--reference", "few.npz", "--companions", "none", "--presets", "grouped"
+    )
+    assert found["I-TMMD", "near", "grouped"]["floor"] is None  # another number of videos: not comparable
+    assert found["I-TMMD E", "near", "grouped"]["floor"] == pytest.approx(i_tmmd(few).details["E"], abs=1e-9)
+    verdicts = {d["metric"]: d["details"]["better"] for d in data["scores"] if d["metric"].endswith("difference")}
+    assert verdicts["I-TMMD difference"] is None
+    assert verdicts["TMMD difference"] == "near"
+
+
+def test_generators_that_vary_less_than_real_touches_are_told(capsys, sets):
+    still = dataclasses.replace(sets["real"], features=unit(sets["real"].features.mean(axis=0) + 0.05 * sets["real"].features))
+    still.save(Path("still.npz"))
+    _, data = score(capsys, "--generated", "still.npz", "--reference", "real.npz", "--companions", "none", "--presets", "grouped")
+    assert any("I-TMMD E, still: below the floor" in note for note in data["notes"])
+    wild = dataclasses.replace(sets["real"], features=features(9, 0.1, 0) + 0)
+    x = wild.features + np.repeat(np.random.default_rng(1).normal(size=(VIDEOS, D)), FRAMES, 0).astype(np.float32)
+    dataclasses.replace(wild, features=unit(x)).save(Path("wild.npz"))
+    _, data = score(capsys, "--generated", "wild.npz", "--reference", "real.npz", "--companions", "none", "--presets", "grouped")
+    assert not any("below the floor" in note for note in data["notes"])
+
+
+def test_companions_on_features_have_paired_differences(capsys, sets):
+    found, data = score(
+        capsys, "--generated", "near.npz", "far.npz", "--reference", "real.npz", "--companions", "kid", "prdc", "--presets", "grouped"
+    )
+    differences = {d["metric"]: d for d in data["scores"] if d["metric"].endswith("difference")}
+    kid = next(d for m, d in differences.items() if m.startswith("KID"))
+    assert kid["details"]["better"] == "near"
+    assert kid["interval"][1] < 0
+    one = next(s for (m, subject, _), s in found.items() if m.startswith("KID") and subject == "near")
+    direct = distance(sets["near"].features, sets["real"].features, kernel=Polynomial(), normalize=False).value
+    assert one["value"] == pytest.approx(direct, abs=1e-9)
+    assert one["interval"][0] < one["value"] < one["interval"][1]
+    for name in ("Precision", "Recall", "Density", "Coverage"):
+        metric = next(m for m in differences if m.startswith(name))
+        a, b = (
+            next(s["value"] for (m, subject, _), s in found.items() if m == metric.removesuffix(" difference") and subject == who)
+            for who in ("near", "far")
+        )
+        assert differences[metric]["value"] == pytest.approx(a - b, abs=1e-12)
+
+
+def test_streamed_rows_at_a_narrow_bandwidth_and_one_file_for_two_are_refused(capsys, sets, monkeypatch):
+    monkeypatch.setattr(embeddings, "STREAMED", 10)
+    status, out, err = call(capsys, "--generated", "near.npy", "--reference", "real.npy", "--sigma", "0.3")
+    assert (status, out, "--backend blocked" in err) == (2, "", True)
+    status, _, err = call(capsys, "--generated", "near.npz", "--reference", "real.npz", "-o", "same.x", "--latex", "same.x")
+    assert (status, "two files" in err, Path("same.x").exists()) == (2, True, False)
+    status, _, err = call(capsys, "--generated", "near.npz", "--reference", "real.npz", "--sigma", "1e-300")
+    assert (status, "sigma" in err, "Traceback" in err) == (2, True, False)

@@ -1,12 +1,14 @@
 """The pass over the pairs: both back ends, every kernel and every layout against loops over pairs."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.core import PalpateError
-from palpate.metrics import Gaussian, Linear, Polynomial, distance, mmd2
+from palpate.core import FeatureSet, PalpateError
+from palpate.metrics import Gaussian, Linear, Polynomial, distance, four_scores, i_tmmd, mmd2
 from palpate.metrics import blocked as blocked_module
 from palpate.metrics import engine as engine_module
 from palpate.metrics.arrays import ArrayApiOps, Ops, ops_of
@@ -193,8 +195,109 @@ def test_auto_takes_moments_where_they_are_cheaper_and_good_enough(calls, monkey
     assert distance(x[:30], y[:30]).backend == "blocked"
     assert calls == ["blocked_sums"]
     monkeypatch.setattr(engine_module, "LONG", 100)
-    with pytest.warns(UserWarning, match="takes long"):
+    with pytest.warns(UserWarning, match="takes long. Moments were not taken: they would leave"):
         distance(x, y, tolerance=0)
+    with pytest.warns(UserWarning, match="takes long. Moments were not taken: the kernel is"):
+        distance(x, y, sigma=(5.0, 10.0))
+
+
+def features_of(x, prefix, videos=10):
+    names = [f"{prefix}{k}" for k in range(len(x))]
+    return FeatureSet(names, x, [f"c{k % 3}" for k in range(len(x))], [f"{prefix}v{k % videos}" for k in range(len(x))])
+
+
+def test_the_four_metrics_take_moments_within_the_tolerance_and_blocks_beyond(calls):
+    g, r = features_of(spread_rows(0, 240, 8), "a", 12), features_of(spread_rows(1, 240, 8), "b", 12)
+    easy = four_scores(g, r, permutations=0)
+    assert set(calls) == {"_moments"}
+    assert {s.details["backend"] for s in easy} == {"moments"}
+    worst = max(s.details["bound"] for s in easy)
+    assert 0 < worst <= 1e-4
+    calls.clear()
+    hard = four_scores(g, r, permutations=0, tolerance=easy[0].details["bound"] / 2)
+    assert calls == ["_moments", "blocked_sums"]
+    assert {s.details["backend"] for s in hard} == {"blocked"}
+    for a, b in zip(easy, hard, strict=True):
+        assert abs(a.value - b.value) <= a.details["bound"] + 1e-9
+    one = easy[1].details
+    assert abs(one["E"] - hard[1].details["E"]) <= one["E_bound"] + 1e-9
+    calls.clear()
+    assert four_scores(g, r, permutations=0, scale=1.0, tolerance=1e-4)[0].details["backend"] == "moments"
+    assert (
+        four_scores(g, r, permutations=0, scale=1.0, tolerance=easy[0].details["bound"] / 2)[0].details["backend"] == "blocked"
+    )  # tolerances are at scale 1000
+
+
+@pytest.mark.parametrize(("sigma", "scale"), [(0.03, 1.0), (10.0, 300.0)])
+def test_a_bound_that_overflows_is_no_bound(calls, sigma, scale):
+    rng = np.random.default_rng(0)
+    centres = unit_rows(0, 20, 8)
+    x = centres[np.arange(400) % 20] + 1e-3 * rng.normal(size=(400, 8))
+    x = scale * x / np.linalg.norm(x, axis=1, keepdims=True)
+    options = {"sigma": sigma, "normalize": False}
+    got = distance(x[::2], x[1::2], **options)
+    assert got.backend == "blocked"
+    assert got.value == pytest.approx(distance(x[::2], x[1::2], backend="blocked", **options).value)
+    with pytest.raises(PalpateError, match="wide against the features"):
+        distance(x[::2], x[1::2], backend="moments", **options)
+    one = features_of(x, "a", 20)
+    exact, forced = i_tmmd(one, backend="blocked", **options), i_tmmd(one, backend="moments", **options)
+    assert i_tmmd(one, **options).value == exact.value
+    assert forced.value is None
+    assert "do not bound" in forced.note
+
+
+@pytest.mark.parametrize("sigma", ["median", "multi"])
+def test_the_median_is_that_of_the_rows_that_are_scored(sigma):
+    g, r = features_of(spread_rows(0, 60, 5), "a"), features_of(spread_rows(1, 60, 5), "b")
+    far = [dataclasses.replace(s, features=30 * s.features) for s in (g, r)]
+    plain, scaled = (four_scores(*sets, floor=sets[1], sigma=sigma, normalize=True, permutations=0) for sets in ((g, r), far))
+    for a, b in zip(plain, scaled, strict=True):
+        assert (a.value, a.floor) == (pytest.approx(b.value, abs=1e-9), pytest.approx(b.floor, abs=1e-9) if b.floor is not None else None)
+
+
+def test_more_refusals():
+    x = unit_rows(0, 12, 3)
+    for options, words in (
+        ({"tolerance": -1}, "tolerance"), ({"tolerance": float("nan")}, "tolerance"), ({"sigma": None}, "sigma"), ({"block": 1.5}, "block"),
+        ({"groups_x": ["a"]}, "groups_x"), ({"groups_y": ["a"] * 3, "sigma": "median"}, "groups_y"),
+    ):  # fmt: skip
+        with pytest.raises(PalpateError, match=words):
+            distance(x, x[::-1], **options)
+    one = features_of(x, "a", 3)
+    for options, words in (
+        ({"permutations": 1.5}, "whole number"),
+        ({"sigmaa": 3}, "sigmaa"),
+        ({"tolerance": -1}, "tolerance"),
+        ({"seed": "a"}, "seed"),
+    ):
+        with pytest.raises(PalpateError, match=words):
+            i_tmmd(one, **options)
+    assert mmd2(x.astype(">f8"), x[:5]) == mmd2(x, x[:5])
+    assert mmd2(np.asfortranarray(x), x[::-1][:5]) == pytest.approx(mmd2(x, x[::-1][:5].copy()), abs=1e-12)
+    assert mmd2(x, x[:5], sigma=np.array(10.0)) == mmd2(x, x[:5])
+    slack = x * (1 + 5e-3)
+    with pytest.raises(PalpateError, match="L2-normalised"):
+        mmd2(slack, x)
+    assert np.isfinite(mmd2(x * (1 + 5e-4), x))
+
+
+def test_copies_are_found_on_disk_and_in_large_sets(tmp_path, monkeypatch):
+    monkeypatch.setattr("palpate.metrics.checks.SLAB", 7)
+    x = unit_rows(0, 40, 3)
+    np.save(tmp_path / "x.npy", x)
+    with pytest.warns(UserWarning, match="40 rows of x"):
+        distance(np.load(tmp_path / "x.npy", mmap_mode="r"), x[::-1])
+
+
+def test_changes_in_a_private_map_survive(tmp_path):
+    x = unit_rows(0, 40, 3)
+    np.save(tmp_path / "x.npy", x)
+    mapped = np.load(tmp_path / "x.npy", mmap_mode="c")
+    mapped[0] = -mapped[0]
+    FeatureSet([str(k) for k in range(40)], mapped)
+    distance(mapped, x[5:])
+    np.testing.assert_array_equal(mapped[0], -x[0])
 
 
 @pytest.mark.parametrize(

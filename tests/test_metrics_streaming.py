@@ -393,6 +393,6 @@ def test_records_tell_everything(n, d, wide, real, names, given_, copies):
 
 def test_contract_of_torchmetrics_and_no_torch():
     for cls in ALL:
-        assert (cls.higher_is_better, cls.is_differentiable, cls.full_state_update) == (False, False, False)
+        assert (cls.higher_is_better, cls.is_differentiable, cls.full_state_update) == (False if cls is TMMD else None, False, False)
     code = "import sys, palpate.metrics.streaming as s; s.TMMD(); sys.exit('torch' in sys.modules or 'torchmetrics' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

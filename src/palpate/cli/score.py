@@ -81,6 +81,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         guard_output(options.output, inputs)
     if options.latex:
         guard_output(options.latex, inputs, (b"% palpate",))
+        if options.output and options.latex.resolve() == options.output.resolve():
+            raise PalpateError("-o and --latex must be two files", str(options.latex), "Give one of them another name")
     with _told(terminal), terminal.progress() as progress:
         results = scoring_runs.score(options, terminal, progress)
     if options.output:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -121,6 +122,17 @@ def columns(scores: Iterable[Score]) -> dict[str, list[Score]]:
     return table
 
 
+def _finite_rows(features: np.ndarray, slab: int = 8192) -> np.ndarray:
+    """(n,) whether all numbers of a row are finite; an array on disk is read in slabs, whose pages are given back."""
+    out = np.ones(len(features), dtype=bool)
+    held = getattr(features, "_mmap", None)
+    for k in range(0, len(features), slab):
+        out[k : k + slab] = np.isfinite(features[k : k + slab]).all(axis=1)
+        if held is not None and hasattr(held, "madvise") and getattr(features, "mode", "c") != "c":  # own changes would be lost
+            held.madvise(mmap.MADV_DONTNEED)
+    return out
+
+
 @dataclass(frozen=True)
 class FeatureSet:
     """Features of samples, in one order.
@@ -152,7 +164,7 @@ class FeatureSet:
             column = getattr(self, name)
             if column is not None and len(column) != shape[0]:
                 raise PalpateError(f"{name} must have one entry a row ({shape[0]})", f"{len(column)}", f"Pass {name} in the order of ids")
-        bad = np.flatnonzero(~np.isfinite(self.features).all(axis=1))
+        bad = np.flatnonzero(~_finite_rows(self.features))
         if bad.size:
             raise PalpateError(
                 "Features must be finite",

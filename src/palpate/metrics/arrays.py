@@ -73,7 +73,7 @@ class Ops:
 
     def at_least_float32(self, x: Any) -> Any:
         """As float32 or float64."""
-        return x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)
+        return x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)  # native byte order too
 
     def divide_rows(self, x: Any, norms: NDArray[np.float64]) -> Any:
         """Rows divided by (n,) numbers, in the type of ``x``."""
@@ -205,7 +205,7 @@ def full_products() -> Generator[None]:
 def release(x: Any) -> None:
     """Lets the system forget the pages of an array on disk that were read: they would count as this process's memory."""
     held = getattr(x, "_mmap", None)
-    if isinstance(x, np.memmap) and held is not None and hasattr(held, "madvise"):
+    if isinstance(x, np.memmap) and held is not None and hasattr(held, "madvise") and x.mode != "c":  # own changes would be lost
         held.madvise(mmap.MADV_DONTNEED)
 
 

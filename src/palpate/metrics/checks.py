@@ -8,7 +8,7 @@ half precision is widened because ``exp`` of a small exponent rounds to 1 there 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -23,8 +23,6 @@ Floats = NDArray[np.floating[Any]]
 #: Rows may differ from unit length by this much before ``normalize="check"`` refuses them.
 NORM_TOLERANCE = 1e-3
 SLAB = 8192
-#: Copies are looked for in sets of up to this size together; the look-up holds the reference's bytes once more.
-COPIES_BYTES = 256 << 20
 
 
 def rows_text(bad: NDArray[np.bool_]) -> str:
@@ -58,7 +56,8 @@ def as_array(name: str, x: Any) -> Any:
 def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Any:
     """``x`` as a float32 or float64 array (n, d) that a kernel may be evaluated on.
 
-    Looked at in slabs, so that an array on disk (``np.memmap``) is read but never held.
+    Looked at in slabs, so that an array on disk (``np.memmap``) of float32 or float64 rows is read but not held; one that has to be normalised, or
+    widened from half precision, is copied into memory.
 
     Args:
         name: what the error calls it.
@@ -72,7 +71,7 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
     if normalize is not True and normalize is not False and normalize != "check":
         raise PalpateError('normalize must be "check", True or False', repr(normalize), "Leave it out for the default")
     x = as_array(name, x)
-    kind = str(x.dtype).rsplit(".", maxsplit=1)[-1]
+    kind = x.dtype.name if isinstance(x, np.ndarray) else str(x.dtype).rsplit(".", maxsplit=1)[-1]
     if not kind.startswith(("float", "bfloat", "longdouble")):
         raise PalpateError(
             f"{name} must be floating-point features", f"dtype {x.dtype}", "Pass the encoder's float output, not pixels or codes"
@@ -119,15 +118,22 @@ def checked_pair(x: Any, y: Any, *, normalize: Normalize, least: int, names: tup
     return ops_of(a).one_type(a, b)
 
 
-def copies_across(x: Any, y: Any) -> int:
+def copies_across(x: Any, y: Any) -> int | None:
     """How many rows of ``x`` are also rows of ``y``, bit for bit. A copy is not a generator.
 
-    Arrays on disk or on a device are not looked through: 0.
+    By 64-bit hashes of the rows, slab by slab, so that arrays on disk are read but not held. None for arrays on a device.
     """
-    if any(is_foreign(v) or isinstance(v, np.memmap) for v in (x, y)):
-        return 0
-    seen = {row.tobytes() for row in np.ascontiguousarray(y)} if x.nbytes + y.nbytes <= COPIES_BYTES else set()
-    return sum(row.tobytes() in seen for row in np.ascontiguousarray(x)) if seen else 0
+    if is_foreign(x) or is_foreign(y):
+        return None
+    seen = set(_row_hashes(y))
+    return sum(h in seen for h in _row_hashes(x))
+
+
+def _row_hashes(x: NDArray[Any]) -> Iterator[int]:
+    for k in range(0, len(x), SLAB):
+        for row in np.ascontiguousarray(x[k : k + SLAB]):
+            yield hash(row.tobytes())
+        release(x)
 
 
 def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] | None:
@@ -150,8 +156,15 @@ def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] 
 def checked_positive(**values: float) -> None:
     """Refuses parameters that are not finite and positive."""
     for name, value in values.items():
-        if not (np.isfinite(value) and value > 0):
+        if not isinstance(value, int | float | np.number) or not (np.isfinite(value) and value > 0):
             raise PalpateError(f"{name} must be positive", f"{value!r}", f"Pass e.g. {name}=10")
+
+
+def checked_numbers(**values: Any) -> None:
+    """Refuses parameters that are not finite numbers from 0 on."""
+    for name, value in values.items():
+        if not isinstance(value, int | float | np.number) or isinstance(value, bool) or not (np.isfinite(value) and value >= 0):
+            raise PalpateError(f"{name} must be a finite number from 0 on", repr(value), "Leave it out for the default")
 
 
 def checked_choice(name: str, value: Any, choices: Sequence[str]) -> None:

@@ -26,7 +26,7 @@ Backend = Literal["auto", "blocked", "moments"]
 BACKENDS = ("auto", "blocked", "moments")
 #: Moments are tried from so many rows on, in units of the width and in all: there they take a fraction of the blocks' time.
 ROWS_A_WIDTH, LEAST_ROWS = 8, 4096
-#: Moments of all items may take so many bytes; up to the second number in any case.
+#: Moments of all items may take so many bytes, and four times that where the pairs would take hours; up to the second number in any case.
 MOMENT_BYTES, STATE_BYTES = 512 << 20, 64 << 20
 #: From so many rows on a fall back to blocks is announced: it takes hours.
 LONG = 300_000
@@ -65,7 +65,7 @@ def kernel_sums(
     """
     width, rows = int(parts[0].shape[1]), len(segment)
     items, number = np.unique(np.stack([segment, unit]), axis=1, return_inverse=True)
-    why_not = _no_moments(kernel, items.shape[1], width)
+    why_not = _no_moments(kernel, items.shape[1], width, MOMENT_BYTES if rows <= LONG else 4 * MOMENT_BYTES)
     if backend == "moments" and why_not:
         raise PalpateError("The moments back end needs one Gaussian bandwidth and few items", why_not, 'Pass backend="blocked"')
     # Second moments that take more room than the features, and more than a little, are no saving.
@@ -75,22 +75,20 @@ def kernel_sums(
         rest = bound(found.sums)
         if backend == "moments" or rest <= tolerance:
             return found
-        if rows > LONG:
-            warnings.warn(
-                f"Moments would leave {rest:.2g} open, more than the tolerance {tolerance:g}: all {rows**2 / 2:.2g} pairs are "
-                'formed instead, which takes long; pass backend="moments" or a larger tolerance to accept the bound',
-                stacklevel=4,
-            )
+        why_not = f"they would leave {rest:.2g} open, more than the tolerance {tolerance:.2g}"
+    if rows > LONG:
+        reason = f" Moments were not taken: {why_not}." if backend == "auto" and why_not else ""
+        warnings.warn(f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{reason}", stacklevel=4)
     x = ops_of(parts[0]).join(list(parts))
     return blocked_sums(x, segment, unit, segments=segments, kernel=kernel, block=block, spread=spread)
 
 
-def _no_moments(kernel: Kernel, items: int, width: int) -> str:
+def _no_moments(kernel: Kernel, items: int, width: int, room: int) -> str:
     """Why the sums cannot come from moments; '' if they can."""
     if not isinstance(kernel, Gaussian) or kernel.bandwidth is None:
-        return str(kernel.settings())
-    if items * width**2 * 4 > MOMENT_BYTES:
-        return f"{items} items of width {width}"
+        return f"the kernel is {kernel.settings()}, not one Gaussian"
+    if items * width**2 * 4 > room:
+        return f"second moments of {items} (unit, segment) cells of width {width} take more than {room >> 20} MiB"
     return ""
 
 

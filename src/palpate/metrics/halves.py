@@ -25,8 +25,9 @@ from palpate.metrics.mmd import mmd_bound, mmd_matrix
 from palpate.metrics.presets import Plan
 from palpate.metrics.sums import Totals
 
-#: More leave-one-out units than this are joined into random blocks where samples count as independent.
-BLOCKS = 1000
+#: More leave-one-out units than this are joined into random blocks where samples count as independent; fewer blocks where there are so many
+#: samples that only moments are quick, whose room grows with the number of units.
+BLOCKS, MANY, BLOCKS_OF_MANY = 1000, 100_000, 50
 
 
 def half_of(ids: Sequence[str], within: Index, plan: Plan) -> Index:
@@ -56,9 +57,10 @@ def sample_units(ids: Sequence[str], seed: int) -> tuple[Index, str, list[str]]:
     if len(names) <= BLOCKS:
         number = {name: k for k, name in enumerate(names)}
         return np.array([number[i] for i in ids], dtype=np.intp), "sample", names
+    blocks = BLOCKS if len(names) <= MANY else BLOCKS_OF_MANY
     names.sort(key=lambda name: (seed_for(seed, "block", name), name))
-    number = {name: k * BLOCKS // len(names) for k, name in enumerate(names)}
-    return np.array([number[i] for i in ids], dtype=np.intp), "random-block", [f"block {k}" for k in range(BLOCKS)]
+    number = {name: k * blocks // len(names) for k, name in enumerate(names)}
+    return np.array([number[i] for i in ids], dtype=np.intp), "random-block", [f"block {k}" for k in range(blocks)]
 
 
 @dataclass(frozen=True)

@@ -191,8 +191,11 @@ def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) 
             raise PalpateError('sigma must be positive, several of that, "median" or "multi"', repr(sigma), "Pass e.g. sigma=10")
         middle = median_distance(x, groups)
         return Gaussian(tuple(f * middle for f in (FACTORS if sigma == "multi" else (1.0,))), f"gaussian, {sigma}")
-    several = tuple(float(s) for s in sigma) if isinstance(sigma, Sequence | np.ndarray) else (float(sigma),)
-    if not several or not all(np.isfinite(s) and s > 0 for s in several):
+    try:
+        several = tuple(float(s) for s in (sigma if isinstance(sigma, Sequence) else np.atleast_1d(np.asarray(sigma, dtype=np.float64))))
+    except (TypeError, ValueError):
+        several = ()
+    if not several or not all(np.isfinite(s) and 1e-100 < s < 1e100 for s in several):
         raise PalpateError("sigma must be positive", f"{sigma!r}", "Pass e.g. sigma=10")
     return Gaussian(several)
 

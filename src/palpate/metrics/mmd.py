@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import Normalize, checked_choice, checked_names, checked_pair, checked_positive, copies_across
+from palpate.metrics.checks import Normalize, checked_choice, checked_names, checked_numbers, checked_pair, checked_positive, copies_across
 from palpate.metrics.engine import BACKENDS, Backend, kernel_sums
 from palpate.metrics.kernels import Array, Index, Kernel, Sigma, gaussian
 from palpate.metrics.sums import PairSums, Totals
@@ -65,9 +65,10 @@ def largest_bound(sums: PairSums, estimator: Estimator, scale: float) -> float:
     """The largest :func:`mmd_bound` between two segments; 0 where sums are exact."""
     if sums.bound is None:
         return 0.0
-    matrix = mmd_bound(sums.bound.totals, estimator, scale)
-    off = matrix[~np.eye(len(matrix), dtype=bool) & np.isfinite(matrix)]
-    return float(off.max(initial=0.0))
+    # Where there are no pairs there is nothing to bound; elsewhere a bound that overflowed is no bound.
+    known = np.isfinite(mmd_matrix(sums.totals, estimator, scale)) & ~np.eye(sums.segments, dtype=bool)
+    off = mmd_bound(sums.bound.totals, estimator, scale)[known]
+    return float(np.where(np.isfinite(off), off, np.inf).max(initial=0.0))
 
 
 def unit_index(*columns: Sequence[str]) -> list[Index]:
@@ -136,11 +137,12 @@ def distance(
         groups_y: n group names.
         normalize: ``"check"`` refuses rows not of unit length (1e-3), ``True`` normalises, ``False`` takes them as they are.
         backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
-        tolerance: largest bound that ``auto`` accepts.
+        tolerance: largest bound that ``auto`` accepts, at scale 1000.
         block: rows of a kernel block; memory is about ``block^2`` numbers a thread.
 
     Returns:
-        The value; blocked: float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9.
+        The value; blocked: float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9. Rounding errors average out over rows that
+        differ; where most rows are copies of a few, float32 leaves up to 1e-6 of the value.
 
     Raises:
         PalpateError: on features that :func:`palpate.metrics.checks.checked_features` refuses, fewer than two rows for
@@ -149,28 +151,33 @@ def distance(
     checked_choice("estimator", estimator, ESTIMATORS)
     checked_choice("backend", backend, BACKENDS)
     checked_positive(scale=scale, block=block)
+    checked_numbers(tolerance=tolerance)
+    if not isinstance(block, int | np.integer):
+        raise PalpateError("block must be a whole number", repr(block), "Leave it out for the default")
     x, y = checked_pair(x, y, normalize=normalize, least=1 if estimator == "biased" else 2)
     if copies := copies_across(x, y):
         warnings.warn(f"{copies} rows of x are bit for bit rows of y: a copy is not a generator", stacklevel=2)
     sets = np.repeat(np.arange(2), [len(x), len(y)])
     units = sets  # no pair is left out: a set is one item
+    gx, gy = checked_names("groups_x", groups_x, len(x)), checked_names("groups_y", groups_y, len(y))
     if estimator == "grouped":
-        gx, gy = checked_names("groups_x", groups_x, len(x)), checked_names("groups_y", groups_y, len(y))
         if gx is None or gy is None:
             raise PalpateError('estimator="grouped" must know the groups of both sets', "none", "Pass groups_x and groups_y")
         units = np.concatenate(unit_index(gx, gy))
-    kernel = gaussian(sigma, y, groups_y) if kernel is None else kernel
+    kernel = gaussian(sigma, y, gy) if kernel is None else kernel
     found = kernel_sums(
-        [x, y], sets, units, segments=2, kernel=kernel, backend=backend, tolerance=tolerance, block=block,
+        [x, y], sets, units, segments=2, kernel=kernel, backend=backend, tolerance=tolerance * scale / 1000, block=block,
         bound=lambda sums: largest_bound(sums, estimator, scale),
     ).sums  # fmt: skip
     value = float(mmd_matrix(found.totals, estimator, scale)[0, 1])
     if not np.isfinite(value):
         got = f"{len(set(groups_x or ()))} and {len(set(groups_y or ()))} groups"
         raise PalpateError("Each set must have at least two groups, not all shared", got, 'Use estimator="unbiased", or more groups')
-    return Distance(
-        value, largest_bound(found, estimator, scale), found.backend, estimator, kernel.settings(), kernel.bandwidth, scale, len(x), len(y)
-    )
+    bound = largest_bound(found, estimator, scale)
+    if bound > 2 * scale:  # more than the metric can be
+        got = f"a bound of {bound:.2g}"
+        raise PalpateError("The moments back end needs a bandwidth that is wide against the features", got, 'Pass backend="blocked"')
+    return Distance(value, bound, found.backend, estimator, kernel.settings(), kernel.bandwidth, scale, len(x), len(y))
 
 
 def mmd2(x: Any, y: Any, **options: Any) -> float:

@@ -146,7 +146,8 @@ class Moments:
         sums[np.diag_indices_from(sums)] -= self.diagonal
         rest = second.copy()
         rest[np.diag_indices_from(rest)] -= self.fourth  # i = j is known: it is 0
-        return sums, rest_factor(self.rho) * np.maximum(rest, 0)
+        # Numbers beyond any use stay finite: they are added and multiplied by zeros on their way.
+        return sums, np.minimum(min(rest_factor(self.rho), 1e100) * np.maximum(rest, 0), 1e200)
 
     def sums(self, segment: Index, unit: Index, segments: int) -> PairSums:
         """As :func:`palpate.metrics.blocked.blocked_sums` gives them, with ``bound``; item p lies in one segment and one unit."""
@@ -183,7 +184,8 @@ def rest_factor(rho: float) -> float:
     if rho <= 0:
         return 0.0
     # sum_{p >= 3} rho^p / p! = exp(rho) * P(3, rho), with P the regularised lower incomplete gamma function.
-    return float(np.exp(rho) * special.gammainc(3, rho) / rho**2)
+    with np.errstate(over="ignore"):
+        return float(np.exp(rho + np.log(special.gammainc(3, rho)) - 2 * np.log(rho))) if rho > 1e-80 else rho / 6
 
 
 def centre_of(parts: Iterable[Any], rows: int = 4096, run: int = 64) -> Array:

@@ -78,6 +78,24 @@ def prdc(
         PalpateError: on features that are refused, unequal widths, encoders of different digests, k < 1, a set of k rows or fewer, or
             (grouped) a group outside which there are fewer than k rows.
     """
+    return prdc_rows(
+        generated, reference, k, grouped=grouped, normalize=normalize, subject=subject, split=split, level=level, progress=progress
+    )[0]
+
+
+def prdc_rows(
+    generated: FeatureSet,
+    reference: FeatureSet,
+    k: int = 5,
+    *,
+    grouped: bool | None = None,
+    normalize: bool = False,
+    subject: str = "generated",
+    split: str | None = None,
+    level: float = 0.95,
+    progress: Progress = quiet,
+) -> tuple[list[Score], dict[str, Array]]:
+    """As :func:`prdc`, with what each score is the mean of: (n,) of the generated rows for Precision and Density, (m,) of the real ones for the others."""
     if k < 1:
         raise PalpateError("k must be at least 1", str(k), "Pass e.g. k=5")
     x, y = checked_sets(generated, reference, normalize=normalize, least=k + 1)
@@ -97,12 +115,16 @@ def prdc(
         "subject": subject, "level": level, "estimator": "per-row mean", "n": len(x), "m": len(y), "encoder": generated.encoder,
         "split": split, "higher_is_better": True, "settings": settings,
     }  # fmt: skip
-    return [
+    rows = {
+        "Precision": inside.precision, "Recall": inside.recall, "Density": inside.density / k, "Coverage": inside.coverage,
+    }  # fmt: skip
+    scores = [
         _score("Precision", inside.precision, groups[0], sets, note, common),
         _score("Recall", inside.recall, groups[1], sets, note, common),
         _score("Density", inside.density / k, groups[0], sets, note, common),
         _score("Coverage", inside.coverage, groups[1], sets, note, common),
     ]
+    return scores, {name: np.asarray(v, dtype=np.float64) for name, v in rows.items()}
 
 
 def checked_sets(generated: FeatureSet, reference: FeatureSet, *, normalize: bool, least: int) -> tuple[Floats, Floats]:
@@ -118,7 +140,7 @@ def checked_sets(generated: FeatureSet, reference: FeatureSet, *, normalize: boo
     return checked_pair(generated.features, reference.features, normalize=normalize, least=least, names=names)
 
 
-def copies_note(copies: int, n: int) -> str:
+def copies_note(copies: int | None, n: int) -> str:
     """What is to be said of generated rows that equal real ones."""
     return f"{copies} of {n} generated rows equal a real row bit for bit: a copy is not a generator" if copies else ""
 

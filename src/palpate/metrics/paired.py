@@ -26,9 +26,9 @@ from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
 from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Options, plan_for
-from palpate.metrics.scored import Scored, require_one_encoder
+from palpate.metrics.scored import Scored, require_one_encoder, same_units, with_floor
 from palpate.metrics.tables import build_table
-from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, four_of, i_tmmd_of
+from palpate.metrics.tactile import floors_of, four_of, tmmd_of
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,34 @@ def compare(
     first, *others = generators
     sets = {first: generators[first]} | {name: _like(generators[first], first, generators[name], name) for name in others}
     found = {name: four_of(of, reference, cast("Options", {**options, "subject": name})) for name, of in sets.items()}
-    floors: list[Scored | None] = [None]
+    floors: list[Scored | None] = [None] * 4
     if floor is not None:
-        floors += _floors(floor, reference, sets[first], options)
-        found = {name: [four[0], *map(_with_floor, four[1:], floors[1:])] for name, four in found.items()}
+        real = floors_of(floor, reference, sets[first], options)
+        found, floors = {name: [four[0], *map(with_floor, four[1:], real)] for name, four in found.items()}, [None, *real]
     pairs = list(combinations(found, 2))
-    differences = [difference(found[a][k], found[b][k], floors[k] if floor is not None else None) for k in range(4) for a, b in pairs]
+    differences = [difference(found[a][k], found[b][k], floors[k]) for k in range(4) for a, b in pairs]
     scores = [one.score for four in found.values() for one in four]
     return Comparison(scores, [d for k in range(4) for d in holm(differences[k * len(pairs) : (k + 1) * len(pairs)])])
+
+
+def compare_tmmd(generators: Mapping[str, FeatureSet], reference: FeatureSet, **options: Unpack[Options]) -> Comparison:
+    """As :func:`compare`, TMMD alone: with ``kernel=Polynomial()``, ``normalize=False`` and ``preset="paper"`` it is KID, with intervals.
+
+    Raises:
+        PalpateError: as :func:`compare`.
+    """
+    if not generators:
+        raise PalpateError("There must be a generator to score", "none", "Pass at least one")
+    first, *others = generators
+    sets = {first: generators[first]} | {name: _like(generators[first], first, generators[name], name) for name in others}
+    found: dict[str, Scored] = {}
+    for name, of in sets.items():
+        require_one_encoder(of, reference, "reference")
+        grouped = of.groups is not None and reference.groups is not None
+        plan = plan_for(cast("Options", {**options, "subject": name}), grouped=grouped)
+        found[name] = tmmd_of(build_table(of, reference, plan, grouped=grouped), of, reference, plan)
+    differences = [difference(found[a], found[b]) for a, b in combinations(found, 2)]
+    return Comparison([one.score for one in found.values()], holm(differences))
 
 
 def _like(wanted: FeatureSet, name: str, other: FeatureSet, called: str) -> FeatureSet:
@@ -90,20 +110,6 @@ def _like(wanted: FeatureSet, name: str, other: FeatureSet, called: str) -> Feat
         if mine != yours:
             raise PalpateError(f"{called!r} and {name!r} must have the same {column}", "different ones", "Take both from one manifest")
     return other
-
-
-def _floors(floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Options) -> list[Scored]:
-    require_one_encoder(like, floor, "floor")
-    if (floor.groups is None) != (like.groups is None):
-        must = "The floor must be scored like the generated touches"
-        raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
-    plan = plan_for(options, grouped=floor.groups is not None)
-    table = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference)
-    return [f(table, floor, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
-
-
-def _with_floor(one: Scored, floor: Scored | None) -> Scored:
-    return replace(one, score=replace(one.score, floor=floor.score.value if floor else None))
 
 
 def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
@@ -137,7 +143,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
         if interval is None:
             note, method = "No interval: leaving out a unit is undefined, or changes nothing", ""
         else:
-            details["p_value"] = 2 * min(ahead, 1 - ahead)
+            details["p_value"] = 2 * min(ahead, _interval(-value, a.replicates - b.replicates, x.level)[1])
         _decide(details, value, (interval, ahead), a, b, floor)
     return replace(
         x, metric=f"{x.metric} difference", subject=f"{x.subject} - {y.subject}", value=value, interval=interval, interval_method=method,
@@ -161,10 +167,10 @@ def _decide(
     if x.higher_is_better is None:
         if floor is None or floor.score.value is None or x.value is None or y.value is None:
             return
-        value, found = abs(x.value - floor.score.value) - abs(y.value - floor.score.value), (None, 0.5)
-        if list(floor.units) == list(a.units):
-            gaps = np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates)
-            found = _interval(value, gaps, x.level)
+        if not same_units(a, floor):
+            return
+        value = abs(x.value - floor.score.value) - abs(y.value - floor.score.value)
+        found = _interval(value, np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates), x.level)
         details |= {"gap": value, "gap_interval": found[0]}
     interval, below = found
     sign = -value if x.higher_is_better else value

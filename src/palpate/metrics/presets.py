@@ -15,10 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict
 
+import numpy as np
+
 from palpate.core import PalpateError
-from palpate.metrics.checks import Normalize, checked_choice, checked_positive
+from palpate.metrics.checks import Normalize, checked_choice, checked_numbers, checked_positive
 from palpate.metrics.engine import BACKENDS, Backend
-from palpate.metrics.kernels import Sigma
+from palpate.metrics.kernels import Kernel, Sigma
 from palpate.metrics.mmd import ESTIMATORS, Estimator
 
 Halves = Literal["group", "random", "ordered"]
@@ -37,6 +39,7 @@ class Options(TypedDict, total=False):
         estimator, halves, denominator, aggregate: override one entry of the preset.
         sigma: kernel bandwidth, default 10; several are averaged; ``"median"``: the median distance of the reference; ``"multi"``: five
             bandwidths around it (:mod:`palpate.metrics.kernels`).
+        kernel: another kernel than the Gaussian of ``sigma``, e.g. :class:`palpate.metrics.kernels.Polynomial`.
         scale: factor on the result, default 1000.
         normalize: ``"check"`` (default), True or False, see :func:`palpate.metrics.checks.checked_features`.
         backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
@@ -56,6 +59,7 @@ class Options(TypedDict, total=False):
     denominator: Denominator
     aggregate: Aggregate
     sigma: Sigma
+    kernel: Kernel | None
     scale: float
     normalize: Normalize
     backend: Backend
@@ -79,6 +83,7 @@ class Plan:
     denominator: Denominator
     aggregate: Aggregate
     sigma: Sigma = 10.0
+    kernel: Kernel | None = None
     scale: float = 1000.0
     normalize: Normalize = "check"
     backend: Backend = "auto"
@@ -113,6 +118,9 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     preset = options.get("preset") or ("grouped" if grouped else "paper")
     checked_choice("preset", preset, tuple(PRESETS))
     given: dict[str, Any] = {k: v for k, v in options.items() if k != "preset"}
+    if unknown := sorted(set(given) - set(Options.__annotations__)):
+        must = f"Options must be among {', '.join(Options.__annotations__)}"
+        raise PalpateError(must, ", ".join(unknown), "Check the spelling")
     plan = Plan(**{**PRESETS[preset].__dict__, **given})
     checked_choice("estimator", plan.estimator, ESTIMATORS)
     checked_choice("halves", plan.halves, HALVES)
@@ -120,9 +128,10 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     checked_choice("aggregate", plan.aggregate, AGGREGATES)
     checked_choice("backend", plan.backend, BACKENDS)
     checked_positive(scale=plan.scale, block=plan.block)
-    if not plan.tolerance >= 0 or plan.permutations < 0:
-        got = f"{plan.tolerance!r} and {plan.permutations!r}"
-        raise PalpateError("tolerance and permutations must not be negative", got, "Leave them out for the defaults")
+    checked_numbers(tolerance=plan.tolerance, permutations=plan.permutations, seed=plan.seed)
+    for name in ("block", "permutations", "min_samples", "seed"):
+        if not isinstance(getattr(plan, name), int | np.integer):
+            raise PalpateError(f"{name} must be a whole number", repr(getattr(plan, name)), "Leave it out for the default")
     if not 0 < plan.level < 1:
         raise PalpateError("level must lie in (0, 1)", f"{plan.level!r}", "Pass e.g. level=0.95")
     if plan.min_samples < 4:

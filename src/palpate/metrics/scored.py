@@ -7,7 +7,7 @@ from them (:mod:`palpate.metrics.paired`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,8 @@ def scored(
         **rest: further fields of the score.
     """
     value = plain(found.values[0]) if found else None
+    if value is not None and not bound <= 2 * plan.scale:
+        value, note = None, 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
     interval = found.interval(0, plan.level) if found and value is not None else None
     method = found.method if found and interval else ""
     if value is None:
@@ -87,6 +89,18 @@ def scored(
     if found is None or not len(found.units):
         return Scored(score)
     return Scored(score, found.replicates[:, 0], [table.names[int(u)] for u in found.units])
+
+
+def same_units(a: Scored, floor: Scored) -> bool:
+    """Whether two sets have the same units (videos), so that values that depend on their number may stand side by side."""
+    return list(a.units) == list(floor.units)
+
+
+def with_floor(one: Scored, floor: Scored) -> Scored:
+    """The score beside that of real touches: its value where it is comparable, and E, which does not depend on the number of groups."""
+    value = floor.score.value if same_units(one, floor) or one.score.settings.get("halves") != "group" else None
+    details = {f"{name}_floor": floor.score.details.get(name) for name in ("E", "E_ratio") if name in one.score.details}
+    return replace(one, score=replace(one.score, floor=value, details={**one.score.details, **details}))
 
 
 def plain(value: Any) -> Any:
@@ -136,7 +150,7 @@ def halves_note(plan: Plan, sums: PairSums, *, grouped: bool) -> str:
 
 
 def null_band(centre: float, sd: float) -> Interval | None:
-    """95 % of random halves."""
+    """95 % of random halves, by a normal approximation: the true distribution leans to the right where a few directions dominate."""
     return (centre - 1.96 * sd, centre + 1.96 * sd) if np.isfinite(sd) and np.isfinite(centre) else None
 
 

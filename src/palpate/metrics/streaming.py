@@ -26,7 +26,7 @@ import numpy as np
 from palpate.core import FeatureSet, PalpateError, Score, digest_json
 from palpate.metrics.checks import checked_choice
 from palpate.metrics.presets import Options, Plan, plan_for
-from palpate.metrics.scored import RANDOM_NOTE, Scored
+from palpate.metrics.scored import RANDOM_NOTE, Scored, with_floor
 from palpate.metrics.streaming_states import Columns, FeatureState, Layout, SumState, sized, to_host
 from palpate.metrics.tables import Table, build_table
 from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, tmmd, tmmd_of
@@ -59,7 +59,7 @@ class StreamingMetric:
     """
 
     name: ClassVar[str]
-    higher_is_better: ClassVar[bool] = False
+    higher_is_better: ClassVar[bool | None] = False
     is_differentiable: ClassVar[bool] = False
     full_state_update: ClassVar[bool] = False
     of_halves: ClassVar[bool] = True
@@ -175,14 +175,13 @@ class StreamingMetric:
 
     def _function(self, generated: FeatureSet, real: FeatureSet | None) -> Score:
         plan, grouped = plan_for(self.options, grouped=generated.groups is not None), generated.groups is not None
-        score = self._of(build_table(generated, None, plan, grouped=grouped, median_of=real), generated, plan).score
+        one = self._of(build_table(generated, None, plan, grouped=grouped, median_of=real), generated, plan)
         if real is None:
-            return score
+            return one.score
         if (real.groups is None) == grouped:
             must = "The floor must be scored like the generated touches"
             raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
-        floor = self._of(build_table(real, None, plan, grouped=grouped, median_of=real), real, plan).score.value
-        return replace(score, floor=floor)
+        return with_floor(one, self._of(build_table(real, None, plan, grouped=grouped, median_of=real), real, plan)).score
 
     def _from_sums(self, state: SumState) -> Score:
         score, by = self._one_set(state, real=False), state.checked_hash(state.hashed)
@@ -220,6 +219,7 @@ class ITMMD(StreamingMetric):
     """I-TMMD, between halves of the generated touches (paper, Eq. 3); the streaming form of :func:`palpate.metrics.i_tmmd`."""
 
     name = "I-TMMD"
+    higher_is_better: ClassVar[bool | None] = None
 
     def _of(self, table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         return i_tmmd_of(table, generated, plan)
@@ -229,6 +229,7 @@ class CITMMD(StreamingMetric):
     """CI-TMMD, between halves of each class (paper, Eq. 4); the streaming form of :func:`palpate.metrics.ci_tmmd`."""
 
     name = "CI-TMMD"
+    higher_is_better: ClassVar[bool | None] = None
     by_class = True
 
     def _of(self, table: Table, generated: FeatureSet, plan: Plan) -> Scored:
@@ -239,6 +240,7 @@ class DTMMD(StreamingMetric):
     """D-TMMD, halves of a class against other classes (paper, Eq. 5-7); the streaming form of :func:`palpate.metrics.d_tmmd`."""
 
     name = "D-TMMD"
+    higher_is_better: ClassVar[bool | None] = None
     by_class = True
 
     def _of(self, table: Table, generated: FeatureSet, plan: Plan) -> Scored:

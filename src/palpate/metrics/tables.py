@@ -15,7 +15,7 @@ import numpy as np
 from palpate.core import FeatureSet
 from palpate.metrics.checks import checked_features, checked_names, checked_pair, copies_across
 from palpate.metrics.engine import kernel_sums
-from palpate.metrics.halves import half_of, halves_bound, sample_units, take_sets
+from palpate.metrics.halves import half_of, halves_bound, sample_units, self_distances, take_sets
 from palpate.metrics.intervals import Interval, jackknife_errors, leave_one_out, t_interval
 from palpate.metrics.kernels import Array, Index, Kernel, gaussian
 from palpate.metrics.mmd import largest_bound, unit_index
@@ -34,7 +34,7 @@ class Table:
         names: the name of each unit number.
         kernel: what was summed.
         spread: (1 + C,) centred squares (:mod:`palpate.metrics.blocked`) of the generated set and of each class.
-        copies: generated rows that are bit for bit rows of the reference.
+        copies: generated rows that are bit for bit rows of the reference; None where they were not looked for.
     """
 
     sums: PairSums
@@ -43,7 +43,7 @@ class Table:
     names: Sequence[str]
     kernel: Kernel
     spread: Array
-    copies: int = 0
+    copies: int | None = 0
 
     @property
     def grouped(self) -> bool:
@@ -83,7 +83,7 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
     Raises:
         PalpateError: on features or groups that are refused.
     """
-    copies = 0
+    copies: int | None = 0
     if reference is None:
         parts = [checked_features("The generated features", generated.features, normalize=plan.normalize)]
         sets = [generated]
@@ -104,11 +104,16 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
     ids = [str(i) for i in generated.ids]
     own = 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
     segment = np.concatenate([own, np.full(len(units) - len(own), 4 * len(classes), dtype=np.intp)])
-    whole = median_of if median_of is not None else sets[-1]
-    kernel = gaussian(plan.sigma, np.asarray(whole.features), whole.groups)
+    if plan.kernel is not None:
+        kernel = plan.kernel
+    elif median_of is None or not isinstance(plan.sigma, str):
+        kernel = gaussian(plan.sigma, parts[-1], sets[-1].groups)
+    else:
+        rows = checked_features("The features that the median distance is taken over", median_of.features, normalize=plan.normalize)
+        kernel = gaussian(plan.sigma, rows, median_of.groups)
     rest = [np.arange(4 * len(classes)), *(np.arange(4 * c, 4 * c + 4) for c in range(len(classes)))]
     found = kernel_sums(
-        parts, segment, units, segments=4 * len(classes) + 1, kernel=kernel, backend=plan.backend, tolerance=plan.tolerance,
+        parts, segment, units, segments=4 * len(classes) + 1, kernel=kernel, backend=plan.backend, tolerance=plan.tolerance * plan.scale / 1000,
         bound=lambda sums: _bound(Table(sums, classes, unit, names, kernel, np.zeros(0)), plan), block=plan.block, spread=rest,
     )  # fmt: skip
     return Table(found.sums, classes, unit, names, kernel, found.spread, copies)
@@ -116,14 +121,17 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
 
 def _bound(table: Table, plan: Plan) -> float:
     """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most; classes too small to be scored are left out."""
-    own = table.set_halves().bound
+    whole = table.set_halves()
+    own = whole.bound
     joint = (
         0.0
         if not table.sums.n[table.sums.segment == table.sums.segments - 1].sum()
         else largest_bound(table.tmmd(), plan.estimator, plan.scale)
     )
-    halves = halves_bound(own.totals, plan) if own is not None else np.zeros(1)
-    return max(joint, largest_bound(table.whole_classes(), plan.estimator, plan.scale), float(np.nanmax(halves, initial=0.0)))
+    known = np.isfinite(self_distances(whole.totals, plan)[0])
+    halves = halves_bound(own.totals, plan)[known] if own is not None else np.zeros(1)
+    halves = np.where(np.isfinite(halves), halves, np.inf)
+    return max(joint, largest_bound(table.whole_classes(), plan.estimator, plan.scale), float(halves.max(initial=0.0)))
 
 
 @dataclass(frozen=True)
@@ -142,8 +150,8 @@ class Estimate:
 
     def interval(self, k: int, level: float) -> Interval | None:
         """Interval of value k, or None where it has none."""
-        if not (np.isfinite(self.values[k]) and np.isfinite(self.errors[k])):
-            return None
+        if not (np.isfinite(self.values[k]) and np.isfinite(self.errors[k]) and self.errors[k] > 0):
+            return None  # no variation between units is no evidence of certainty
         return t_interval(float(self.values[k]), float(self.errors[k]), self.df, level)
 
 

@@ -14,7 +14,6 @@ defined has value None and a note; samples and classes left out are listed in ``
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Unpack
 
 import numpy as np
@@ -26,7 +25,7 @@ from palpate.metrics.kernels import Array, Index
 from palpate.metrics.mmd import largest_bound, mmd_bound, mmd_matrix
 from palpate.metrics.permutation import permutation_test
 from palpate.metrics.presets import AGGREGATES, DENOMINATORS, Options, Plan, plan_for
-from palpate.metrics.scored import Scored, halves_fields, halves_note, null_band, require_one_encoder, scored, unfit, units_of
+from palpate.metrics.scored import Scored, halves_fields, halves_note, null_band, require_one_encoder, scored, unfit, units_of, with_floor
 from palpate.metrics.sums import PairSums, Totals
 from palpate.metrics.tables import Table, build_table, class_estimate, estimate
 
@@ -60,7 +59,9 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
     if not np.isfinite(found.values[0]):
         needs = "two groups, not all shared, for the grouped estimator" if plan.estimator == "grouped" else "two samples"
         notes.append(f"Undefined: each set needs {needs}")
-    if table.copies:
+    if table.copies is None:
+        notes.append("Copies of reference rows were not looked for on the device")
+    elif table.copies:
         notes.append(
             f"{table.copies} of {len(generated.ids)} generated rows are bit for bit rows of the reference: a copy is not a generator"
         )
@@ -88,7 +89,7 @@ def i_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
     With ``halves="group"`` the value is the average over halvings by whole groups, in closed form (:mod:`palpate.metrics.halves`).
 
     Returns:
-        Value, interval, ``null`` (95 % of random halves, closed form); ``details``: ``E`` (between-group excess, independent of the
+        Value, interval, ``null`` (95 % of random halves by a normal approximation with the exact variance); ``details``: ``E`` (between-group excess, independent of the
         number of groups) and its interval, ``z`` (distance from the null in its standard deviations), ``dispersion``.
 
     Raises:
@@ -111,6 +112,7 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     details = {
         "E": found.values[1] if table.grouped else None,
         "E_interval": found.interval(1, plan.level) if table.grouped else None,
+        "E_bound": _halves_bound(sums, plan)[0] / float(design.own[0]) if table.grouped and design.own[0] > 0 else None,
         "z": (found.values[0] - centre) / sd if sd > 0 else None,
         "dispersion": dispersion,
         "units": sums.units,
@@ -256,7 +258,7 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     found = class_estimate(sums, statistic, table.unit)
     matrix, below, errors = d_matrix(sums.totals, plan), found.values[4:], found.errors[4:]
     apart = found.values[3] > (2 * found.errors[3] if np.isfinite(found.errors[3]) else 0.0)
-    unstable = [name for k, name in enumerate(details["classes"]) if below[k] <= (2 * errors[k] if np.isfinite(errors[k]) else 0.0)]
+    unstable = [name for k, name in enumerate(details["classes"]) if not below[k] > (2 * errors[k] if np.isfinite(errors[k]) else np.inf)]
     details |= {
         "matrix": matrix,
         "variants": {f"{d}/{a}": d_ratio(matrix, d, a) for d in DENOMINATORS for a in AGGREGATES},
@@ -270,7 +272,8 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     }
     note = "Undefined: the classes do not separate (a denominator is not positive)" if not np.isfinite(found.values[0]) else ""
     if not note and unstable:
-        note = f"Denominators within two standard errors of 0, so the ratio is unreliable: {', '.join(unstable)}"
+        why = "within two standard errors of 0" if np.isfinite(errors).all() else "of unknown error (too few groups)"
+        note = f"Denominators {why}, so the ratio is unreliable: {', '.join(unstable)}"
     return scored(
         "D-TMMD", table, generated, plan, settings, found=found, bound=_d_bound(sums, matrix, plan), details=details, note=note, **fields,
     )  # fmt: skip
@@ -301,26 +304,33 @@ def four_scores(
     Args:
         generated: features of generated touches, with labels (for CI and D) and groups.
         reference: features of the real test touches.
-        floor: real touches on which the three reference-free metrics are computed for ``Score.floor``; usually ``reference``.
+        floor: real touches on which the three reference-free metrics are computed for ``Score.floor``; usually ``reference``. With halves of
+            whole groups their values depend on the number of groups: ``Score.floor`` is given where the groups are the same, and the floor of
+            what does not depend on it, ``details["E_floor"]``, in any case.
         **options: see :class:`Options`; the same for all four.
 
     Raises:
         PalpateError: as the single metrics do.
     """
     require_one_encoder(generated, reference, "reference")
-    if floor is not None:
-        require_one_encoder(generated, floor, "floor")
-        if (floor.groups is None) != (generated.groups is None):
-            raise PalpateError(
-                "The floor must be scored like the generated touches", "groups in one of the two", "Give groups to both, or to none"
-            )
-    plan = plan_for(options, grouped=generated.groups is not None)
-    found = [one.score for one in four_of(generated, reference, options)]
-    if floor is None:
-        return found
-    real = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference)
-    floors = [f(real, floor, plan).score.value for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
-    return [found[0], *(replace(s, floor=v) for s, v in zip(found[1:], floors, strict=True))]
+    floors = [] if floor is None else floors_of(floor, reference, generated, options)
+    first, *rest = four_of(generated, reference, options)
+    return [one.score for one in (first, *(map(with_floor, rest, floors) if floors else rest))]
+
+
+def floors_of(floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Options) -> list[Scored]:
+    """I-, CI- and D-TMMD of real touches, made like those of ``like``.
+
+    Raises:
+        PalpateError: if one of the two has groups and the other none, or encoders differ.
+    """
+    require_one_encoder(like, floor, "floor")
+    if (floor.groups is None) != (like.groups is None):
+        must = "The floor must be scored like the generated touches"
+        raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
+    plan = plan_for(options, grouped=floor.groups is not None)
+    table = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference)
+    return [f(table, floor, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
 
 
 def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> list[Scored]:

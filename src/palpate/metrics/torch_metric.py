@@ -53,7 +53,7 @@ class TorchMetric(Metric):
     where a set is missing. That costs a whole computation; ``update`` does not. ``dist_sync_on_step`` does not apply to it.
     """
 
-    higher_is_better = False
+    higher_is_better: bool | None = False
     is_differentiable = False
     full_state_update = False
     plain_class: type[streaming.StreamingMetric]
@@ -242,15 +242,18 @@ class ITMMD(TorchMetric):
     """:class:`palpate.metrics.streaming.ITMMD` for torchmetrics."""
 
     plain_class = streaming.ITMMD
+    higher_is_better: bool | None = None
 
 
 class CITMMD(TorchMetric):
     """:class:`palpate.metrics.streaming.CITMMD` for torchmetrics."""
 
     plain_class = streaming.CITMMD
+    higher_is_better: bool | None = None
 
 
 class DTMMD(TorchMetric):
     """:class:`palpate.metrics.streaming.DTMMD` for torchmetrics."""
 
     plain_class = streaming.DTMMD
+    higher_is_better: bool | None = None

@@ -17,10 +17,10 @@ from scipy import special
 
 from palpate import __version__
 from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet, require_comparable
-from palpate.metrics import PRESETS, Polynomial, compare, distance, tmmd
+from palpate.metrics import PRESETS, Polynomial, compare, compare_tmmd, distance, tmmd
 from palpate.metrics.frechet import fid
 from palpate.metrics.intervals import mean_interval
-from palpate.metrics.neighbours import prdc
+from palpate.metrics.neighbours import prdc_rows
 from palpate.metrics.paired import holm
 
 #: Companions on features; the first three need nothing further.
@@ -29,7 +29,7 @@ ON_FEATURES = ("fid", "kid", "prdc", "cmmd")
 SIGMA = 10.0
 #: From so many rows on the companions that form all pairs must be asked for.
 MANY = 50_000
-KID_NOTE = "No interval: the spread over random subsets that others print with KID is not one"
+KID_NOTE = "The interval is that of whole groups left out; the spread over random subsets that others print with KID is no interval"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,8 +101,7 @@ class Outcome:
         less = [
             f"{s.metric}, {s.subject}: below the floor of real touches, so these vary less than real ones do; that is not better"
             for s in self.scores
-            if s.metric.startswith(("I-TMMD", "CI-TMMD")) and s.settings.get("halves") == "group" and s.floor and s.interval
-            and s.interval[1] < s.floor
+            if s.metric.startswith(("I-TMMD E", "CI-TMMD E")) and s.floor and s.interval and s.interval[1] < s.floor
         ]  # fmt: skip
         return replace(
             self,
@@ -162,10 +161,28 @@ def compare_features(
         for some in sets:
             found = compare(some, reference, floor=floor, **options)
             scores = [replace(s, floor=least) if s.metric == "TMMD" else s for s in found.scores]
+            scores = [one for s in scores for one in (s, excess(s)) if one is not None]
             out.scores += [_named(s, sigma, asked) for s in scores]
             out.differences += [_named(d, sigma, asked) for d in found.differences]
         progress("TMMD family", k + 1, len(columns))
     return out
+
+
+def excess(score: Score) -> Score | None:
+    """The between-video excess E of an I- or CI-TMMD as a score of its own, so that every table shows it; None where there is none.
+
+    It does not depend on the number of videos, and its floor is always comparable: it is what to report.
+    """
+    d = score.details
+    if d.get("E") is None or score.metric not in ("I-TMMD", "CI-TMMD") or score.settings.get("halves") != "group":
+        return None
+    interval = d.get("E_interval")
+    kept = {k: d[k] for k in ("unit", "units", "backend", "version") if k in d} | {"bound": d.get("E_bound")}
+    return replace(
+        score, metric=f"{score.metric} E", value=d["E"], interval=None if interval is None else (interval[0], interval[1]), null=None,
+        interval_method=score.interval_method if interval else "", floor=d.get("E_floor"), estimator="unbiased", seed=None, note="",
+        details=kept,
+    )  # fmt: skip
 
 
 def require_rows(generators: Mapping[str, FeatureSet], reference: FeatureSet) -> None:
@@ -229,34 +246,38 @@ def _fid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, wh
     return Outcome([replace(s, metric=f"FID ({what})") for s in found])
 
 
-def _kid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, *_: Any) -> Outcome:
+def _kid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, paired: bool, *_: Any) -> Outcome:
+    options: dict[str, Any] = {
+        "kernel": Polynomial(), "preset": "paper", "normalize": False, "permutations": 0, "seed": asked.seed, "split": asked.split,
+    }  # fmt: skip
     out = Outcome()
-    for name, one in sets.items():
-        require_one_encoder(name, one, reference)
-        d = distance(one.features, reference.features, kernel=Polynomial(), estimator="unbiased", normalize=False, scale=1000)
-        details = {"backend": d.backend, "bound": d.bound, "version": __version__}
-        out.scores.append(
-            Score(
-                f"KID ({what})",
-                name,
-                d.value,
-                estimator=d.estimator,
-                scale=d.scale,
-                n=d.m,
-                m=d.n,
-                encoder=one.encoder,
-                split=asked.split,
-                settings={**d.kernel, "normalize": False},
-                details=details,
-                note=KID_NOTE,
-            )
-        )
+    for some in [dict(sets)] if paired else [{name: one} for name, one in sets.items()]:
+        found = compare_tmmd(some, reference, **options)
+        out.scores += [_as_kid(s, what) for s in found.scores]
+        out.differences += [_as_kid(d, what) for d in found.differences]
     return out
 
 
+def _as_kid(score: Score, what: str) -> Score:
+    """TMMD with KID's kernel under its own name."""
+    settings = {k: v for k, v in score.settings.items() if k != "preset"}
+    note = score.note if score.metric.endswith(" difference") else ". ".join(filter(None, [KID_NOTE, score.note]))
+    return replace(score, metric=score.metric.replace("TMMD", f"KID ({what})", 1), settings=settings, note=note)
+
+
 def _prdc(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, paired: bool, progress: Progress) -> Outcome:
-    found = [s for name, one in sets.items() for s in prdc(one, reference, subject=name, split=asked.split, progress=progress)]
-    return Outcome([replace(s, metric=f"{s.metric} ({what})") for s in found])
+    first = next(iter(sets.values()))
+    out, found = Outcome(), {}
+    for name, one in sets.items():
+        rows = one.take(list(first.ids)) if paired else one  # row by row the same samples
+        found[name] = prdc_rows(rows, reference, subject=name, split=asked.split, progress=progress)
+    for k, own in enumerate((first.groups, reference.groups, first.groups, reference.groups)):
+        scores = {name: replace(s[k], metric=f"{s[k].metric} ({what})") for name, (s, _) in found.items()}
+        out.scores += scores.values()
+        if paired and len(found) > 1:
+            values = {name: rows[s[k].metric] for name, (s, rows) in found.items()}
+            out.differences += mean_differences(scores, values, own if scores[next(iter(found))].settings["grouped"] else None)
+    return out
 
 
 def _cmmd(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, paired: bool, progress: Progress) -> Outcome:
@@ -311,6 +332,11 @@ def stream_tmmd(generators: Mapping[str, NDArray[Any]], reference: NDArray[Any],
         backend: Any = "moments" if asked.backend == "auto" else asked.backend
         estimator: Any = asked.estimator or PRESETS[preset].estimator
         d = distance(x, reference, sigma=sigma, estimator=estimator, normalize=asked.normalize, backend=backend)
+        if d.bound > 1e-4 and asked.backend == "auto":
+            must = "Streamed rows need a bandwidth that is wide against them"
+            raise PalpateError(
+                must, f"an error of up to {d.bound:.2g} at sigma {sigma}", "Pass --backend blocked and wait, or a larger --sigma"
+            )
         if d.bound > 1e-4:
             words = f"sigma {sigma}" if isinstance(sigma, str) else f"sigma {sigma:g}"
             out.remarks.append(f"TMMD of {name}, {words}: within {d.bound:.2g} of the exact value, as the bandwidth is narrow for moments")
@@ -325,7 +351,8 @@ def stream_tmmd(generators: Mapping[str, NDArray[Any]], reference: NDArray[Any],
             m=d.n,
             split=asked.split,
             settings={**d.kernel, "preset": preset, "normalize": asked.normalize},
-            note="No interval: neither groups nor repeats are known",
+            note="No interval: neither groups nor repeats are known"
+            + (f"; within {d.bound:.2g} of the exact value" if d.bound > 1e-4 else ""),
             details={"backend": d.backend, "bound": d.bound, "version": __version__},
         )
         out.scores.append(_named(score, sigma, asked))

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from palpate.core import FeatureSet, PalpateError, Progress, quiet
 from palpate.data.images import cached_images, load_images, read_image
@@ -185,6 +186,11 @@ def _of_pictures(
     if pairs:
         sets = {name: one.take(reference.ids) for name, one in sets.items()}
     out = Outcome()
+    whole = min(read_image(reference.paths("tactile")[0]).size)
+    if whole != size:
+        out.remarks.append(
+            f"Pixels are compared at {size} x {size}, the generators' size: the reference's {whole} px were resized, and smaller pictures score higher"
+        )
     if wanted.standard:
         out.add(
             standard_companions(
@@ -230,12 +236,29 @@ def _size(generators: Mapping[str, Manifest]) -> int:
     Raises:
         PalpateError: if generators differ in it: scores of pixels at different sizes are not comparable.
     """
-    sizes = {name: min(read_image(made.paths("tactile")[0]).size) for name, made in generators.items()}
+    sizes: dict[str, int] = {}
+    for name, made in generators.items():
+        shapes = {path: _shape(path) for path in made.paths("tactile")}
+        first, *others = shapes.items()
+        if other := next((item for item in others if item[1] != first[1]), None):
+            got = f"{first[0].name} of {first[1][0]} x {first[1][1]} and {other[0].name} of {other[1][0]} x {other[1][1]}"
+            fix = "Resize them alike, or leave scores of pixels out: --companions fid kid prdc, or none"
+            raise PalpateError(f"All pictures of {name} must have one size", got, fix)
+        sizes[name] = min(first[1])
     if len(set(sizes.values())) > 1:
         got = ", ".join(f"{name} {size}" for name, size in sizes.items())
         fix = "Resize them alike, or leave scores of pixels out: --companions fid kid prdc, or none"
         raise PalpateError("Generators side by side must have pictures of one size", got, fix)
     return next(iter(sizes.values()))
+
+
+def _shape(path: Path) -> tuple[int, int]:
+    """Width and height, from the head of the file where it can be told without decoding."""
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except OSError:
+        return read_image(path).size  # says what is wrong
 
 
 def _load(touches: Manifest, column: str, size: int, folder: Path, progress: Progress) -> Images:
