@@ -228,7 +228,7 @@ def test_the_four_metrics_take_moments_within_the_tolerance_and_blocks_beyond(ca
     )  # tolerances are at scale 1000
 
 
-@pytest.mark.parametrize(("sigma", "scale"), [(0.03, 1.0), (10.0, 300.0)])
+@pytest.mark.parametrize(("sigma", "scale"), [(0.3, 1.0), (0.05, 1.0), (0.03, 1.0), (0.003, 1.0), (10.0, 300.0)])
 def test_a_bound_that_overflows_is_no_bound(calls, sigma, scale):
     rng = np.random.default_rng(0)
     centres = unit_rows(0, 20, 8)

@@ -146,8 +146,13 @@ class Moments:
         sums[np.diag_indices_from(sums)] -= self.diagonal
         rest = second.copy()
         rest[np.diag_indices_from(rest)] -= self.fourth  # i = j is known: it is 0
-        # Numbers beyond any use stay finite: they are added and multiplied by zeros on their way.
-        return sums, np.minimum(min(rest_factor(self.rho), 1e100) * np.maximum(rest, 0), 1e200)
+        if self.rho <= WIDEST:
+            return sums, rest_factor(self.rho) * np.maximum(rest, 0)
+        # The weights u underflow where h overflows: their product says nothing. No kernel value is larger than 1, so this is no bound;
+        # it stays finite, as it is added and multiplied by zeros on its way.
+        pairs = np.outer(self.n, self.n)
+        pairs[np.diag_indices_from(pairs)] -= self.n
+        return sums, NO_BOUND * pairs
 
     def sums(self, segment: Index, unit: Index, segments: int) -> PairSums:
         """As :func:`palpate.metrics.blocked.blocked_sums` gives them, with ``bound``; item p lies in one segment and one unit."""
@@ -175,6 +180,8 @@ class Moments:
         return squares * shrunk**2
 
 
+#: Largest ``rho`` that the bound is formed for: exp(30) is 1e13, and every number is well inside float32.
+WIDEST, NO_BOUND = 30.0, 1e30
 #: Second moments of all items are float64 up to this many bytes.
 WIDE = 256 << 20
 
