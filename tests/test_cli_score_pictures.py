@@ -178,8 +178,8 @@ def test_pictures_with_an_encoder(capsys, tmp_path, monkeypatch, small_manifest,
         assert [k for k in found if k[0] == metric], metric
     assert not [k for k in found if k[0].startswith(("CMMD", "LPIPS"))]
     assert data["settings"]["digests"]["touch tower"] == mini.digest("touch")
-    status, _, err = call(capsys, "--generated", "elsewhere", "--reference", "m", "--encoder", "palpate/mini", "--presets", "paper")
-    assert (status, "share no id" in err) == (0, True), err
+    status, out, err = call(capsys, "--generated", "elsewhere", "--reference", "m", "--encoder", "palpate/mini", "--presets", "paper")
+    assert (status, "share no id" in out) == (0, True), err
     # CMMD on a CLIP of one's own: the shipped one stands in.
     found, _ = score(capsys, "--generated", "a", "--reference", "m", "--companions", "cmmd", "--clip", "palpate/mini")
     assert found["CMMD (CLIP)", "a", "cmmd"]["encoder"] == mini.digest("vision")

@@ -31,9 +31,9 @@ def show(results: Results, terminal: Terminal) -> None:
         if s.value is None:
             why.setdefault(s.note, []).append(s.metric if _column(s) not in known else f"{s.metric} of {s.subject}")
     for note, metrics in why.items():
-        terminal.say(f"{', '.join(dict.fromkeys(metrics))}: {note}")
+        terminal.print(f"{', '.join(dict.fromkeys(metrics))}: {note}")
     for remark in results.notes:
-        terminal.say(remark)
+        terminal.print(remark)  # part of the result: -q leaves it
 
 
 def _column(score: Score) -> tuple[str, str]:

@@ -116,7 +116,8 @@ def confidence(difference: Score) -> str:
     if d.get("p_better") is None or d.get("better") is None:
         return ""
     ahead = d["p_better"] if d["better"] == d["a"] else 1 - d["p_better"]
-    adjusted = f", Holm p = {d['p_adjusted']:.2g}" if d.get("p_adjusted") is not None else ""
+    p = d.get("p_adjusted")
+    adjusted = "" if p is None else ", Holm p < 1e-15" if p < 1e-15 else f", Holm p = {p:.2g}"
     return f"{d['better']} is better with {percent(ahead)} confidence{adjusted}"
 
 
@@ -387,8 +388,8 @@ def _mean_difference(x: Score, y: Score, delta: NDArray[np.float64], groups: Seq
     if interval is not None and value is not None:
         df = (len(kept) if names is None else len(set(names))) - 1
         error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
-        ahead = float(special.stdtr(df, sign / error))
-        details |= {"p_better": ahead, "p_value": 2 * min(ahead, 1 - ahead), "decided": not interval[0] <= 0 <= interval[1]}
+        ahead, behind = (float(special.stdtr(df, s / error)) for s in (sign, -sign))  # either tail keeps its digits
+        details |= {"p_better": ahead, "p_value": 2 * min(ahead, behind), "decided": not interval[0] <= 0 <= interval[1]}
     note = "Undefined: no pair of images has a value" if value is None else "" if interval else "No interval: too few groups or images"
     return replace(
         x,
