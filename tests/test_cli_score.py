@@ -1,7 +1,6 @@
 """``palpate score`` without a split: embeddings, several generators, and every way to ask for what cannot be compared."""
 
 import dataclasses
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from palpate.cli import main
 from palpate.core import FeatureSet, PalpateError, Results, Split
 from palpate.metrics import Polynomial, compare, distance, i_tmmd
 from palpate.protocol import comparing, embeddings
+from score_calls import call, score
 
 VIDEOS, FRAMES, D = 8, 6, 5
 IDS = [f"v{v}/{k}" for v in range(VIDEOS) for k in range(FRAMES)]
@@ -42,19 +42,6 @@ def sets(tmp_path, monkeypatch) -> dict[str, FeatureSet]:
         one.save(Path(f"{name}.npz"))
         np.save(f"{name}.npy", one.features)
     return found
-
-
-def call(capsys, *args):
-    status = main(["score", *map(str, args)])
-    said = capsys.readouterr()
-    return status, said.out, said.err
-
-
-def score(capsys, *args):
-    status, out, err = call(capsys, *args, "--json")
-    assert status == 0, err
-    data = json.loads(out)
-    return {(s["metric"], s["subject"], s["settings"].get("preset")): s for s in data["scores"]}, data
 
 
 def brute(x, y, kernel, groups=None):

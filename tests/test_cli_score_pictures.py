@@ -11,22 +11,9 @@ import pytest
 from PIL import Image
 from scipy import stats
 
-from palpate.cli import main
 from palpate.core import Split
 from palpate.metrics import compare, distance
-
-
-def call(capsys, *args):
-    status = main(["score", *map(str, args)])
-    said = capsys.readouterr()
-    return status, said.out, said.err
-
-
-def score(capsys, *args):
-    status, out, err = call(capsys, *args, "--json")
-    assert status == 0, err
-    data = json.loads(out)
-    return {(s["metric"], s["subject"], s["settings"].get("preset")): s for s in data["scores"]}, data
+from score_calls import call, score
 
 
 def paint(folder: Path, names, seed: int, suffix: str = ".png", side: int = 32):

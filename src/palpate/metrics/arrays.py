@@ -24,8 +24,6 @@ R = TypeVar("R")
 class Ops:
     """Operations on NumPy arrays."""
 
-    in_threads = True
-
     def columns(self, x: Any, *extra: Any) -> Any:
         """``x`` (n, d) with further columns (n,) behind, contiguous."""
         out = np.empty((len(x), x.shape[1] + len(extra)), dtype=x.dtype)
@@ -111,8 +109,6 @@ class Ops:
 
 class ArrayApiOps(Ops):
     """The same on another library's arrays, by the functions that the array-API standard names."""
-
-    in_threads = False
 
     def __init__(self, xp: Any, device: Any) -> None:
         self.xp, self.device = xp, device
