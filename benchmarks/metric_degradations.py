@@ -26,7 +26,7 @@ from scipy import stats
 
 from palpate.core import FeatureSet, rng_for
 from palpate.encoders.towers import Towers
-from palpate.metrics import Polynomial, ci_tmmd, d_tmmd, distance, i_tmmd, psnr_per_image, ssim_per_image, tmmd
+from palpate.metrics import Polynomial, ci_tmmd, d_tmmd, distance, i_tmmd, ms_ssim_per_image, psnr_per_image, ssim_per_image, tmmd
 from palpate.metrics.contact import contact_per_image
 from palpate.metrics.frechet import fid
 from palpate.metrics.neighbours import prdc
@@ -35,13 +35,25 @@ from palpate.sim import VERSION
 FIRST_SEED = 40_000
 SPLITS = 8  # halvings of the real touches by video
 PIXELS = 12  # every so many pairs are compared pixel by pixel
-UP = ("precision", "recall", "density", "coverage", "PSNR", "SSIM", "contact SSIM", "contact PSNR", "contact IoU")
+UP = (
+    "precision",
+    "recall",
+    "density",
+    "coverage",
+    "PSNR",
+    "SSIM",
+    "MS-SSIM",
+    "contact SSIM",
+    "contact MS-SSIM",
+    "contact PSNR",
+    "contact IoU",
+)
 TESTS = ("TMMD", "TMMD, median", "TMMD, multi")
 COLUMNS = {
     "against the reference": ("TMMD", "TMMD, median", "TMMD, multi", "TMMD, paper", "KID", "FID", "precision", "recall", "density", "coverage"),
     "without a reference, lower taken as better": ("I, random", "I", "I: E", "CI: E", "D", "D: E_ratio"),
     "without a reference, distance to the same on real touches": ("I: E, off the floor", "CI: E, off the floor", "D: E_ratio, off the floor"),
-    "picture by picture": ("PSNR", "SSIM", "contact PSNR", "contact SSIM", "contact residual", "contact IoU"),
+    "picture by picture": ("PSNR", "SSIM", "MS-SSIM", "contact PSNR", "contact SSIM", "contact MS-SSIM", "contact residual", "contact IoU"),
 }  # fmt: skip
 CONTROLS = {
     "perfect generator (other touches of the videos)": None,
@@ -108,8 +120,12 @@ def picture_scores(scene, images):
         if key not in scene.compared:
             pair, real = images[k : k + 1], scene.real[k : k + 1]
             found = contact_per_image(pair, real, scene.empty[k : k + 1])
-            contact = {f"contact {name}": getattr(found, name.lower())[0] for name in ("PSNR", "SSIM", "residual", "IoU")}
-            scene.compared[key] = {"PSNR": psnr_per_image(pair, real)[0], "SSIM": ssim_per_image(pair, real)[0], **contact}
+            contact = {
+                f"contact {name}": getattr(found, name.lower().replace("-", "_"))[0]
+                for name in ("PSNR", "SSIM", "MS-SSIM", "residual", "IoU")
+            }
+            whole = {"PSNR": psnr_per_image, "SSIM": ssim_per_image, "MS-SSIM": ms_ssim_per_image}
+            scene.compared[key] = {name: each(pair, real)[0] for name, each in whole.items()} | contact
         rows.append(scene.compared[key])
     return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}  # a touch without contact is left out
 

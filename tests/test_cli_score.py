@@ -12,7 +12,8 @@ import pytest
 from palpate.cli import main
 from palpate.core import FeatureSet, PalpateError, Results, Split
 from palpate.metrics import Polynomial, compare, distance, i_tmmd
-from palpate.protocol import comparing, embeddings
+from palpate.metrics.paired import mean_differences
+from palpate.protocol import embeddings, streamed
 from score_calls import call, score
 
 VIDEOS, FRAMES, D = 8, 6, 5
@@ -201,7 +202,7 @@ def test_many_bare_rows_are_streamed_and_never_held(capsys, sets, monkeypatch):
     wanted = distance(np.load("big.npy"), np.load("base.npy"), backend="blocked").value
     monkeypatch.setattr(embeddings, "STREAMED", 500)
     seen = []
-    monkeypatch.setattr(comparing, "distance", lambda x, y, **how: seen.append((x, y)) or distance(x, y, **how))
+    monkeypatch.setattr(streamed, "distance", lambda x, y, **how: seen.append((x, y)) or distance(x, y, **how))
     monkeypatch.setattr(embeddings.Embeddings, "feature_set", lambda *_: pytest.fail("held in memory"))
     found, data = score(capsys, "--generated", "big.npy", "--reference", "base.npy")
     assert all(isinstance(v, np.memmap) for v in seen[0])
@@ -283,7 +284,7 @@ def test_differences_need_comparable_scores():
 
     x, y = Score("SSIM", "a", 0.5, settings={"size": 32}), Score("SSIM", "b", 0.6, settings={"size": 64})
     with pytest.raises(PalpateError, match="must agree in settings"):
-        comparing.mean_differences({"a": x, "b": y}, {"a": np.ones(3), "b": np.zeros(3)}, None)
+        mean_differences({"a": x, "b": y}, {"a": np.ones(3), "b": np.zeros(3)}, None)
 
 
 @pytest.mark.parametrize(("up", "better"), [(True, "a"), (False, "b")])
@@ -294,7 +295,7 @@ def test_the_better_mean_is_the_one_in_the_metrics_direction(up, better):
     low, groups = rng.normal(size=40), [f"v{k % 8}" for k in range(40)]
     values = {"a": low + 1 + 0.1 * rng.normal(size=40), "b": low}
     scores = {name: Score("X", name, float(v.mean()), higher_is_better=up) for name, v in values.items()}
-    one = comparing.mean_differences(scores, values, groups)[0].details
+    one = mean_differences(scores, values, groups)[0].details
     assert (one["better"], one["decided"]) == (better, True)
     assert (one["p_better"] > 0.99) == (better == "a")
     assert (one["p_better"] < 0.01) == (better == "b")
@@ -363,3 +364,47 @@ def test_streamed_rows_at_a_narrow_bandwidth_and_one_file_for_two_are_refused(ca
     assert (status, "two files" in err, Path("same.x").exists()) == (2, True, False)
     status, _, err = call(capsys, "--generated", "near.npz", "--reference", "real.npz", "--sigma", "1e-300")
     assert (status, "sigma" in err, "Traceback" in err) == (2, True, False)
+
+
+def test_what_was_widened_or_formed_is_in_the_results_and_said_once(capsys, sets):
+    far = np.load("far.npz")
+    np.savez("thin.npz", features=far["features"].astype(np.float16), **{k: far[k] for k in ("ids", "labels", "groups")})
+    status, out, err = call(capsys, "--generated", "thin.npz", "--reference", "real.npz", "--companions", "none", "-o", "s.json")
+    note = "The features of 'thin': float16 features were widened to float32; their rounding stays"
+    assert status == 0, err
+    assert note in Results.load(Path("s.json")).notes
+    assert (note in err, note in out) == (True, False)
+    status, out, _ = call(capsys, "--generated", "thin.npz", "--reference", "real.npz", "--companions", "none", "-q")
+    assert (status, note in out) == (0, True)
+
+
+def test_errors_name_the_generator_that_is_wrong(capsys, sets):
+    spoilt = sets["far"].features.copy()
+    spoilt[3] *= 2
+    np.savez("spoilt.npz", features=spoilt, ids=np.array(IDS), groups=np.array(GROUPS), labels=np.array(LABELS))
+    status, _, err = call(capsys, "--generated", "near.npz", "spoilt.npz", "--reference", "real.npz")
+    assert status == 2
+    assert "The features of 'spoilt' must be L2-normalised. Got norm 2 in 1 row (3). Pass --normalize yes" in err
+
+
+def test_options_that_would_do_nothing_are_refused(capsys, sets):
+    Path("i.pt").write_bytes(b"")
+    Path("l.csv").write_text("id,material\n")
+    base = ("--generated", "far.npz", "--reference", "real.npz")
+    for extra, word in (
+        (("--companions", "ssim", "--inception", "i.pt"), "--inception must have a score to make"),
+        (("--companions", "ssim", "--clip", "palpate/mini"), "--clip must have a score to make"),
+        (("--companions", "kid", "--lpips", "i.pt", "i.pt"), "--lpips must have a score to make"),
+    ):
+        status, _, err = call(capsys, *base, *extra)
+        assert (status, word in err) == (2, True), err
+    manifest = ("m", "--split", "s.json", "--encoder", "palpate/mini", "--generated", "g", "--labels", "l.csv")
+    status, _, err = call(capsys, *manifest)
+    assert (status, "--labels and --groups must go with --reference" in err) == (2, True), err
+
+
+def test_features_that_rounding_cannot_tell_apart_are_refused(capsys, sets):
+    np.savez("huge.npz", features=sets["far"].features * 1e30, ids=np.array(IDS), groups=np.array(GROUPS))
+    status, _, err = call(capsys, "--generated", "huge.npz", "--reference", "real.npz", "--normalize", "no", "--companions", "none")
+    assert status == 2
+    assert "wide enough for rounding to tell the rows' distances" in err

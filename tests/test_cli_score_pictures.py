@@ -1,6 +1,7 @@
 """``palpate score`` of pictures: folders of images, manifests and folders of generate, with an encoder and without."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -78,7 +79,38 @@ def test_paired_differences_of_pixels_are_those_of_the_images(capsys, tmp_path, 
     assert d["details"]["better"] == ahead
     assert (d["details"]["p_better"] > 0.5) == (ahead == "a")
     assert d["interval_method"].startswith("paired, cluster-robust over groups")
-    assert {m for m, _, _ in found} >= {"MS-SSIM", "contact residual", "contact IoU difference"}
+    assert {m for m, _, _ in found} >= {"MS-SSIM", "contact residual", "contact IoU difference", "contact MS-SSIM difference"}
+
+
+def test_lpips_of_files_is_that_of_the_pictures_and_of_their_contact(capsys, tmp_path, monkeypatch, small_manifest):
+    from lpips_files import random_states, save_states
+    from palpate.encoders.perceptual import load_lpips, lpips_per_image
+    from palpate.metrics import contact_pictures
+
+    monkeypatch.chdir(tmp_path)
+    small_manifest.save(Path("m/manifest.parquet"))
+    made = {name: paint(tmp_path / name, small_manifest.ids, seed) for seed, name in enumerate("ab", 5)}
+    files = save_states(random_states(), tmp_path)
+    where = ("--generated", "a", "b", "--reference", "m", "--companions", "lpips", "--lpips", *map(str, files))
+    found, _ = score(capsys, *where)
+    network = load_lpips(*files)
+    real, gel = (np.stack([np.asarray(Image.open(p)) for p in small_manifest.paths(k)]) for k in ("tactile", "background"))
+    whole, contact = {}, {}
+    for name, pictures in made.items():
+        images = np.stack([pictures[i] for i in small_manifest.ids])
+        whole[name] = lpips_per_image(images, real, network)
+        pairs = contact_pictures(images, real, gel)
+        contact[name] = lpips_per_image(pairs.generated, pairs.reference, network, mask=pairs.mask)
+    pairs = contact_pictures(gel, real, gel)
+    empty = lpips_per_image(pairs.generated, pairs.reference, network, mask=pairs.mask)
+    for metric, values in (("LPIPS", whole), ("contact LPIPS", contact)):
+        for name in "ab":
+            assert found[metric, name, None]["value"] == pytest.approx(np.nanmean(values[name]), rel=1e-5)
+            assert found[metric, name, None]["higher_is_better"] is False
+        difference = found[f"{metric} difference", "a - b", None]
+        assert difference["value"] == pytest.approx(np.nanmean(values["a"] - values["b"]), rel=1e-3, abs=1e-6)
+    assert found["contact LPIPS", "a", None]["details"]["empty"] == pytest.approx(np.nanmean(empty), rel=1e-5)
+    assert ("show no contact" in found["contact LPIPS", "a", None]["note"]) == bool(np.isnan(empty).any())
 
 
 def test_unequal_ids_are_an_error_and_disjoint_ones_leave_pairs_out(capsys, tmp_path, monkeypatch):
@@ -161,7 +193,16 @@ def test_pictures_with_an_encoder(capsys, tmp_path, monkeypatch, small_manifest,
     for s in want:
         assert found[s.metric, "a", "grouped"]["value"] == pytest.approx(s.value, rel=1e-6, abs=1e-6), s.metric
     assert found["TMMD", "a", "grouped"]["encoder"] == mini.digest("touch")
-    for metric in ("FID (touch)", "SSIM", "MS-SSIM", "contact residual", "Precision (touch)", "TMMD difference", "SSIM difference"):
+    for metric in (
+        "FID (touch)",
+        "FID (touch) difference",
+        "SSIM",
+        "MS-SSIM",
+        "contact residual",
+        "Precision (touch)",
+        "TMMD difference",
+        "SSIM difference",
+    ):
         assert [k for k in found if k[0] == metric], metric
     assert not [k for k in found if k[0].startswith(("CMMD", "LPIPS"))]
     assert data["settings"]["digests"]["touch tower"] == mini.digest("touch")
@@ -181,3 +222,36 @@ def test_pictures_with_an_encoder(capsys, tmp_path, monkeypatch, small_manifest,
     s = found["TMMD", "a", "paper"]
     assert s["floor"] == pytest.approx(distance(real.features[:16], real.features[16:]).value, abs=1e-6)
     assert (s["n"], s["m"]) == (32, 32)
+
+
+def test_a_stopped_run_goes_on_from_its_embeddings_and_leaves_nothing_when_done(capsys, tmp_path, monkeypatch, small_manifest, mini):
+    from palpate.encoders.towers import Towers
+    from palpate.protocol import touches
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Towers, "load", lambda *_, **__: mini)
+    small_manifest.save(Path("m/manifest.parquet"))
+    for seed, name in enumerate("ab"):
+        paint(tmp_path / name, small_manifest.ids, seed, suffix=".bmp")  # of one size, and of one time
+        for file in (tmp_path / name).rglob("*.bmp"):
+            os.utime(file, ns=(10**18, 10**18))
+    args = ("--generated", "a", "b", "--reference", "m", "--encoder", "palpate/mini", "--companions", "psnr", "--permutations", "0")
+    plain, _ = score(capsys, *args)
+    with monkeypatch.context() as stop:
+        stop.setattr(touches, "compare_features", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        status, _, err = call(capsys, *args, "-o", "s.json")
+    assert (status, "goes on from what is done" in err) == (130, True)
+    kept = sorted(Path(".s.json.work").rglob("touch-*.npz"))
+    assert len(kept) == 3
+    calls = []
+    with monkeypatch.context() as count:
+        count.setattr(Towers, "encode", lambda *_, **__: calls.append(1))
+        found, _ = score(capsys, *args, "-o", "s.json")
+    assert not calls
+    assert not Path(".s.json.work").exists()
+    assert Path("s.json").is_file()
+    monkeypatch.setattr(touches, "HELD", 0)  # every picture in a file of the cache
+    again, _ = score(capsys, *args, "--cache", "kept")
+    for one in (found, again):
+        assert {k: s["value"] for k, s in one.items()} == pytest.approx({k: s["value"] for k, s in plain.items()}, rel=1e-6, abs=1e-9)
+    assert len(list(Path("kept").rglob("tactile-*.npy"))) == 3

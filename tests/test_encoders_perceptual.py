@@ -5,33 +5,21 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from lpips_files import SHAPES, random_states, save_states
 from palpate.core import PalpateError
 from palpate.encoders.perceptual import Lpips, load_lpips, lpips_per_image
 
-SHAPES = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
 STEPS = {0: (4, 2), 3: (1, 2), 6: (1, 1), 8: (1, 1), 10: (1, 1)}
 
 
 @pytest.fixture(scope="module")
 def states():
-    """Weights by the names that torchvision and LPIPS v0.1 give them."""
-    draw = torch.Generator().manual_seed(0)
-    backbone = {"classifier.1.weight": torch.zeros(2, 2)}
-    heads = {}
-    for k, (place, shape) in enumerate(SHAPES.items()):
-        fan = shape[1] * shape[2] * shape[3]
-        backbone[f"features.{place}.weight"] = torch.randn(shape, generator=draw) * (2 / fan) ** 0.5
-        backbone[f"features.{place}.bias"] = 0.1 * torch.randn(shape[0], generator=draw)
-        heads[f"lin{k}.model.1.weight"] = torch.rand((1, shape[0], 1, 1), generator=draw)
-    return backbone, heads
+    return random_states()
 
 
 @pytest.fixture(scope="module")
 def files(states, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("lpips")
-    torch.save(states[0], folder / "alexnet-owt-7be5be79.pth")
-    torch.save(states[1], folder / "alex.pth", _use_new_zipfile_serialization=False)  # the published file is of the old format
-    return folder / "alexnet-owt-7be5be79.pth", folder / "alex.pth"
+    return save_states(states, tmp_path_factory.mktemp("lpips"))
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +58,36 @@ def test_the_distance_is_the_published_formula(states, network, size):
         weights = [states[1][f"lin{i}.model.1.weight"].double().numpy()[0] for i in range(5)]
         expect = sum((w * (a - b) ** 2).sum(axis=0).mean() for a, b, w in zip(*stages, weights, strict=True))
         assert found[k] == pytest.approx(expect, rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (64, 48)])
+def test_a_mask_weighs_the_places_of_every_stage(states, network, size):
+    first, second = pairs(3, *size)
+    mask = np.zeros((3, *size), bool)
+    mask[0, 5:20, 9:30] = True
+    mask[1] = True
+    found = lpips_per_image(first, second, network, mask=mask, batch=2)
+    assert found[1] == pytest.approx(lpips_per_image(first, second, network)[1], rel=1e-6)
+    assert np.isnan(found[2])
+    stages = [written_out(states[0], v[0].transpose(2, 0, 1) / 127.5 - 1) for v in (first, second)]
+    expect = 0.0
+    for i, (a, b) in enumerate(zip(*stages, strict=True)):
+        (h, w), (rows, columns) = size, a.shape[1:]
+        weight = np.array(
+            [
+                [
+                    mask[0, r * h // rows : -(-(r + 1) * h // rows), c * w // columns : -(-(c + 1) * w // columns)].mean()
+                    for c in range(columns)
+                ]
+                for r in range(rows)
+            ]
+        )
+        places = (states[1][f"lin{i}.model.1.weight"].double().numpy()[0] * (a - b) ** 2).sum(axis=0)
+        expect += (weight * places).sum() / weight.sum()
+    assert found[0] == pytest.approx(expect, rel=1e-5)
+    for bad in (mask[:2], mask[:, :-1], mask.astype(float)):
+        with pytest.raises(PalpateError, match="mask must be of shape"):
+            lpips_per_image(first, second, network, mask=bad)
 
 
 def test_identical_images_are_at_0_and_the_distance_is_symmetric_and_grows(network):

@@ -8,17 +8,18 @@ import pytest
 from scipy import ndimage, stats
 
 from palpate.core import PalpateError, require_comparable
-from palpate.metrics import contact
+from palpate.metrics import masks
 from palpate.metrics.contact import (
-    LEAST,
     contact_iou,
-    contact_mask,
+    contact_ms_ssim,
     contact_per_image,
+    contact_pictures,
     contact_psnr,
     contact_residual,
     contact_scores,
     contact_ssim,
 )
+from palpate.metrics.masks import LEAST, contact_mask
 from palpate.sim import Video, World, WorldOptions
 from palpate.sim.fidelity import change, contact_area
 from palpate.sim.plan import first_contact, plan_world
@@ -181,16 +182,19 @@ def test_what_lies_outside_the_contact_earns_and_costs_nothing():
 
 def test_empty_gel_and_the_touch_itself_are_the_two_ends():
     background, real = pressed(7)
-    residual, similarity, noise, overlap = contact_scores(background, real, background)
+    residual, similarity, noise, overlap, several = contact_scores(background, real, background)
     assert residual.value == residual.details["empty"] == residual.details["per_real_energy"] == 1
     assert overlap.value == 0
     assert similarity.value == pytest.approx(similarity.details["empty"], abs=1e-12)
     assert similarity.value < 0.05
+    assert several.value == pytest.approx(several.details["empty"], abs=1e-12)
+    assert several.value < 0.1
     assert noise.value == pytest.approx(noise.details["empty"])
     elsewhere = np.clip(background + 0.1, 0, 1)  # empty gel of another sensor, on its own background
     assert contact_residual(elsewhere, real, background, generated_background=elsewhere).value == 1
-    residual, similarity, noise, overlap = contact_scores(real, real, background)
+    residual, similarity, noise, overlap, several = contact_scores(real, real, background)
     assert (residual.value, overlap.value) == (0, 1)
+    assert several.value == pytest.approx(1)
     assert similarity.value == pytest.approx(1)
     assert noise.value is None
     assert noise.details["identical"] == 3
@@ -229,6 +233,7 @@ def test_another_touch_of_the_same_material_does_not_lose_to_empty_gel():
         assert scores[2].value < scores[2].details["empty"]
         assert scores[1].value > scores[1].details["empty"]
         assert scores[3].value > 0.15
+        assert scores[4].value > scores[4].details["empty"]
     assert values["video"][0].value < values["material"][0].value
     blurred = ndimage.gaussian_filter(touch, (0, 2, 2, 0))
     assert contact_residual(blurred, touch, background).value < values["video"][0].value
@@ -261,9 +266,9 @@ def test_single_scores_directions_intervals_and_settings():
     background, real = pressed(10, 6)
     made = pressed(11, 6)[1]
     scores = contact_scores(made, real, background)
-    assert [s.metric for s in scores] == ["contact residual", "contact SSIM", "contact PSNR", "contact IoU"]
-    assert [s.higher_is_better for s in scores] == [False, True, True, True]
-    for call, score in zip((contact_residual, contact_ssim, contact_psnr, contact_iou), scores, strict=True):
+    assert [s.metric for s in scores] == ["contact residual", "contact SSIM", "contact PSNR", "contact IoU", "contact MS-SSIM"]
+    assert [s.higher_is_better for s in scores] == [False, True, True, True, True]
+    for call, score in zip((contact_residual, contact_ssim, contact_psnr, contact_iou, contact_ms_ssim), scores, strict=True):
         assert call(made, real, background) == score
     values = contact_per_image(made, real, background).residual
     reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
@@ -362,10 +367,71 @@ def test_noise_is_that_of_the_gel_and_not_of_its_markers():
     every = np.ones((64, 64), bool)
     for deviation in (0.01, 0.05):
         noisy = slope + rng.normal(size=slope.shape) * deviation
-        assert contact._noise(noisy, every) == pytest.approx(deviation, rel=0.05)
+        assert masks._noise(noisy, every) == pytest.approx(deviation, rel=0.05)
         keep = every.copy()
         keep[::5] = False
         noisy[::5] = rng.random((13, 64, 3))
-        assert contact._noise(noisy, keep) == pytest.approx(deviation, rel=0.08)
+        assert masks._noise(noisy, keep) == pytest.approx(deviation, rel=0.08)
         keep[::2] = False
-        assert contact._noise(noisy, keep) == 0
+        assert masks._noise(noisy, keep) == 0
+
+
+def slow_ms_ssim(made, real, kept, scales):
+    """MS-SSIM of two differences over some pixels, window by window."""
+    at = np.arange(11) - 5
+    window = np.exp(-0.5 * (at[:, None] ** 2 + at**2) / 1.5**2)
+    window /= window.sum()
+    c1, c2, values = (0.01 * 0.25) ** 2, (0.03 * 0.25) ** 2, []
+    exponents = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333][:scales])
+    for channel in range(real.shape[2]):
+        x, y, weight, product = made[..., channel], real[..., channel], kept.astype(float), 1.0
+        for j in range(scales):
+            if j:
+                pad = [(0, n % 2) for n in x.shape]
+                x, y, weight = np.pad(x, pad, "edge"), np.pad(y, pad, "edge"), np.pad(weight, pad)
+                x, y, weight = ((v[::2, ::2] + v[1::2, ::2] + v[::2, 1::2] + v[1::2, 1::2]) / 4 for v in (x, y, weight))
+            above = below = 0.0
+            wide = [np.pad(v, 5, "reflect") for v in (x, y)]
+            for r in range(x.shape[0]):
+                for c in range(x.shape[1]):
+                    a, b = (v[r : r + 11, c : c + 11] for v in wide)
+                    ma, mb = (window * a).sum(), (window * b).sum()
+                    va, vb, cov = (window * (a - ma) ** 2).sum(), (window * (b - mb) ** 2).sum(), (window * (a - ma) * (b - mb)).sum()
+                    value = (2 * cov + c2) / (va + vb + c2)
+                    if j == scales - 1:
+                        value *= (2 * ma * mb + c1) / (ma**2 + mb**2 + c1)
+                    above, below = above + weight[r, c] * value, below + weight[r, c]
+            product *= max(above / below, 0) ** (exponents / exponents.sum())[j]
+        values.append(product)
+    return np.mean(values)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (47, 51)])
+def test_contact_ms_ssim_is_the_definition_by_windows(size):
+    rng = np.random.default_rng(15)
+    background = np.full((1, *size, 3), 0.5)
+    real, made = background.copy(), background.copy()
+    shape = np.clip(ndimage.gaussian_filter(rng.normal(size=(30, 40, 3)), (2, 2, 0)), -0.4, 0.4)
+    real[0, -30:, -40:] += 0.8 * shape
+    made[0, -30:, -40:] += 0.8 * ndimage.shift(shape, (1, 1, 0)) + 0.01 * rng.normal(size=shape.shape)
+    score = contact_ms_ssim(made, real, background, markers="keep")
+    kept = contact_mask(real, background)[0]
+    scales = 3
+    assert score.settings["scales"] == scales
+    assert score.value == pytest.approx(slow_ms_ssim((made - background)[0], (real - background)[0], kept, scales), rel=1e-9)
+    assert 0.05 < score.value < 0.95
+
+
+def test_contact_pictures_are_grey_but_for_the_contact():
+    background, real = pressed(16)
+    made = pressed(17)[1]
+    found = contact_pictures(made, real, background)
+    found_8_bit = contact_pictures(*(np.round(v * 255).astype(np.uint8) for v in (made, real, background)))
+    for picture, touch in ((found.generated, made), (found.reference, real)):
+        assert picture.dtype == np.float32
+        assert (picture[~found.mask] == 0.5).all()
+        np.testing.assert_allclose(picture[found.mask], np.clip(0.5 + touch - background, 0, 1)[found.mask], atol=1e-6)
+    assert np.abs(found_8_bit.reference - found.reference)[found.mask & found_8_bit.mask].max() < 0.01
+    assert (found.mask & ~contact_mask(real, background)).sum() == 0
+    assert found.mask.any(axis=(1, 2)).all()
+    assert not contact_pictures(made, background, background).mask.any()

@@ -11,7 +11,8 @@ from scipy import linalg, stats
 
 from palpate.core import FeatureSet, PalpateError, Score
 from palpate.metrics import frechet
-from palpate.metrics.frechet import Moments, fid, frechet_distance
+from palpate.metrics.frechet import compare_fid, fid
+from palpate.metrics.gaussians import Moments, frechet_distance
 
 
 def features(x, groups=None, encoder=None):
@@ -248,3 +249,71 @@ def test_moments_take_torch_tensors():
     np.testing.assert_allclose(Moments.of(torch.tensor(x).bfloat16()).mean, x.mean(axis=0), atol=0.01)
     with pytest.raises(PalpateError, match="floating-point"):
         Moments.of(torch.ones(3, 2, dtype=torch.int64))
+
+
+def trio(n=84, width=3, videos=7, seed=9):
+    rng = np.random.default_rng(seed)
+    y = rng.normal(size=(n, width))
+    return 1.4 * rng.normal(size=(n, width)), 1.1 * y + 0.3, y, [f"v{i % videos}" for i in range(n)]
+
+
+@pytest.mark.parametrize("width", [3, 90])
+def test_the_difference_of_two_fids_is_left_one_out_as_a_whole(width):
+    x, z, y, groups = trio(width=width)
+    found = compare_fid({"a": features(x, groups), "b": features(z, groups)}, features(y, groups))
+    assert found.scores == [fid(features(v, groups), features(y, groups), subject=name) for name, v in (("a", x), ("b", z))]
+    (one,) = found.differences
+    kept = [np.array(groups) != f"v{k}" for k in range(7)]
+    out = np.array([definition(x[k], y[k]) - definition(z[k], y[k]) for k in kept])
+    error = np.sqrt(6 / 7 * ((out - out.mean()) ** 2).sum())
+    value, reach = definition(x, y) - definition(z, y), stats.t.ppf(0.975, 6) * error
+    assert one.value == pytest.approx(value, rel=1e-6)
+    assert one.interval == pytest.approx((value - reach, value + reach), rel=1e-5)
+    assert one.details["p_better"] == pytest.approx(stats.t.cdf(-value / error, 6), rel=1e-4)
+    assert one.details["better"] == ("b" if value > 0 else "a")
+    assert one.interval_method == "paired leave-one-group-out jackknife, t, 6 df"
+    assert one.details["infinity"] is None  # seven videos are too few to extrapolate
+    assert "biases need not be equal" in one.note
+
+
+def test_paired_fids_share_their_blocks_and_the_order_of_rows_does_not_matter():
+    x, z, y, _ = trio(n=240, seed=10)
+    groups, order = [f"v{i % 60}" for i in range(240)], np.random.default_rng(0).permutation(240)
+    ids = [str(i) for i in range(240)]
+    one, real = FeatureSet(ids, x, None, groups), FeatureSet(ids, y, None, groups)
+    here = compare_fid({"a": one, "b": FeatureSet(ids, z, None, groups)}, real)
+    other = FeatureSet([ids[i] for i in order], z[order], None, [groups[i] for i in order])
+    there = compare_fid({"a": one, "b": other}, real)
+    assert here.differences[0].value == pytest.approx(there.differences[0].value)
+    assert here.differences[0].interval == pytest.approx(there.differences[0].interval)
+    assert here.differences[0].interval_method == "paired leave-one-block-out jackknife, t, 19 df"
+    limits = [s.details["infinity"] for s in here.scores]
+    assert here.differences[0].details["infinity"] == pytest.approx(limits[0] - limits[1])
+    same = compare_fid({"a": one, "b": one}, real).differences[0]
+    assert (same.value, same.interval, same.details["better"]) == (0, None, None)
+
+
+def test_paired_fids_refuse_other_samples_and_nobody():
+    x, z, y, groups = trio()
+    with pytest.raises(PalpateError, match="same samples"):
+        compare_fid({"a": features(x, groups), "b": features(z[:-1], groups[:-1])}, features(y, groups))
+    with pytest.raises(PalpateError, match="same groups"):
+        compare_fid({"a": features(x, groups), "b": features(z, groups[::-1])}, features(y, groups))
+    with pytest.raises(PalpateError, match="a generator"):
+        compare_fid({}, features(y))
+
+
+@pytest.mark.slow
+def test_intervals_of_paired_fids_cover_the_expected_difference_over_videos():
+    """Frames of a video share a draw; the truth is the mean difference over many replicates at this size, bias included."""
+    rng, videos, frames, width, replicates = np.random.default_rng(11), 20, 6, 4, 300
+    groups = [f"v{i // frames}" for i in range(videos * frames)]
+    differences = []
+    for _ in range(replicates):
+        shared, mine, yours = (np.repeat(rng.normal(size=(videos, width)), frames, axis=0) for _ in range(3))
+        noise = lambda: 0.5 * rng.normal(size=(videos * frames, width))  # noqa: E731
+        sets = {"a": features(shared + 0.6 * mine + noise(), groups), "b": features(1.2 * shared + 0.4 * yours + noise() + 0.2, groups)}
+        differences.append(compare_fid(sets, features(shared + noise(), groups)).differences[0])
+    truth = np.mean([d.value for d in differences])
+    covered = np.mean([d.interval[0] <= truth <= d.interval[1] for d in differences])
+    assert 0.92 <= covered <= 0.99

@@ -137,7 +137,7 @@ def test_nan_is_named_by_id_and_file(tmp_path):
     bad = X.copy()
     bad[2, 1] = np.nan
     np.savez(tmp_path / "x.npz", features=bad, ids=np.array(IDS))
-    with pytest.raises(PalpateError, match=r"x\.npz: Features must be finite. Got NaN or infinity in 1 rows, first 'odd"):
+    with pytest.raises(PalpateError, match=r"x\.npz: Features must be finite. Got NaN or infinity in 1 row, first 'odd"):
         read_embeddings(tmp_path / "x.npz").feature_set()
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import shutil
 import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -64,6 +65,8 @@ class Options(Common):
     """The two files of LPIPS: AlexNet's weights and the heads."""
     group: Literal["auto", "video", "touch", "object"] = "auto"
     """What stays together in halves and intervals; `auto` takes what the split kept whole, else the video."""
+    cache: Path | None = None
+    """Folder that keeps embeddings and decoded pictures. Default: one beside -o, for a run that is stopped; removed at the end."""
     controls: Annotated[bool, tyro.conf.FlagConversionOff] = True
     """With MANIFEST and --split: score the empty gel and real touches of the same material as well (True or False)."""
     seed: int = 0
@@ -83,8 +86,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         guard_output(options.latex, inputs, (b"% palpate",))
         if options.output and options.latex.resolve() == options.output.resolve():
             raise PalpateError("-o and --latex must be two files", str(options.latex), "Give one of them another name")
-    with _told(terminal), terminal.progress() as progress:
-        results = scoring_runs.score(options, terminal, progress)
+    cache = _cache(options)
+    with _told(terminal) as told, terminal.progress() as progress:
+        results = scoring_runs.score(options, terminal, cache, progress)
+    results = replace(results, notes=[*results.notes, *told])
     if options.output:
         results.save(options.output)
     if options.latex:
@@ -92,8 +97,18 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         from palpate.report.latex import latex_tables
 
         write_text(options.latex, latex_tables(results))
-    show(results, terminal)
+    if cache is not None and options.cache is None:
+        shutil.rmtree(cache, ignore_errors=True)
+    show(results, terminal, said=[] if terminal.silent else told)
     return results.to_json()
+
+
+def _cache(options: Options) -> Path | None:
+    """The folder for embeddings: the one named, else one beside the output."""
+    if options.cache is not None:
+        return options.cache
+    output = options.output or options.latex
+    return output.absolute().parent / f".{output.name}.work" if output else None
 
 
 def sigmas(options: Options) -> tuple[float | str, ...]:
@@ -133,6 +148,12 @@ def _check(options: Options) -> None:
     if options.names and len(options.names) != len(options.generated):
         got = f"{len(options.names)} names for {len(options.generated)}"
         raise PalpateError("--names must name every generator", got, "One name for each entry of --generated")
+    if options.manifest is not None and (options.labels or options.groups):
+        raise PalpateError("--labels and --groups must go with --reference", "a manifest, which has its own", "Leave them out")
+    for flag, kinds in (("inception", ("fid", "kid")), ("clip", ("cmmd",)), ("lpips", ("lpips",))):
+        if getattr(options, flag) is not None and options.companions is not None and not set(kinds) & set(options.companions):
+            fix = f"Add {kinds[0]} to --companions, or leave --{flag} out"
+            raise PalpateError(f"--{flag} must have a score to make", f"--companions {' '.join(options.companions)}", fix)
     if options.permutations < 0:
         raise PalpateError("--permutations must not be negative", str(options.permutations), "0 makes none")
     if not options.sigma:
@@ -141,8 +162,8 @@ def _check(options: Options) -> None:
 
 
 @contextmanager
-def _told(terminal: Terminal) -> Generator[None]:
-    """Warnings of the metrics as remarks, and their advice in this command's words."""
+def _told(terminal: Terminal) -> Generator[list[str]]:
+    """Warnings of the metrics as remarks, which are listed as they come, and their advice in this command's words."""
     flags = {
         "normalize=True": "Pass --normalize yes to divide by the norm, or --normalize no to keep it",
         'preset="paper"': "Pass --groups FILE, or --presets paper",
@@ -151,16 +172,16 @@ def _told(terminal: Terminal) -> Generator[None]:
     }
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        said: set[str] = set()
+        said: list[str] = []
 
         def say(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
             if issubclass(category, UserWarning) and str(message) not in said:
-                said.add(str(message))
+                said.append(str(message))
                 terminal.say(f"Note: {message}")
 
         warnings.showwarning = say
         try:
-            yield
+            yield said
         except PalpateError as error:
             if type(error) is not PalpateError or (fix := next((v for k, v in flags.items() if k in error.fix), None)) is None:
                 raise

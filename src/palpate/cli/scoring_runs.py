@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.cli.terminal import Terminal, require_extra
 from palpate.core import MissingExtraError, PalpateError, Progress, Results, Split
-from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, compare_features, feature_companions, require_one_encoder, stream_tmmd
+from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, compare_features, feature_companions, require_one_encoder
 from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, read_columns, read_embeddings
+from palpate.protocol.streamed import stream_tmmd
 
 if TYPE_CHECKING:
     from palpate.cli.score import Options
@@ -20,8 +21,14 @@ if TYPE_CHECKING:
 GIVEN = "embeddings"
 
 
-def score(options: Options, terminal: Terminal, progress: Progress) -> Results:
+def score(options: Options, terminal: Terminal, cache: Path | None, progress: Progress) -> Results:
     """Everything that was asked for, as results.
+
+    Args:
+        options: of the command.
+        terminal: for its command line.
+        cache: folder for embeddings and decoded pictures, or None.
+        progress: told what is being done.
 
     Raises:
         PalpateError: on anything that cannot be scored or compared.
@@ -37,7 +44,7 @@ def score(options: Options, terminal: Terminal, progress: Progress) -> Results:
     paths = _named(options)
     group = options.group if options.group != "auto" else str(split.rule.get("group", "video")) if split else "video"
     if options.manifest is not None and split is not None:
-        return _of_split(options, split, asked, paths, group, terminal, progress)
+        return _of_split(options, split, asked, paths, group, terminal, cache, progress)
     assert options.reference is not None
     kinds = {path: is_embeddings(path) for path in (*paths.values(), options.reference)}
     if len(set(kinds.values())) > 1:
@@ -48,7 +55,7 @@ def score(options: Options, terminal: Terminal, progress: Progress) -> Results:
     columns = _columns(options, group)
     if kinds[options.reference]:
         return _of_embeddings(options, split, asked, paths, columns, terminal, progress)
-    return _of_pictures(options, split, asked, paths, columns, group, terminal, progress)
+    return _of_pictures(options, split, asked, paths, columns, group, terminal, cache, progress)
 
 
 def _named(options: Options) -> dict[str, Path]:
@@ -73,7 +80,14 @@ def _columns(options: Options, group: str) -> Columns | None:
 
 
 def _of_split(
-    options: Options, split: Split, asked: Asked, paths: Mapping[str, Path], group: str, terminal: Terminal, progress: Progress
+    options: Options,
+    split: Split,
+    asked: Asked,
+    paths: Mapping[str, Path],
+    group: str,
+    terminal: Terminal,
+    cache: Path | None,
+    progress: Progress,
 ) -> Results:
     """The test part of a split, beside controls."""
     require_extra("palpate score")
@@ -89,7 +103,7 @@ def _of_split(
     manifest, towers = Manifest.load(options.manifest), Towers.load(options.encoder)
     found = compare_generated(
         manifest, split, folders, towers, replace(asked, presets=asked.presets or ("grouped", "paper")), group=group,
-        controls=options.controls, companions=options.companions, weights=_weights(options), progress=progress,
+        controls=options.controls, companions=options.companions, weights=_weights(options), cache=cache, progress=progress,
     )  # fmt: skip
     digests = {"manifest": manifest.digest, "split": split.digest, "touch tower": towers.digest("touch")}
     settings = {"digests": digests, "split rule": dict(split.rule), "generated": {name: dict(f.settings) for name, f in folders.items()}}
@@ -105,6 +119,7 @@ def _of_pictures(
     columns: Columns | None,
     group: str,
     terminal: Terminal,
+    cache: Path | None,
     progress: Progress,
 ) -> Results:
     """Folders of images, manifests, folders of ``palpate generate``."""
@@ -140,6 +155,7 @@ def _of_pictures(
         companions=options.companions,
         weights=_weights(options),
         train=train,
+        cache=cache,
         progress=progress,
     )
     settings = {"digests": digests, "encoder": options.encoder or "none", "options": _said(asked, group)}

@@ -15,8 +15,8 @@ from palpate.protocol.comparing import percent
 TAIL = " difference"
 
 
-def show(results: Results, terminal: Terminal) -> None:
-    """Prints both tables, and what a reader must know."""
+def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None:
+    """Prints both tables, and what a reader must know but for what was ``said`` already."""
     scores = [s for s in results.scores if not s.metric.endswith(TAIL)]
     differences = [s for s in results.scores if s.metric.endswith(TAIL) and s.value is not None]
     known = {_column(s) for s in scores if s.value is not None}
@@ -32,7 +32,7 @@ def show(results: Results, terminal: Terminal) -> None:
             why.setdefault(s.note, []).append(s.metric if _column(s) not in known else f"{s.metric} of {s.subject}")
     for note, metrics in why.items():
         terminal.print(f"{', '.join(dict.fromkeys(metrics))}: {note}")
-    for remark in results.notes:
+    for remark in (r for r in results.notes if r not in said):
         terminal.print(remark)  # part of the result: -q leaves it
 
 

@@ -271,7 +271,9 @@ def run_verb(name: str, args: Sequence[str]) -> int:
             sys.stdout.write(json.dumps(error.to_json(), indent=1, ensure_ascii=False) + "\n")
         return USER_ERROR
     except KeyboardInterrupt:
-        sys.stderr.write(f"\npalpate {name}: stopped. Run the same command again to go on from what is done.\n")
+        sys.stderr.write(
+            f"\npalpate {name}: stopped. Run the same command again: with an output or a cache it goes on from what is done.\n"
+        )
         return INTERRUPTED
     except Exception:  # our own mistake: the traceback helps to report it, and the status differs from a failed check
         traceback.print_exc()

@@ -168,7 +168,7 @@ class FeatureSet:
         if bad.size:
             raise PalpateError(
                 "Features must be finite",
-                f"NaN or infinity in {bad.size} rows, first {self.ids[int(bad[0])]!r}",
+                f"NaN or infinity in {bad.size} row{'s' * (bad.size != 1)}, first {self.ids[int(bad[0])]!r}",
                 "Check the images of those ids",
             )
 

@@ -60,6 +60,7 @@ def embed(
     labels: str = "material",
     groups: str = "video",
     cache: Path | None = None,
+    keep_pixels: bool = True,
     batch: int = 128,
     progress: Progress = quiet,
 ) -> FeatureSet:
@@ -73,6 +74,7 @@ def embed(
         labels: column to carry along as labels; one without any value gives None.
         groups: the same, as groups.
         cache: folder for ``<tower>-<key>.npz`` and the decoded pixels; None computes anew and keeps nothing.
+        keep_pixels: whether the decoded pixels are kept in the cache, for another tower or another column of labels.
         batch: images at a time; changes the result by rounding only (1e-5).
         progress: told how many samples are done.
 
@@ -97,7 +99,7 @@ def embed(
         return found
     if tower == "text":
         features = embed_texts([str(t) for t in inputs], towers, batch=batch, progress=progress)
-    elif cache is not None:
+    elif cache is not None and keep_pixels:
         pixels = cached_images(manifest, column, towers.preprocess(tower).resize, cache, progress)
         features = embed_images(pixels, towers, tower, batch=batch, progress=progress)
     else:

@@ -69,10 +69,20 @@ class Lpips(nn.Module):
             found.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
         return found
 
-    def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """The distances (b,), float64, of pixels (b, 3, h, w) in [-1, 1]; differentiable."""
-        pairs = zip(self.stages_of(first), self.stages_of(second), self.heads, strict=True)
-        return torch.stack([head((a - b).square()).double().mean(dim=(1, 2, 3)) for a, b, head in pairs]).sum(dim=0)
+    def forward(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
+        """The distances (b,), float64, of pixels (b, 3, h, w) in [-1, 1]; differentiable.
+
+        ``weights`` (b, 1, h, w), not negative and not all 0, is averaged over the pixels of every place of a stage and weighs it there.
+        """
+        found: list[Tensor] = []
+        for a, b, head in zip(self.stages_of(first), self.stages_of(second), self.heads, strict=True):
+            places = head((a - b).square()).double()
+            if weights is None:
+                found.append(places.mean(dim=(1, 2, 3)))
+            else:
+                w = F.adaptive_avg_pool2d(weights.double(), places.shape[2:])
+                found.append((w * places).sum(dim=(1, 2, 3)) / w.sum(dim=(1, 2, 3)))
+        return torch.stack(found).sum(dim=0)
 
 
 def load_lpips(backbone: Path, heads: Path, *, device: str = "cpu") -> Lpips:
@@ -102,7 +112,13 @@ def load_lpips(backbone: Path, heads: Path, *, device: str = "cpu") -> Lpips:
 
 
 def lpips_per_image(
-    generated: NDArray[Any], reference: NDArray[Any], network: Lpips, *, batch: int = 64, progress: Progress = quiet
+    generated: NDArray[Any],
+    reference: NDArray[Any],
+    network: Lpips,
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    batch: int = 64,
+    progress: Progress = quiet,
 ) -> NDArray[np.float64]:
     """LPIPS of each pair of images, at the size they have.
 
@@ -110,16 +126,20 @@ def lpips_per_image(
         generated: (n, h, w, 3 or 1) uint8, or float in [0, 1]; h, w >= 32. Published values are of 64 px patches, or of whole images.
         reference: the same shape; image i is the partner of generated image i. One channel stands for three equal ones.
         network: of :func:`load_lpips`.
+        mask: (n, h, w): the pixels whose distances are averaged, the others only lend the network their surroundings; default all.
         batch: pairs at a time.
         progress: told how many pairs are done.
 
     Returns:
-        (n,) distances, 0 for identical images; lower is better.
+        (n,) distances, 0 for identical images; lower is better. NaN where the mask is empty.
 
     Raises:
         PalpateError: on other shapes, dtypes, ranges (image numbers are named), or images smaller than 32 x 32.
     """
     _check(generated, reference)
+    if mask is not None and (mask.shape != generated.shape[:3] or mask.dtype != bool):
+        must = f"The mask must be of shape {generated.shape[:3]} and of truth values"
+        raise PalpateError(must, f"shape {mask.shape}, dtype {mask.dtype}", "Pass one mask an image")
     if batch < 1:
         raise PalpateError("--batch must be at least 1", str(batch), "Pass e.g. --batch 64")
     out = np.empty(len(generated), np.float64)
@@ -127,7 +147,8 @@ def lpips_per_image(
     with _exact():
         for start in range(0, len(out), batch):
             at = slice(start, start + batch)
-            out[at] = network(_pixels(generated[at], device), _pixels(reference[at], device)).cpu().numpy()
+            weights = None if mask is None else torch.from_numpy(mask[at][:, None].astype(np.float32)).to(device)
+            out[at] = network(_pixels(generated[at], device), _pixels(reference[at], device), weights).cpu().numpy()
             progress("LPIPS", min(start + batch, len(out)), len(out))
     return out
 

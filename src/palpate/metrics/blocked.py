@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.core import PalpateError
 from palpate.metrics.arrays import Ops, ops_of
 from palpate.metrics.kernels import Array, Gaussian, Index, Kernel
 from palpate.metrics.sums import PairSums, split_by
@@ -99,6 +100,7 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops) -> Any:
         wide = ops.xp.astype(ops.xp.take(x, ops.xp.asarray(order, device=ops.device), axis=0), ops.xp.float64)  # type: ignore[attr-defined]
         z = wide - ops.xp.mean(wide, axis=0) if isinstance(kernel, Gaussian) else wide  # type: ignore[attr-defined]
         radius = float(ops.xp.max(ops.squares(z))) if len(order) else 0.0  # type: ignore[attr-defined]
+        _require_known_distances(radius, kernel)
         single = x.dtype != ops.xp.float64 and len(order) > FLOAT64_BELOW and radius <= kernel.radius_limit  # type: ignore[attr-defined]
         return ops.xp.astype(z, ops.xp.float32) if single else z  # type: ignore[attr-defined]
     slabs = [slice(i, i + SLAB) for i in range(0, len(order), SLAB)]
@@ -106,11 +108,24 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops) -> Any:
         return x[order].astype(np.float64)
     mean = x.mean(axis=0, dtype=np.float64)
     radius = max((float(((x[at] - mean) ** 2).sum(axis=1).max()) for at in slabs), default=0.0)
+    _require_known_distances(radius, kernel)
     wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or radius > kernel.radius_limit
     z = np.empty(x.shape, dtype=np.float64 if wide else np.float32)
     for at in slabs:
         z[at] = x[order[at]] - mean
     return z
+
+
+def _require_known_distances(radius: float, kernel: Kernel) -> None:
+    """Refuses rows so far from their mean that a product cannot tell distances of a bandwidth in float64.
+
+    The limit of a kernel is where float32 keeps 1e-6; float64 has 2^29 times as much room.
+    """
+    if kernel.radius_limit > 0 and not radius <= kernel.radius_limit * 2.0**29:
+        got = f"rows up to {radius**0.5:.3g} from their mean"
+        raise PalpateError(
+            "The bandwidth must be wide enough for rounding to tell the rows' distances", got, 'Normalise the rows, or pass sigma="median"'
+        )
 
 
 class _Run:

@@ -122,6 +122,7 @@ def distance(
     backend: Backend = "auto",
     tolerance: float = 1e-4,
     block: int = 1024,
+    names: tuple[str, str] = ("x", "y"),
 ) -> Distance:
     """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``, with back end and bound.
 
@@ -139,6 +140,7 @@ def distance(
         backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
         tolerance: largest bound that ``auto`` accepts, at scale 1000.
         block: rows of a kernel block; memory is about ``block^2`` numbers a thread.
+        names: what errors and warnings call the two sets.
 
     Returns:
         The value; blocked: float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9. Rounding errors average out over rows that
@@ -154,9 +156,9 @@ def distance(
     checked_numbers(tolerance=tolerance)
     if not isinstance(block, int | np.integer):
         raise PalpateError("block must be a whole number", repr(block), "Leave it out for the default")
-    x, y = checked_pair(x, y, normalize=normalize, least=1 if estimator == "biased" else 2)
+    x, y = checked_pair(x, y, normalize=normalize, least=1 if estimator == "biased" else 2, names=names)
     if copies := copies_across(x, y):
-        warnings.warn(f"{copies} rows of x are bit for bit rows of y: a copy is not a generator", stacklevel=2)
+        warnings.warn(f"{copies} rows of {names[0]} are bit for bit rows of {names[1]}: a copy is not a generator", stacklevel=2)
     sets = np.repeat(np.arange(2), [len(x), len(y)])
     units = sets  # no pair is left out: a set is one item
     gx, gy = checked_names("groups_x", groups_x, len(x)), checked_names("groups_y", groups_y, len(y))

@@ -20,9 +20,10 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Score
-from palpate.metrics.compat import OWN, WINDOW, Pairs, Range, checked_pairs, local_maps, pooled
+from palpate.metrics.compat import OWN, WINDOW, Convention, Pairs, Range, checked_pairs, local_maps, pooled
 from palpate.metrics.kernels import Array
 from palpate.metrics.pairwise import mean_score
 
@@ -106,13 +107,49 @@ def ms_ssim(
     )  # fmt: skip
 
 
+def fitting_scales(size: Sequence[int]) -> int:
+    """How many scales, of at most five, an image of that height and width holds; 0 where it is smaller than the window."""
+    return max((m for m in range(1, len(WEIGHTS) + 1) if min(size) >= least_side(m)), default=0)
+
+
+def weighted_ms_ssim(x: Array, y: Array, kept: NDArray[np.bool_], scales: int, convention: Convention, reach: float) -> float:
+    """MS-SSIM of two images over some of their pixels.
+
+    The factors of each scale are averaged with the share of a cell that is kept as weight; a last odd row or column is repeated instead of
+    dropped, so that what is kept there counts.
+
+    Args:
+        x: (c, h, w).
+        y: the same shape.
+        kept: (h, w), at least one pixel.
+        scales: of :func:`fitting_scales`.
+        convention: a window at every pixel (``border="mirror"``).
+        reach: the data range.
+
+    Returns:
+        A value in [0, 1].
+    """
+    weight, means = kept.astype(np.float64)[None], np.empty((scales, len(x)))
+    for j in range(scales):
+        if j:
+            x, y, weight = pooled(_even(x, "edge"), 2), pooled(_even(y, "edge"), 2), pooled(_even(weight, "constant"), 2)
+        similarity, structure = local_maps(x, y, convention, reach)
+        means[j] = np.average((similarity if j == scales - 1 else structure).reshape(len(x), -1), axis=1, weights=weight.ravel())
+    return float(np.prod(np.maximum(means, 0) ** scale_weights(scales)[:, None], axis=0).mean())
+
+
+def _even(image: Array, mode: Literal["edge", "constant"]) -> Array:
+    """(c, h, w) with even h and w."""
+    return np.pad(image, [(0, 0), *((0, n % 2) for n in image.shape[1:])], mode=mode)
+
+
 def _number(scales: Any, pairs: Pairs) -> int:
     side = min(pairs.a.shape[1:3])
     size = f"{pairs.a.shape[1]} x {pairs.a.shape[2]}"
     if scales == "auto":
         if side < WINDOW:
             raise PalpateError(f"Images must be at least {WINDOW} x {WINDOW} for MS-SSIM", size, "Score larger images")
-        return max(m for m in range(1, len(WEIGHTS) + 1) if side >= least_side(m))
+        return fitting_scales(pairs.a.shape[1:3])
     if isinstance(scales, bool) or not isinstance(scales, int | np.integer) or not 1 <= scales <= len(WEIGHTS):
         raise PalpateError(
             f'scales must be "auto" or a whole number from 1 to {len(WEIGHTS)}', repr(scales), "Leave it out for the default"

@@ -23,7 +23,7 @@ import numpy as np
 from scipy import special
 
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
-from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
+from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
 from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Options, plan_for
 from palpate.metrics.scored import Scored, require_one_encoder, same_units, with_floor
@@ -58,14 +58,11 @@ def compare(
     Raises:
         PalpateError: if generators differ in ids, labels, groups or encoder, or as the metrics do.
     """
-    if not generators:
-        raise PalpateError("There must be a generator to score", "none", "Pass at least one")
-    first, *others = generators
-    sets = {first: generators[first]} | {name: _like(generators[first], first, generators[name], name) for name in others}
+    sets = same_samples(generators)
     found = {name: four_of(of, reference, cast("Options", {**options, "subject": name})) for name, of in sets.items()}
     floors: list[Scored | None] = [None] * 4
     if floor is not None:
-        real = floors_of(floor, reference, sets[first], options)
+        real = floors_of(floor, reference, next(iter(sets.values())), options)
         found, floors = {name: [four[0], *map(with_floor, four[1:], real)] for name, four in found.items()}, [None, *real]
     pairs = list(combinations(found, 2))
     differences = [difference(found[a][k], found[b][k], floors[k]) for k in range(4) for a, b in pairs]
@@ -79,18 +76,26 @@ def compare_tmmd(generators: Mapping[str, FeatureSet], reference: FeatureSet, **
     Raises:
         PalpateError: as :func:`compare`.
     """
-    if not generators:
-        raise PalpateError("There must be a generator to score", "none", "Pass at least one")
-    first, *others = generators
-    sets = {first: generators[first]} | {name: _like(generators[first], first, generators[name], name) for name in others}
     found: dict[str, Scored] = {}
-    for name, of in sets.items():
+    for name, of in same_samples(generators).items():
         require_one_encoder(of, reference, "reference")
         grouped = of.groups is not None and reference.groups is not None
         plan = plan_for(cast("Options", {**options, "subject": name}), grouped=grouped)
         found[name] = tmmd_of(build_table(of, reference, plan, grouped=grouped), of, reference, plan)
     differences = [difference(found[a], found[b]) for a, b in combinations(found, 2)]
     return Comparison([one.score for one in found.values()], holm(differences))
+
+
+def same_samples(generators: Mapping[str, FeatureSet]) -> dict[str, FeatureSet]:
+    """The generators with their rows in the order of the first.
+
+    Raises:
+        PalpateError: if there is none, or if they differ in ids, labels, groups or encoder.
+    """
+    if not generators:
+        raise PalpateError("There must be a generator to score", "none", "Pass at least one")
+    first, *others = generators
+    return {first: generators[first]} | {name: _like(generators[first], first, generators[name], name) for name in others}
 
 
 def _like(wanted: FeatureSet, name: str, other: FeatureSet, called: str) -> FeatureSet:
@@ -138,7 +143,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     elif not a.units or list(a.units) != list(b.units):
         note = "No interval: the two scores share no units to leave out"
     else:
-        method = f"paired leave-one-{x.details['unit']}-out jackknife, t, {len(a.units) - 1} df"
+        method = f"paired leave-one-{x.details.get('left_out', x.details['unit'])}-out jackknife, t, {len(a.units) - 1} df"
         interval, ahead = _interval(value, a.replicates - b.replicates, x.level)
         if interval is None:
             note, method = "No interval: leaving out a unit is undefined, or changes nothing", ""
@@ -178,6 +183,50 @@ def _decide(
     if interval is not None:
         details["p_better"] = 1 - below if x.higher_is_better else below
         details["decided"] = not interval[0] <= 0 <= interval[1]
+
+
+def mean_differences(scores: Mapping[str, Score], values: Mapping[str, Array], groups: Sequence[str] | None) -> list[Score]:
+    """Paired differences of a metric that is a mean over images.
+
+    Args:
+        scores: of the generators, of one metric.
+        values: (n,) of each generator, image by image in one order; pairs in which one is not finite are left out.
+        groups: n groups, or None.
+
+    Raises:
+        PalpateError: if the scores are of different settings.
+    """
+    return holm([_mean_difference(scores[a], scores[b], values[a] - values[b], groups) for a, b in combinations(scores, 2)])
+
+
+def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | None) -> Score:
+    require_comparable([x, y])
+    finite = np.isfinite(delta)
+    kept = delta[finite]
+    names = None if groups is None else [g for g, ok in zip(groups, finite, strict=True) if ok]
+    value = float(kept.mean()) if len(kept) else None
+    interval, method = mean_interval(kept, names, x.level)
+    sign = (value or 0.0) * (1 if x.higher_is_better else -1)
+    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "p_better": None, "p_value": None, "better": None}
+    details["better"] = x.subject if sign > 0 else y.subject if sign < 0 else None
+    if interval is not None and value is not None:
+        df = (len(kept) if names is None else len(set(names))) - 1
+        error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
+        ahead, behind = (float(special.stdtr(df, s / error)) for s in (sign, -sign))  # either tail keeps its digits
+        details |= {"p_better": ahead, "p_value": 2 * min(ahead, behind), "decided": not interval[0] <= 0 <= interval[1]}
+    note = "Undefined: no pair of images has a value" if value is None else "" if interval else "No interval: too few groups or images"
+    return replace(
+        x,
+        metric=f"{x.metric} difference",
+        subject=f"{x.subject} - {y.subject}",
+        value=value,
+        interval=interval,
+        interval_method=f"paired, {method}" if method else "",
+        null=None,
+        floor=None,
+        details=details,
+        note=note,
+    )
 
 
 def holm(differences: Sequence[Score]) -> list[Score]:

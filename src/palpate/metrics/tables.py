@@ -83,12 +83,13 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
     Raises:
         PalpateError: on features or groups that are refused.
     """
+    own = "The generated features" if plan.subject == "generated" else f"The features of {plan.subject!r}"
     copies: int | None = 0
     if reference is None:
-        parts = [checked_features("The generated features", generated.features, normalize=plan.normalize)]
+        parts = [checked_features(own, generated.features, normalize=plan.normalize)]
         sets = [generated]
     else:
-        names = ("The generated features", "The reference features")
+        names = (own, "The reference features")
         parts = list(checked_pair(generated.features, reference.features, normalize=plan.normalize, least=1, names=names))
         sets, copies = [generated, reference], copies_across(*parts)
     if grouped:
@@ -102,8 +103,8 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
     number = {name: k for k, name in enumerate(classes)}
     label = np.array([number[v] for v in labels], dtype=np.intp)
     ids = [str(i) for i in generated.ids]
-    own = 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
-    segment = np.concatenate([own, np.full(len(units) - len(own), 4 * len(classes), dtype=np.intp)])
+    halves = 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
+    segment = np.concatenate([halves, np.full(len(units) - len(halves), 4 * len(classes), dtype=np.intp)])
     if plan.kernel is not None:
         kernel = plan.kernel
     elif median_of is None or not isinstance(plan.sigma, str):

@@ -15,19 +15,28 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet
 from palpate.metrics import psnr, psnr_per_image, ssim, ssim_per_image
-from palpate.metrics.contact import contact_per_image, contact_scores
+from palpate.metrics.contact import contact_per_image, contact_pictures, contact_scores
+from palpate.metrics.masks import LEAST
 from palpate.metrics.multiscale import ms_ssim, ms_ssim_per_image
+from palpate.metrics.paired import mean_differences
 from palpate.metrics.pairwise import mean_score
-from palpate.protocol.comparing import Asked, Outcome, feature_companions, mean_differences
+from palpate.protocol.comparing import Asked, Outcome, feature_companions
 
 if TYPE_CHECKING:
+    from palpate.encoders.perceptual import Lpips
     from palpate.encoders.standard import Kind
 
 Images = NDArray[np.uint8]
 #: Companions on pairs of pictures.
 ON_PAIRS = ("ssim", "psnr", "ms-ssim", "contact", "lpips")
+#: Those that look at the gel without contact where it is known.
+ON_GEL = frozenset({"contact", "lpips"})
 #: Name of a contact score -> its field of :class:`palpate.metrics.contact.Contacts`.
-CONTACT = {"contact residual": "residual", "contact SSIM": "ssim", "contact PSNR": "psnr", "contact IoU": "iou"}
+CONTACT = {
+    "contact residual": "residual", "contact SSIM": "ssim", "contact PSNR": "psnr", "contact IoU": "iou", "contact MS-SSIM": "ms_ssim",
+}  # fmt: skip
+#: Pairs whose contacts are made into pictures at a time.
+PICTURES = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +104,7 @@ def picture_companions(
         if kind == "contact":
             make = lambda: _contact(pictures, real, background, compared, common)  # noqa: E731
         elif kind == "lpips":
-            make = lambda: _lpips(pictures, real, weights or Weights(), compared, common, progress)  # noqa: E731
+            make = lambda: _lpips(pictures, real, background, weights or Weights(), compared, common, progress)  # noqa: E731
         else:
             make = lambda kind=kind: _pairwise(kind, pictures, real, compared, common)  # noqa: E731
         out.attempt(kind, make, asked=not default)
@@ -130,32 +139,59 @@ def _contact(
 
 
 def _lpips(
-    pictures: Mapping[str, Images], real: Images, weights: Weights, compared: Sequence[str], common: Mapping[str, Any], progress: Progress
+    pictures: Mapping[str, Images],
+    real: Images,
+    background: Images | None,
+    weights: Weights,
+    compared: Sequence[str],
+    common: Mapping[str, Any],
+    progress: Progress,
 ) -> Outcome:
+    """LPIPS of whole pictures and, where there are backgrounds, of the contact alone."""
     weights.require(["lpips"])
     assert weights.lpips is not None
     from palpate.encoders.perceptual import load_lpips, lpips_per_image
 
     network = load_lpips(*weights.lpips)
-    values = {name: lpips_per_image(images, real, network, progress=progress) for name, images in pictures.items()}
     settings = {"network": "alex", "version": "0.1", "size": [int(v) for v in real.shape[1:3]]}
-    found = {
-        name: mean_score(
-            "LPIPS",
-            v,
-            common["ids"],
-            common["groups"],
-            better=False,
-            level=0.95,
-            subject=name,
-            split=common["split"],
-            settings=settings,
-            encoder=network.digest,
+    rest: dict[str, Any] = {"level": 0.95, "split": common["split"], "encoder": network.digest, "better": False}
+    out = Outcome()
+
+    def keep(metric: str, values: Mapping[str, NDArray[np.float64]], settings: Mapping[str, Any], **more: Any) -> None:
+        found = {
+            name: mean_score(metric, v, common["ids"], common["groups"], subject=name, settings=dict(settings), **rest, **more)
+            for name, v in values.items()
+        }
+        out.scores += found.values()
+        if len(compared) > 1:
+            out.differences += mean_differences({name: found[name] for name in compared}, values, common["groups"])
+
+    keep("LPIPS", {name: lpips_per_image(images, real, network, progress=progress) for name, images in pictures.items()}, settings)
+    if background is not None:
+        on_contact = lambda images: _contact_lpips(images, real, background, network, progress)  # noqa: E731
+        empty = on_contact(background)
+        bare = int(np.isnan(empty).sum())
+        keep(
+            "contact LPIPS",
+            {name: on_contact(images) for name, images in pictures.items()},
+            settings | {"markers": "skip", "least": round(LEAST, 6), "generated_background": "real"},
+            note=f"{bare} of {len(real)} real touches show no contact, left out of the mean" if bare else "",
+            details={"empty": float(np.nanmean(empty)) if bare < len(real) else None},
         )
-        for name, v in values.items()
-    }
-    pairs = {name: found[name] for name in compared}
-    return Outcome(list(found.values()), mean_differences(pairs, values, common["groups"]) if len(pairs) > 1 else [])
+    return out
+
+
+def _contact_lpips(images: Images, real: Images, background: Images, network: Lpips, progress: Progress) -> NDArray[np.float64]:
+    """LPIPS (n,) of the differences to the empty gel inside the contact mask; NaN where a real touch is empty."""
+    from palpate.encoders.perceptual import lpips_per_image
+
+    out = np.empty(len(real))
+    for start in range(0, len(real), PICTURES):
+        at = slice(start, start + PICTURES)
+        pairs = contact_pictures(images[at], real[at], background[at])
+        out[at] = lpips_per_image(pairs.generated, pairs.reference, network, mask=pairs.mask)
+        progress("LPIPS of the contact", min(start + PICTURES, len(real)), len(real))
+    return out
 
 
 def standard_companions(

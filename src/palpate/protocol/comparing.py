@@ -8,20 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy import special
-
-from palpate import __version__
-from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet, require_comparable
-from palpate.metrics import PRESETS, Polynomial, compare, compare_tmmd, distance, tmmd
-from palpate.metrics.frechet import fid
-from palpate.metrics.intervals import mean_interval
+from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet
+from palpate.metrics import Polynomial, compare, compare_fid, compare_tmmd, tmmd
 from palpate.metrics.neighbours import prdc_rows
-from palpate.metrics.paired import holm
+from palpate.metrics.paired import mean_differences
 
 #: Companions on features; the first three need nothing further.
 ON_FEATURES = ("fid", "kid", "prdc", "cmmd")
@@ -152,7 +144,7 @@ def compare_features(
     known = [s.groups is not None for s in generators.values()]
     presets = asked.presets_for(grouped=all(known) and reference.groups is not None)
     floor = reference if all(k == (reference.groups is not None) for k in known) else None
-    sets = [dict(generators)] if paired else [{name: one} for name, one in generators.items()]
+    sets = _together(generators, paired)
     columns = [(preset, sigma) for preset in presets for sigma in asked.sigmas]
     out = Outcome()
     for k, (preset, sigma) in enumerate(columns):
@@ -163,10 +155,15 @@ def compare_features(
             found = compare(some, reference, floor=floor, **options)
             scores = [replace(s, floor=least) if s.metric == "TMMD" else s for s in found.scores]
             scores = [one for s in scores for one in (s, excess(s)) if one is not None]
-            out.scores += [_named(s, sigma, asked) for s in scores]
-            out.differences += [_named(d, sigma, asked) for d in found.differences]
+            out.scores += [named(s, sigma, asked) for s in scores]
+            out.differences += [named(d, sigma, asked) for d in found.differences]
         progress("TMMD family", k + 1, len(columns))
     return out
+
+
+def _together(sets: Mapping[str, FeatureSet], paired: bool) -> list[dict[str, FeatureSet]]:
+    """What is compared with each other: all, or each alone."""
+    return [dict(sets)] if paired else [{name: one} for name, one in sets.items()]
 
 
 def excess(score: Score) -> Score | None:
@@ -197,7 +194,8 @@ def require_rows(generators: Mapping[str, FeatureSet], reference: FeatureSet) ->
             raise PalpateError(f"There must be touches in {name}", "none", "Check its path, and the split: is that part empty?")
 
 
-def _named(score: Score, sigma: float | str, asked: Asked) -> Score:
+def named(score: Score, sigma: float | str, asked: Asked) -> Score:
+    """The score with its bandwidth in the name, where several were asked for and it is not the usual one."""
     if len(asked.sigmas) < 2 or sigma == SIGMA:
         return score
     tag = f"(σ {sigma})" if isinstance(sigma, str) else f"(σ = {sigma:g})"
@@ -242,9 +240,14 @@ def feature_companions(
     return out
 
 
-def _fid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, *_: Any) -> Outcome:
-    found = [fid(one, reference, subject=name, split=asked.split, seed=asked.seed) for name, one in sets.items()]
-    return Outcome([replace(s, metric=f"FID ({what})") for s in found])
+def _fid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, paired: bool, *_: Any) -> Outcome:
+    called = lambda score: replace(score, metric=score.metric.replace("FID", f"FID ({what})", 1))  # noqa: E731
+    out = Outcome()
+    for some in _together(sets, paired):
+        found = compare_fid(some, reference, split=asked.split, seed=asked.seed)
+        out.scores += [called(s) for s in found.scores]
+        out.differences += [called(d) for d in found.differences]
+    return out
 
 
 def _kid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, what: str, paired: bool, *_: Any) -> Outcome:
@@ -252,7 +255,7 @@ def _kid(sets: Mapping[str, FeatureSet], reference: FeatureSet, asked: Asked, wh
         "kernel": Polynomial(), "preset": "paper", "normalize": False, "permutations": 0, "seed": asked.seed, "split": asked.split,
     }  # fmt: skip
     out = Outcome()
-    for some in [dict(sets)] if paired else [{name: one} for name, one in sets.items()]:
+    for some in _together(sets, paired):
         found = compare_tmmd(some, reference, **options)
         out.scores += [_as_kid(s, what) for s in found.scores]
         out.differences += [_as_kid(d, what) for d in found.differences]
@@ -302,104 +305,3 @@ def require_one_encoder(name: str, one: FeatureSet, reference: FeatureSet) -> No
     if one.encoder is not None and reference.encoder is not None and one.encoder != reference.encoder:
         got = f"digests {one.encoder[:12]} and {reference.encoder[:12]}"
         raise PalpateError(f"{name!r} and the reference must come from one encoder", got, "Embed both with the same encoder")
-
-
-def stream_tmmd(generators: Mapping[str, NDArray[Any]], reference: NDArray[Any], asked: Asked, *, progress: Progress = quiet) -> Outcome:
-    """TMMD of arrays that are too long to be held: rows pass by once, and only moments are kept.
-
-    Args:
-        generators: name -> (n, d), possibly mapped.
-        reference: (m, d).
-        asked: presets and bandwidths; ``backend="auto"`` is moments here.
-        progress: told how many scores are done.
-
-    Raises:
-        PalpateError: for what would need all pairs or all rows in memory, or as :func:`palpate.metrics.distance`.
-    """
-    presets = asked.presets_for(grouped=False)
-    if "grouped" in presets or asked.estimator == "grouped":
-        raise PalpateError(
-            "The grouped estimator must know the group of every row", "an array without", "Pass --groups, or --presets paper"
-        )
-    if "multi" in asked.sigmas and asked.backend != "blocked":
-        got = f"{len(reference):,} rows"
-        raise PalpateError("--sigma multi must form all pairs", got, "Pass --sigma median or a number; or --backend blocked, and wait")
-    if asked.normalize is True:
-        raise PalpateError("Rows that are streamed must be L2-normalised already", "--normalize yes", "Normalise them when saving")
-    out = Outcome(remarks=["Streamed, as there are too many rows to hold: TMMD alone, without interval, p-value or companions"])
-    todo = [(name, x, preset, sigma) for name, x in generators.items() for preset in presets for sigma in asked.sigmas]
-    for k, (name, x, preset, sigma) in enumerate(todo):
-        progress("streaming", k, len(todo))
-        backend: Any = "moments" if asked.backend == "auto" else asked.backend
-        estimator: Any = asked.estimator or PRESETS[preset].estimator
-        d = distance(x, reference, sigma=sigma, estimator=estimator, normalize=asked.normalize, backend=backend)
-        if d.bound > 1e-4 and asked.backend == "auto":
-            must = "Streamed rows need a bandwidth that is wide against them"
-            raise PalpateError(
-                must, f"an error of up to {d.bound:.2g} at sigma {sigma}", "Pass --backend blocked and wait, or a larger --sigma"
-            )
-        if d.bound > 1e-4:
-            words = f"sigma {sigma}" if isinstance(sigma, str) else f"sigma {sigma:g}"
-            out.remarks.append(f"TMMD of {name}, {words}: within {d.bound:.2g} of the exact value, as the bandwidth is narrow for moments")
-        score = Score(
-            "TMMD",
-            name,
-            d.value,
-            estimator=d.estimator,
-            bandwidth=d.bandwidth,
-            scale=d.scale,
-            n=d.m,
-            m=d.n,
-            split=asked.split,
-            settings={**d.kernel, "preset": preset, "normalize": asked.normalize},
-            note="No interval: neither groups nor repeats are known"
-            + (f"; within {d.bound:.2g} of the exact value" if d.bound > 1e-4 else ""),
-            details={"backend": d.backend, "bound": d.bound, "version": __version__},
-        )
-        out.scores.append(_named(score, sigma, asked))
-    progress("streaming", len(todo), len(todo))
-    return out
-
-
-def mean_differences(scores: Mapping[str, Score], values: Mapping[str, NDArray[np.float64]], groups: Sequence[str] | None) -> list[Score]:
-    """Paired differences of a metric that is a mean over images.
-
-    Args:
-        scores: of the generators, of one metric.
-        values: (n,) of each generator, image by image in one order; pairs in which one is not finite are left out.
-        groups: n groups, or None.
-
-    Raises:
-        PalpateError: if the scores are of different settings.
-    """
-    return holm([_mean_difference(scores[a], scores[b], values[a] - values[b], groups) for a, b in combinations(scores, 2)])
-
-
-def _mean_difference(x: Score, y: Score, delta: NDArray[np.float64], groups: Sequence[str] | None) -> Score:
-    require_comparable([x, y])
-    finite = np.isfinite(delta)
-    kept = delta[finite]
-    names = None if groups is None else [g for g, ok in zip(groups, finite, strict=True) if ok]
-    value = float(kept.mean()) if len(kept) else None
-    interval, method = mean_interval(kept, names, x.level)
-    sign = (value or 0.0) * (1 if x.higher_is_better else -1)
-    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "p_better": None, "p_value": None, "better": None}
-    details["better"] = x.subject if sign > 0 else y.subject if sign < 0 else None
-    if interval is not None and value is not None:
-        df = (len(kept) if names is None else len(set(names))) - 1
-        error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
-        ahead, behind = (float(special.stdtr(df, s / error)) for s in (sign, -sign))  # either tail keeps its digits
-        details |= {"p_better": ahead, "p_value": 2 * min(ahead, behind), "decided": not interval[0] <= 0 <= interval[1]}
-    note = "Undefined: no pair of images has a value" if value is None else "" if interval else "No interval: too few groups or images"
-    return replace(
-        x,
-        metric=f"{x.metric} difference",
-        subject=f"{x.subject} - {y.subject}",
-        value=value,
-        interval=interval,
-        interval_method=f"paired, {method}" if method else "",
-        null=None,
-        floor=None,
-        details=details,
-        note=note,
-    )

@@ -24,7 +24,7 @@ from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.probe import fit_probe, material_accuracy
 from palpate.encoders.towers import Towers
 from palpate.generate import Generated
-from palpate.protocol.companions import Weights, picture_companions, split_off, standard_companions
+from palpate.protocol.companions import ON_GEL, Weights, picture_companions, split_off, standard_companions
 from palpate.protocol.comparing import Asked, Outcome, compare_features, feature_companions
 from palpate.protocol.touches import TOUCH, Wanted
 
@@ -121,8 +121,8 @@ def compare_generated(
     wanted = Wanted.of(companions, weights, encoder=True, background=gel)
     size = read_image(next(iter(generated.values())).paths[0]).size[0]
     real = load_images(test.paths("tactile"), size, progress=progress)
-    features = embed(test, towers, "touch", groups=group, cache=cache, progress=progress)
-    train_features = embed(train, towers, "touch", groups=group, cache=cache, progress=progress)
+    features = embed(test, towers, "touch", groups=group, cache=cache, keep_pixels=False, progress=progress)
+    train_features = embed(train, towers, "touch", groups=group, cache=cache, keep_pixels=False, progress=progress)
     pictures = {name: load_images([folder.path(i) for i in test.ids], size, progress=progress) for name, folder in generated.items()}
     if controls:
         pictures |= _controls(test, train, size, asked.seed, progress)
@@ -134,7 +134,7 @@ def compare_generated(
     for sets in split_off(made, compared):
         out.add(feature_companions(wanted.features, sets, features, asked, what=TOUCH, default=wanted.default, progress=progress))
     out.add(standard_companions(wanted.standard, made, pictures, features, real, weights, asked, compared=compared, progress=progress))
-    empty = load_images(test.paths("background"), size, progress=progress) if gel and "contact" in wanted.pairs else None
+    empty = load_images(test.paths("background"), size, progress=progress) if gel and ON_GEL & set(wanted.pairs) else None
     out.add(
         picture_companions(
             wanted.pairs,

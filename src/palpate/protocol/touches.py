@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import FeatureSet, PalpateError, Progress, quiet
+from palpate.core import FeatureSet, PalpateError, Progress, digest_json, quiet, short
 from palpate.data.images import cached_images, load_images, read_image
 from palpate.data.manifest import Manifest
 from palpate.metrics.pairwise import paired_by_id
-from palpate.protocol.companions import ON_PAIRS, Weights, picture_companions, standard_companions
+from palpate.protocol.companions import ON_GEL, ON_PAIRS, Weights, picture_companions, standard_companions
 from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, compare_features, feature_companions
 
 if TYPE_CHECKING:
@@ -102,6 +103,7 @@ def compare_touches(
     companions: Sequence[str] | None = None,
     weights: Weights | None = None,
     train: Manifest | None = None,
+    cache: Path | None = None,
     progress: Progress = quiet,
 ) -> Outcome:
     """Scores of one or several generators, from pictures.
@@ -115,6 +117,7 @@ def compare_touches(
         companions: see :meth:`Wanted.of`.
         weights: of encoders that are not ours.
         train: other real touches; their TMMD to the reference is the floor of TMMD.
+        cache: folder for embeddings and decoded pictures, which a run that was stopped finds again.
         progress: told what is being done.
 
     Raises:
@@ -124,29 +127,34 @@ def compare_touches(
     background = not reference.table["background"].null_count()
     wanted = Wanted.of(companions, weights, encoder=towers is not None, background=background)
     pairs = _paired(generators, reference, wanted)
-    sets = {name: _set(made, towers, group, progress) for name, made in generators.items()}
-    real = _set(reference, towers, group, progress)
+    sets = {name: _set(made, towers, group, cache, progress) for name, made in generators.items()}
+    real = _set(reference, towers, group, cache, progress)
     out = Outcome()
     if towers is not None:
-        others = _set(train, towers, group, progress) if train is not None and len(train) else None
+        others = _set(train, towers, group, cache, progress) if train is not None and len(train) else None
         out.add(compare_features(sets, real, asked, train=others, progress=progress))
         out.add(feature_companions(wanted.features, sets, real, asked, what=TOUCH, default=wanted.default, progress=progress))
     if wanted.standard or (wanted.pairs and pairs):
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
             out.add(_of_pictures(generators, reference, (sets, real), wanted, pairs, weights, asked, Path(folder), progress))
     if wanted.pairs and not pairs:
         out.remarks.append("Scores of pairs of pictures left out: generated and real touches share no id")
     return out
 
 
-def _set(touches: Manifest, towers: Towers | None, group: str, progress: Progress) -> FeatureSet:
+def _set(touches: Manifest, towers: Towers | None, group: str, cache: Path | None, progress: Progress) -> FeatureSet:
     """Features of touches; without an encoder a set with ids, labels and groups alone."""
     if towers is not None:
         from palpate.encoders.embed import embed
 
-        return embed(touches, towers, "touch", groups=group, progress=progress)
+        return embed(touches, towers, "touch", groups=group, cache=cache and _own(cache, touches), keep_pixels=False, progress=progress)
     column = lambda name: None if touches.table[name].null_count() == len(touches) else [v or "" for v in touches.column(name)]  # noqa: E731
     return FeatureSet(touches.ids, np.zeros((len(touches), 1), np.float32), column("material"), column(group))
+
+
+def _own(cache: Path, touches: Manifest) -> Path:
+    """A folder for one source of pictures: two generators may have files of one name, size and time."""
+    return cache / short(digest_json(str(touches.root.resolve())))
 
 
 def _paired(generators: Mapping[str, Manifest], reference: Manifest, wanted: Wanted) -> bool:
@@ -206,7 +214,7 @@ def _of_pictures(
             )
         )
     if pairs:
-        gel = _load(reference, "background", size, folder, progress) if "contact" in wanted.pairs and _has_gel(reference) else None
+        gel = _load(reference, "background", size, folder, progress) if ON_GEL & set(wanted.pairs) and _has_gel(reference) else None
         groups = None if like.groups is None or "" in like.groups else list(like.groups)
         out.add(
             picture_companions(
@@ -264,5 +272,5 @@ def _shape(path: Path) -> tuple[int, int]:
 def _load(touches: Manifest, column: str, size: int, folder: Path, progress: Progress) -> Images:
     """Pictures as squares; many of them in a file."""
     if len(touches) * size * size * 3 > HELD:
-        return cached_images(touches, column, size, folder, progress)
+        return cached_images(touches, column, size, _own(folder, touches), progress)
     return load_images(touches.paths(column), size, progress=progress)
