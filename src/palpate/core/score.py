@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import mmap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ from palpate.core.errors import PalpateError
 from palpate.core.files import atomic_path
 
 #: Settings that must agree before two scores may stand in one column.
-COMPARABLE = ("metric", "estimator", "bandwidth", "scale", "settings", "encoder", "split")
+COMPARABLE = ("metric", "estimator", "bandwidth", "scale", "settings", "encoder", "reference", "split")
 
 
 #: Arrow and words for ``Score.higher_is_better``.
@@ -41,7 +44,7 @@ class Score:
         scale: factor that the raw value was multiplied by.
         n: samples scored; m: reference samples, or None.
         seed: seed of any random halving, or None.
-        encoder, split: digests, or None.
+        encoder, reference, split: digests of the encoder, of the real touches compared with, and of the split, or None.
         higher_is_better: direction; None where neither is: closer to the floor is better (the metrics without reference).
         settings: further settings that must agree for a comparison.
         details: anything else worth keeping (per class values, matrices as lists); not compared.
@@ -63,6 +66,7 @@ class Score:
     m: int | None = None
     seed: int | None = None
     encoder: str | None = None
+    reference: str | None = None
     split: str | None = None
     higher_is_better: bool | None = False
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -133,13 +137,24 @@ def _finite_rows(features: np.ndarray, slab: int = 8192) -> np.ndarray:
     return out
 
 
+def _on_host(features: Any) -> np.ndarray:
+    """A tensor without its graph, from any device; NumPy has no bfloat16."""
+    if hasattr(features, "detach"):
+        features = features.detach().cpu()
+        features = features.float() if str(features.dtype).endswith("bfloat16") else features
+    try:
+        return np.asarray(features)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise PalpateError("Features must turn into an array (n, d)", str(error).splitlines()[0], "Pass rows of one width") from None
+
+
 @dataclass(frozen=True)
 class FeatureSet:
     """Features of samples, in one order.
 
     Attributes:
         ids: n sample ids.
-        features: float32 array (n, d); towers give L2-normalised rows.
+        features: float32 array (n, d), or a tensor, which is copied to the host; towers give L2-normalised rows.
         labels: n materials, or None.
         groups: n groups (videos, or touches), or None.
         encoder: digest of the encoder that made them.
@@ -155,8 +170,8 @@ class FeatureSet:
     encoder: str | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.features, np.ndarray):  # a tensor on the CPU, or a list of rows
-            object.__setattr__(self, "features", np.asarray(self.features))
+        if not isinstance(self.features, np.ndarray):  # a tensor, or a list of rows
+            object.__setattr__(self, "features", _on_host(self.features))
         shape = self.features.shape
         if len(shape) != 2 or shape[0] != len(self.ids):
             raise PalpateError(f"Features must have shape ({len(self.ids)}, d), one row an id", f"shape {shape}", "Pass one row per id")
@@ -171,6 +186,15 @@ class FeatureSet:
                 f"NaN or infinity in {bad.size} row{'s' * (bad.size != 1)}, first {self.ids[int(bad[0])]!r}",
                 "Check the images of those ids",
             )
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of ids and features, in whatever order the rows are."""
+        order = np.argsort(np.array([str(i) for i in self.ids], dtype=str), kind="stable")
+        found = hashlib.sha256(json.dumps([str(self.features.dtype), self.features.shape[1], [str(self.ids[k]) for k in order]]).encode())
+        for k in range(0, len(order), 8192):
+            found.update(np.ascontiguousarray(self.features[order[k : k + 8192]]).tobytes())
+        return found.hexdigest()
 
     def take(self, ids: Sequence[str]) -> FeatureSet:
         """The rows of ``ids``, in that order.
