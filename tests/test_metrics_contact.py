@@ -129,6 +129,16 @@ def test_values_by_hand():
     assert contact_per_image(negative, real, background).residual[0] == pytest.approx(2)
 
 
+@pytest.mark.parametrize("sigma", [4, 8, 16])
+def test_the_negative_of_a_touch_is_not_called_alike(sigma):
+    background, real = np.full((1, 64, 64, 3), 0.5), np.full((1, 64, 64, 3), 0.5)
+    at = np.arange(64) - 32
+    real += 0.3 * np.exp(-(at[:, None] ** 2 + at**2) / (2 * sigma**2))[..., None]
+    found = contact_per_image(1 - real, real, background)
+    assert found.ssim[0] < 0 < found.empty_ssim[0]
+    assert found.ms_ssim[0] <= found.empty_ms_ssim[0]
+
+
 def slow(made, real, mask):
     """SSIM of two differences (h, w, c) at the pixels of the mask, window by window on mirrored images, data range 0.25."""
     at = np.arange(11) - 5
@@ -141,7 +151,8 @@ def slow(made, real, mask):
             u, v = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
             mu, mv = (window * u).sum(), (window * v).sum()
             vu, vv, uv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum(), (window * (u - mu) * (v - mv)).sum()
-            values.append((2 * mu * mv + c1) * (2 * uv + c2) / ((mu**2 + mv**2 + c1) * (vu + vv + c2)))
+            bright, alike = (2 * mu * mv + c1) / (mu**2 + mv**2 + c1), (2 * uv + c2) / (vu + vv + c2)
+            values.append(-bright * alike if bright < 0 and alike < 0 else bright * alike)
     return np.mean(values)
 
 
@@ -399,7 +410,8 @@ def slow_ms_ssim(made, real, kept, scales):
                     va, vb, cov = (window * (a - ma) ** 2).sum(), (window * (b - mb) ** 2).sum(), (window * (a - ma) * (b - mb)).sum()
                     value = (2 * cov + c2) / (va + vb + c2)
                     if j == scales - 1:
-                        value *= (2 * ma * mb + c1) / (ma**2 + mb**2 + c1)
+                        bright = (2 * ma * mb + c1) / (ma**2 + mb**2 + c1)
+                        value *= -bright if bright < 0 and value < 0 else bright
                     above, below = above + weight[r, c] * value, below + weight[r, c]
             product *= max(above / below, 0) ** (exponents / exponents.sum())[j]
         values.append(product)

@@ -96,10 +96,11 @@ def test_centred_squares_are_those_of_the_centred_matrix():
     k = np.expm1(-((x[:, None] - x[None]) ** 2).sum(-1) / 2)
     h = np.eye(40) - 1 / 40
     slow = h @ k @ h
-    np.fill_diagonal(slow, 0)
-    assert centred_squares((k**2).sum(), k.sum(axis=1)) == pytest.approx((slow**2).sum(), rel=1e-10)
+    own = np.diagonal(slow)
+    expect = ((slow**2).sum() - (own**2).sum(), own.sum(), (own**2).sum())
+    assert centred_squares((k**2).sum(), k.sum(axis=1)) == pytest.approx(expect, rel=1e-10)
     got = blocked_sums(x, np.zeros(40, int), np.arange(40) % 7, segments=1, kernel=Gaussian((1.0,)), block=9, spread=[np.arange(1)])
-    assert got.spread[0] == pytest.approx((slow**2).sum(), rel=1e-10)
+    assert got.spread[0] == pytest.approx(expect, rel=1e-10)
 
 
 def spread_rows(seed, n, d, scale=0.4):
@@ -169,7 +170,9 @@ def test_spread_from_moments_is_right_to_leading_order():
     exact = blocked_sums(x, np.zeros(300, int), np.arange(300), segments=1, kernel=Gaussian(), spread=[np.arange(1)]).spread[0]
     moments = Moments.empty(np.zeros(12), 10.0, 1)  # a poor centre: only the leading order is lost, not the value
     moments.add(x)
-    assert moments.spread(np.arange(1)) == pytest.approx(exact, rel=0.03)
+    found = moments.spread(np.arange(1))
+    assert found[:2] == pytest.approx(tuple(exact[:2]), rel=0.03)
+    assert found[2] == pytest.approx(exact[2], rel=0.2)  # it counts a hundredth of the others here
 
 
 @pytest.fixture

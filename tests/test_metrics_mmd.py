@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate.core import PalpateError
-from palpate.metrics import blocked, mmd2
+from palpate.core import FeatureSet, PalpateError
+from palpate.metrics import blocked, i_tmmd, mmd2
 from palpate.metrics.blocked import blocked_sums
 from palpate.metrics.intervals import random_halves_sd
 from palpate.metrics.kernels import Gaussian
@@ -133,16 +133,33 @@ def test_biased_minus_unbiased_is_the_published_gap():
 
 
 @pytest.mark.parametrize("estimator", ["unbiased", "biased"])
-def test_closed_form_sd_of_random_halves(estimator):
-    n, rng = 60, np.random.default_rng(0)
+@pytest.mark.parametrize("sizes", [(2, 2), (3, 2), (3, 3), (4, 4), (5, 4), (5, 3), (5, 5)])
+def test_closed_form_sd_of_random_halves_is_that_of_all_halvings(estimator, sizes):
+    n = sum(sizes)
     x = unit_rows(6, n, 8)
-    draws = []
-    for _ in range(600):
-        p = rng.permutation(n)
-        draws.append(mmd2(x[p[:30]], x[p[30:]], estimator=estimator))
+    x[0] = x[1]
+    parts = [np.isin(np.arange(n), half) for half in itertools.combinations(range(n), sizes[0])]
+    values = [mmd2(x[h], x[~h], estimator=estimator) for h in parts]
     one = np.zeros(n, dtype=int)
     spread = blocked_sums(x, one, np.arange(n), segments=1, kernel=Gaussian(), block=7, spread=[np.arange(1)]).spread
-    assert random_halves_sd(spread, np.array([n]), estimator, 1000.0)[0] == pytest.approx(np.std(draws), rel=0.12)
+    found = random_halves_sd(spread, np.array([sizes]), estimator, 1000.0)[0]
+    assert found == pytest.approx(np.std(values), rel=1e-9)
+    if estimator == "biased":  # and what they average
+        score = i_tmmd(FeatureSet([str(i) for i in range(n)], x), preset="cmmd")
+        if sizes[0] - sizes[1] < 2:
+            assert score.details["dispersion"] == pytest.approx(np.mean(values), abs=1e-9)
+            assert score.null == pytest.approx((np.mean(values) - 1.96 * found, np.mean(values) + 1.96 * found))
+
+
+@pytest.mark.parametrize("sigma", [2.1, 2.5, 5.0, 10.0])
+@pytest.mark.parametrize("m", [2, 5, 20, 512])
+def test_float32_keeps_its_promise_in_a_small_set_beside_a_large_one(sigma, m):
+    rng = np.random.default_rng(m)
+    x, y = rng.normal(size=(m, 64)) + 0.3 * rng.normal(size=64), rng.normal(size=(1500, 64))
+    x, y = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (x, y))
+    x, y = x.astype(np.float32), y.astype(np.float32)
+    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    assert mmd2(x, y, sigma=sigma, backend="blocked") == pytest.approx(exact, abs=1e-6)
 
 
 def test_is_about_ten_times_the_squared_distance_of_the_means():

@@ -105,13 +105,15 @@ def require_comparable(scores: Sequence[Score]) -> None:
     Raises:
         PalpateError: naming the first setting in which two of them differ.
     """
-    for other in scores[1:]:
-        for name in COMPARABLE:
-            a, b = getattr(scores[0], name), getattr(other, name)
+    for name in COMPARABLE:
+        # Running sums do not know what they were made from: references must agree where they are known.
+        able = [s for s in scores if name != "reference" or s.reference is not None]
+        for other in able[1:]:
+            a, b = getattr(able[0], name), getattr(other, name)
             if _finite(a) != _finite(b):
                 raise PalpateError(
                     f"Scores in one column must agree in {name}",
-                    f"{a!r} for {scores[0].subject!r} and {b!r} for {other.subject!r}",
+                    f"{a!r} for {able[0].subject!r} and {b!r} for {other.subject!r}",
                     "Score both again with the same settings, or put them into two tables",
                 )
 

@@ -136,6 +136,7 @@ def lpips_per_image(
     Raises:
         PalpateError: on other shapes, dtypes, ranges (image numbers are named), or images smaller than 32 x 32.
     """
+    generated, reference = (_array(name, v) for name, v in (("generated", generated), ("reference", reference)))
     _check(generated, reference)
     if mask is not None and (mask.shape != generated.shape[:3] or mask.dtype != bool):
         must = f"The mask must be of shape {generated.shape[:3]} and of truth values"
@@ -179,6 +180,13 @@ def _fill(parameter: Tensor, state: Mapping[str, Any], name: str, path: Path) ->
 def _pixels(images: NDArray[Any], device: torch.device) -> Tensor:
     unit = np.array(images, dtype=np.float32) / (255 if images.dtype == np.uint8 else 1)
     return torch.from_numpy(unit).to(device).permute(0, 3, 1, 2).expand(-1, 3, -1, -1) * 2 - 1
+
+
+def _array(name: str, images: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(images.detach().cpu() if isinstance(images, Tensor) else images)
+    except (TypeError, ValueError) as error:
+        raise PalpateError(f"The {name} images must be one array", str(error).splitlines()[0], "Stack them, of one size") from None
 
 
 def _check(generated: NDArray[Any], reference: NDArray[Any]) -> None:

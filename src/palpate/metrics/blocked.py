@@ -25,6 +25,8 @@ from palpate.metrics.sums import PairSums, split_by
 
 #: Up to this many rows float64 costs nothing; few pairs would not average float32 rounding away.
 FLOAT64_BELOW = 1024
+#: In segments of fewer rows the features may reach only so much of the kernel's limit: sigma >= 9 for unit-norm features.
+MANY_ROWS, FEW = 512, 0.05
 #: Blocks are not made smaller than this for speed; the caller may ask for less.
 SMALL_BLOCK = 256
 #: Up to this many items their sums with one another are kept (34 MB).
@@ -38,7 +40,7 @@ class Sweep:
 
     Attributes:
         sums: by item and segment.
-        spread: (K,) sum of the squares of the doubly centred kernel over i != j for each of the sets asked for; see :func:`centred_squares`.
+        spread: (K, 3) of the doubly centred kernel of each of the sets asked for: see :func:`centred_squares`.
     """
 
     sums: PairSums
@@ -68,7 +70,7 @@ def blocked_sums(
     """
     ops = ops_of(x)
     order = np.lexsort((unit, segment))
-    z = centred(x, order, kernel, ops)
+    z = centred(x, order, kernel, ops, int(np.bincount(segment)[np.unique(segment)].min(initial=len(segment))))
     segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
     start = np.flatnonzero(np.r_[True, (np.diff(segment) != 0) | (np.diff(unit) != 0)]) if len(order) else np.zeros(0, np.intp)
     own = kernel.diagonal(z, ops)
@@ -91,17 +93,19 @@ def blocked_sums(
     return Sweep(sums, run.spread)
 
 
-def centred(x: Any, order: Index, kernel: Kernel, ops: Ops) -> Any:
+def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> Any:
     """Rows of ``x`` in this order, formed in float64 and rounded once to the type that the sums need.
 
-    The Gaussian's are centred, which changes no distance; other kernels take rows as they are, in float64.
+    The Gaussian's are centred, which changes no distance; other kernels take rows as they are, in float64. ``smallest``: rows of the smallest
+    segment, over which float32 rounding must average away.
     """
+    limit = kernel.radius_limit * (1.0 if smallest >= MANY_ROWS else FEW)
     if type(ops) is not Ops:  # on a device: one expression
         wide = ops.xp.astype(ops.xp.take(x, ops.xp.asarray(order, device=ops.device), axis=0), ops.xp.float64)  # type: ignore[attr-defined]
         z = wide - ops.xp.mean(wide, axis=0) if isinstance(kernel, Gaussian) else wide  # type: ignore[attr-defined]
         radius = float(ops.xp.max(ops.squares(z))) if len(order) else 0.0  # type: ignore[attr-defined]
         _require_known_distances(radius, kernel)
-        single = x.dtype != ops.xp.float64 and len(order) > FLOAT64_BELOW and radius <= kernel.radius_limit  # type: ignore[attr-defined]
+        single = x.dtype != ops.xp.float64 and len(order) > FLOAT64_BELOW and radius <= limit  # type: ignore[attr-defined]
         return ops.xp.astype(z, ops.xp.float32) if single else z  # type: ignore[attr-defined]
     slabs = [slice(i, i + SLAB) for i in range(0, len(order), SLAB)]
     if not isinstance(kernel, Gaussian):
@@ -109,7 +113,7 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops) -> Any:
     mean = x.mean(axis=0, dtype=np.float64)
     radius = max((float(((x[at] - mean) ** 2).sum(axis=1).max()) for at in slabs), default=0.0)
     _require_known_distances(radius, kernel)
-    wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or radius > kernel.radius_limit
+    wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or radius > limit
     z = np.empty(x.shape, dtype=np.float64 if wide else np.float32)
     for at in slabs:
         z[at] = x[order[at]] - mean
@@ -150,7 +154,8 @@ class _Run:
         for (i, j), found in zip(pairs, ops.each(self._block, pairs), strict=True):
             self._add(i, j, *found)
         self.spread = np.array(
-            [centred_squares(q, r) for q, r in zip(self.squares, self.row_sums, strict=True)] if sets else [], dtype=np.float64
+            [centred_squares(q, r) for q, r in zip(self.squares, self.row_sums, strict=True)] if sets else np.zeros((0, 3)),
+            dtype=np.float64,
         )
 
     def _block(self, pair: tuple[int, int]) -> tuple[Array, Array | None, list[tuple[int, Array, Array | None, float]]]:
@@ -193,15 +198,16 @@ class _Run:
             self.squares[s] += squares
 
 
-def centred_squares(squares: float, row_sums: Array) -> float:
-    """Sum over i != j of the squared doubly centred kernel, from sum_ij k^2 and row sums of a matrix whose diagonal is 0.
+def centred_squares(squares: float, row_sums: Array) -> tuple[float, float, float]:
+    """Of the doubly centred kernel the sum of squares over i != j, its trace, and the sum of the squares of its diagonal.
 
-    ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means; its diagonal, ``r - 2 r_i``, is taken off at the end.
+    From sum_ij k^2 and row sums of a matrix whose diagonal is 0: ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means, and ``Kc_ii = r - 2 r_i``.
     """
     n = len(row_sums)
     if n < 2:
-        return float("nan")
+        return np.nan, np.nan, np.nan
     r = row_sums / n
     mean = r.mean()
-    centred = squares - 2 * n * (r**2).sum() + n**2 * mean**2
-    return max(float(centred - ((mean - 2 * r) ** 2).sum()), 0.0)
+    diagonal = mean - 2 * r
+    own = float((diagonal**2).sum())
+    return max(float(squares - 2 * n * (r**2).sum() + n**2 * mean**2) - own, 0.0), float(diagonal.sum()), own

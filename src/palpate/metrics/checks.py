@@ -136,6 +136,11 @@ def _row_hashes(x: NDArray[Any]) -> Iterator[int]:
         release(x)
 
 
+def is_missing(value: Any) -> bool:
+    """Whether a name is none: None, an empty string, NaN, or what a table has in their place (pandas' NA and NaT)."""
+    return value is None or value == "" or type(value).__name__ in ("NAType", "NaTType") or bool(value != value)
+
+
 def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] | None:
     """Group names, one a row, as strings; None stays None.
 
@@ -147,10 +152,23 @@ def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] 
     names = list(values)
     if len(names) != n:
         raise PalpateError(f"{name} must have one entry a row ({n})", f"{len(names)}", f"Pass {name} in the order of the rows")
-    missing = np.array([v is None or v == "" for v in names], dtype=bool)
+    missing = np.array([is_missing(v) for v in names], dtype=bool)
     if missing.any():
         raise PalpateError(f"{name} must be known for every row", f"none in {rows_text(missing)}", f"Fill {name}, or pass None for all")
     return [str(v) for v in names]
+
+
+def checked_level(level: Any) -> None:
+    """Refuses a coverage that is not inside (0, 1)."""
+    if not isinstance(level, int | float | np.number) or not 0 < level < 1:
+        raise PalpateError("level must lie in (0, 1)", f"{level!r}", "Pass e.g. level=0.95")
+
+
+def checked_whole(least: int, **values: Any) -> None:
+    """Refuses parameters that are not whole numbers from ``least`` on."""
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value < 2**63:
+            raise PalpateError(f"{name} must be a whole number of at least {least}", repr(value), "Leave it out for the default")
 
 
 def checked_positive(**values: float) -> None:

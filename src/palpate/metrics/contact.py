@@ -11,7 +11,7 @@ d = touch - background in [-1, 1] and compared where the real touch touches:
   sum d^2 alone would reward the empty gel: there a touch that is as strong and unrelated has 2, and a real touch of the same material
   loses to empty gel; that ratio is in ``details["per_real_energy"]``.
 * *SSIM*: the map of SSIM (Gaussian 11 / 1.5, population variances, mirrored at the edge so that contact at the edge counts) of d' and d,
-  averaged over mask and channels. Its data range is 0.25, a few deviations of a contact: with 2, the range of d, C2 exceeds the
+  averaged over mask and channels; where luminance and structure are both negative, as of a touch and its negative, so is their product. Its data range is 0.25, a few deviations of a contact: with 2, the range of d, C2 exceeds the
   contact's own variance and empty gel is rated above a real touch of the same material.
 * *MS-SSIM*: the same maps at every scale that the image holds (:mod:`palpate.metrics.multiscale`), each averaged with the share of a cell that
   is in the mask as its weight. A window of the coarsest scale sees 11 cells a side, most of a small touch, so what it adds is whether
@@ -35,10 +35,10 @@ from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Score
 from palpate.metrics.checks import checked_choice, checked_images, checked_names, checked_positive
-from palpate.metrics.compat import WINDOW, Convention, local_maps
+from palpate.metrics.compat import WINDOW, Convention
 from palpate.metrics.kernels import Array
 from palpate.metrics.masks import LEAST, Mask, checked_touches, mask_of, unit
-from palpate.metrics.multiscale import fitting_scales, weighted_ms_ssim
+from palpate.metrics.multiscale import fitting_scales, signed_maps, weighted_ms_ssim
 from palpate.metrics.pairwise import mean_score
 
 Markers = Literal["skip", "keep"]
@@ -286,7 +286,7 @@ def _compared(made: Array, real: Array, kept: Mask) -> dict[str, float]:
     """Every metric of two differences (h, w, c) on the pixels ``kept``, and of no difference at all."""
     error, energy, own = (float((v[kept] ** 2).mean()) for v in (made - real, real, made))
     x, y = (np.ascontiguousarray(np.moveaxis(v, 2, 0)) for v in (made, real))
-    maps = [local_maps(v, y, _SSIM, SSIM_RANGE)[0] for v in (x, np.zeros_like(y))]
+    maps = [signed_maps(v, y, _SSIM, SSIM_RANGE)[0] for v in (x, np.zeros_like(y))]
     scales = fitting_scales(kept.shape)
     several = [weighted_ms_ssim(v, y, kept, scales, _SSIM, SSIM_RANGE) for v in (x, np.zeros_like(y))]
     with np.errstate(divide="ignore"):

@@ -101,4 +101,4 @@ def _moments(parts: Sequence[Any], items: Index, number: Index, segments: int, k
             release(part)
             first += len(slab)
     found = [moments.spread(np.flatnonzero(np.isin(items[0], s))) for s in spread or []]
-    return Sweep(moments.sums(items[0], items[1], segments), np.array(found, dtype=np.float64))
+    return Sweep(moments.sums(items[0], items[1], segments), np.array(found, dtype=np.float64).reshape(-1, 3))

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate import __version__
-from palpate.core import FeatureSet, PalpateError, Score, rng_for
-from palpate.metrics.checks import Floats, checked_names, copies_across
+from palpate.core import FeatureSet, Score, rng_for
+from palpate.metrics.checks import Floats, checked_level, checked_names, checked_whole, copies_across
 from palpate.metrics.gaussians import Array, Moments, distance_of_features, distance_of_moments
 from palpate.metrics.intervals import jackknife_errors, t_interval
 from palpate.metrics.neighbours import checked_sets, copies_note
@@ -121,8 +121,9 @@ def _fid(
     level: float = 0.95,
 ) -> Scored:
     """FID, and its value without each block."""
-    if blocks < 2:
-        raise PalpateError("blocks must be at least 2", str(blocks), "Pass e.g. blocks=20")
+    checked_whole(2, blocks=blocks)
+    checked_whole(0, seed=seed)
+    checked_level(level)
     x, y = checked_sets(generated, reference, normalize=normalize, least=2)
     whole = Moments.of(x), Moments.of(y)
     value = distance_of_moments(*whole) if min(len(x), len(y)) > x.shape[1] else distance_of_features(x, y)
@@ -140,7 +141,7 @@ def _fid(
         details |= {"infinity": parts.infinity(value, seed), "units": parts.units, "unit": parts.unit, "left_out": parts.left_out}
     score = Score(
         "FID", subject, value, found, level=level, interval_method=method, estimator="plug-in", n=len(x), m=len(y),
-        seed=seed if interval else None, encoder=generated.encoder, split=split, details=details,
+        seed=seed if interval else None, encoder=generated.encoder, reference=reference.digest, split=split, details=details,
         settings={"normalize": normalize, "covariance": "n - 1"},
         note=". ".join(filter(None, [note, _note(min(len(x), len(y)), x.shape[1], value, details["infinity"], interval and found is None)])),
     )  # fmt: skip

@@ -56,20 +56,43 @@ def mean_interval(values: Array, groups: Sequence[str] | None, level: float) -> 
     return t_interval(float(values.mean()), error, g - 1, level), f"{method}, t, {g - 1} df ({g} {what}s)"
 
 
-def random_halves_sd(spread: Array, n: Array, estimator: str, scale: float) -> Array:
+def halves_of(n: Array) -> Array:
+    """(K, 2) sizes of the halves of (K,) samples: as equal as they can be."""
+    return np.stack([np.ceil(n / 2), np.floor(n / 2)], axis=1)
+
+
+def random_halves_sd(spread: Array, sizes: Array, estimator: str, scale: float) -> Array:
     """Standard deviation (K,) of dist^2 between two random halves of each of K sets, by closed form.
 
-    Let z = +-1 mark the halves of n = 2m samples and Kc be the doubly centred kernel matrix. Then biased = z'Kc z / m^2 and
-    unbiased = const + z'Kc z (2m-1) / (2m^2 (m-1)), and the variance of z'Kc z over halvings is about 2 sum_{i != j} Kc_ij^2. The
-    mean over all halvings is exactly 0 for unbiased (for any data), and (2/m) (1 - mean off-diagonal k) for biased.
+    Let s = +-1 mark halves of m and m' samples, n = m + m', D = m - m', and Kc be the doubly centred kernel matrix, whose rows add up to 0. With
+    ``W = sum_{i != j} Kc_ij s_i s_j`` and ``L = sum_i Kc_ii s_i``
+
+    biased = const + W (1/m + 1/m')^2 / 4,   unbiased = const + c W - 2 b L,
+
+    c = [1/(m(m-1)) + 1/(m'(m'-1))] / 4 + 1/(2 m m'), b = [1/(m(m-1)) - 1/(m'(m'-1))] / 4, which is 0 for equal halves. Variances follow from
+    the mean products of one to four distinct signs over all halvings: p1 = D/n, p2 = (D^2 - n) / (n(n-1)),
+    p3 = (D^3 - (3n-2) D) / (n(n-1)(n-2)), p4 = (D^4 - (6n-8) D^2 + 3n^2 - 6n) / (n(n-1)(n-2)(n-3)). The mean is exactly 0 for unbiased (for any
+    data), and (1/m + 1/m') (mean diagonal k - mean off-diagonal k) for biased.
 
     Args:
-        spread: (K,) sum over i != j of Kc_ij^2.
-        n: (K,) samples.
+        spread: (K, 3): S, sum over i != j of Kc_ij^2; T and Q, sums of Kc_ii and of their squares.
+        sizes: (K, 2) m and m'.
         estimator: ``"biased"``, or any other for unbiased.
         scale: factor on the result.
     """
-    m = n / 2
+    (off, trace, squares), (x, y) = spread.T, sizes.T
+    n, d = x + y, x - y
     with np.errstate(divide="ignore", invalid="ignore"):
-        factor = 1 / m**2 if estimator == "biased" else (2 * m - 1) / (2 * m**2 * (m - 1))
-        return np.where(n < 4, np.nan, scale * factor * np.sqrt(2 * spread))
+        p1, p2, p3 = d / n, (d**2 - n) / (n * (n - 1)), (d**3 - (3 * n - 2) * d) / (n * (n - 1) * (n - 2))
+        p4 = (d**4 - (6 * n - 8) * d**2 + 3 * n**2 - 6 * n) / (n * (n - 1) * (n - 2) * (n - 3))
+        var_w = 2 * off + 4 * p2 * (squares - off) + p4 * (trace**2 - 2 * off - 4 * (squares - off)) - (p2 * trace) ** 2
+        var_l = squares * (1 - p1**2) + (trace**2 - squares) * (p2 - p1**2)
+        both = -2 * p1 * squares + p3 * (2 * squares - trace**2) + p1 * p2 * trace**2
+        if estimator == "biased":
+            c, b = (1 / x + 1 / y) ** 2 / 4, 0.0
+        else:
+            own, other = 1 / (x * (x - 1)), 1 / (y * (y - 1))
+            c, b = (own + other) / 4 + 1 / (2 * x * y), (own - other) / 4
+        variance = c**2 * var_w + 4 * b**2 * var_l - 4 * b * c * both
+        few = (n < 4) | (sizes.min(axis=1) < (1 if estimator == "biased" else 2))
+        return np.where(few, np.nan, scale * np.sqrt(np.maximum(variance, 0)))

@@ -62,6 +62,14 @@ class Kernel(Protocol):
         ...
 
 
+def checked_kernel(kernel: Any) -> None:
+    """Refuses what is no kernel; None stands for the Gaussian of ``sigma``."""
+    if kernel is not None and not all(hasattr(kernel, name) for name in ("augment", "values", "diagonal", "settings")):
+        raise PalpateError(
+            "kernel must be a kernel, e.g. Gaussian(), Polynomial() or Linear()", repr(kernel), "Import it from palpate.metrics"
+        )
+
+
 @dataclass(frozen=True)
 class Gaussian:
     """``mean over sigmas of exp(-||x - y||^2 / (2 sigma^2)) - 1``; the diagonal is exactly 0.
@@ -115,6 +123,14 @@ class Polynomial:
     gamma: float | None = None
     coef0: float = 1.0
     bandwidth: float | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.degree, bool) or not isinstance(self.degree, int | np.integer) or self.degree < 1:
+            raise PalpateError("The degree of a polynomial kernel must be a whole number from 1 on", repr(self.degree), "KID's is 3")
+        for name in ("gamma", "coef0"):
+            value = getattr(self, name)
+            if not (name == "gamma" and value is None) and not (isinstance(value, int | float | np.number) and np.isfinite(value)):
+                raise PalpateError(f"{name} of a polynomial kernel must be a finite number", repr(value), "Leave it out for KID's")
 
     @property
     def radius_limit(self) -> float:

@@ -22,9 +22,18 @@ from typing import Any, Literal
 import numpy as np
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import Normalize, checked_choice, checked_names, checked_numbers, checked_pair, checked_positive, copies_across
+from palpate.metrics.checks import (
+    Normalize,
+    checked_choice,
+    checked_names,
+    checked_numbers,
+    checked_pair,
+    checked_positive,
+    checked_whole,
+    copies_across,
+)
 from palpate.metrics.engine import BACKENDS, Backend, kernel_sums
-from palpate.metrics.kernels import Array, Index, Kernel, Sigma, gaussian
+from palpate.metrics.kernels import Array, Index, Kernel, Sigma, checked_kernel, gaussian
 from palpate.metrics.sums import PairSums, Totals
 
 Estimator = Literal["unbiased", "biased", "grouped"]
@@ -152,10 +161,10 @@ def distance(
     """
     checked_choice("estimator", estimator, ESTIMATORS)
     checked_choice("backend", backend, BACKENDS)
-    checked_positive(scale=scale, block=block)
+    checked_positive(scale=scale)
     checked_numbers(tolerance=tolerance)
-    if not isinstance(block, int | np.integer):
-        raise PalpateError("block must be a whole number", repr(block), "Leave it out for the default")
+    checked_whole(1, block=block)
+    checked_kernel(kernel)
     x, y = checked_pair(x, y, normalize=normalize, least=1 if estimator == "biased" else 2, names=names)
     if copies := copies_across(x, y):
         warnings.warn(f"{copies} rows of {names[0]} are bit for bit rows of {names[1]}: a copy is not a generator", stacklevel=2)
@@ -172,8 +181,10 @@ def distance(
         bound=lambda sums: largest_bound(sums, estimator, scale),
     ).sums  # fmt: skip
     value = float(mmd_matrix(found.totals, estimator, scale)[0, 1])
+    if not np.isfinite(found.totals.sums).all():
+        raise PalpateError("Kernel values must be finite", "infinity or NaN", "Normalise the rows, or scale them down")
     if not np.isfinite(value):
-        got = f"{len(set(groups_x or ()))} and {len(set(groups_y or ()))} groups"
+        got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
         raise PalpateError("Each set must have at least two groups, not all shared", got, 'Use estimator="unbiased", or more groups')
     bound = largest_bound(found, estimator, scale)
     if bound > 2 * scale:  # more than the metric can be

@@ -161,16 +161,17 @@ class Moments:
         bound = PairSums.from_block(rest, n, np.zeros_like(n), segment, unit, segments, backend="moments")
         return PairSums.from_block(block, n, np.zeros_like(n), segment, unit, segments, backend="moments", bound=bound)
 
-    def spread(self, items: Index) -> float:
-        """Sum over i != j of the squared doubly centred kernel of the samples of some items, to leading order in 1 / sigma^2.
+    def spread(self, items: Index) -> tuple[float, float, float]:
+        """As :func:`palpate.metrics.blocked.centred_squares`, of the samples of some items, to leading order in 1 / sigma^2.
 
         ``Kc_ij = z_i . z_j`` with z centred on the mean of these samples: within ``rho`` of its size of the exact value.
         """
         n, first = self.n[items].sum(), self.first[items].sum(axis=0)
         if n < 2:
-            return float("nan")
+            return np.nan, np.nan, np.nan
         second = self.second[items].sum(axis=0, dtype=np.float64) - np.outer(first, first) / n
-        return max(float((second**2).sum() - self._fourth_about(items, first / n)), 0.0)
+        own = self._fourth_about(items, first / n)
+        return max(float((second**2).sum() - own), 0.0), float(np.trace(second)), own
 
     def _fourth_about(self, items: Index, mean: Array) -> float:
         """Sum of ``||z - mean||^4`` over the samples, with the mean distance taken for the cross terms: a correction of order 1 / n."""

@@ -133,9 +133,17 @@ def weighted_ms_ssim(x: Array, y: Array, kept: NDArray[np.bool_], scales: int, c
     for j in range(scales):
         if j:
             x, y, weight = pooled(_even(x, "edge"), 2), pooled(_even(y, "edge"), 2), pooled(_even(weight, "constant"), 2)
-        similarity, structure = local_maps(x, y, convention, reach)
+        similarity, structure = signed_maps(x, y, convention, reach)
         means[j] = np.average((similarity if j == scales - 1 else structure).reshape(len(x), -1), axis=1, weights=weight.ravel())
     return float(np.prod(np.maximum(means, 0) ** scale_weights(scales)[:, None], axis=0).mean())
+
+
+def signed_maps(x: Array, y: Array, convention: Convention, reach: float) -> tuple[Array, Array]:
+    """As :func:`palpate.metrics.compat.local_maps`, of images that have negative values: those of a touch and of its negative have both factors
+    negative, and their product must not call that alike.
+    """
+    similarity, structure = local_maps(x, y, convention, reach)
+    return np.where((structure < 0) & (similarity > 0), -similarity, similarity), structure
 
 
 def _even(image: Array, mode: Literal["edge", "constant"]) -> Array:

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from palpate import __version__
 from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet
-from palpate.metrics.checks import Floats, checked_names, checked_pair, copies_across
+from palpate.metrics.checks import Floats, checked_level, checked_names, checked_pair, checked_whole, copies_across
 from palpate.metrics.intervals import mean_interval
 
 Array = NDArray[np.float64]
@@ -96,8 +96,8 @@ def prdc_rows(
     progress: Progress = quiet,
 ) -> tuple[list[Score], dict[str, Array]]:
     """As :func:`prdc`, with what each score is the mean of: (n,) of the generated rows for Precision and Density, (m,) of the real ones for the others."""
-    if k < 1:
-        raise PalpateError("k must be at least 1", str(k), "Pass e.g. k=5")
+    checked_whole(1, k=k)
+    checked_level(level)
     x, y = checked_sets(generated, reference, normalize=normalize, least=k + 1)
     groups = [checked_names("groups", s.groups, len(v)) for s, v in zip((generated, reference), (x, y), strict=True)]
     known = groups[0] is not None and groups[1] is not None
@@ -112,7 +112,7 @@ def prdc_rows(
     inside, note = _compare(sets[0], sets[1], progress), copies_note(copies_across(x, y), len(x))
     settings = {"k": k, "grouped": grouped, "normalize": normalize, "inside": "<"}
     common: dict[str, Any] = {
-        "subject": subject, "level": level, "estimator": "per-row mean", "n": len(x), "m": len(y), "encoder": generated.encoder,
+        "subject": subject, "level": level, "estimator": "per-row mean", "n": len(x), "m": len(y), "encoder": generated.encoder, "reference": reference.digest,
         "split": split, "higher_is_better": True, "settings": settings,
     }  # fmt: skip
     rows = {

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from palpate import __version__
 from palpate.core import PalpateError, Score
-from palpate.metrics.checks import checked_names
+from palpate.metrics.checks import checked_level, checked_names
 from palpate.metrics.compat import SSIM_CONVENTIONS, Compat, Pairs, Range, checked_pairs, psnr_values, ssim_values
 from palpate.metrics.intervals import mean_interval
 from palpate.metrics.kernels import Array
@@ -123,6 +123,7 @@ def mean_score(
         level: coverage of the interval.
         **rest: further fields of the score; ``details`` and ``note`` are joined to those made here.
     """
+    checked_level(level)
     names = checked_names("ids", ids, len(values))
     groups = checked_names("groups", groups, len(values))
     finite = np.isfinite(values)
@@ -242,6 +243,7 @@ def _pooled_psnr(errors: Array, ids: Sequence[str] | None, groups: Sequence[str]
     """``-10 log10`` of the mean of all squared errors; its interval has the reach ``10 / ln 10 * reach(mean) / mean``."""
     names, groups = checked_names("ids", ids, len(errors)), checked_names("groups", groups, len(errors))
     mean, level = float(errors.mean()), rest["level"]
+    checked_level(level)
     value, interval = (-10 * float(np.log10(mean)) if mean > 0 else None), None
     around, method = mean_interval(errors, groups, level)
     if value is not None and around is not None:

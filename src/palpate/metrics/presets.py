@@ -15,12 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict
 
-import numpy as np
-
 from palpate.core import PalpateError
-from palpate.metrics.checks import Normalize, checked_choice, checked_numbers, checked_positive
+from palpate.metrics.checks import Normalize, checked_choice, checked_level, checked_numbers, checked_positive, checked_whole
 from palpate.metrics.engine import BACKENDS, Backend
-from palpate.metrics.kernels import Kernel, Sigma
+from palpate.metrics.kernels import Kernel, Sigma, checked_kernel
 from palpate.metrics.mmd import ESTIMATORS, Estimator
 
 Halves = Literal["group", "random", "ordered"]
@@ -128,14 +126,12 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     checked_choice("aggregate", plan.aggregate, AGGREGATES)
     checked_choice("backend", plan.backend, BACKENDS)
     checked_positive(scale=plan.scale, block=plan.block)
-    checked_numbers(tolerance=plan.tolerance, permutations=plan.permutations, seed=plan.seed)
-    for name in ("block", "permutations", "min_samples", "seed"):
-        if not isinstance(getattr(plan, name), int | np.integer):
-            raise PalpateError(f"{name} must be a whole number", repr(getattr(plan, name)), "Leave it out for the default")
-    if not 0 < plan.level < 1:
-        raise PalpateError("level must lie in (0, 1)", f"{plan.level!r}", "Pass e.g. level=0.95")
-    if plan.min_samples < 4:
-        raise PalpateError("min_samples must be at least 4, two for each half", f"{plan.min_samples}", "Leave it out for the default")
+    checked_numbers(tolerance=plan.tolerance)
+    checked_whole(1, block=plan.block)
+    checked_whole(0, permutations=plan.permutations, seed=plan.seed)
+    checked_whole(4, min_samples=plan.min_samples)  # two for each half
+    checked_level(plan.level)
+    checked_kernel(plan.kernel)
     if not grouped and "grouped" in (plan.preset, plan.estimator):
         raise PalpateError("The grouped estimator must know the group of every sample", "none", 'Give groups, or preset="paper"')
     if not grouped and plan.halves == "group":

@@ -25,6 +25,9 @@ RANDOM_NOTE = (
 )
 
 
+UNBOUNDED = 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
+
+
 @dataclass(frozen=True)
 class Scored:
     """A score and how it moves.
@@ -49,6 +52,7 @@ def scored(
     *,
     found: Estimate | None = None,
     bound: float = 0.0,
+    limit: float | None = None,
     details: dict[str, Any],
     note: str = "",
     **rest: Any,
@@ -63,17 +67,21 @@ def scored(
         settings: options that bear on this metric.
         found: its first value is the score's; None for an undefined one.
         bound: the value is within this of the exact one, rounding aside.
+        limit: the largest bound that leaves a value; default: as much as a distance can be.
         details: kept with the score.
         note: for people.
         **rest: further fields of the score.
     """
     value = plain(found.values[0]) if found else None
-    if value is not None and not bound <= 2 * plan.scale:
-        value, note = None, 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
+    if value is not None and not bound <= (2 * plan.scale if limit is None else limit):
+        value, note = None, UNBOUNDED
+    elif value is not None and bound > 1e-4 * (plan.scale / 1000 if limit is None else 1):
+        note = ". ".join(filter(None, [f"Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments", note]))
     interval = found.interval(0, plan.level) if found and value is not None else None
     method = found.method if found and interval else ""
     if value is None:
         rest["null"] = None
+        details = {**details, **{name: None for name in ("p_value", "z") if name in details}}
         note = note or "Undefined: an average over no pairs"
     elif interval is None:
         note = ". ".join(filter(None, [note, "No interval: too few groups or samples to leave one out"]))
@@ -97,10 +105,29 @@ def same_units(a: Scored, floor: Scored) -> bool:
 
 
 def with_floor(one: Scored, floor: Scored) -> Scored:
-    """The score beside that of real touches: its value where it is comparable, and E, which does not depend on the number of groups."""
-    value = floor.score.value if same_units(one, floor) or one.score.settings.get("halves") != "group" else None
-    details = {f"{name}_floor": floor.score.details.get(name) for name in ("E", "E_ratio") if name in one.score.details}
-    return replace(one, score=replace(one.score, floor=value, details={**one.score.details, **details}))
+    """The score beside that of real touches: its value where it is comparable, and E, which does not depend on the number of groups.
+
+    A mean over classes has a floor over the same classes alone: E of CI-TMMD that of the real touches of the generator's classes, D-TMMD and
+    its E_ratio none where the classes differ.
+    """
+    mine, theirs = one.score, floor.score
+    classes = mine.details.get("classes")
+    alike = classes == theirs.details.get("classes")
+    known = (same_units(one, floor) or mine.settings.get("halves") != "group") and alike
+    details: dict[str, Any] = {}
+    if "E" in mine.details:
+        details["E_floor"] = theirs.details.get("E") if alike else _mean_excess(theirs, classes or [])
+    if "E_ratio" in mine.details:
+        details["E_ratio_floor"] = theirs.details.get("E_ratio") if alike else None
+    why = "" if known or mine.value is None else f"No floor: real touches of other {'groups' if alike else 'classes'} have another value"
+    note = ". ".join(filter(None, [mine.note, why]))
+    return replace(one, score=replace(mine, floor=theirs.value if known else None, details={**mine.details, **details}, note=note))
+
+
+def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:
+    """The mean E of some classes, None unless all are known."""
+    each = [score.details.get("per_class", {}).get(name, {}).get("E") for name in classes]
+    return sum(each) / len(each) if each and None not in each else None
 
 
 def plain(value: Any) -> Any:

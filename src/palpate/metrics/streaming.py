@@ -26,7 +26,7 @@ import numpy as np
 from palpate.core import FeatureSet, PalpateError, Score, digest_json
 from palpate.metrics.checks import checked_choice
 from palpate.metrics.presets import Options, Plan, plan_for
-from palpate.metrics.scored import RANDOM_NOTE, Scored, with_floor
+from palpate.metrics.scored import RANDOM_NOTE, UNBOUNDED, Scored, with_floor
 from palpate.metrics.streaming_states import Columns, FeatureState, Layout, SumState, sized, to_host
 from palpate.metrics.tables import Table, build_table
 from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, tmmd, tmmd_of
@@ -94,7 +94,7 @@ class StreamingMetric:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the settings that states must share to be merged."""
+        """SHA-256 of the settings that states depend on: metrics of one digest can share a state, whatever they compute from it."""
         layout = None if self.layout is None else [self.layout.__dict__, None if self.centre is None else self.centre.tolist()]
         return digest_json([self.keep, self.encoder, self.reset_real_features, self.plan.normalize, layout])
 
@@ -147,7 +147,9 @@ class StreamingMetric:
         Raises:
             PalpateError: if class, settings, width or centre differ.
         """
-        if type(other) is not type(self) or other.digest != self.digest:
+        if other is self:
+            raise PalpateError("A metric must be merged with another one", "itself", "Merge what other processes have seen")
+        if type(other) is not type(self) or other.digest != self.digest or other.options != self.options:
             got = f"{type(self).__name__} and {type(other).__name__}" + (" of different settings" if type(other) is type(self) else "")
             raise PalpateError("Metrics that are merged must be of one class with the same settings", got, "Construct all alike")
         self.state = cast(Any, self.state).merge(other.state)
@@ -293,8 +295,9 @@ def checked_centre(centre: Any) -> np.ndarray:
 def without_units(score: Score, details: Mapping[str, Any], small: Sequence[str]) -> Score:
     """A score of sums: without what leaves out units, and with the true reason why classes are excluded."""
     found: dict[str, Any] = {**score.details, "unit": None, "units": None, **details}
+    note = UNBOUNDED.replace('backend="blocked"', 'keep="features"') if score.note == UNBOUNDED else score.note
     if "excluded" in found:
         found["excluded"] = {**found["excluded"], **dict.fromkeys(small, "fewer than two samples in a half")}
     if "per_class" in found:
         found["per_class"] = {name: {**of, "units": None} for name, of in found["per_class"].items()}
-    return replace(score, interval=None, interval_method="", details=found)
+    return replace(score, interval=None, interval_method="", details=found, note=note)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, seed_for
 from palpate.metrics.arrays import is_foreign
-from palpate.metrics.checks import Normalize, checked_features, checked_names
+from palpate.metrics.checks import Normalize, checked_features, checked_names, is_missing
 from palpate.metrics.kernels import Array, Gaussian, Index
 from palpate.metrics.moments import Moments, centre_of
 from palpate.metrics.tables import Table
@@ -94,7 +94,7 @@ def names_of(name: str, values: Any, n: int, *, gaps: bool = False) -> list[str]
     plain = [v.item() if hasattr(v, "item") else v for v in (plain if isinstance(plain, list) else [plain])]
     if not gaps or len(plain) != n:
         return checked_names(name, plain, n)
-    return ["" if v is None else str(v) for v in plain]
+    return ["" if is_missing(v) else str(v) for v in plain]
 
 
 def to_host(x: Any) -> Any:
@@ -344,16 +344,9 @@ class SumState:
             sums = sums.merge(to, last + 1)
         pairs: Iterable[Index] = np.arange(len(segment)).reshape(-1, 2) if self.layout.halves else []
         spread = np.array([moments.spread(at) for at in [np.arange(len(segment)), *pairs]])
-        if self.layout.halves:
-            spread *= unequal(np.concatenate([sizes.sum(axis=0)[None], sizes])) ** 2
-        table = Table(sums, classes, "sample", ["all"], Gaussian((self.layout.sigma,)), spread)
+        halves = np.concatenate([sizes.sum(axis=0)[None], sizes]) if self.layout.halves else None
+        table = Table(sums, classes, "sample", ["all"], Gaussian((self.layout.sigma,)), spread, sizes=halves)
         return table, [classes[c] for c in small], sizes.astype(int).tolist()
-
-
-def unequal(sizes: Array) -> Array:
-    """(K,) by how much dist^2 of random halves of (K, 2) samples varies more than that of equal halves: (1/m + 1/m') / (4 / (m + m'))."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(sizes.min(axis=1) > 0, sizes.sum(axis=1) ** 2 / (4 * sizes.prod(axis=1)), np.nan)
 
 
 def sized(n: int, *, labelled: bool = False, encoder: str | None = None) -> FeatureSet:

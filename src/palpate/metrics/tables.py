@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core import FeatureSet
-from palpate.metrics.checks import checked_features, checked_names, checked_pair, copies_across
+from palpate.metrics.checks import checked_features, checked_names, checked_pair, copies_across, is_missing
 from palpate.metrics.engine import kernel_sums
 from palpate.metrics.halves import half_of, halves_bound, sample_units, self_distances, take_sets
 from palpate.metrics.intervals import Interval, jackknife_errors, leave_one_out, t_interval
@@ -33,8 +33,9 @@ class Table:
         unit: what the jackknife leaves out: ``"group"``, ``"sample"`` or ``"random-block"``.
         names: the name of each unit number.
         kernel: what was summed.
-        spread: (1 + C,) centred squares (:mod:`palpate.metrics.blocked`) of the generated set and of each class.
+        spread: (1 + C, 3) centred squares (:mod:`palpate.metrics.blocked`) of the generated set and of each class.
         copies: generated rows that are bit for bit rows of the reference; None where they were not looked for.
+        sizes: (1 + C, 2) sizes of the halves of the set and of each class, where they are not as equal as they can be.
     """
 
     sums: PairSums
@@ -44,6 +45,7 @@ class Table:
     kernel: Kernel
     spread: Array
     copies: int | None = 0
+    sizes: Array | None = None
 
     @property
     def grouped(self) -> bool:
@@ -70,7 +72,15 @@ class Table:
         return self.sums.merge(np.append(np.repeat(np.arange(len(self.classes)), 4), -1), len(self.classes))
 
 
-def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan, *, grouped: bool, median_of: Any = None) -> Table:
+def build_table(
+    generated: FeatureSet,
+    reference: FeatureSet | None,
+    plan: Plan,
+    *,
+    grouped: bool,
+    median_of: Any = None,
+    further: Callable[[Table, Plan], float] | None = None,
+) -> Table:
     """Checks the sets and passes once over all their pairs.
 
     Args:
@@ -78,6 +88,7 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
         reference: real touches, or None where no metric needs them.
         plan: halves, seed, bandwidth, back end, normalisation.
         grouped: whether the groups of the sets are the jackknife's units; else samples are.
+        further: the bound of a statistic without scale, which moments must keep within the tolerance as well: D-TMMD is a ratio.
         median_of: the set whose median distance ``sigma="median"`` takes; else the reference, or the generated set without one.
 
     Raises:
@@ -98,7 +109,7 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
         names = sorted({name for column in groups for name in column})
     else:
         units, unit, names = sample_units([str(i) for s in sets for i in s.ids], plan.seed)
-    labels = ["" if v is None else str(v) for v in (generated.labels if generated.labels is not None else [None] * len(generated.ids))]
+    labels = ["" if is_missing(v) else str(v) for v in (generated.labels if generated.labels is not None else [None] * len(generated.ids))]
     classes = sorted(set(labels))
     number = {name: k for k, name in enumerate(classes)}
     label = np.array([number[v] for v in labels], dtype=np.intp)
@@ -112,10 +123,15 @@ def build_table(generated: FeatureSet, reference: FeatureSet | None, plan: Plan,
     else:
         rows = checked_features("The features that the median distance is taken over", median_of.features, normalize=plan.normalize)
         kernel = gaussian(plan.sigma, rows, median_of.groups)
+
+    def bound(sums: PairSums) -> float:
+        table = Table(sums, classes, unit, names, kernel, np.zeros((0, 3)))
+        return max(_bound(table, plan), further(table, plan) * plan.scale / 1000 if further is not None else 0.0)
+
     rest = [np.arange(4 * len(classes)), *(np.arange(4 * c, 4 * c + 4) for c in range(len(classes)))]
     found = kernel_sums(
         parts, segment, units, segments=4 * len(classes) + 1, kernel=kernel, backend=plan.backend, tolerance=plan.tolerance * plan.scale / 1000,
-        bound=lambda sums: _bound(Table(sums, classes, unit, names, kernel, np.zeros(0)), plan), block=plan.block, spread=rest,
+        bound=bound, block=plan.block, spread=rest,
     )  # fmt: skip
     return Table(found.sums, classes, unit, names, kernel, found.spread, copies)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from palpate.core import FeatureSet, PalpateError, Score
 from palpate.metrics.halves import Design, design_of, halves_bound, self_distances, whole_sets
-from palpate.metrics.intervals import random_halves_sd
+from palpate.metrics.intervals import halves_of, random_halves_sd
 from palpate.metrics.kernels import Array, Index
 from palpate.metrics.mmd import largest_bound, mmd_bound, mmd_matrix
 from palpate.metrics.permutation import permutation_test
@@ -79,7 +79,7 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
     null = None if test is None else (float(np.quantile(test.null, 0.025)), float(np.quantile(test.null, 0.975)))
     return scored(
         "TMMD", table, generated, plan, (), found=found, bound=largest_bound(sums, plan.estimator, plan.scale), estimator=plan.estimator,
-        m=len(reference.ids), details=details, note=". ".join(notes), null=null,
+        m=len(reference.ids), reference=reference.digest if reference.features.shape[1] else None, details=details, note=". ".join(notes), null=null,
     )  # fmt: skip
 
 
@@ -105,14 +105,15 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     design = design_of(sums.totals, plan)
     found = estimate(sums, lambda t: np.concatenate(self_distances(t, plan, design)), table.unit)
     whole = sums.merge(np.zeros(2, dtype=np.intp), 1)
-    sd, n = float(random_halves_sd(table.spread[:1], whole.totals.n, plan.estimator, plan.scale)[0]), len(generated.ids)
-    dispersion = _dispersion(whole.totals, plan)[0]
+    sizes, n = (halves_of(whole.totals.n) if table.sizes is None else table.sizes[:1]), len(generated.ids)
+    sd = float(random_halves_sd(table.spread[:1], sizes, plan.estimator, plan.scale)[0])
+    dispersion = _dispersion(whole.totals, sizes, plan)[0]
     centre = dispersion if plan.estimator == "biased" else 0.0
     reason = unfit(whole, 0, plan)
     details = {
         "E": found.values[1] if table.grouped else None,
         "E_interval": found.interval(1, plan.level) if table.grouped else None,
-        "E_bound": _halves_bound(sums, plan)[0] / float(design.own[0]) if table.grouped and design.own[0] > 0 else None,
+        "E_bound": _excess_bound(sums, design, plan) if table.grouped else None,
         "z": (found.values[0] - centre) / sd if sd > 0 else None,
         "dispersion": dispersion,
         "units": sums.units,
@@ -129,10 +130,17 @@ def _halves_bound(sums: PairSums, plan: Plan) -> Array:
     return np.zeros(sums.segments // 2) if sums.bound is None else halves_bound(sums.bound.totals, plan)
 
 
-def _dispersion(t: Totals, plan: Plan) -> Array:
-    """What biased dist^2 averages over random halves: (4/n) scale (mean diagonal k - mean off-diagonal k), for each segment."""
+def _excess_bound(sums: PairSums, design: Design, plan: Plan) -> float | None:
+    """What the mean E may be off by: dist^2 of halves of whole groups is E times a number of the design."""
+    if sums.bound is None:
+        return 0.0
+    return float((_halves_bound(sums, plan) / design.own).mean()) if (design.own > 0).all() else None
+
+
+def _dispersion(t: Totals, sizes: Array, plan: Plan) -> Array:
+    """What biased dist^2 averages over random halves: (1/m + 1/m') scale (mean diagonal k - mean off-diagonal k), for each segment."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return 4 / t.n * plan.scale * (t.own / t.n - np.diagonal(t.sums) / (t.n * (t.n - 1)))
+        return (1 / sizes).sum(axis=1) * plan.scale * (t.own / t.n - np.diagonal(t.sums) / (t.n * (t.n - 1)))
 
 
 def _usable(table: Table, plan: Plan) -> tuple[Index, dict[str, str]]:
@@ -170,13 +178,15 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     found = class_estimate(sums, lambda t: np.array([v.mean() for v in self_distances(t, plan, design)]), table.unit)  # Eq. 4
     each, excess = self_distances(sums.totals, plan)
     whole = sums.merge(np.repeat(np.arange(len(kept)), 2), len(kept))
-    spread = random_halves_sd(table.spread[1 + kept], whole.totals.n, plan.estimator, plan.scale)
+    sizes = halves_of(whole.totals.n) if table.sizes is None else table.sizes[1 + kept]
+    spread = random_halves_sd(table.spread[1 + kept], sizes, plan.estimator, plan.scale)
     sd = float(np.sqrt((spread**2).sum())) / len(kept)
-    dispersion = float(_dispersion(whole.totals, plan).mean())
+    dispersion = float(_dispersion(whole.totals, sizes, plan).mean())
     centre = dispersion if plan.estimator == "biased" else 0.0
     details |= {
         "E": found.values[1] if table.grouped else None,
         "E_interval": found.interval(1, plan.level) if table.grouped else None,
+        "E_bound": _excess_bound(sums, design, plan) if table.grouped else None,
         "z": (found.values[0] - centre) / sd if sd > 0 else None,
         "dispersion": dispersion,
         "per_class": {
@@ -206,7 +216,7 @@ def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
     plan = plan_for(options, grouped=generated.groups is not None)
-    return d_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan).score
+    return d_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None, further=ratio_bound), generated, plan).score
 
 
 def d_matrix(t: Totals, plan: Plan, design: Design | None = None) -> Array:
@@ -275,8 +285,17 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         why = "within two standard errors of 0" if np.isfinite(errors).all() else "of unknown error (too few groups)"
         note = f"Denominators {why}, so the ratio is unreliable: {', '.join(unstable)}"
     return scored(
-        "D-TMMD", table, generated, plan, settings, found=found, bound=_d_bound(sums, matrix, plan), details=details, note=note, **fields,
+        "D-TMMD", table, generated, plan, settings, found=found, bound=_d_bound(sums, matrix, plan), limit=1.0, details=details, note=note, **fields,
     )  # fmt: skip
+
+
+def ratio_bound(table: Table, plan: Plan) -> float:
+    """How far D-TMMD from this table may be from the exact one; 0 where it is not defined anyhow."""
+    kept, _ = _usable(table, plan)
+    if len(kept) < 2:
+        return 0.0
+    sums = table.class_halves(kept)
+    return _d_bound(sums, d_matrix(sums.totals, plan), plan)
 
 
 def _d_bound(sums: PairSums, matrix: Array, plan: Plan) -> float:
@@ -286,10 +305,11 @@ def _d_bound(sums: PairSums, matrix: Array, plan: Plan) -> float:
     rest = mmd_bound(whole_sets(sums.bound.totals), plan.estimator, plan.scale)
     np.fill_diagonal(rest, _halves_bound(sums, plan))
     own, off = np.diagonal(matrix), denominators(matrix, plan.denominator)
-    more, less = np.abs(own) + np.diagonal(rest), off - denominators(rest, plan.denominator)
+    wide, low = np.diagonal(rest), denominators(rest, plan.denominator)
     if plan.aggregate == "ratio_of_means":
-        own, off, more, less = (np.array([v.mean()]) for v in (np.abs(own), off, more, less))
-    return float((more / less - np.abs(own) / off).mean()) if (less > 0).all() else float("inf")
+        own, off, wide, low = (np.array([v.mean()]) for v in (own, off, wide, low))
+    own, off = np.abs(own), np.abs(off)
+    return float(((own + wide) / (off - low) - own / off).mean()) if (off > low).all() else float("inf")
 
 
 def four_scores(
@@ -329,7 +349,7 @@ def floors_of(floor: FeatureSet, reference: FeatureSet, like: FeatureSet, option
         must = "The floor must be scored like the generated touches"
         raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
     plan = plan_for(options, grouped=floor.groups is not None)
-    table = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference)
+    table = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference, further=ratio_bound)
     return [f(table, floor, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
 
 
@@ -338,6 +358,6 @@ def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> l
     own = generated.groups is not None
     both = own and reference.groups is not None
     plan, joint = plan_for(options, grouped=own), plan_for(options, grouped=both)
-    table = build_table(generated, reference, joint, grouped=both)
-    alone = table if own == both else build_table(generated, None, plan, grouped=own, median_of=reference)
+    table = build_table(generated, reference, joint, grouped=both, further=ratio_bound)
+    alone = table if own == both else build_table(generated, None, plan, grouped=own, median_of=reference, further=ratio_bound)
     return [tmmd_of(table, generated, reference, joint), *(f(alone, generated, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of))]

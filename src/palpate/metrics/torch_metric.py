@@ -11,7 +11,9 @@ States, all registered with ``add_state`` and a ``dist_reduce_fx``:
   settings agree hold one list together (torchmetrics' compute groups): features are stored once for all four.
 * ``keep="sums"``: moments ("sum"), their radius ("max"), how halves were dealt ("sum"). ``centre`` must be given: states of fixed size need its
   width, and processes that share nothing else must share it.
-* ``settings`` ("max"): digest of the settings, which must be the same in all processes and within a compute group.
+* ``settings`` ("max"): digest of the settings that states depend on (mode, normalisation, encoder; for sums classes, centre, bandwidth), which
+  must be the same in all processes and within a compute group. What is computed from a state is each process's own affair: construct the
+  metric alike everywhere.
 
 torch and torchmetrics are loaded when this module is, and by no other module of this room; by name, because neither has to be there for
 the rest of it.
@@ -107,7 +109,7 @@ class TorchMetric(Metric):
         """The value, a float64 tensor on the metric's device; NaN where it is undefined.
 
         Raises:
-            PalpateError: as :meth:`palpate.metrics.streaming.StreamingMetric.compute`, or if processes differ in their settings.
+            PalpateError: as :meth:`palpate.metrics.streaming.StreamingMetric.compute`, or if processes differ in settings that states depend on.
         """
         self._same_settings(self.settings)
         self._score = self.plain.score_of(self._state())
@@ -150,8 +152,15 @@ class TorchMetric(Metric):
         """Adds the state of another metric of the same settings.
 
         Raises:
-            PalpateError: if settings differ.
+            PalpateError: if settings differ; of a bare state only those that states depend on are known.
         """
+        if isinstance(incoming_state, TorchMetric):
+            if incoming_state is self:
+                raise PalpateError("A metric must be merged with another one", "itself", "Merge what other processes have seen")
+            if type(incoming_state) is not type(self) or incoming_state.plain.options != self.plain.options:
+                raise PalpateError(
+                    "Metrics that are merged must be of one class with the same settings", "different ones", "Construct all alike"
+                )
         states = incoming_state.metric_state if isinstance(incoming_state, Metric) else incoming_state
         self._same_settings(states["settings"])
         self._computed = self._score = None
