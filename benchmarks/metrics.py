@@ -14,6 +14,7 @@ n x n products, means over all entries. torchmetrics and torch-fidelity are run 
 
 import argparse
 import datetime
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -95,11 +96,10 @@ def torchmetrics_polynomial(x, y):
 
 def torch_fidelity(kernel):
     def run(x, y):
-        from torch_fidelity import metric_kid
-        from torch_fidelity.metric_kid import kernel_mmd2, polynomial_kernel, rbf_kernel  # noqa: F401
+        from torch_fidelity.metric_kid import kernel_mmd
 
-        of = (lambda a, b: polynomial_kernel(a, b, 3, None, 1)) if kernel == "poly" else (lambda a, b: rbf_kernel(a, b, 10.0))
-        return float(metric_kid.mmd2(of(x, x), of(x, y), of(y, y), unit_diagonal=False))
+        options = {"kid_kernel_poly_degree": 3, "kid_kernel_poly_gamma": None, "kid_kernel_poly_coef0": 1, "kid_kernel_rbf_sigma": 10.0}
+        return float(kernel_mmd(x, y, kid_kernel=kernel, **options))
 
     return run
 
@@ -189,12 +189,13 @@ def beside_the_peers(chosen):
     for name, (_, needs) in RUNS.items():
         if needs and importlib.util.find_spec(needs) is None:
             print(f"{name}: {needs} is not installed, skipped", flush=True)
+            found.append({"name": name, "error": "not installed"})
             continue
         row = in_a_process(
             ["--one", name, "--n", str(chosen.n), "--m", str(chosen.m or chosen.n), "--d", str(chosen.d), "--repeats", str(chosen.repeats)],
             chosen.threads,
         )
-        row.setdefault("name", name)
+        row["name"] = name if needs is None else f"{name} ({importlib.metadata.version(needs.replace('_', '-'))})"
         found.append(row)
         print(row.get("error") or f"{name}: {row['cpu']:.2f} CPU s, {row['wall']:.2f} s, {row['mib']:.0f} MiB, {row['value']}", flush=True)
     return found

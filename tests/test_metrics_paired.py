@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from palpate.core import PalpateError
-from palpate.metrics import compare, four_scores, i_tmmd, mmd2, tmmd
+from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, mmd2, tmmd
 from palpate.metrics.blocked import blocked_sums
 from palpate.metrics.kernels import Gaussian
 from palpate.metrics.paired import holm
@@ -239,3 +239,37 @@ def test_one_bandwidth_for_all_generators(three):
     several = compare(generators, r, sigma="multi", permutations=0).scores[0]
     assert several.bandwidth is None
     assert len(several.settings["sigmas"]) == 5
+
+
+def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
+    r, generators = three
+    near = generators["near"]
+    centre = near.features.mean(axis=0)
+    x = 0.2 * near.features + 0.8 * centre
+    sets = {"collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)), "near": near}
+    found = compare(sets, r, floor=r, permutations=0).excess
+    assert [(s.metric, s.subject) for s in found.scores] == [
+        (m, s) for s in ("collapsed", "near") for m in ("I-TMMD E", "CI-TMMD E")
+    ]
+    groups = sorted(set(r.groups))
+    for metric, function in (("I-TMMD E", i_tmmd), ("CI-TMMD E", ci_tmmd)):
+        value = lambda s: function(s).details["E"]  # noqa: B023, E731
+        score = {s.subject: s for s in found.scores if s.metric == metric}
+        for name, s in sets.items():
+            assert score[name].value == pytest.approx(value(s))
+            assert score[name].interval == pytest.approx(function(s).details["E_interval"])
+            assert score[name].floor == pytest.approx(value(r))
+        (d,) = (d for d in found.differences if d.metric == f"{metric} difference")
+        a, b, floor = (value(s) for s in (*sets.values(), r))
+        out = np.array([[value(keep(s, np.array(s.groups) != g)) for s in (*sets.values(), r)] for g in groups])
+        for got, interval, values in (
+            (d.value, d.interval, out[:, 0] - out[:, 1]),
+            (d.details["gap"], d.details["gap_interval"], np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2])),
+        ):
+            reach = stats.t.ppf(0.975, 14) * np.sqrt(14 / 15 * ((values - values.mean()) ** 2).sum())
+            assert interval == pytest.approx((got - reach, got + reach), abs=1e-9)
+        assert d.value == pytest.approx(a - b)
+        assert d.details["gap"] == pytest.approx(abs(a - floor) - abs(b - floor))
+        assert d.details["better"] == "near"
+    bare = {name: change(s, groups=None) for name, s in sets.items()}
+    assert compare(bare, change(r, groups=None), permutations=0).excess.scores == []

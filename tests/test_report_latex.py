@@ -1,5 +1,6 @@
 """LaTeX tables: text stays text, the best is bold only where it is better, and the caption says how."""
 
+import dataclasses
 import re
 
 import pytest
@@ -98,7 +99,8 @@ def test_a_table_has_values_intervals_floor_and_how_they_were_made():
     assert ["b", "$12.00$"] in rows
     assert ["floor (real touches)", "$0.25$"] in rows
     assert ["", r"SSIM $\uparrow$"] in rows
-    assert ["b", "--"] in rows
+    assert ["b", r"--\textsuperscript{a}"] in rows
+    assert r"\textsuperscript{a}~Undefined: why.}" in text
     assert [r"TMMD $\downarrow$", "a", "b", "$-11.00$", "$[-13.00, -9.00]$", r"$90.0\,\%$", "$< 0.001$"] in rows
     caption = next(line for line in text.splitlines() if "caption" in line)
     for fact in ("$n$ 10", "$m$ 12", r"$\sigma$ 10", "values times 1000", "jackknife, t, 3 df", r"encoder \texttt{abababababab}",
@@ -121,3 +123,80 @@ def test_metrics_of_other_features_have_tables_of_their_own():
     mixed = [make("FID (touch)", "a", 1.0, preset=""), make("KID (touch)", "a", 1.0, preset="")]
     object.__setattr__(mixed[0], "scale", 1.0)
     assert "scaled: KID (touch) times 1000" in latex_tables(Results(title="t", scores=mixed))
+
+
+def test_of_several_seeds_the_first_stands():
+    scores = [make("I-TMMD", "a", v, up=None, preset="paper", interval_method=f"of {v}") for v in (1.0, 2.0)]
+    assert [row for row in cells(latex_tables(Results(title="t", scores=scores))) if row[0] == "a"] == [["a", "$1.000$"]]
+
+
+def excesses(a, b, floor, times, gap_interval, difference=None):
+    """E of two generators, and the difference of what is ``times`` E."""
+    column = [make("CI-TMMD E", "a", a, floor=floor, up=None), make("CI-TMMD E", "b", b, floor=floor, up=None)]
+    gap = (abs(a - floor) - abs(b - floor)) * times
+    d = delta(
+        "CI-TMMD", "a", "b", (a - b) * times if difference is None else difference, gap_interval, up=None, better="a" if gap < 0 else "b"
+    )
+    return column, dataclasses.replace(d, details={**d.details, "gap": gap})
+
+
+def test_excess_is_bold_by_its_own_difference_or_by_one_that_says_the_same():
+    column, d = excesses(2.1, 5.0, 2.0, 0.2, (-1, -0.5))
+    assert best_of(column, [d]) == "a"
+    text = latex_tables(Results(title="t", scores=[*column, d]))
+    assert r"CI-TMMD E $\rightarrow$" in text
+    assert bold(text) == ["2.100"]
+    assert best_of(column, [excesses(2.1, 5.0, 2.0, 0.2, (-1, 0.5))[1]]) is None
+    assert best_of(column, [excesses(2.1, 5.0, 2.0, 0.2, (-1, -0.5), difference=-0.7)[1]]) is None  # classes of unequal designs
+    own = delta("CI-TMMD E", "a", "b", -2.9, (-3, -1), up=None, better="b")
+    assert best_of(column, [d, own]) == "b"  # its own stands above that of CI-TMMD
+    tagged = [dataclasses.replace(s, metric="CI-TMMD E (σ multi)") for s in column]
+    assert best_of(tagged, [dataclasses.replace(d, metric="CI-TMMD (σ multi) difference")]) == "a"
+    assert best_of(tagged, [d]) is None
+
+
+def test_the_p_value_of_the_permutations_stands_below_the_interval():
+    tested = make("TMMD", "a", 1.0, (0.5, 1.5))
+    sure = make("TMMD", "b", 1.0)
+    for score, p in ((tested, 0.0123), (sure, 0.0004)):
+        score.details.update(p_value=p, permutations={"count": 9999})
+    text = latex_tables(Results(title="t", scores=[tested, sure, make("I-TMMD", "a", 2.0, up=None)]))
+    assert ["", r"{\scriptsize $p = 0.012$}", ""] in cells(text)
+    assert ["", r"{\scriptsize $p < 0.001$}", ""] in cells(text)
+    assert "$p$ by relabellings: 9,999" in text
+
+
+def test_what_a_reader_must_know_has_letters_below_the_table():
+    left = make("CI-TMMD", "a", 1.0, up=None, note="Of all. Of this & one")
+    left.details["excluded"] = {f"c_{k}": "all samples are of one group" for k in range(7)} | {"(no label)": "no label"}
+    text = latex_tables(Results(title="t", scores=[left, make("TMMD", "a", 2.0, note="Of all")]))
+    below = next(line for line in text.splitlines() if "parbox" in line)
+    assert r"c\_0, c\_1, c\_2, c\_3, c\_4 (all samples are of one group); and 3 more. Of all.}" in below
+    assert r"\textsuperscript{a}~Of this \& one. \textsuperscript{b}~Left out: c" in below
+    assert below.count("Of all") == 1
+    assert ["a", r"$1.000$\textsuperscript{a,b}", "$2.000$"] in cells(text)
+    assert not below.endswith(r"\\")
+    many = [make(f"m{k}", "a", 1.0, preset="", note=f"Note {k}") for k in range(28)]
+    marks = re.findall(r"superscript\{(\w+)\}~Note", latex_tables(Results(title="t", scores=many)))
+    assert marks == [*"abcdefghijklmnopqrstuvwxyz", "aa", "bb"]
+
+
+def test_the_empty_gel_has_a_row():
+    score = make("contact PSNR", "a", 20.0, up=True, preset="")
+    score.details["empty"] = 28.61
+    text = latex_tables(Results(title="t", scores=[score, make("SSIM", "a", 0.5, up=True, preset="")]))
+    assert ["empty gel", "$28.61$", "--"] in cells(text)
+
+
+def test_scores_of_different_references_are_bold_by_their_own_differences():
+    scores = []
+    for reference, better in (("1" * 64, "a"), ("2" * 64, "b")):
+        d = delta("TMMD", "a", "b", -1 if better == "a" else 1, (-2, -0.1) if better == "a" else (0.1, 2))
+        own = [make("TMMD", "a", 1.0), make("TMMD", "b", 2.0), d]
+        free = [make("I-TMMD", n, v, floor=0.5, up=None) for n, v in (("a", 0.2), ("b", 0.6))]
+        gap = delta("I-TMMD", "a", "b", -0.4, (-0.5, -0.3), up=None, better=better)
+        scores += [dataclasses.replace(s, reference=reference) for s in own] + [*free, gap]
+    text = latex_tables(Results(title="t", scores=scores))
+    assert bold(text) == ["1.000", "0.200", "2.000", "0.600"]
+    assert text.count(r"\begin{table}") == 4
+    assert r"reference \texttt{111111111111}" in text

@@ -121,6 +121,7 @@ def test_uneven_bins():
     [
         ("D-TMMD", "Touch features"), ("CMMD", "Image distributions"), ("FID", "Image distributions"), ("PSNR", "Image by image"),
         ("material accuracy", "Recognition"), ("tac-text top-5", "Recognition"), ("recall@5", "Recognition"), ("novel", "Other metrics"),
+        ("contact residual", "Image by image"), ("contact IoU", "Image by image"), ("contact LPIPS", "Image by image"),
     ],
 )  # fmt: skip
 def test_families(metric, title):
@@ -143,7 +144,7 @@ def test_score_tables_share_what_is_shared():
     assert (touch.columns[0].size, touch.columns[1].size) == ("", "n = 10")
     assert [touch.cells[s]["TMMD"][0].size for s in touch.subjects] == ["n = 10", "n = 20"]
     assert touch.notes == ["A note."]
-    assert [touch.cells["real"]["TMMD"][0].footnote, touch.cells["generated"]["I-TMMD"][0].footnote] == [1, 1]
+    assert [touch.cells["real"]["TMMD"][0].footnotes, touch.cells["generated"]["I-TMMD"][0].footnotes] == [[1], [1]]
     assert ("window", "11") in images.columns[0].made
     assert images.shared == []
 

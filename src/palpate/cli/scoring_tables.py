@@ -1,18 +1,43 @@
-"""The tables of ``palpate score`` in the terminal: one of scores, one of paired differences."""
+"""The tables of ``palpate score`` in the terminal: one of scores, one of paired differences, and below them what a reader must know, each sentence once.
+
+Where a table is wider than the terminal, the metrics become headings, and the columns that can be spared are left out and named.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+from rich.cells import cell_len
 from rich.markup import escape
 from rich.table import Table
 
 from palpate.cli.terminal import Terminal
 from palpate.core import Results, Score
 from palpate.core.score import ARROWS
-from palpate.protocol.comparing import percent
+from palpate.protocol.comparing import confidence, percent
+from palpate.report.remarks import INDEPENDENT, Footnotes, no_floor, reason, remarks
+from palpate.report.sides import TAIL
+from palpate.report.tables import gel_of
 
-TAIL = " difference"
+GEL = "gel: what the empty gel scores on the same touches, without any contact; squared errors (PSNR) prefer it to a wrong touch"
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table before it is drawn.
+
+    Attributes:
+        heads: names of the columns of ``rows``.
+        left: how many of them are names, flush left; the others are numbers.
+        spare: columns that a narrow terminal does without.
+        rows: (metric, preset, cells) of each row, as plain text.
+    """
+
+    heads: Sequence[str]
+    left: int
+    spare: frozenset[str]
+    rows: Sequence[tuple[str, str, Sequence[str]]]
 
 
 def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None:
@@ -20,18 +45,31 @@ def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None
     scores = [s for s in results.scores if not s.metric.endswith(TAIL)]
     differences = [s for s in results.scores if s.metric.endswith(TAIL) and s.value is not None]
     known = {_column(s) for s in scores if s.value is not None}
+    listed = [s for s in scores if _column(s) in known]
+    notes, told = Footnotes(), set(results.notes)
     if known:
-        terminal.out.print(_scores([s for s in scores if _column(s) in known]))
+        _draw(_scores(listed, notes, told), terminal)
     if differences:
         terminal.out.print()
         terminal.out.print("Differences on the same samples, a - b", style="bold")
-        terminal.out.print(_differences(differences))
+        frames = {_column(s) for s in listed if INDEPENDENT in remarks(s)}
+        _draw(_differences(differences, notes, frames), terminal)
+    if notes.texts:
+        below = Table.grid(padding=(0, 2, 0, 0))
+        below.add_column(justify="right")
+        for k, text in enumerate(notes.texts, 1):
+            below.add_row(str(k), escape(text))
+        terminal.out.print()
+        terminal.out.print(below)
+    if any(gel_of(s) is not None for s in listed):
+        terminal.print(GEL)
     why: dict[str, list[str]] = {}
     for s in scores:
         if s.value is None:
-            why.setdefault(s.note, []).append(s.metric if _column(s) not in known else f"{s.metric} of {s.subject}")
-    for note, metrics in why.items():
-        terminal.print(f"{', '.join(dict.fromkeys(metrics))}: {note}")
+            text = ". ".join([reason(s), *(t for t in remarks(s) if t not in notes.texts)])
+            why.setdefault(text, []).append(s.metric if _column(s) not in known else f"{s.metric} of {s.subject}")
+    for text, metrics in why.items():
+        terminal.print(f"{', '.join(dict.fromkeys(metrics))}: {text}")
     for remark in (r for r in results.notes if r not in said):
         terminal.print(remark)  # part of the result: -q leaves it
 
@@ -40,33 +78,106 @@ def _column(score: Score) -> tuple[str, str]:
     return score.metric, str(score.settings.get("preset", ""))
 
 
-def _scores(scores: Sequence[Score]) -> Table:
-    table = Table("metric", "preset", "subject", box=None, pad_edge=False)
-    for name in ("value", "95 % interval", "null", "p", "floor", "n"):
-        table.add_column(name, justify="right", no_wrap=True)
-    # One metric below the other: what is to be compared stands together.
+def _scores(scores: Sequence[Score], notes: Footnotes, told: set[str]) -> Grid:
+    """The scores, one metric below the other: what is to be compared stands together."""
     order = list(dict.fromkeys(map(_column, scores)))
+    rows: list[tuple[str, str, Sequence[str]]] = []
     for s in sorted(scores, key=lambda s: order.index(_column(s))):
-        p = s.details.get("p_value")
-        table.add_row(
-            f"{escape(s.metric)} {ARROWS[s.higher_is_better]}", s.settings.get("preset", ""), escape(s.subject), _number(s.value),
-            _interval(s.interval), _interval(s.null), _p(p), "-" if s.floor is None else _number(s.floor), str(s.n),
-        )  # fmt: skip
-    return table
+        # A remark of the results says of whom, and is printed anyhow.
+        known = [t for t in (*remarks(s), no_floor(s)) if t and f"{s.subject}: {t}" not in told]
+        gel = gel_of(s)
+        floor = f"gel {_number(gel)}" if gel is not None else "-" if s.floor is None else _number(s.floor)
+        cells = [
+            s.subject, _number(s.value), _interval(s.interval), _interval(s.null), _p(s.details.get("p_value")), floor, str(s.n),
+            _marks(notes, known),
+        ]  # fmt: skip
+        rows.append((f"{s.metric} {ARROWS[s.higher_is_better]}", _column(s)[1], cells))
+    return Grid(("subject", "value", "95 % interval", "null", "p", "floor", "n", "note"), 1, frozenset({"null", "n"}), rows)
 
 
-def _differences(scores: Sequence[Score]) -> Table:
-    table = Table("metric", "preset", "a", "b", box=None, pad_edge=False)
-    for name in ("a - b", "95 % interval", "confidence that a is better", "Holm p"):
-        table.add_column(name, justify="right", no_wrap=True)
+def _differences(scores: Sequence[Score], notes: Footnotes, frames: set[tuple[str, str]]) -> Grid:
+    """The differences; ``frames`` are the columns whose intervals take samples as independent."""
+    rows: list[tuple[str, str, Sequence[str]]] = []
     for s in scores:
-        d = s.details
-        sure, p = d.get("p_better"), d.get("p_adjusted")
-        table.add_row(
-            f"{escape(s.metric.removesuffix(TAIL))} {ARROWS[s.higher_is_better]}", s.settings.get("preset", ""), escape(d["a"]),
-            escape(d["b"]), _number(s.value), _interval(s.interval), "-" if sure is None else percent(sure), _p(p),
-        )  # fmt: skip
-    return table
+        metric, d = s.metric.removesuffix(TAIL), s.details
+        ahead = confidence(s)
+        known = [t for t in remarks(s) if t not in ahead]
+        known += [INDEPENDENT] if s.interval and (metric, _column(s)[1]) in frames and INDEPENDENT not in known else []
+        sure = d.get("p_better")
+        cells = [
+            d["a"], d["b"], _number(s.value), _interval(s.interval), "-" if sure is None else percent(sure), _p(d.get("p_adjusted")),
+            _marks(notes, known),
+        ]  # fmt: skip
+        rows.append((f"{metric} {ARROWS[s.higher_is_better]}", _column(s)[1], cells))
+    heads = ("a", "b", "a - b", "95 % interval", "confidence that a is better", "Holm p", "note")
+    return Grid(heads, 2, frozenset(), rows)
+
+
+def _draw(grid: Grid, terminal: Terminal) -> None:
+    """Prints a grid as one table; in sections by metric where the terminal is too narrow for that."""
+    noted = any(cells[-1] for _, _, cells in grid.rows)
+    keep = [k for k, head in enumerate(grid.heads) if head != "note" or noted]
+    wide = Table("metric", "preset", box=None, pad_edge=False)
+    for k in keep:
+        number = k >= grid.left and grid.heads[k] != "note"
+        wide.add_column(grid.heads[k], justify="right" if number else "left", no_wrap=k >= grid.left)
+    for metric, preset, cells in grid.rows:
+        wide.add_row(escape(metric), preset, *(escape(cells[k]) for k in keep))
+    room = terminal.out.width
+    if terminal.out.measure(wide, options=terminal.out.options.update(width=10_000)).maximum <= room:
+        terminal.out.print(wide)
+        return
+    spared = [grid.heads[k] for k in keep if grid.heads[k] in grid.spare]
+    if spared and not _fits(grid, keep, room):
+        keep = [k for k in keep if grid.heads[k] not in spared]
+    else:
+        spared = []
+    _sections(grid, keep, terminal)
+    if spared:
+        terminal.print(f"Left out in this width: {' and '.join(spared)}. They are in the results of -o, and in a wider window.")
+
+
+def _widths(grid: Grid, keep: Sequence[int]) -> list[int]:
+    """The widest cell of each of the columns ``keep``."""
+    return [max(cell_len(_short(grid.heads[k])), *(cell_len(cells[k]) for _, _, cells in grid.rows)) for k in keep]
+
+
+def _short(head: str) -> str:
+    return head.replace("confidence that a is better", "a better")
+
+
+def _fits(grid: Grid, keep: Sequence[int], room: int) -> bool:
+    return sum(_widths(grid, keep)) + 2 * (len(keep) - 1) <= room
+
+
+def _sections(grid: Grid, keep: Sequence[int], terminal: Terminal) -> None:
+    """The columns ``keep`` of a grid, each metric below a line of its own; names fold where even that is too wide."""
+    widths = _widths(grid, keep)
+    if not _fits(grid, keep, terminal.out.width):
+        rest = sum(widths[grid.left :]) + 2 * (len(keep) - 1)
+        names = max(4, (terminal.out.width - rest) // grid.left)
+        widths[: grid.left] = [min(width, names) for width in widths[: grid.left]]
+
+    def lines() -> Table:
+        table = Table(box=None, pad_edge=False, show_header=False)
+        for k, width in zip(keep, widths, strict=True):
+            justify = "left" if k < grid.left or grid.heads[k] == "note" else "right"
+            table.add_column(justify=justify, width=width, overflow="fold", no_wrap=k >= grid.left)
+        return table
+
+    table, before = lines(), None
+    table.add_row(*(_short(grid.heads[k]) for k in keep), style="bold")
+    for metric, preset, cells in grid.rows:
+        if (metric, preset) != before:
+            terminal.out.print(table)
+            terminal.out.print(escape(", ".join(filter(None, [metric, preset]))), style="bold")
+            table, before = lines(), (metric, preset)
+        table.add_row(*(escape(cells[k]) for k in keep))
+    terminal.out.print(table)
+
+
+def _marks(notes: Footnotes, said: Sequence[str]) -> str:
+    return " ".join(map(str, notes.numbers(said)))
 
 
 def _number(value: float | None) -> str:
@@ -74,7 +185,7 @@ def _number(value: float | None) -> str:
 
 
 def _interval(pair: tuple[float, float] | None) -> str:
-    return "-" if pair is None else f"\\[{pair[0]:.4g}, {pair[1]:.4g}]"
+    return "-" if pair is None else f"[{pair[0]:.4g}, {pair[1]:.4g}]"
 
 
 def _p(p: float | None) -> str:

@@ -11,8 +11,9 @@ d = touch - background in [-1, 1] and compared where the real touch touches:
   sum d^2 alone would reward the empty gel: there a touch that is as strong and unrelated has 2, and a real touch of the same material
   loses to empty gel; that ratio is in ``details["per_real_energy"]``.
 * *SSIM*: the map of SSIM (Gaussian 11 / 1.5, population variances, mirrored at the edge so that contact at the edge counts) of d' and d,
-  averaged over mask and channels; where luminance and structure are both negative, as of a touch and its negative, so is their product. Its data range is 0.25, a few deviations of a contact: with 2, the range of d, C2 exceeds the
-  contact's own variance and empty gel is rated above a real touch of the same material.
+  averaged over mask and channels; where luminance and structure are both negative, as of a touch and its negative, so is their product.
+  Its data range is 0.25, a few deviations of a contact: with 2, the range of d, C2 exceeds the contact's own variance and empty gel is
+  rated above a real touch of the same material.
 * *MS-SSIM*: the same maps at every scale that the image holds (:mod:`palpate.metrics.multiscale`), each averaged with the share of a cell that
   is in the mask as its weight. A window of the coarsest scale sees 11 cells a side, most of a small touch, so what it adds is whether
   the contact as a whole lies right.

@@ -26,7 +26,7 @@ from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
 from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Options, plan_for
-from palpate.metrics.scored import Scored, require_one_encoder, same_units, with_floor
+from palpate.metrics.scored import Scored, excess_of, require_one_encoder, same_units, with_floor
 from palpate.metrics.tables import build_table
 from palpate.metrics.tactile import floors_of, four_of, tmmd_of
 
@@ -38,10 +38,12 @@ class Comparison:
     Attributes:
         scores: the four metrics of each generator, in the order given; ``subject`` is its name.
         differences: one score a metric and pair, ``value`` = a - b; ``details`` as in :func:`difference`, and ``p_adjusted``.
+        excess: of :func:`compare`: the same of E, the between-group excess of I- and CI-TMMD (``"I-TMMD E"``, ``"CI-TMMD E"``).
     """
 
     scores: list[Score]
     differences: list[Score]
+    excess: Comparison | None = None
 
 
 def compare(
@@ -64,10 +66,18 @@ def compare(
     if floor is not None:
         real = floors_of(floor, reference, next(iter(sets.values())), options)
         found, floors = {name: [four[0], *map(with_floor, four[1:], real)] for name, four in found.items()}, [None, *real]
-    pairs = list(combinations(found, 2))
-    differences = [difference(found[a][k], found[b][k], floors[k]) for k in range(4) for a, b in pairs]
-    scores = [one.score for four in found.values() for one in four]
-    return Comparison(scores, [d for k in range(4) for d in holm(differences[k * len(pairs) : (k + 1) * len(pairs)])])
+    excess = {name: [excess_of(one) for one in four[1:3]] for name, four in found.items()}
+    between = _compared(excess, [None if one is None else excess_of(one) for one in floors[1:3]])
+    return replace(_compared(found, floors), excess=between)
+
+
+def _compared(found: Mapping[str, Sequence[Scored | None]], floors: Sequence[Scored | None]) -> Comparison:
+    """Scores of each generator, and differences of those that both of a pair have, metric by metric."""
+    differences: list[Score] = []
+    for k, floor in enumerate(floors):
+        pairs = [(found[a][k], found[b][k]) for a, b in combinations(found, 2)]
+        differences += holm([difference(a, b, floor) for a, b in pairs if a is not None and b is not None])
+    return Comparison([one.score for some in found.values() for one in some if one is not None], differences)
 
 
 def compare_tmmd(generators: Mapping[str, FeatureSet], reference: FeatureSet, **options: Unpack[Options]) -> Comparison:

@@ -25,6 +25,8 @@ RANDOM_NOTE = (
 )
 
 
+#: A bound at scale 1000 from which it is told.
+TOLD = 1e-4
 UNBOUNDED = 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
 
 
@@ -36,11 +38,13 @@ class Scored:
         score: the score.
         replicates: (G,) the value without each unit.
         units: (G,) names of the units; empty where classes were left out instead.
+        excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
     """
 
     score: Score
     replicates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     units: Sequence[str] = ()
+    excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
 
 
 def scored(
@@ -75,8 +79,8 @@ def scored(
     value = plain(found.values[0]) if found else None
     if value is not None and not bound <= (2 * plan.scale if limit is None else limit):
         value, note = None, UNBOUNDED
-    elif value is not None and bound > 1e-4 * (plan.scale / 1000 if limit is None else 1):
-        note = ". ".join(filter(None, [f"Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments", note]))
+    elif value is not None and bound > TOLD * (plan.scale / 1000 if limit is None else 1):
+        note = ". ".join(filter(None, [within(bound), note]))
     interval = found.interval(0, plan.level) if found and value is not None else None
     method = found.method if found and interval else ""
     if value is None:
@@ -96,7 +100,36 @@ def scored(
     )  # fmt: skip
     if found is None or not len(found.units):
         return Scored(score)
-    return Scored(score, found.replicates[:, 0], [table.names[int(u)] for u in found.units])
+    excess = found.replicates[:, 1] if "E" in details else np.zeros(0)
+    return Scored(score, found.replicates[:, 0], [table.names[int(u)] for u in found.units], excess)
+
+
+def excess_of(one: Scored) -> Scored | None:
+    """The between-group excess E of an I- or CI-TMMD as a score of its own; None where there is none.
+
+    It does not depend on the number of groups, and its floor is that of the same classes: it is what to report. Where moments do not bound
+    it, it is undefined; where they bound it loosely, the note says so.
+    """
+    score, d = one.score, one.score.details
+    if d.get("E") is None or score.settings.get("halves") != "group":
+        return None
+    bound = np.inf if d.get("E_bound") is None else float(d["E_bound"])  # JSON has no infinity
+    known, interval = bound <= 2 * score.scale, d.get("E_interval")
+    interval, note = (interval if known else None), "" if known else UNBOUNDED
+    if known and bound > TOLD * score.scale / 1000:
+        note = within(bound)
+    kept = {name: d[name] for name in ("unit", "units", "backend", "version", "classes", "excluded") if name in d}
+    found = replace(
+        score, metric=f"{score.metric} E", value=d["E"] if known else None, interval=None if interval is None else (interval[0], interval[1]),
+        null=None, interval_method=score.interval_method if interval else "", floor=d.get("E_floor"), estimator="unbiased", seed=None,
+        note=note, details=kept | {"bound": bound if known else None},
+    )  # fmt: skip
+    return Scored(found, one.excess, one.units if len(one.excess) else ())
+
+
+def within(bound: float) -> str:
+    """What a reader must know of a bound that is not small."""
+    return f"Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments"
 
 
 def same_units(a: Scored, floor: Scored) -> bool:

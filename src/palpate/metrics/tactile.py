@@ -326,7 +326,7 @@ def four_scores(
         reference: features of the real test touches.
         floor: real touches on which the three reference-free metrics are computed for ``Score.floor``; usually ``reference``. With halves of
             whole groups their values depend on the number of groups: ``Score.floor`` is given where the groups are the same, and the floor of
-            what does not depend on it, ``details["E_floor"]``, in any case.
+            what does not depend on it, ``details["E_floor"]``, for any groups of the same classes.
         **options: see :class:`Options`; the same for all four.
 
     Raises:

@@ -1,24 +1,29 @@
 r"""Scores as LaTeX tables for a paper: ``booktabs``, one table a family of metrics, and one of paired differences.
 
-Rows are subjects, columns are metrics with the arrow of the better direction; the interval stands below the value. A value is bold only where its generator
-is better than every other one by a paired difference whose interval leaves out 0: a best of overlapping values is nobody's. The caption says how the
-numbers were made. Text is escaped: no name can be a command. Needs ``\usepackage{booktabs}``.
+Rows are subjects, columns are metrics with the arrow of the better direction; the interval stands below the value, and the p-value of a permutation test
+below that. A value is bold only where its generator is better than every other one by a paired difference whose interval leaves out 0: a best of
+overlapping values is nobody's. The caption says how the numbers were made; what a reader must know of single values (classes left out, intervals over
+frames) has a letter below the table. Text is escaped: no name can be a command. Needs ``\usepackage{booktabs}``.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 
 from palpate.core import Results, Score, short
-from palpate.report.tables import score_tables
+from palpate.report.remarks import Footnotes, reason, remarks
+from palpate.report.sides import TAIL, sides
+from palpate.report.tables import gel_of, parts, score_tables
 from palpate.report.text import decimals, defined, setting_of
 
-TAIL = " difference"
 #: First line of the file: how the command knows a file of its own.
 MARK = "% palpate: tables of scores"
 #: By whether higher is better; None: closer to the floor is.
 ARROWS = {True: r"$\uparrow$", False: r"$\downarrow$", None: r"$\rightarrow$"}
+#: What the name of E has more than that of its metric.
+_EXCESS = re.compile(r"(?<=-TMMD) E\b")
 _SPECIAL = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "`": r"\textasciigrave{}",
@@ -49,16 +54,18 @@ def latex_tables(results: Results) -> str:
     Raises:
         PalpateError: if two scores that would share a column were not made alike.
     """
-    scores = [s for s in results.scores if not s.metric.endswith(TAIL)]
-    differences = [s for s in results.scores if s.metric.endswith(TAIL)]
+    differences = [(s, side) for s, side in zip(results.scores, sides(results.scores).of, strict=True) if s.metric.endswith(TAIL)]
     lines = [MARK, *(f"% {_comment(c)}" for c in results.commands), r"% Needs \usepackage{booktabs}.", ""]
-    for table in score_tables(scores):
+    for table in score_tables(results.scores):
+        if table.columns[0].metric.endswith(TAIL):
+            continue
+        beside = [d for d, side in differences if side in table.sides]
         members = [cell.score for row in table.cells.values() for cells in row.values() for cell in cells]
         for tag in dict.fromkeys(_tag(c.metric) for c in table.columns):
             metrics = [c.metric for c in table.columns if _tag(c.metric) == tag]
-            lines += _scores(table.title, tag, metrics, [s for s in members if s.metric in metrics], differences, results)
-    for setting in dict.fromkeys(map(setting_of, differences)):
-        lines += _differences([d for d in differences if setting_of(d) == setting], results)
+            lines += _scores(table.title, tag, metrics, [s for s in members if s.metric in metrics], beside, results)
+    for part in parts(results.scores):
+        lines += _differences(part.title, part.scores, results) if part.differences else []
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -83,16 +90,28 @@ def _scores(
     better = {m: next(s.higher_is_better for s in members if s.metric == m) for m in metrics}
     best = {m: best_of([found[key] for key in found if key[1] == m], differences) for m in metrics}
     title += f", {tag[2:-1]}" if tag else ""
+    gels = {m: next((gel for s in members if s.metric == m and (gel := gel_of(s)) is not None), None) for m in metrics}
+    said = {key: [*filter(None, [reason(s)]), *remarks(s)] for key, s in found.items()}
+    common = [text for text in next(iter(said.values())) if all(text in own for own in said.values())]
+    notes = Footnotes()
+    marks = {key: notes.numbers(text for text in own if text not in common) for key, own in said.items()}
     rows = [_row(["", *(f"{escape(m.removesuffix(tag))} {ARROWS[better[m]]}" for m in metrics)]), r"\midrule"]
     for subject in subjects:
         cells = [found.get((subject, m)) for m in metrics]
-        values = [_value(s, digits[m], bold=best[m] == subject) for m, s in zip(metrics, cells, strict=True)]
+        values = [_value(s, digits[m], marks.get((subject, m), []), bold=best[m] == subject) for m, s in zip(metrics, cells, strict=True)]
         rows.append(_row([escape(subject), *values]))
         if any(s is not None and s.interval for s in cells):
             rows.append(_row(["", *(_interval(s, digits[m]) for m, s in zip(metrics, cells, strict=True))]))
-    if any(v is not None for v in floors.values()):
-        rows += [r"\midrule", _row(["floor (real touches)", *(number(floors[m], digits[m]) for m in metrics)])]
-    return _environment(title, f"l{'r' * len(metrics)}", rows, members, results, differences=bool(differences))
+        if any(s is not None and s.details.get("p_value") is not None for s in cells):
+            rows.append(_row(["", *map(_tested, cells)]))
+    last = [
+        _row([title, *(number(values[m], digits[m]) for m in metrics)])
+        for title, values in (("floor (real touches)", floors), ("empty gel", gels))
+        if any(v is not None for v in values.values())
+    ]
+    rows += [r"\midrule", *last] if last else []
+    below = [*(f"{_raised([k])}~{escape(text)}" for k, text in enumerate(notes.texts, 1)), *map(escape, common)]
+    return _environment(title, f"l{'r' * len(metrics)}", rows, members, results, differences=bool(differences), below=below)
 
 
 def _tag(metric: str) -> str:
@@ -104,11 +123,12 @@ def _row(cells: Sequence[str]) -> str:
     return " & ".join(cells) + r" \\"
 
 
-def _value(score: Score | None, digits: int, *, bold: bool) -> str:
+def _value(score: Score | None, digits: int, marks: Sequence[int], *, bold: bool) -> str:
+    raised = _raised(marks) if marks else ""
     if score is None or not defined(score):
-        return "--"
+        return f"--{raised}"
     text = number(score.value, digits)
-    return rf"$\mathbf{{{text[1:-1]}}}$" if bold else text
+    return (rf"$\mathbf{{{text[1:-1]}}}$" if bold else text) + raised
 
 
 def _interval(score: Score | None, digits: int) -> str:
@@ -118,23 +138,53 @@ def _interval(score: Score | None, digits: int) -> str:
     return rf"{{\scriptsize $[{low}, {high}]$}}"
 
 
+def _raised(marks: Sequence[int]) -> str:
+    """Letters, since a raised number is an exponent; after z follow aa, bb."""
+    return rf"\textsuperscript{{{','.join(chr(97 + (k - 1) % 26) * (1 + (k - 1) // 26) for k in marks)}}}"
+
+
+def _tested(score: Score | None) -> str:
+    p = None if score is None else score.details.get("p_value")
+    return "" if p is None else rf"{{\scriptsize $p {'' if p < 0.001 else '= '}{_p(p)[1:-1]}$}}"
+
+
 def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None:
     """The subject that is better than every other generator by a paired difference that is decided; None where there is none.
 
     Args:
         column: scores of one metric, made alike.
-        differences: paired differences of any metrics; subjects without one (controls, real touches) take no part.
+        differences: paired differences of any metrics; subjects without one (controls, real touches) take no part. E without differences of
+            its own goes by those of its metric, where they say the same.
     """
+    alike = [d for d in differences if column and (d.reference, *setting_of(d)) == (column[0].reference, *setting_of(column[0]))]
+    own = [d for d in alike if d.metric == column[0].metric + TAIL]
+    if not own and alike and _EXCESS.search(column[0].metric):
+        own = [d for d in alike if d.metric == _EXCESS.sub("", column[0].metric) + TAIL]
+        own = own if all(_same_verdict(d, column) for d in own) else []
     wins: dict[str, bool] = {}
-    for d in differences:
-        if not column or d.metric != column[0].metric + TAIL or setting_of(d) != setting_of(column[0]):
-            continue
+    for d in own:
         for name in (d.details["a"], d.details["b"]):
             wins[name] = wins.get(name, True) and bool(d.details.get("decided")) and d.details["better"] == name
     return next((name for name, won in wins.items() if won), None)
 
 
-def _differences(differences: Sequence[Score], results: Results) -> list[str]:
+def _same_verdict(difference: Score, column: Sequence[Score]) -> bool:
+    """Whether a difference of I- or CI-TMMD is that of E times a number, so that E is decided as it is.
+
+    Halves of whole groups make them E times a number that the sizes of groups give (:mod:`palpate.metrics.halves`); so do their jackknifes. Over
+    classes that holds where the classes have one design. Then one number must turn E's difference, and its gap of distances to the floor, into theirs.
+    """
+    found = {s.subject: s for s in column}
+    a, b = (found.get(difference.details[k]) for k in ("a", "b"))
+    gap = difference.details.get("gap")
+    if a is None or b is None or a.value is None or b.value is None or a.floor is None or gap is None or not difference.value:
+        return False
+    delta, own = a.value - b.value, abs(a.value - a.floor) - abs(b.value - a.floor)
+    factor = difference.value / delta if delta else 0.0
+    return factor > 0 and math.isclose(gap, factor * own, rel_tol=1e-6)
+
+
+def _differences(title: str, differences: Sequence[Score], results: Results) -> list[str]:
     rows = [_row(["metric", "$a$", "$b$", "$a - b$", "interval", "$a$ better", "Holm $p$"]), r"\midrule"]
     for d in differences:
         digits = decimals([v for v in (d.value, *(d.interval or ())) if v is not None])
@@ -153,8 +203,6 @@ def _differences(differences: Sequence[Score], results: Results) -> list[str]:
                 ]
             )
         )
-    preset = str(differences[0].settings.get("preset", ""))
-    title = "Paired differences" + (f", {preset}" if preset else "")
     return _environment(title, "lllrrrr", rows, differences, results, differences=False)
 
 
@@ -167,12 +215,19 @@ def _p(p: float) -> str:
 
 
 def _environment(
-    title: str, columns: str, rows: Sequence[str], members: Sequence[Score], results: Results, *, differences: bool
+    title: str,
+    columns: str,
+    rows: Sequence[str],
+    members: Sequence[Score],
+    results: Results,
+    *,
+    differences: bool,
+    below: Sequence[str] = (),
 ) -> list[str]:
     caption = ". ".join([escape(title), *_made(members, differences), *(rf"Command: \texttt{{{escape(c)}}}" for c in results.commands[:1])])
     return [
         r"\begin{table}", r"\centering", rf"\caption{{{caption}.}}", rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *rows, r"\bottomrule",
-        r"\end{tabular}", r"\end{table}", "",
+        r"\end{tabular}", *([rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {'. '.join(t.rstrip('.') for t in below)}.}}"] if below else []), r"\end{table}", "",
     ]  # fmt: skip
 
 
@@ -188,7 +243,9 @@ def _made(members: Sequence[Score], differences: bool) -> list[str]:
         "scaled:": [f"{escape(s.metric)} times {s.scale:g}" for s in members if s.scale != 1 and not one_scale],
         "intervals": [f"{100 * s.level:g}\\,\\% ({escape(s.interval_method)})" for s in members if s.interval],
         "encoder": [rf"\texttt{{{short(s.encoder)}}}" for s in members if s.encoder],
+        "reference": [rf"\texttt{{{short(s.reference)}}}" for s in members if s.reference],
         "split": [rf"\texttt{{{short(s.split)}}}" for s in members if s.split],
+        "$p$ by relabellings:": [f"{d['count']:,}" for s in members if isinstance(d := s.details.get("permutations"), Mapping)],
         "seed": [str(s.seed) for s in members if s.seed is not None],
         "palpate": [escape(str(s.details["version"])) for s in members if s.details.get("version")],
     }

@@ -13,7 +13,7 @@ from palpate.core import Audit, Impact, LeakPair, Results, SampleRef
 from palpate.report.audits import interval_percent, matrix_view, pair_facts, pair_lists, signal_row, signal_view
 from palpate.report.page import in_turns, material_of
 from palpate.report.sentences import leak_line, purpose, summary_lines, there, where
-from palpate.report.tables import Cell, Heat, Table, heat_tables, score_tables
+from palpate.report.tables import Cell, Heat, Table, heat_tables, score_tables, settings_of
 from palpate.report.text import HINTS, HOW_TO_READ, count, number, percent, plain, plural
 
 #: Rows of pictures listed in the Markdown; the JSON holds all.
@@ -56,14 +56,14 @@ def _picture(path: str | None) -> str:
 
 
 def _cell(cell: Cell) -> str:
+    marks = "".join(f"({k})" for k in cell.footnotes)
     if cell.why:
-        return f"undefined: {esc(cell.why)}"
+        return f"undefined: {esc(cell.why)} {marks}".rstrip()
     parts = [f"**{cell.value}**", cell.interval]
     parts += [f"floor {cell.floor}"] if cell.floor else []
+    parts += [f"gel {cell.gel}"] if cell.gel else []
     parts += [f"null {cell.null}"] if cell.null else []
-    parts += [cell.size] if cell.size else []
-    parts += [f"({cell.footnote})"] if cell.footnote else []
-    return " ".join(p for p in parts if p)
+    return " ".join(p for p in (*parts, cell.size, marks) if p)
 
 
 def _scores(table: Table) -> list[str]:
@@ -236,7 +236,7 @@ def render_markdown(results: Results) -> str:
     for audit in results.audits:
         lines += _audit(audit)
     lines += [] if results.audits else _hint("audits")
-    lines += ["## Settings and digests", "", *(_tree(plain(results.settings)) or _hint("settings")), ""]
+    lines += ["## Settings and digests", "", *(_tree(settings_of(results)) or _hint("settings")), ""]
     lines += ["## Commands", ""]
     if results.commands:
         lines += _commands(results.commands)

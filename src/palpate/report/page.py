@@ -25,7 +25,7 @@ from palpate.report import plots
 from palpate.report.audits import MAX_PAIRS, OPEN_PAIRS, AuditView, PairRow, audit_view, pair_facts, pair_lists, pair_pictures, side_of
 from palpate.report.pictures import Album, Darkroom, Picture, Wanted
 from palpate.report.sentences import purpose, summary_lines, where
-from palpate.report.tables import heat_tables, score_tables
+from palpate.report.tables import heat_tables, score_tables, settings_of
 from palpate.report.text import HINTS, HOW_TO_READ, count, defined, number, percent, plain, plural
 
 #: Gallery rows that are open, and that the page holds at all; the JSON beside the page names every one.
@@ -239,7 +239,7 @@ def render_page(results: Results, base: Path, *, max_bytes: int, names: Sequence
         "heats": heat_tables(results.scores),
         "undefined": sum(not defined(s) for s in results.scores),
         "details": [(s, plain({k: v for k, v in s.details.items() if k not in ("matrix", "labels", "classes")})) for s in results.scores],
-        "settings": plain(results.settings),
+        "settings": settings_of(results),
         "hints": HINTS,
         "how_to_read": HOW_TO_READ,
         "style": Markup(_template("style.css")),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from palpate.core import Audit, Results, SampleRef, Score, Signal, columns
 from palpate.core.score import BETTER
+from palpate.report.sides import sides
 from palpate.report.text import count, decimals, defined, interval_text, number, percent, plural, score_text, setting_of
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {there} the other part), and how a share of the test
@@ -132,8 +133,9 @@ def audit_line(audit: Audit) -> str:
 
 def score_line(scores: Sequence[Score]) -> str:
     """The first column with a value, in one sentence; '' if there is none."""
-    first = next((setting_of(s) for s in scores if defined(s)), None)
-    for metric, column in columns(s for s in scores if setting_of(s) == first).items():
+    places = [(*setting_of(s), side) for s, side in zip(scores, sides(scores).of, strict=True)]
+    first = next((place for s, place in zip(scores, places, strict=True) if defined(s)), None)
+    for metric, column in columns(s for s, place in zip(scores, places, strict=True) if place == first).items():
         shown = [s for s in column if defined(s)]
         if shown:
             digits = decimals([s.value for s in shown if s.value is not None])

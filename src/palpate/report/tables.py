@@ -10,9 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from palpate.core import Score, columns
+from palpate.core import Results, Score, columns
 from palpate.core.score import ARROWS, BETTER
 from palpate.report.plots import Axis, axis_of
+from palpate.report.remarks import Footnotes, reason, remarks
+from palpate.report.sides import TAIL, Sides, sides
 from palpate.report.text import decimals, defined, interval_text, number, plain, setting_of
 
 #: Family title, what it asks, and the pieces of a metric's name (lower case) that put it there; the first match wins.
@@ -27,12 +29,17 @@ FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         "Are the sets of images alike to a general image encoder?",
         ("cmmd", "fid", "kid", "mmd", "precision", "recall (", "density", "coverage"),
     ),
-    ("Image by image", "Does each generated touch match its own real touch, pixel by pixel or patch by patch?", ("ssim", "psnr", "lpips", "l1", "mse")),
+    (
+        "Image by image",
+        "Does each generated touch match its own real touch, pixel by pixel or patch by patch?",
+        ("contact ", "ssim", "psnr", "lpips", "l1", "mse"),
+    ),
     ("Recognition", "What can be read from the touch: its material, or the text and photo that belong to it?", ("acc", "top", "retriev", "probe", "@")),
 )  # fmt: skip
 OTHER = ("Other metrics", "")
-#: What a metric's name ends in where a score is the difference of two generators, and the family of such scores.
-TAIL = " difference"
+#: Stands with the question where a table has contact scores.
+GEL = "Gel: what the empty gel, without any touch, has in the place of a contact score; squared errors such as PSNR prefer it to a wrong touch."
+#: The family of differences of two generators.
 DIFFERENCES = (
     "Paired differences",
     "Which of two generators is better on the same samples? Values are a - b; where the interval leaves out 0 the difference is more than chance.",
@@ -46,9 +53,10 @@ class Cell:
     Attributes:
         score: the score itself.
         value, interval, floor, null: numbers as text, '' where there is none.
+        gel: what the empty gel scores, for contact scores.
         size: ``"n = 240"`` or ``"n = 240, m = 1,200"``; '' where the whole column shares it.
-        footnote: number of the note below the table, or 0.
-        why: the note of an undefined score.
+        footnotes: numbers of the notes below the table.
+        why: why an undefined score is.
     """
 
     score: Score
@@ -56,8 +64,9 @@ class Cell:
     interval: str
     floor: str
     null: str
+    gel: str
     size: str
-    footnote: int
+    footnotes: Sequence[int]
     why: str
 
 
@@ -86,7 +95,8 @@ class Column:
 class Table:
     """One family. ``cells[subject][metric]`` lists the scores that stand there (several where seeds differ).
 
-    ``shared`` is how all columns were made alike; a column's ``made`` is what is its own.
+    ``shared`` is how all columns were made alike; a column's ``made`` is what is its own. ``sides`` are the real touches of these scores, as in
+    :mod:`palpate.report.sides`.
     """
 
     title: str
@@ -96,6 +106,22 @@ class Table:
     cells: Mapping[str, Mapping[str, Sequence[Cell]]]
     shared: Sequence[tuple[str, str]]
     notes: Sequence[str]
+    sides: frozenset[int]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Scores that stand in one table: its title and question, and the sides of the scores."""
+
+    title: str
+    question: str
+    scores: Sequence[Score]
+    sides: frozenset[int]
+
+    @property
+    def differences(self) -> bool:
+        """Whether these are paired differences."""
+        return self.scores[0].metric.endswith(TAIL)
 
 
 @dataclass(frozen=True)
@@ -130,7 +156,7 @@ def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
     seeds = dict.fromkeys(str(s.seed) for s in column if s.seed is not None)
     rows.append(("seed", ", ".join(seeds)))
     rows += [(str(k).replace("_", " "), v if isinstance(v, str) else str(plain(v))) for k, v in first.settings.items()]
-    rows += [("encoder", first.encoder or ""), ("split", first.split or "")]
+    rows += [("encoder", first.encoder or ""), ("reference", first.reference or ""), ("split", first.split or "")]
     return [(what, how) for what, how in rows if how]
 
 
@@ -138,21 +164,24 @@ def _size(score: Score) -> str:
     return ", ".join(f"{k} = {v:,}" for k, v in (("n", score.n or None), ("m", score.m)) if v is not None)
 
 
-def _cell(score: Score, digits: int, notes: list[str], size: str) -> Cell:
-    footnote = 0
-    if score.note and defined(score):
-        if score.note not in notes:
-            notes.append(score.note)
-        footnote = notes.index(score.note) + 1
+def gel_of(score: Score) -> float | None:
+    """What the empty gel, without any touch, scores in the place of a contact score; None for other scores."""
+    empty = score.details.get("empty")
+    return empty if isinstance(empty, int | float) and not isinstance(empty, bool) and math.isfinite(empty) else None
+
+
+def _cell(score: Score, digits: int, notes: Footnotes, size: str) -> Cell:
+    gel = gel_of(score)
     return Cell(
         score,
         value=number(score.value, digits),
         interval=interval_text(score, digits),
         floor=number(score.floor, digits) if score.floor is not None else "",
         null=f"{number(score.null[0], digits)} to {number(score.null[1], digits)}" if score.null else "",
+        gel=number(gel, digits) if gel is not None else "",
         size=size,
-        footnote=footnote,
-        why="" if defined(score) else score.note.removeprefix("Undefined: ") or "no reason recorded",
+        footnotes=notes.numbers(remarks(score)),
+        why="" if defined(score) else reason(score).removeprefix("Undefined: "),
     )
 
 
@@ -165,47 +194,84 @@ READINGS = {
 }
 
 
-def score_tables(scores: Sequence[Score]) -> list[Table]:
-    """The tables of all scores, families in fixed order, metrics and subjects in the order of first appearance.
+def parts(scores: Sequence[Score]) -> list[Part]:
+    """The scores of each table, families in fixed order.
 
-    Scores of another preset or of another split stand in tables of their own; within a table a column is checked.
-
-    Raises:
-        PalpateError: if two scores that share a column were not made alike.
+    Scores of another preset or of another split, or compared with other real touches, stand in tables of their own. A score that was compared
+    with none (I-, CI-, D-TMMD) stands with the others of its subject.
     """
     order = [title for title, _, _ in FAMILIES] + [OTHER[0], DIFFERENCES[0]]
-    parts: dict[tuple[int, str, str], list[Score]] = {}
-    for score in scores:
-        key = (order.index(family_of(score.metric)[0]), *setting_of(score))
-        parts.setdefault(key, []).append(score)
-    several = len({split for _, _, split in parts}) > 1
-    tables: list[Table] = []
-    for (place, preset, split), members in sorted(parts.items(), key=lambda item: item[0][0]):
-        title, question = family_of(members[0].metric)
+    found: dict[tuple[int, str, str], list[int]] = {}
+    for k, score in enumerate(scores):
+        found.setdefault((order.index(family_of(score.metric)[0]), *setting_of(score)), []).append(k)
+    several, at, out = len({split for _, _, split in found}) > 1, sides(scores), list[Part]()
+    for (place, preset, split), members in sorted(found.items(), key=lambda item: item[0][0]):
+        title, question = family_of(scores[members[0]].metric)
         if preset:
             title += f", {preset}: {READINGS[preset]}" if preset in READINGS else f", {preset}"
         if several and split:
             title += f", split {split[:8]}"
-        first = not any(t.question == question for t in tables)
-        tables.append(_table(title, question if first or place == len(FAMILIES) else "", members))
-    return tables
+        for tail, some in _by_side(members, scores, at):
+            first = not any(p.question == question for p in out)
+            asked = question if first or place == len(FAMILIES) else ""
+            out.append(Part(title + tail, asked, [scores[k] for k in some], frozenset(at.of[k] for k in some)))
+    return out
 
 
-def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
-    notes: list[str] = []
+def _by_side(members: Sequence[int], scores: Sequence[Score], at: Sides) -> list[tuple[str, list[int]]]:
+    """The members by side, with what their title ends in, where those with a reference are of more than one; else all of them."""
+    if len({at.of[k] for k in members if at.bound[k]}) < 2:
+        return [("", list(members))]
+    apart: dict[int, list[int]] = {}
+    for k in members:
+        apart.setdefault(at.of[k], []).append(k)
+    digests = {side: dict.fromkeys(scores[k].reference or "" for k in some if at.bound[k]) for side, some in apart.items()}
+    said = {side: " and ".join(d[:8] or "not recorded" for d in digests[side] or at.references[side]) for side in apart}
+    return [(f", reference {said[side]}", some) for side, some in apart.items()]
+
+
+def score_tables(scores: Sequence[Score]) -> list[Table]:
+    """The tables of all scores, as :func:`parts`; metrics and subjects in the order of first appearance.
+
+    Raises:
+        PalpateError: if two scores that share a column were not made alike.
+    """
+    return [_table(part) for part in parts(scores)]
+
+
+def _table(part: Part) -> Table:
+    notes = Footnotes()
     cells: dict[str, dict[str, list[Cell]]] = {}
     heads: list[Column] = []
-    for metric, column in columns(scores).items():
+    for metric, column in columns(part.scores).items():
         near = [v for s in column for v in (s.value, s.floor, *(s.interval or ())) if v is not None and math.isfinite(v)]
         common = _size(column[0]) if len({_size(s) for s in column}) == 1 else ""
         for score in column:
             cell = _cell(score, decimals(near), notes, "" if common else _size(score))
             cells.setdefault(score.subject, {}).setdefault(metric, []).append(cell)
         heads.append(Column(metric, column[0].higher_is_better, axis_of(column), common, _made(column)))
-    subjects = list(dict.fromkeys(score.subject for score in scores))
+    subjects = list(dict.fromkeys(score.subject for score in part.scores))
     shared = [row for row in heads[0].made if len(heads) > 1 and all(row in h.made for h in heads)]
     heads = [replace(h, made=[row for row in h.made if row not in shared]) for h in heads]
-    return Table(title, question, heads, subjects, cells, shared, notes)
+    question = " ".join(filter(None, [part.question, GEL if any(gel_of(s) is not None for s in part.scores) else ""]))
+    return Table(part.title, question, heads, subjects, cells, shared, notes.texts, part.sides)
+
+
+def settings_of(results: Results) -> dict[str, Any]:
+    """The settings of results, with the digests of the real touches that their scores were compared with."""
+    by_subject: dict[str, list[str]] = {}
+    for score in results.scores:
+        if score.reference and not score.metric.endswith(TAIL):
+            by_subject.setdefault(score.subject, []).append(score.reference)
+    joined: dict[tuple[str, ...], list[str]] = {}
+    for subject, digests in by_subject.items():
+        joined.setdefault(tuple(dict.fromkeys(digests)), []).append(subject)
+    shown = plain(results.settings)
+    if joined:
+        shown["real touches compared with"] = {
+            ", ".join(subjects): digests[0] if len(digests) == 1 else list(digests) for digests, subjects in joined.items()
+        }
+    return shown
 
 
 def _square(matrix: Any) -> list[list[float | None]] | None:

@@ -1,0 +1,134 @@
+"""What ``palpate score`` prints: what stands in the tables, the notes below them, and both in narrow terminals."""
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from palpate.cli.scoring_tables import GEL, show
+from palpate.cli.terminal import Common, Terminal
+from palpate.core import Results, Score
+from palpate.report.remarks import INDEPENDENT
+
+SEEN = "The touch tower was trained on another split: it may have seen test touches"
+
+
+def scored(metric, subject, value=1.0, *, preset="grouped", **more):
+    return Score(metric, subject, value, settings={"preset": preset} if preset else {}, n=120, **more)
+
+
+def delta(metric, a, b, **more):
+    details = {"a": a, "b": b, "p_better": 0.975, "better": a, "p_adjusted": 0.05}
+    return scored(f"{metric} difference", f"{a} - {b}", -1.0, details=details, **more)
+
+
+def printed(scores, width=200, said=(), **more):
+    terminal, text = Terminal(Common()), io.StringIO()
+    terminal.out = Console(file=text, width=width, highlight=False)
+    show(Results("t", scores=scores, **more), terminal, said)
+    return text.getvalue()
+
+
+def notes(text):
+    """Number -> sentence, and first word of the metric -> numbers of each row."""
+    below = dict(re.findall(r"^(\d+)  (.*?) *$", text, re.M))
+    rows = [(line.split()[0], re.findall(r"(?<=120  ).*", line)) for line in text.splitlines() if "grouped" in line]
+    return below, [(name, (found[0] if found else "").split()) for name, found in rows]
+
+
+def test_notes_of_scores_with_a_value_stand_below_once():
+    excluded = {"excluded": {"v0c": "all samples are of one group"}}
+    text = printed(
+        [
+            scored("TMMD", "a", floor=0.1, note=SEEN), scored("TMMD", "b", floor=0.1, note=SEEN), scored("CI-TMMD", "a", details=excluded, floor=0.1),
+            scored("D-TMMD", "a", floor=0.1, note=f"Denominators near 0, so the ratio is unreliable: m0, m1. {SEEN}"),
+            scored("Recall", "a", interval=(0.0, 1.0), interval_method="per image, taken as independent, t, 9 df"),
+        ]
+    )  # fmt: skip
+    below, rows = notes(text)
+    assert below == {
+        "1": SEEN, "2": "Left out: v0c (all samples are of one group)", "3": "Denominators near 0, so the ratio is unreliable: m0, m1", "4": INDEPENDENT,
+    }  # fmt: skip
+    assert rows == [("TMMD", ["1"]), ("TMMD", ["1"]), ("CI-TMMD", ["2"]), ("D-TMMD", ["1", "3"]), ("Recall", ["4"])]
+    assert "note" in text.splitlines()[0]
+
+
+def test_without_remarks_there_is_no_column_for_them():
+    text = printed([scored("TMMD", "a", floor=0.1)])
+    assert "note" not in text
+    assert text.count("\n") == 2
+
+
+def test_a_lacking_floor_is_explained():
+    below, rows = notes(
+        printed([scored("TMMD", "a"), scored("I-TMMD", "a", note="No floor: real touches of other groups"), scored("FID", "a")])
+    )
+    assert [numbers for _, numbers in rows] == [["1"], ["2"], []]
+    assert below["1"].startswith("No floor: that of TMMD")
+    assert below["2"] == "No floor: real touches of other groups"
+
+
+def test_what_the_remarks_say_of_a_subject_is_not_said_again():
+    copied = "5 of 120 generated rows are bit for bit rows of the reference: a copy is not a generator"
+    text = printed([scored("TMMD", "a", floor=0.1, note=f"{copied}. {SEEN}")], notes=[f"a: {copied}", "Other"], said=["Other"])
+    assert text.count(copied) == 1
+    assert f"a: {copied}" in text.splitlines()
+    assert "Other" not in text
+
+
+def test_undefined_scores_are_told_by_what_is_known_of_their_column():
+    left = {"excluded": {"m1": "fewer than 4 samples"}}
+    text = printed(
+        [
+            scored("TMMD", "a", floor=0.1, note=SEEN), scored("TMMD", "b", None, note=f"Undefined: too few. {SEEN}"),
+            scored("CI-TMMD", "a", None, note="Undefined: no class", details=left), scored("CI-TMMD", "b", None, note="Undefined: no class", details=left),
+        ]
+    )  # fmt: skip
+    lines = text.splitlines()
+    assert "TMMD of b: Undefined: too few" in lines
+    assert "CI-TMMD: Undefined: no class. Left out: m1 (fewer than 4 samples)" in lines
+    assert "CI-TMMD →" not in text  # a column without any value is no row
+    assert sum("undefined" in line for line in lines) == 1
+    assert text.count(SEEN) == 1
+
+
+def test_contact_scores_show_what_the_empty_gel_has():
+    text = printed([scored("contact PSNR", "a", 18.2, details={"empty": 28.6}), scored("PSNR", "a", 17.0)])
+    row = next(line for line in text.splitlines() if line.startswith("contact PSNR"))
+    assert "gel 28.6 " in row
+    assert text.splitlines()[-1] == GEL
+    assert "gel" not in printed([scored("PSNR", "a", 17.0)])
+
+
+def test_differences_of_intervals_over_frames_say_so():
+    frames = {"interval": (-2.0, 0.0), "interval_method": "leave-one-sample-out jackknife, t, 239 df, samples taken as independent"}
+    paired = {"interval": (-2.0, 0.0), "interval_method": "paired leave-one-sample-out jackknife, t, 239 df"}
+    scores = [*(scored("TMMD", n, floor=0.1, **frames) for n in "ab"), *(scored("SSIM", n, preset="") for n in "ab")]
+    said = "a is better with 97.5 % confidence, Holm p = 0.05"
+    text = printed(
+        [*scores, delta("TMMD", "a", "b", **paired, note=said), delta("SSIM", "a", "b", preset="", note=f"{said}. Of this size")]
+    )
+    tail = text.partition("Differences on the same samples")[2]
+    assert re.search(r"^TMMD .* 0\.05  1 *$", tail, re.M)
+    assert re.search(r"^SSIM .* 0\.05  2 *$", tail, re.M)
+    assert re.findall(r"^\d+  (.*?) *$", tail, re.M) == [INDEPENDENT, "Of this size"]
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 120, 160])
+def test_tables_stay_readable_in_narrow_terminals(width):
+    wide = {"interval": (-0.007656, 0.08971), "null": (-0.6496, -0.01584), "floor": 0.25}
+    names = ("generated", "real, same material")
+    scores = [scored(m, n, -0.02058, note=SEEN, **wide) for m in ("TMMD", "Precision (embeddings)") for n in names]
+    text = printed([*scores, *(delta(m, *names, interval=(-1.102, -0.9051)) for m in ("TMMD", "Precision (embeddings)"))], width)
+    lines = text.splitlines()
+    assert "…" not in text
+    kept = [line for line in lines if not line.startswith("Left out in this width")]
+    assert max(map(len, kept)) <= width
+    assert text.count("[-0.007656, 0.08971]") == 4
+    assert text.count("-0.02058") == 4
+    assert text.count("97.5 %") == 2
+    assert text.count("[-0.6496, -0.01584]") == (4 if width >= 100 else 0)
+    assert ("Left out in this width: null and n." in text) == (width < 100)
+    assert any(line.startswith("TMMD ↓, grouped") for line in lines) == (width < 160)
+    assert " ".join(text.split()).count(SEEN) == 1
