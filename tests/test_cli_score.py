@@ -78,7 +78,7 @@ def test_embeddings_side_by_side_agree_with_loops_and_with_the_library(capsys, s
     assert ahead["note"].startswith("near is better with")
     metrics = {m for m, _, _ in found}
     assert {f"{m} (embeddings)" for m in ("FID", "KID", "Precision", "Recall", "Density", "Coverage")} <= metrics
-    assert data["settings"]["digests"] == {"encoder": "e" * 64}
+    assert data["settings"]["digests"] == {"encoder": "e" * 64, "reference": sets["real"].digest}
     assert data["commands"][0].startswith("palpate score --generated near.npz")
 
 
@@ -362,8 +362,6 @@ def test_streamed_rows_at_a_narrow_bandwidth_and_one_file_for_two_are_refused(ca
     assert (status, out, "--backend blocked" in err) == (2, "", True)
     status, _, err = call(capsys, "--generated", "near.npz", "--reference", "real.npz", "-o", "same.x", "--latex", "same.x")
     assert (status, "two files" in err, Path("same.x").exists()) == (2, True, False)
-    status, _, err = call(capsys, "--generated", "near.npz", "--reference", "real.npz", "--sigma", "1e-300")
-    assert (status, "sigma" in err, "Traceback" in err) == (2, True, False)
 
 
 def test_what_was_widened_or_formed_is_in_the_results_and_said_once(capsys, sets):
@@ -385,22 +383,6 @@ def test_errors_name_the_generator_that_is_wrong(capsys, sets):
     status, _, err = call(capsys, "--generated", "near.npz", "spoilt.npz", "--reference", "real.npz")
     assert status == 2
     assert "The features of 'spoilt' must be L2-normalised. Got norm 2 in 1 row (3). Pass --normalize yes" in err
-
-
-def test_options_that_would_do_nothing_are_refused(capsys, sets):
-    Path("i.pt").write_bytes(b"")
-    Path("l.csv").write_text("id,material\n")
-    base = ("--generated", "far.npz", "--reference", "real.npz")
-    for extra, word in (
-        (("--companions", "ssim", "--inception", "i.pt"), "--inception must have a score to make"),
-        (("--companions", "ssim", "--clip", "palpate/mini"), "--clip must have a score to make"),
-        (("--companions", "kid", "--lpips", "i.pt", "i.pt"), "--lpips must have a score to make"),
-    ):
-        status, _, err = call(capsys, *base, *extra)
-        assert (status, word in err) == (2, True), err
-    manifest = ("m", "--split", "s.json", "--encoder", "palpate/mini", "--generated", "g", "--labels", "l.csv")
-    status, _, err = call(capsys, *manifest)
-    assert (status, "--labels and --groups must go with --reference" in err) == (2, True), err
 
 
 def test_features_that_rounding_cannot_tell_apart_are_refused(capsys, sets):

@@ -224,6 +224,66 @@ def test_pictures_with_an_encoder(capsys, tmp_path, monkeypatch, small_manifest,
     assert (s["n"], s["m"]) == (32, 32)
 
 
+def test_a_split_parts_the_generated_pictures_as_well(capsys, tmp_path, monkeypatch, small_manifest, mini):
+    from palpate.encoders.towers import Towers
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Towers, "load", lambda *_, **__: mini)
+    small_manifest.save(Path("m/manifest.parquet"))
+    ids = small_manifest.ids
+    Split.from_ids(train=ids[:16], test=ids[16:], rule={"group": "video"}, manifest=small_manifest.digest).save(Path("s.json"))
+    paint(tmp_path / "a", ids, 0)
+    args = (
+        "--generated", "a", "--reference", "m", "--encoder", "palpate/mini", "--split", "s.json", "--companions", "psnr", "--permutations",
+        "0", "--presets", "grouped",
+    )  # fmt: skip
+    whole, data = score(capsys, *args)
+    assert data["notes"][0] == "a: 16 of 48 touches lie outside the split's test part, and were left out"
+    for i in ids[:16]:
+        (tmp_path / "a" / f"{i}.png").unlink()
+    part, data = score(capsys, *args)
+    assert part["TMMD", "a", "grouped"]["n"] == 32
+    assert not any("left out" in note for note in data["notes"])
+    for key, s in part.items():
+        assert whole[key]["n"] == s["n"]
+        assert whole[key]["value"] == pytest.approx(s["value"], abs=1e-6), key
+    assert part["CI-TMMD E", "a", "grouped"]["value"] is not None  # material and video are the manifest's
+    (tmp_path / "a" / f"{ids[-1]}.png").unlink()
+    status, _, err = call(capsys, *args)
+    assert (status, f"Got 1 of 32 missing, first {ids[-1]!r}" in err) == (2, True), err
+
+
+def test_one_stray_picture_does_not_take_the_videos_from_all(capsys, tmp_path, monkeypatch, small_manifest, mini):
+    from palpate.encoders.towers import Towers
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Towers, "load", lambda *_, **__: mini)
+    small_manifest.save(Path("m/manifest.parquet"))
+    paint(tmp_path / "a", [*small_manifest.ids, "v0/stray"], 0)
+    args = ("--generated", "a", "--reference", "m", "--encoder", "palpate/mini", "--companions", "none", "--permutations", "0")
+    status, out, err = call(capsys, *args)
+    assert (status, out, "Got 1 of 49 without, first 'v0/stray'" in err) == (2, "", True), err
+    rows = zip([*small_manifest.ids, "v0/stray"], [*small_manifest.column("video"), "v0"], strict=True)
+    Path("c.csv").write_text("id,material,video\n" + "".join(f"{i},Wood,{v}\n" for i, v in rows))
+    found, _ = score(capsys, *args, "--labels", "c.csv")
+    assert found["TMMD", "a", "grouped"]["n"] == 49
+
+
+def test_scores_of_pictures_name_their_reference_the_same_after_a_copy(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(("real", "made")):
+        paint(tmp_path / name, ["1", "2", "3"], seed)
+    shutil.copytree("real", "again")
+    paint(tmp_path / "other", ["1", "2", "3"], 7, side=40)
+    told = {}
+    for name in ("real", "again", "other"):
+        found, data = score(capsys, "--generated", "made", "--reference", name, "--companions", "psnr")
+        told[name] = found["PSNR", "made", None]["reference"]
+        assert told[name] == data["settings"]["digests"]["reference"]
+        assert set(data["settings"]["digests"]["generated"]) == {"made"}
+    assert told["real"] == told["again"] != told["other"]
+
+
 def test_a_stopped_run_goes_on_from_its_embeddings_and_leaves_nothing_when_done(capsys, tmp_path, monkeypatch, small_manifest, mini):
     from palpate.encoders.towers import Towers
     from palpate.protocol import touches

@@ -1,5 +1,6 @@
 """Core: errors, digests, files, splits, scores, results, stages."""
 
+import itertools
 import json
 import pickle
 
@@ -25,6 +26,7 @@ from palpate.core import (
     columns,
     digest_json,
     inside,
+    require_comparable,
     rng_for,
     seed_for,
 )  # fmt: skip
@@ -111,6 +113,57 @@ def test_incomparable_scores_refuse_one_column():
         columns([a, Score("TMMD", "theirs", 2.0, bandwidth=5.0, encoder="e1")])
     with pytest.raises(PalpateError, match="encoder"):
         columns([a, Score("TMMD", "theirs", 2.0, bandwidth=10.0, encoder="e2")])
+
+
+def test_scores_against_other_references_refuse_one_column_wherever_they_stand():
+    unknown, one, two = (Score("TMMD", "g", 1.0, reference=r) for r in (None, "r1", "r2"))
+    for fine in (
+        [],
+        [unknown],
+        [one],
+        [unknown, unknown],
+        [unknown, one],
+        [one, unknown],
+        [one, unknown, one],
+        [unknown, two, unknown, two],
+    ):
+        require_comparable(fine)
+    for places in itertools.permutations([unknown, unknown, one, two]):
+        with pytest.raises(PalpateError, match=r"agree in reference. Got '(r1' for 'g' and 'r2|r2' for 'g' and 'r1)' for 'g'"):
+            require_comparable(places)
+    with pytest.raises(PalpateError, match="reference"):
+        require_comparable([one, one, two])
+    with pytest.raises(PalpateError, match="encoder"):  # for what is not a reference, unknown is a value of its own
+        require_comparable([Score("TMMD", "g", 1.0, encoder="e"), unknown])
+
+
+def test_the_digest_of_features_is_of_ids_and_values_in_any_order():
+    ids, x = [f"v/{k}" for k in range(9)], np.random.default_rng(0).normal(size=(9, 4)).astype(np.float32)
+    digest = FeatureSet(ids, x).digest
+    assert len(digest) == 64
+    assert int(digest, 16) >= 0
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(9)
+        assert FeatureSet([ids[k] for k in order], x[order]).digest == digest
+    assert FeatureSet(ids, np.asfortranarray(x)).digest == FeatureSet(ids, np.repeat(x, 2, axis=0)[::2]).digest == digest
+    assert FeatureSet(ids, x, labels=["a"] * 9, groups=["b"] * 9, encoder="e").digest == digest
+    bit, renamed, swapped = x.copy(), [*ids[:8], "v/9"], [ids[1], ids[0], *ids[2:]]
+    bit[8, 3] = np.nextafter(bit[8, 3], np.float32(9))
+    others = [
+        FeatureSet(ids, bit), FeatureSet(renamed, x), FeatureSet(swapped, x), FeatureSet(ids[:8], x[:8]), FeatureSet(ids, x[:, :3]),
+        FeatureSet(ids, x.astype(np.float64)), FeatureSet(["v/0v/1", "", *ids[2:]], x),
+    ]  # fmt: skip
+    assert len({digest, *(s.digest for s in others)}) == 8
+
+
+def test_every_slab_counts_in_the_digest():
+    """More rows than are hashed at a time: the last one counts, and order does not."""
+    ids, x = [f"{k}" for k in range(8200)], np.arange(8200, dtype=np.float32)[:, None]
+    digest = FeatureSet(ids, x).digest
+    assert FeatureSet(ids[::-1], x[::-1]).digest == digest
+    other = x.copy()
+    other[sorted(range(8200), key=lambda k: ids[k])[-1]] += 1
+    assert FeatureSet(ids, other).digest != digest
 
 
 def test_features_name_the_bad_row_and_round_trip(tmp_path):

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import ndimage, stats
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from palpate.core import PalpateError, require_comparable
@@ -168,3 +168,26 @@ def test_refuses_unknown_conventions_and_small_images():
     assert ssim(a[:, :7], b[:, :7], compat="skimage").value is not None
     with pytest.raises(PalpateError, match="11 x 11"):
         ssim(a[:, :10], b[:, :10], compat="torchmetrics")
+
+
+def test_torchmetrics_takes_no_negative_variance():
+    """Constant patches far from 0 in units of the range, as torchmetrics leaves its lower end: E x^2 - (E x)^2 falls below 0 by rounding."""
+    low = 1e4
+    a, b = (np.full((1, 24, 24, 1), low + v) for v in (0.3, 0.7))
+    a[:, 12:], b[:, :, 9:] = low + 0.1, low + 1 / 3
+
+    def blur(image):
+        at = np.exp(-((np.arange(11) - 5) ** 2) / 4.5)
+        return ndimage.correlate1d(ndimage.correlate1d(image, at / at.sum(), axis=0, mode="mirror"), at / at.sum(), axis=1, mode="mirror")
+
+    x, y = a[0, ..., 0], b[0, ..., 0]
+    mx, my = blur(x), blur(y)
+    vx, vy, xy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    assert min(vx.min(), vy.min()) < -1e-8
+    similarity = lambda variances: (  # noqa: E731
+        ((2 * mx * my + 1e-4) * (2 * xy + 9e-4)) / ((mx**2 + my**2 + 1e-4) * (variances + 9e-4))
+    ).mean()
+    clamped, plain = similarity(np.maximum(vx, 0) + np.maximum(vy, 0)), similarity(vx + vy)
+    assert abs(clamped - plain) > 1e-7
+    found = ssim_per_image(a, b, compat="torchmetrics", data_range=(low, low + 1))[0]
+    assert found == pytest.approx(clamped, abs=abs(clamped - plain) / 10)

@@ -173,3 +173,18 @@ def test_bad_input_is_refused_by_name():
         prdc(features(good), features(zero), normalize=True)
     with pytest.warns(UserWarning, match="float16 features were widened"):
         prdc(features(good.astype(np.float16)), features(good.astype(np.float16)))
+
+
+@pytest.mark.parametrize("seed", range(12, 22))
+def test_a_row_exactly_at_the_radius_is_outside_whichever_way_its_norm_is_rounded(seed):
+    """q is as far from the origin as p, whose distance is the radius of the ball there: its numbers stand in another order.
+
+    The origin is the centre of all rows, so that all rounding is that of |q|^2 and of |p|^2.
+    """
+    p = np.random.default_rng(seed).normal(size=9)
+    q = np.roll(p, 1) * np.resize([1, -1], 9)
+    assert min((p - q) @ (p - q), (p + q) @ (p + q)) > 1.1 * p @ p  # in no other ball either
+    ball, points = features(np.array([0 * p, p, -p])), features(np.array([q, -q]))
+    assert prdc(points, ball, 1)[0].value == 0  # no generated row inside a real ball
+    assert prdc(points, ball, 1)[2].value == 0
+    assert prdc(ball, points, 1)[1].value == 0  # and no real row inside a generated one

@@ -1,17 +1,19 @@
 """Permutations of whole videos, paired differences, and copies of reference rows."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from palpate.core import PalpateError
+from palpate.core import PalpateError, Score
 from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, mmd2, tmmd
 from palpate.metrics.blocked import blocked_sums
 from palpate.metrics.kernels import Gaussian
 from palpate.metrics.paired import holm
 from palpate.metrics.permutation import permutation_test
+from palpate.metrics.scored import Scored, excess_of
 from test_metrics_mmd import loop_mmd, unit_rows
 from test_metrics_tactile import change, keep, world
 
@@ -248,9 +250,7 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
     x = 0.2 * near.features + 0.8 * centre
     sets = {"collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)), "near": near}
     found = compare(sets, r, floor=r, permutations=0).excess
-    assert [(s.metric, s.subject) for s in found.scores] == [
-        (m, s) for s in ("collapsed", "near") for m in ("I-TMMD E", "CI-TMMD E")
-    ]
+    assert [(s.metric, s.subject) for s in found.scores] == [(m, s) for s in ("collapsed", "near") for m in ("I-TMMD E", "CI-TMMD E")]
     groups = sorted(set(r.groups))
     for metric, function in (("I-TMMD E", i_tmmd), ("CI-TMMD E", ci_tmmd)):
         value = lambda s: function(s).details["E"]  # noqa: B023, E731
@@ -273,3 +273,19 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
         assert d.details["better"] == "near"
     bare = {name: change(s, groups=None) for name, s in sets.items()}
     assert compare(bare, change(r, groups=None), permutations=0).excess.scores == []
+
+
+@pytest.mark.parametrize(("bound", "note"), [
+    (0.0, ""), (0.9e-5, ""), (2e-4, "Within 0.0002 of the exact value, as the bandwidth is narrow for moments"), (2.5e-5, "Within 2.5e-05 of the exact value, as the bandwidth is narrow for moments"),
+    (201.0, None), (math.inf, None), (None, None),
+])  # fmt: skip
+def test_an_excess_that_moments_do_not_bound_is_undefined(bound, note):
+    details = {"E": 3.0, "E_interval": (2.0, 4.0), "E_bound": bound, "unit": "group"}
+    score = Score("I-TMMD", "g", 1.0, scale=100.0, details=details, settings={"halves": "group"}, interval_method="jackknife")
+    found = excess_of(Scored(score, np.zeros(3), "abc", np.ones(3))).score
+    if note is None:
+        assert (found.value, found.interval, found.interval_method) == (None, None, "")
+        assert found.note == 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
+        return
+    assert (found.value, found.interval, found.details["bound"]) == (3.0, (2.0, 4.0), bound)
+    assert found.note == note

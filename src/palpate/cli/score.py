@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, Terminal, guard_output
-from palpate.core import PalpateError
+from palpate.core import PalpateError, Results
 
 Companion = Literal["fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"]
 
@@ -90,6 +90,16 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     with _told(terminal) as told, terminal.progress() as progress:
         results = scoring_runs.score(options, terminal, cache, progress)
     results = replace(results, notes=[*results.notes, *told])
+    try:
+        show(results, terminal, said=[] if terminal.silent else told)  # before saving: a disk that fails loses nothing
+    finally:  # nor does a reader of a pipe that goes away
+        _save(options, results)
+    if cache is not None and options.cache is None:
+        shutil.rmtree(cache, ignore_errors=True)
+    return results.to_json()
+
+
+def _save(options: Options, results: Results) -> None:
     if options.output:
         results.save(options.output)
     if options.latex:
@@ -97,10 +107,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         from palpate.report.latex import latex_tables
 
         write_text(options.latex, latex_tables(results))
-    if cache is not None and options.cache is None:
-        shutil.rmtree(cache, ignore_errors=True)
-    show(results, terminal, said=[] if terminal.silent else told)
-    return results.to_json()
 
 
 def _cache(options: Options) -> Path | None:
@@ -115,7 +121,7 @@ def sigmas(options: Options) -> tuple[float | str, ...]:
     """The bandwidths as numbers and words.
 
     Raises:
-        PalpateError: for another word, or a number that is not positive.
+        PalpateError: for another word, or a number that is not positive, or whose square is not finite.
     """
     found: list[float | str] = []
     for text in options.sigma:
@@ -126,8 +132,8 @@ def sigmas(options: Options) -> tuple[float | str, ...]:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not 0 < value < math.inf:
-            raise PalpateError("--sigma must be positive numbers, median or multi", repr(text), "E.g. --sigma 10 median")
+        if not 1e-100 < value < 1e100:
+            raise PalpateError("--sigma must be numbers from 1e-100 to 1e100, median or multi", repr(text), "E.g. --sigma 10 median")
         found.append(value)
     return tuple(dict.fromkeys(found))
 
@@ -150,6 +156,8 @@ def _check(options: Options) -> None:
         raise PalpateError("--names must name every generator", got, "One name for each entry of --generated")
     if options.manifest is not None and (options.labels or options.groups):
         raise PalpateError("--labels and --groups must go with --reference", "a manifest, which has its own", "Leave them out")
+    if options.manifest is None and not options.controls:
+        raise PalpateError("--controls must go with MANIFEST and --split", "--reference, which has no controls", "Leave it out")
     for flag, kinds in (("inception", ("fid", "kid")), ("clip", ("cmmd",)), ("lpips", ("lpips",))):
         if getattr(options, flag) is not None and options.companions is not None and not set(kinds) & set(options.companions):
             fix = f"Add {kinds[0]} to --companions, or leave --{flag} out"
@@ -169,6 +177,7 @@ def _told(terminal: Terminal) -> Generator[list[str]]:
         'preset="paper"': "Pass --groups FILE, or --presets paper",
         'estimator="unbiased"': "Pass --estimator unbiased, or more groups",
         'backend="blocked"': "Pass --backend blocked",
+        "pass None for all": "Fill the empty cells of that column, or leave the column out",
     }
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)

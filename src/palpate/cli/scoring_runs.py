@@ -10,8 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.cli.terminal import Terminal, require_extra
 from palpate.core import MissingExtraError, PalpateError, Progress, Results, Split
-from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, compare_features, feature_companions, require_one_encoder
-from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, read_columns, read_embeddings
+from palpate.core.digest import digest_file
+from palpate.protocol.comparing import (
+    BACKGROUND,
+    ON_FEATURES,
+    REAL,
+    SAME_MATERIAL,
+    Asked,
+    Outcome,
+    against,
+    compare_features,
+    feature_companions,
+    require_one_encoder,
+)
+from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, known_to, left_out, part_of, read_columns, read_embeddings
 from palpate.protocol.streamed import stream_tmmd
 
 if TYPE_CHECKING:
@@ -19,6 +31,8 @@ if TYPE_CHECKING:
 
 #: What a companion's features are called where they came as a file.
 GIVEN = "embeddings"
+#: What the real touches are called in the settings of a run.
+REFERENCE = "reference"
 
 
 def score(options: Options, terminal: Terminal, cache: Path | None, progress: Progress) -> Results:
@@ -65,6 +79,12 @@ def _named(options: Options) -> dict[str, Path]:
     if len(set(names)) < len(names) or "" in names:
         fix = "Pass --names, one for each entry of --generated: they stand in the tables"
         raise PalpateError("Generators must differ in name", ", ".join(map(repr, names)), fix)
+    taken = (BACKGROUND, SAME_MATERIAL, REAL) if options.manifest is not None else (REFERENCE,)
+    if clash := [name for name in names if name in taken]:
+        must = f"No generator may be called {' or '.join(map(repr, taken))}: real touches or controls beside it bear that name"
+        raise PalpateError(
+            must, f"--generated {options.generated[names.index(clash[0])]} as {clash[0]!r}", "Pass --names with another name"
+        )
     return dict(zip(names, options.generated, strict=True))
 
 
@@ -94,18 +114,27 @@ def _of_split(
     from palpate.data.manifest import Manifest
     from palpate.encoders.towers import Towers
     from palpate.generate import Generated
+    from palpate.protocol.score_inputs import is_generated
     from palpate.protocol.scoring import compare_generated
     from palpate.protocol.summary import gallery
+    from palpate.protocol.touches import files_digest
 
     assert options.manifest is not None
     assert options.encoder is not None
+    _refuse_normalize(options)
+    if plain := next((path for path in paths.values() if not is_generated(path)), None):
+        fix = f"Score other pictures with --reference {options.manifest} --split {options.split} --encoder {options.encoder}"
+        raise PalpateError("With MANIFEST, --generated must be folders of palpate generate", f"{plain}, which has no index of one", fix)
     folders = {name: Generated.load(path) for name, path in paths.items()}
     manifest, towers = Manifest.load(options.manifest), Towers.load(options.encoder)
     found = compare_generated(
-        manifest, split, folders, towers, replace(asked, presets=asked.presets or ("grouped", "paper")), group=group,
+        manifest, split, folders, towers, replace(asked, presets=asked.presets_for(grouped=True)), group=group,
         controls=options.controls, companions=options.companions, weights=_weights(options), cache=cache, progress=progress,
     )  # fmt: skip
-    digests = {"manifest": manifest.digest, "split": split.digest, "touch tower": towers.digest("touch")}
+    digests: dict[str, Any] = {"manifest": manifest.digest, "split": split.digest, "touch tower": towers.digest("touch")}
+    test = manifest.part(split, "test")
+    digests |= {REFERENCE: files_digest(test.ids, test.paths("tactile"))}
+    digests["generated"] = {name: files_digest(f.ids, f.paths) for name, f in folders.items()}
     settings = {"digests": digests, "split rule": dict(split.rule), "generated": {name: dict(f.settings) for name, f in folders.items()}}
     pictures = gallery(manifest, next(iter(folders.values())), options.seed)
     return _results(found, paths, settings | {"options": _said(asked, group)}, terminal, pictures)
@@ -126,6 +155,7 @@ def _of_pictures(
     from palpate.protocol.score_inputs import completed, is_generated, read_touches, touch_gallery
 
     assert options.reference is not None
+    _refuse_normalize(options)
     if options.encoder is None and (options.companions is None or set(options.companions) <= {"none"}):
         fix = "Pass --encoder palpate/mini, a folder of palpate encoder or a hub id; or ask for scores of pixels alone: --companions ssim psnr"
         raise PalpateError("Pictures must have an encoder to be scored with", "no --encoder", fix)
@@ -137,15 +167,21 @@ def _of_pictures(
     reference, train = (whole, None) if split is None else (whole.part(split, "test"), whole.part(split, "train"))
     if not len(reference):
         raise PalpateError("There must be reference touches", "none in the test part", "Check the split")
-    made = {name: completed(read_touches(p), group=group, columns=columns, like=reference) for name, p in paths.items()}
-    towers, digests = None, {"reference": reference.digest, **({"split": split.digest} if split else {})}
+    made = {name: completed(read_touches(p), group=group, columns=columns, like=whole) for name, p in paths.items()}
+    remarks: list[str] = []
+    for name, one in made.items() if split else ():
+        if (part := part_of(name, one.ids, reference.ids, whole.ids)) is not None:
+            made[name], remarks = one.take(part), [*remarks, *left_out(name, one.ids, part)]
+    towers, digests = None, dict[str, Any]({"split": split.digest} if split else {})
     if options.encoder is not None:
         from palpate.encoders.towers import Towers
 
         towers = Towers.load(options.encoder)
         digests["touch tower"] = towers.digest("touch")
-    from palpate.protocol.touches import compare_touches
+    from palpate.protocol.touches import compare_touches, files_digest
 
+    digests[REFERENCE] = files_digest(reference.ids, reference.paths("tactile"))
+    digests["generated"] = {name: files_digest(one.ids, one.paths("tactile")) for name, one in made.items()}
     found = compare_touches(
         made,
         reference,
@@ -158,6 +194,7 @@ def _of_pictures(
         cache=cache,
         progress=progress,
     )
+    found.remarks += remarks
     settings = {"digests": digests, "encoder": options.encoder or "none", "options": _said(asked, group)}
     return _results(found, paths, settings, terminal, touch_gallery(reference, next(iter(made.values())), options.seed))
 
@@ -173,7 +210,7 @@ def _of_embeddings(
 ) -> Results:
     """Files of embeddings."""
     assert options.reference is not None
-    _refuse(options)
+    _refuse(options, columns)
     reference = read_embeddings(options.reference, columns)
     made = {name: read_embeddings(path, columns) for name, path in paths.items()}
     for name, one in made.items():
@@ -185,11 +222,17 @@ def _of_embeddings(
             got = "--split" if split else "--companions"
             raise PalpateError("So many rows without groups are streamed, for TMMD alone", got, "Pass --groups, or leave it out")
         found = stream_tmmd({name: one.features for name, one in made.items()}, reference.features, asked, progress=progress)
+        found = against(found, digest_file(reference.path))
     else:
         found = _compare_embeddings(options, split, asked, made, reference, progress)
     encoder = reference.encoder or next((one.encoder for one in made.values() if one.encoder), None)
-    digests = {name: v for name, v in (("encoder", encoder), ("split", split.digest if split else None)) if v}
-    files = {name: {"file": str(one.path), "rows": len(one.features)} for name, one in {**made, "reference": reference}.items()}
+    compared = next((s.reference for s in found.scores if s.reference), None)
+    known = (("encoder", encoder), ("split", split.digest if split else None), (REFERENCE, compared))
+    digests = {name: v for name, v in known if v}
+    files = {
+        name: {"file": str(one.path), "rows": len(one.features), "digest": digest_file(one.path)}
+        for name, one in {**made, REFERENCE: reference}.items()
+    }
     return _results(found, paths, {"digests": digests, "embeddings": files, "options": _said(asked, "video")}, terminal, [])
 
 
@@ -198,24 +241,29 @@ def _compare_embeddings(
 ) -> Outcome:
     # Rows without ids are numbered; a generated and a real row of one number are not taken for partners.
     real, train = reference.feature_set("reference "), None
-    sets = {name: one.feature_set() for name, one in made.items()}
+    sets, remarks, whole = {name: one.feature_set() for name, one in made.items()}, list[str](), real
     if split is not None:
         if reference.ids is None:
             raise PalpateError(
                 "A split must go with a reference that has ids", f"{reference.path}", "Save it with ids, or leave --split out"
             )
-        known, whole = set(real.ids), real
+        known = set(whole.ids)
         real = whole.take(split.ids("test"))
         train = whole.take(split.ids("train")) if known.issuperset(split.ids("train")) and split.ids("train") else None
     for name, one in sets.items():
         require_one_encoder(name, one, real)
-        row = {i: k for k, i in enumerate(real.ids)} if made[name].ids is not None else {}
-        if row and row.keys() >= set(one.ids):  # what the reference knows of a sample holds for the generated one
-            theirs = {c: (v := getattr(real, c)) and [v[row[i]] for i in one.ids] for c in ("labels", "groups")}
-            sets[name] = replace(one, labels=one.labels or theirs["labels"], groups=one.groups or theirs["groups"])
+        if made[name].ids is None:
+            continue
+        theirs = {c: v for c in ("labels", "groups") if getattr(one, c) is None and (v := getattr(whole, c)) is not None}
+        row = {i: k for k, i in enumerate(whole.ids)}
+        if theirs and known_to(str(made[name].path), one.ids, row, " and ".join(theirs)):  # it holds for the generated sample too
+            sets[name] = replace(one, **{c: [v[row[i]] for i in one.ids] for c, v in theirs.items()})
+        if split is not None and (part := part_of(name, one.ids, real.ids, whole.ids)) is not None:
+            sets[name], remarks = sets[name].take(part), [*remarks, *left_out(name, one.ids, part)]
     numbered = all(one.ids is None for one in made.values())
     paired = not numbered or len({len(one.ids) for one in sets.values()}) == 1
     found = compare_features(sets, real, asked, train=train, paired=paired, progress=progress)
+    found.remarks += remarks
     if len(sets) > 1:
         why = "their files have no ids, and differ in rows" if not paired else ""
         found.remarks += [f"No differences between generators: {why}"] if why else []
@@ -226,8 +274,17 @@ def _compare_embeddings(
     return found
 
 
-def _refuse(options: Options) -> None:
+def _refuse_normalize(options: Options) -> None:
+    if options.normalize != "check":
+        must = "--normalize must go with embeddings"
+        raise PalpateError(must, f"{options.normalize} with pictures, whose features have unit length", "Leave it out")
+
+
+def _refuse(options: Options, columns: Columns | None) -> None:
     """Options that embeddings have no use for."""
+    if options.group not in ("auto", "video") and columns is None:
+        must = "--group must have a file whose column it names: --groups or --labels"
+        raise PalpateError(must, f"--group {options.group} with embeddings alone", "Leave it out")
     pixels = [c for c in options.companions or () if c not in (*ON_FEATURES, "none")]
     if pixels:
         raise PalpateError(f"{pixels[0]} must have pictures", "embeddings", "Pass folders of images, or leave it out")
@@ -253,7 +310,10 @@ def _said(asked: Asked, group: str) -> dict[str, Any]:
 
 def _results(found: Outcome, paths: Mapping[str, Path], settings: dict[str, Any], terminal: Terminal, gallery: Any) -> Results:
     found = found.said()
+    scores = [
+        replace(s, note=s.note.replace('pass backend="blocked"', "pass --backend blocked")) for s in (*found.scores, *found.differences)
+    ]
     return Results(
-        title=f"Scores of {', '.join(paths)}", scores=[*found.scores, *found.differences], gallery=gallery, settings=settings,
+        title=f"Scores of {', '.join(paths)}", scores=scores, gallery=gallery, settings=settings,
         notes=found.remarks, commands=[terminal.command],
     )  # fmt: skip

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import importlib
 import importlib.util
 import io
@@ -18,6 +19,7 @@ import re
 import shlex
 import shutil
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Generator, Mapping, Sequence
@@ -195,7 +197,7 @@ def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
 
 
 def guard_output(output: Path, inputs: Sequence[Path] = (), marks: Sequence[bytes] = (b'"format": "palpate-',)) -> None:
-    """Refuses an output file that would replace an input, or anything that palpate did not write.
+    """Refuses an output file that would replace an input, or anything that palpate did not write, or that cannot be written at all.
 
     Args:
         output: the file to write.
@@ -204,9 +206,11 @@ def guard_output(output: Path, inputs: Sequence[Path] = (), marks: Sequence[byte
 
     Raises:
         PalpateError: saying which.
+        OSError: if the disk is full.
     """
     if any(output.exists() and path.exists() and output.samefile(path) for path in inputs):
         raise PalpateError("An output must not replace an input of the same command", str(output), "Choose another -o")
+    _require_writable(output)
     if output.is_file():
         with open(output, "rb") as file:
             head = file.read(4096)
@@ -214,6 +218,21 @@ def guard_output(output: Path, inputs: Sequence[Path] = (), marks: Sequence[byte
             raise PalpateError(
                 f"{output} must be new, or a file of the kind that this command writes", "another file", "Choose another -o, or remove it"
             )
+
+
+def _require_writable(output: Path) -> None:
+    """Tells now, rather than when all is computed, that no file can be made there: rights alone do not tell, so one is made beside it."""
+    try:
+        if output.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        place = next(p for p in output.absolute().parents if p.exists())  # the folders below it are made when the file is
+        handle, name = tempfile.mkstemp(dir=place, prefix=f".{output.name}.")
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            raise OSError(error.errno, os.strerror(error.errno), str(output)) from None
+        raise PalpateError(f"{output} must be writable", error.strerror or str(error), "Choose another path, or check its rights") from None
+    os.close(handle)
+    Path(name).unlink()
 
 
 def _set_threads() -> None:

@@ -139,6 +139,11 @@ def _finite_rows(features: np.ndarray, slab: int = 8192) -> np.ndarray:
     return out
 
 
+def is_missing(name: Any) -> bool:
+    """Whether a label or group is none: None, an empty string, NaN, or what a table has in their place (pandas' NA and NaT)."""
+    return name is None or type(name).__name__ in ("NAType", "NaTType") or name == "" or bool(name != name)
+
+
 def _on_host(features: Any) -> np.ndarray:
     """A tensor without its graph, from any device; NumPy has no bfloat16."""
     if hasattr(features, "detach"):
@@ -219,7 +224,7 @@ class FeatureSet:
         arrays: dict[str, np.ndarray] = {"ids": np.array(list(self.ids), dtype=str), "features": self.features}
         for name in ("labels", "groups"):
             if (column := getattr(self, name)) is not None:
-                arrays[name] = np.array(["" if c is None else c for c in column], dtype=str)
+                arrays[name] = np.array(["" if is_missing(c) else c for c in column], dtype=str)
         if self.encoder:
             arrays["encoder"] = np.array(self.encoder)
         with atomic_path(Path(path)) as part, open(part, "wb") as file:

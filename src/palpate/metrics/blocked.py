@@ -128,7 +128,7 @@ def _require_known_distances(radius: float, kernel: Kernel) -> None:
     if kernel.radius_limit > 0 and not radius <= kernel.radius_limit * 2.0**29:
         got = f"rows up to {radius**0.5:.3g} from their mean"
         raise PalpateError(
-            "The bandwidth must be wide enough for rounding to tell the rows' distances", got, 'Normalise the rows, or pass sigma="median"'
+            "The bandwidth must be wide enough for rounding to tell the rows' distances", got, "Normalise the rows, or pass a wider sigma"
         )
 
 

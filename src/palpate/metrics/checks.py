@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError
+from palpate.core.score import is_missing
 from palpate.metrics.arrays import is_foreign, ops_of, release
 
 Normalize = Literal["check"] | bool
@@ -134,11 +135,6 @@ def _row_hashes(x: NDArray[Any]) -> Iterator[int]:
         for row in np.ascontiguousarray(x[k : k + SLAB]):
             yield hash(row.tobytes())
         release(x)
-
-
-def is_missing(value: Any) -> bool:
-    """Whether a name is none: None, an empty string, NaN, or what a table has in their place (pandas' NA and NaT)."""
-    return value is None or value == "" or type(value).__name__ in ("NAType", "NaTType") or bool(value != value)
 
 
 def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] | None:

@@ -149,7 +149,7 @@ class StreamingMetric:
         """
         if other is self:
             raise PalpateError("A metric must be merged with another one", "itself", "Merge what other processes have seen")
-        if type(other) is not type(self) or other.digest != self.digest or other.options != self.options:
+        if type(other) is not type(self) or other.digest != self.digest or not same_options(other.options, self.options):
             got = f"{type(self).__name__} and {type(other).__name__}" + (" of different settings" if type(other) is type(self) else "")
             raise PalpateError("Metrics that are merged must be of one class with the same settings", got, "Construct all alike")
         self.state = cast(Any, self.state).merge(other.state)
@@ -266,6 +266,11 @@ def plan_of_sums(options: Options, *, halves: bool) -> Plan:
     if halves and plan.halves != "random":
         raise PalpateError('keep="sums" deals halves by a hash', f"halves={plan.halves!r}", fix)
     return plan
+
+
+def same_options(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether two metrics were given the same; bandwidths may stand in an array."""
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) if k == "sigma" else a[k] == b[k] for k in a)
 
 
 def checked_classes(classes: Sequence[str] | None) -> tuple[str, ...]:

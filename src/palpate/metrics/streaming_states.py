@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, seed_for
+from palpate.core.score import is_missing
 from palpate.metrics.arrays import is_foreign
-from palpate.metrics.checks import Normalize, checked_features, checked_names, is_missing
+from palpate.metrics.checks import Normalize, checked_features, checked_names
 from palpate.metrics.kernels import Array, Gaussian, Index
 from palpate.metrics.moments import Moments, centre_of
 from palpate.metrics.tables import Table

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from palpate.core import FeatureSet
-from palpate.metrics.checks import checked_features, checked_names, checked_pair, copies_across, is_missing
+from palpate.core.score import is_missing
+from palpate.metrics.checks import checked_features, checked_names, checked_pair, copies_across
 from palpate.metrics.engine import kernel_sums
 from palpate.metrics.halves import half_of, halves_bound, sample_units, self_distances, take_sets
 from palpate.metrics.intervals import Interval, jackknife_errors, leave_one_out, t_interval

@@ -25,7 +25,18 @@ from palpate.metrics.kernels import Array, Index
 from palpate.metrics.mmd import largest_bound, mmd_bound, mmd_matrix
 from palpate.metrics.permutation import permutation_test
 from palpate.metrics.presets import AGGREGATES, DENOMINATORS, Options, Plan, plan_for
-from palpate.metrics.scored import Scored, halves_fields, halves_note, null_band, require_one_encoder, scored, unfit, units_of, with_floor
+from palpate.metrics.scored import (
+    UNBOUNDED,
+    Scored,
+    halves_fields,
+    halves_note,
+    null_band,
+    require_one_encoder,
+    scored,
+    unfit,
+    units_of,
+    with_floor,
+)
 from palpate.metrics.sums import PairSums, Totals
 from palpate.metrics.tables import Table, build_table, class_estimate, estimate
 
@@ -280,12 +291,15 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         "E_ratio_interval": found.interval(1, plan.level) if table.grouped and apart else None,
         "units": sums.units,
     }
-    note = "Undefined: the classes do not separate (a denominator is not positive)" if not np.isfinite(found.values[0]) else ""
+    bound, note = _d_bound(sums, matrix, plan), ""
+    if not np.isfinite(found.values[0]):
+        unknown = not bound <= 1 and largest_bound(sums, plan.estimator, plan.scale) > plan.tolerance * plan.scale / 1000
+        note = UNBOUNDED if unknown else "Undefined: the classes do not separate (a denominator is not positive)"
     if not note and unstable:
         why = "within two standard errors of 0" if np.isfinite(errors).all() else "of unknown error (too few groups)"
         note = f"Denominators {why}, so the ratio is unreliable: {', '.join(unstable)}"
     return scored(
-        "D-TMMD", table, generated, plan, settings, found=found, bound=_d_bound(sums, matrix, plan), limit=1.0, details=details, note=note, **fields,
+        "D-TMMD", table, generated, plan, settings, found=found, bound=bound, limit=1.0, details=details, note=note, **fields,
     )  # fmt: skip
 
 

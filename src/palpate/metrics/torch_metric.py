@@ -157,7 +157,7 @@ class TorchMetric(Metric):
         if isinstance(incoming_state, TorchMetric):
             if incoming_state is self:
                 raise PalpateError("A metric must be merged with another one", "itself", "Merge what other processes have seen")
-            if type(incoming_state) is not type(self) or incoming_state.plain.options != self.plain.options:
+            if type(incoming_state) is not type(self) or not streaming.same_options(incoming_state.plain.options, self.plain.options):
                 raise PalpateError(
                     "Metrics that are merged must be of one class with the same settings", "different ones", "Construct all alike"
                 )

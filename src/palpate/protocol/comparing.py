@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet
-from palpate.metrics import Polynomial, compare, compare_fid, compare_tmmd, tmmd
+from palpate.metrics import PRESETS, Polynomial, compare, compare_fid, compare_tmmd, tmmd
 from palpate.metrics.neighbours import prdc_rows
 from palpate.metrics.paired import mean_differences
 
@@ -21,7 +21,11 @@ ON_FEATURES = ("fid", "kid", "prdc", "cmmd")
 SIGMA = 10.0
 #: From so many rows on the companions that form all pairs must be asked for.
 MANY = 50_000
-KID_NOTE = "The interval is that of whole groups left out; the spread over random subsets that others print with KID is no interval"
+#: Names that stand beside the generators' in the tables of a split.
+BACKGROUND, SAME_MATERIAL, REAL = "background only", "real, same material", "real"
+#: Beginnings of metrics that look at one set alone.
+ALONE = ("I-TMMD", "CI-TMMD", "D-TMMD", "material accuracy")
+KID_NOTE = "The spread over random subsets that others print with KID is no interval; this one is"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +38,9 @@ class Asked:
         estimator: instead of every preset's own.
         backend, permutations, normalize, seed: see :class:`palpate.metrics.Options`.
         split: digest that scores keep.
+
+    Raises:
+        PalpateError: for the preset ``grouped`` with another estimator, which would be grouped in name alone.
     """
 
     presets: Sequence[str] | None = None
@@ -45,9 +52,22 @@ class Asked:
     seed: int = 0
     split: str | None = None
 
+    def __post_init__(self) -> None:
+        if not self._may_group and "grouped" in (self.presets or ()):
+            fix = "Drop one of the two, or take the preset paper"
+            raise PalpateError("The preset grouped must keep the grouped estimator", f"the estimator {self.estimator}", fix)
+
+    @property
+    def _may_group(self) -> bool:
+        return self.estimator in (None, "grouped")
+
     def presets_for(self, *, grouped: bool) -> Sequence[str]:
         """The presets, chosen by whether groups are known where none were asked for."""
-        return self.presets if self.presets is not None else ("grouped", "paper") if grouped else ("paper",)
+        return self.presets if self.presets is not None else ("grouped", "paper") if grouped and self._may_group else ("paper",)
+
+    def shown(self, preset: str) -> str:
+        """A preset as tables name it: with the estimator, where that is not its own."""
+        return preset if self.estimator in (None, PRESETS[preset].estimator) else f"{preset}, {self.estimator}"
 
     def options(self, preset: str, sigma: float | str) -> dict[str, Any]:
         """Options of one column of the TMMD family."""
@@ -89,7 +109,11 @@ class Outcome:
 
     def said(self) -> Outcome:
         """The same with a note at every difference that says who is ahead, and how sure that is, and remarks on copies and on collapse."""
-        copies = {s.subject: f"{s.subject}: {s.note.split('. ')[0]}" for s in self.scores if s.details.get("copies")}
+        copies: dict[str, str] = {}
+        for s in self.scores:
+            if count := s.details.get("copies"):
+                copied = f"{s.subject}: {count} of {s.n} generated rows are bit for bit rows of the reference: a copy is not a generator"
+                copies.setdefault(s.subject, copied)
         less = [
             f"{s.metric}, {s.subject}: below the floor of real touches, so these vary less than real ones do; that is not better"
             for s in self.scores
@@ -154,33 +178,22 @@ def compare_features(
         for some in sets:
             found = compare(some, reference, floor=floor, **options)
             scores = [replace(s, floor=least) if s.metric == "TMMD" else s for s in found.scores]
-            scores = [one for s in scores for one in (s, excess(s)) if one is not None]
-            out.scores += [named(s, sigma, asked) for s in scores]
-            out.differences += [named(d, sigma, asked) for d in found.differences]
+            assert found.excess is not None  # compare always gives it
+            out.scores += [named(s, preset, sigma, asked) for s in _behind(scores, found.excess.scores)]
+            out.differences += [named(d, preset, sigma, asked) for d in _behind(found.differences, found.excess.differences)]
         progress("TMMD family", k + 1, len(columns))
     return out
+
+
+def _behind(scores: Sequence[Score], excess: Sequence[Score]) -> list[Score]:
+    """Every score with its excess E behind it: tables show metrics in the order in which they come."""
+    by = {(e.metric.replace(" E", "", 1), e.subject): e for e in excess}
+    return [one for s in scores for one in (s, by.get((s.metric, s.subject))) if one is not None]
 
 
 def _together(sets: Mapping[str, FeatureSet], paired: bool) -> list[dict[str, FeatureSet]]:
     """What is compared with each other: all, or each alone."""
     return [dict(sets)] if paired else [{name: one} for name, one in sets.items()]
-
-
-def excess(score: Score) -> Score | None:
-    """The between-video excess E of an I- or CI-TMMD as a score of its own, so that every table shows it; None where there is none.
-
-    It does not depend on the number of videos, and its floor is always comparable: it is what to report.
-    """
-    d = score.details
-    if d.get("E") is None or score.metric not in ("I-TMMD", "CI-TMMD") or score.settings.get("halves") != "group":
-        return None
-    interval = d.get("E_interval")
-    kept = {k: d[k] for k in ("unit", "units", "backend", "version") if k in d} | {"bound": d.get("E_bound")}
-    return replace(
-        score, metric=f"{score.metric} E", value=d["E"], interval=None if interval is None else (interval[0], interval[1]), null=None,
-        interval_method=score.interval_method if interval else "", floor=d.get("E_floor"), estimator="unbiased", seed=None, note="",
-        details=kept,
-    )  # fmt: skip
 
 
 def require_rows(generators: Mapping[str, FeatureSet], reference: FeatureSet) -> None:
@@ -194,8 +207,15 @@ def require_rows(generators: Mapping[str, FeatureSet], reference: FeatureSet) ->
             raise PalpateError(f"There must be touches in {name}", "none", "Check its path, and the split: is that part empty?")
 
 
-def named(score: Score, sigma: float | str, asked: Asked) -> Score:
-    """The score with its bandwidth in the name, where several were asked for and it is not the usual one."""
+def against(found: Outcome, reference: str) -> Outcome:
+    """The outcome with a digest of the real touches at every score, and every difference, that compares with them."""
+    held = lambda scores: [s if s.metric.startswith(ALONE) else replace(s, reference=reference) for s in scores]  # noqa: E731
+    return replace(found, scores=held(found.scores), differences=held(found.differences))
+
+
+def named(score: Score, preset: str, sigma: float | str, asked: Asked) -> Score:
+    """The score as tables show it: its bandwidth in the name, where several were asked for and it is not the usual one, and its preset."""
+    score = replace(score, settings={**score.settings, "preset": asked.shown(preset)})
     if len(asked.sigmas) < 2 or sigma == SIGMA:
         return score
     tag = f"(σ {sigma})" if isinstance(sigma, str) else f"(σ = {sigma:g})"

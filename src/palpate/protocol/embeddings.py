@@ -22,7 +22,7 @@ import json
 import math
 import zipfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -109,6 +109,58 @@ class Columns:
         at = [row[i] for i in ids]
         pick = lambda column: None if column is None else [column[k] for k in at]  # noqa: E731
         return pick(self.labels), pick(self.groups)
+
+
+def known_to(what: str, ids: Sequence[str], known: Collection[str], lost: str) -> bool:
+    """Whether the reference knows a generator's ids, so that what it knows of them may be taken from it.
+
+    Args:
+        what: the generator, for the error.
+        ids: its ids.
+        known: those of the reference.
+        lost: what would be taken, for the error.
+
+    Raises:
+        PalpateError: if it knows some of them alone: all would lose what it knows.
+    """
+    strange = [i for i in ids if i not in known]
+    if strange and len(strange) < len(ids):
+        got = f"{len(strange)} of {len(ids)} without, first {strange[0]!r}"
+        fix = "Leave these out, give them ids of the reference, or pass --labels and --groups that hold every id"
+        raise PalpateError(f"{what} must have ids of the reference alone, which gives {lost} by id", got, fix)
+    return not strange
+
+
+def part_of(name: str, ids: Sequence[str], wanted: Sequence[str], known: Collection[str]) -> list[str] | None:
+    """Those of a generator's ids that lie in the scored part of a split.
+
+    Args:
+        name: the generator.
+        ids: its ids.
+        wanted: ids of the scored part.
+        known: ids of all parts.
+
+    Returns:
+        A part of ``ids``, or None where no id is among ``known``: names of the generator's own, which no split can part.
+
+    Raises:
+        PalpateError: if ids of the scored part are missing.
+    """
+    known, held, part = set(known), set(ids), set(wanted)
+    if known.isdisjoint(held):
+        return None
+    if missing := [i for i in wanted if i not in held]:
+        got = f"{len(missing)} of {len(wanted)} missing, first {missing[0]!r}"
+        raise PalpateError(
+            f"{name!r} must have every touch of the split's test part", got, "Generate these too, or pass the split it is of"
+        )
+    return [i for i in ids if i in part]
+
+
+def left_out(name: str, all_ids: Sequence[str], kept: Sequence[str]) -> list[str]:
+    """A remark on the touches that :func:`part_of` leaves out, if there are any."""
+    n = len(all_ids) - len(kept)
+    return [f"{name}: {n} of {len(all_ids)} touches lie outside the split's test part, and were left out"] if n else []
 
 
 def is_embeddings(path: Path) -> bool:
@@ -311,11 +363,14 @@ def _parquet_features(path: Path, table: Any) -> NDArray[Any]:
     if not isinstance(column.dtype, pl.List | pl.Array):
         raise PalpateError(f"The column features in {path} must be lists of floats", str(column.dtype), "Write one list a row")
     lists = column.cast(pl.List(column.dtype.inner))
-    lengths = lists.list.len()
-    if (bad := (lengths.fill_null(0) != (lengths[0] or 0)) | lists.is_null()).any():
+    lengths = lists.list.len().fill_null(0)
+    if (bare := lengths == 0).any():
+        got = f"none for {table['id'][bare.arg_true()[0]]!r}"
+        raise PalpateError(f"Every row of {path} must have features", got, "Embed these samples, or drop their rows")
+    if (bad := lengths != lengths[0]).any():
         at = bad.arg_true()[0]
-        got = f"{lengths[at] or 0} numbers for {table['id'][at]!r}"
-        raise PalpateError(f"All features in {path} must have one width ({lengths[0] or 0})", got, "Embed all with the same encoder")
+        got = f"{lengths[at]} numbers for {table['id'][at]!r}"
+        raise PalpateError(f"All features in {path} must have one width ({lengths[0]})", got, "Embed all with the same encoder")
     return lists.explode().to_numpy().reshape(len(table), -1)
 
 

@@ -16,7 +16,7 @@ import polars as pl
 from palpate.core import GalleryItem, PalpateError, ProblemsError, SampleRef, read_json, rng_for
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import Manifest
-from palpate.protocol.embeddings import KINDS, Columns
+from palpate.protocol.embeddings import KINDS, Columns, known_to
 
 #: Rows of the gallery.
 GALLERY = 40
@@ -95,7 +95,7 @@ def completed(manifest: Manifest, *, group: str, columns: Columns | None = None,
             group from it.
 
     Raises:
-        PalpateError: if an id is not in ``columns``.
+        PalpateError: if an id is not in ``columns``, or if ``like`` has some of the ids alone, and something to give them.
     """
     known = [*(like.ids if like is not None else []), *(columns.ids if columns is not None else [])]
     exact, short = set(known), {stem(i): i for i in reversed(known)}
@@ -106,11 +106,11 @@ def completed(manifest: Manifest, *, group: str, columns: Columns | None = None,
     if columns is not None and any(_empty(v) for v in found.values()):
         for name, column in zip(("material", group), columns.of(ids), strict=True):
             found[name] = column if column is not None and _empty(found[name]) else found[name]
-    if like is not None and set(ids) <= set(like.ids):
+    if like is not None:
         row = {i: k for k, i in enumerate(like.ids)}
-        for name, values in found.items():
-            theirs = like.column(name)
-            found[name] = [theirs[row[i]] for i in ids] if _empty(values) else values
+        theirs = {name: column for name, values in found.items() if _empty(values) and not _empty(column := like.column(name))}
+        if theirs and known_to(str(manifest.root), ids, row, " and ".join(theirs)):
+            found |= {name: [column[row[i]] for i in ids] for name, column in theirs.items()}
     table = manifest.table.with_columns(
         pl.Series("id", ids, pl.String), *(pl.Series(n, [v or None for v in c], pl.String) for n, c in found.items())
     )

@@ -25,10 +25,8 @@ from palpate.encoders.probe import fit_probe, material_accuracy
 from palpate.encoders.towers import Towers
 from palpate.generate import Generated
 from palpate.protocol.companions import ON_GEL, Weights, picture_companions, split_off, standard_companions
-from palpate.protocol.comparing import Asked, Outcome, compare_features, feature_companions
-from palpate.protocol.touches import TOUCH, Wanted
-
-BACKGROUND, SAME_MATERIAL = "background only", "real, same material"
+from palpate.protocol.comparing import BACKGROUND, REAL, SAME_MATERIAL, Asked, Outcome, against, compare_features, feature_companions
+from palpate.protocol.touches import TOUCH, Wanted, files_digest
 
 
 def score_generated(
@@ -152,7 +150,7 @@ def compare_generated(
     )
     out.scores += _accuracies(train_features, features, made, split)
     noted = [replace(s, note=". ".join(filter(None, [s.note, *_doubts(s, split, generated, towers)]))) for s in out.scores]
-    return replace(out, scores=noted)
+    return against(replace(out, scores=noted), files_digest(test.ids, test.paths("tactile")))
 
 
 def _accuracies(train: FeatureSet, test: FeatureSet, made: Mapping[str, FeatureSet], split: Split) -> list[Score]:
@@ -161,7 +159,7 @@ def _accuracies(train: FeatureSet, test: FeatureSet, made: Mapping[str, FeatureS
         return []
     probe = fit_probe(train)
     # The real touches of the same material are train touches, which the probe was fitted to.
-    subjects = {name: one for name, one in made.items() if name != SAME_MATERIAL} | {"real": test}
+    subjects = {name: one for name, one in made.items() if name != SAME_MATERIAL} | {REAL: test}
     return [material_accuracy(train, one, probe=probe, subject=name, split=split.digest) for name, one in subjects.items()]
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from palpate import __version__
 from palpate.core import PalpateError, Progress, Score, quiet
 from palpate.metrics import PRESETS, distance
+from palpate.metrics.scored import TOLD
 from palpate.protocol.comparing import Asked, Outcome, named
 
 
@@ -41,21 +42,27 @@ def stream_tmmd(generators: Mapping[str, NDArray[Any]], reference: NDArray[Any],
         progress("streaming", k, len(todo))
         backend: Any = "moments" if asked.backend == "auto" else asked.backend
         estimator: Any = asked.estimator or PRESETS[preset].estimator
-        d = distance(
-            x,
-            reference,
-            sigma=sigma,
-            estimator=estimator,
-            normalize=asked.normalize,
-            backend=backend,
-            names=(f"The features of {name!r}", "The reference features"),
-        )
-        if d.bound > 1e-4 and asked.backend == "auto":
+        try:
+            d = distance(
+                x,
+                reference,
+                sigma=sigma,
+                estimator=estimator,
+                normalize=asked.normalize,
+                backend=backend,
+                names=(f"The features of {name!r}", "The reference features"),
+            )
+        except PalpateError as error:
+            if "normalize=True" not in error.fix:
+                raise
+            fix = "Divide the rows by their norm when saving them, or pass --normalize no"  # streamed rows are not copied
+            raise PalpateError(error.must, error.got, fix) from None
+        if d.bound > TOLD and asked.backend == "auto":
             must = "Streamed rows need a bandwidth that is wide against them"
             raise PalpateError(
                 must, f"an error of up to {d.bound:.2g} at sigma {sigma}", "Pass --backend blocked and wait, or a larger --sigma"
             )
-        if d.bound > 1e-4:
+        if d.bound > TOLD:
             words = f"sigma {sigma}" if isinstance(sigma, str) else f"sigma {sigma:g}"
             out.remarks.append(f"TMMD of {name}, {words}: within {d.bound:.2g} of the exact value, as the bandwidth is narrow for moments")
         score = Score(
@@ -70,9 +77,9 @@ def stream_tmmd(generators: Mapping[str, NDArray[Any]], reference: NDArray[Any],
             split=asked.split,
             settings={**d.kernel, "preset": preset, "normalize": asked.normalize},
             note="No interval: neither groups nor repeats are known"
-            + (f"; within {d.bound:.2g} of the exact value" if d.bound > 1e-4 else ""),
+            + (f"; within {d.bound:.2g} of the exact value" if d.bound > TOLD else ""),
             details={"backend": d.backend, "bound": d.bound, "version": __version__},
         )
-        out.scores.append(named(score, sigma, asked))
+        out.scores.append(named(score, preset, sigma, asked))
     progress("streaming", len(todo), len(todo))
     return out

@@ -6,6 +6,7 @@ and they are left out with a remark; where some are missing it is taken for a mi
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -22,7 +23,7 @@ from palpate.data.images import cached_images, load_images, read_image
 from palpate.data.manifest import Manifest
 from palpate.metrics.pairwise import paired_by_id
 from palpate.protocol.companions import ON_GEL, ON_PAIRS, Weights, picture_companions, standard_companions
-from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, compare_features, feature_companions
+from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, against, compare_features, feature_companions
 
 if TYPE_CHECKING:
     from palpate.encoders.towers import Towers
@@ -139,7 +140,15 @@ def compare_touches(
             out.add(_of_pictures(generators, reference, (sets, real), wanted, pairs, weights, asked, Path(folder), progress))
     if wanted.pairs and not pairs:
         out.remarks.append("Scores of pairs of pictures left out: generated and real touches share no id")
-    return out
+    return against(out, files_digest(reference.ids, reference.paths("tactile")))
+
+
+def files_digest(ids: Sequence[str], paths: Sequence[Path]) -> str:
+    """SHA-256 over id and bytes of every picture, in whatever order.
+
+    The same for a copied folder, and free of the rounding of embeddings, which another machine rounds otherwise.
+    """
+    return digest_json(sorted([i, hashlib.sha256(path.read_bytes()).hexdigest()] for i, path in zip(ids, paths, strict=True)))
 
 
 def _set(touches: Manifest, towers: Towers | None, group: str, cache: Path | None, progress: Progress) -> FeatureSet:

@@ -1,0 +1,200 @@
+"""``palpate score``: what it refuses before it computes, in words of its own options, and what it keeps where a disk fails."""
+
+import errno
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from palpate.cli import scoring_runs, scoring_tables
+from palpate.core import FeatureSet, PalpateError, Results, Score, Split
+from palpate.core.digest import digest_file
+from palpate.core.score import require_comparable
+from palpate.metrics import distance
+from palpate.protocol import embeddings
+from score_calls import call, score
+
+VIDEOS, FRAMES, D = 8, 5, 4
+IDS = [f"v{v}/{k}" for v in range(VIDEOS) for k in range(FRAMES)]
+GROUPS = [f"v{v}" for v in range(VIDEOS) for _ in range(FRAMES)]
+LABELS = [["Wood", "Brick"][v % 2] for v in range(VIDEOS) for _ in range(FRAMES)]
+PAIR = ("--generated", "g.npz", "--reference", "r.npz", "--companions", "none", "--permutations", "0")
+
+
+@pytest.fixture
+def sets(tmp_path, monkeypatch) -> dict[str, FeatureSet]:
+    """``g`` and ``r`` as .npz and .npy, and a split, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    found = {}
+    for seed, name in enumerate("gr"):
+        rng = np.random.default_rng(seed)
+        x = 2 + rng.normal(size=(len(IDS), D)) + np.repeat(rng.normal(size=(VIDEOS, D)), FRAMES, 0)
+        found[name] = FeatureSet(IDS, (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32), LABELS, GROUPS)
+        found[name].save(Path(f"{name}.npz"))
+        np.save(f"{name}.npy", found[name].features)
+    Split.from_ids(train=IDS[:15], test=IDS[15:], rule={"group": "video"}, manifest="m" * 64).save(Path("s.json"))
+    return found
+
+
+def refused(capsys, *args) -> str:
+    status, out, err = call(capsys, *args, "-q")
+    assert (status, out, "Traceback" in err) == (2, "", False), err
+    return err
+
+
+def test_an_output_that_cannot_be_written_is_told_before_anything_is_computed(capsys, sets, monkeypatch):
+    monkeypatch.setattr(scoring_runs, "score", lambda *_: pytest.fail("computed"))
+    Path("folder").mkdir()
+    Path("file").write_text("")
+    before = sorted(Path().iterdir())
+    for flag in ("-o", "--latex"):
+        for place in ("folder", "file/x.json", *(["/proc/x.json"] if Path("/proc").is_dir() else [])):
+            assert f"{place} must be writable" in refused(capsys, *PAIR, flag, place)
+    assert sorted(Path().iterdir()) == before
+
+
+def test_a_disk_that_fails_loses_no_scores(capsys, sets, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", "o.json")
+
+    monkeypatch.setattr(Results, "save", fail)
+    status, out, err = call(capsys, *PAIR, "-o", "o.json", "-q")
+    assert (status, "TMMD" in out, "The disk must have room for o.json" in err) == (2, True, True)
+
+
+def test_a_reader_that_goes_away_loses_no_file(capsys, sets, monkeypatch):
+    def gone(*_, **__):
+        raise BrokenPipeError
+
+    monkeypatch.setattr(scoring_tables, "show", gone)
+    monkeypatch.setattr("sys.stderr.close", lambda: None)
+    call(capsys, *PAIR, "-o", "o.json", "--latex", "o.tex", "-q")
+    assert Results.load(Path("o.json")).scores
+    assert Path("o.tex").is_file()
+
+
+def test_no_generator_bears_the_name_of_a_control_or_of_the_reference(capsys, sets):
+    with_manifest = ("m", "--split", "s.json", "--encoder", "palpate/mini")
+    for name in ("real", "background only", "real, same material"):
+        err = refused(capsys, *with_manifest, "--generated", "x", "--names", name)
+        assert f"Got --generated x as {name!r}. Pass --names" in err
+    assert "Got --generated made/real as 'real'" in refused(capsys, *with_manifest, "--generated", "made/real")
+    assert "Got --generated g.npz as 'reference'" in refused(capsys, *PAIR, "--names", "reference")
+    found, _ = score(capsys, *PAIR, "--names", "real")  # no control is beside it
+    assert ("TMMD", "real", "paper") in found
+
+
+def test_options_that_would_do_nothing_are_refused(capsys, sets):
+    Path("i.pt").write_bytes(b"")
+    Path("l.csv").write_text("id,material\n")
+    base, manifest = PAIR[:4], ("m", "--split", "s.json", "--encoder", "palpate/mini", "--generated", "x")
+    for args, words in (
+        ((*base, "--companions", "ssim", "--inception", "i.pt"), "--inception must have a score to make"),
+        ((*base, "--companions", "ssim", "--clip", "palpate/mini"), "--clip must have a score to make"),
+        ((*base, "--companions", "kid", "--lpips", "i.pt", "i.pt"), "--lpips must have a score to make"),
+        ((*base, "--controls", "False"), "--controls must go with MANIFEST and --split"),
+        ((*base, "--group", "touch"), "--group must have a file whose column it names"),
+        ((*manifest, "--labels", "l.csv"), "--labels and --groups must go with --reference"),
+        ((*manifest, "--normalize", "yes"), "--normalize must go with embeddings. Got yes with pictures"),
+        (("--reference", "p", "--generated", "p", "--encoder", "palpate/mini", "--normalize", "no"), "--normalize must go with embeddings"),
+    ):  # fmt: skip
+        Path("p").mkdir(exist_ok=True)
+        assert words in refused(capsys, *args)
+    pl.DataFrame({"id": IDS, "touch": GROUPS}).write_csv("touches.csv")
+    found, _ = score(capsys, *PAIR[:2], *PAIR[2:], "--group", "touch", "--groups", "touches.csv", "--presets", "grouped")
+    assert found["TMMD", "g", "grouped"]["value"] is not None
+
+
+def test_a_plain_folder_beside_a_manifest_is_pointed_to_the_reference(capsys, sets):
+    Path("plain").mkdir()
+    err = refused(capsys, "m", "--split", "s.json", "--encoder", "palpate/mini", "--generated", "plain")
+    assert "--generated must be folders of palpate generate. Got plain, which has no index of one" in err
+    assert "Score other pictures with --reference m --split s.json" in err
+
+
+def test_refusals_speak_of_options_and_never_of_python(capsys, sets, monkeypatch):
+    pl.DataFrame({"id": IDS, "video": ["", *GROUPS[1:]]}).write_csv("hole.csv")
+    err = refused(capsys, "--generated", "g.npy", "--reference", "r.npy", "--groups", "hole.csv")
+    assert "groups must be known for every row. Got none in 1 row (0). Fill the empty cells of that column" in err
+    assert "None" not in err
+    for sigma in ("1e-300", "1e-100", "1e100", "nan", "0"):
+        assert f"--sigma must be numbers from 1e-100 to 1e100, median or multi. Got '{sigma}'" in refused(capsys, *PAIR, "--sigma", sigma)
+    monkeypatch.setattr(embeddings, "STREAMED", 10)
+    np.save("long.npy", 2 * sets["g"].features)
+    err = refused(capsys, "--generated", "long.npy", "--reference", "r.npy")
+    assert "'long' must be L2-normalised" in err
+    assert "--normalize yes" not in err  # streamed rows are not copied
+    assert "Divide the rows by their norm when saving them, or pass --normalize no" in err
+    found, data = score(
+        capsys, "--generated", "long.npy", "--reference", "r.npy", "--normalize", "no", "--estimator", "biased", "--sigma", "40"
+    )
+    assert found["TMMD", "long", "paper, biased"]["reference"] == digest_file(Path("r.npy")) == data["settings"]["digests"]["reference"]
+
+
+@pytest.mark.parametrize("empty", [None, []])
+def test_a_row_of_parquet_without_features_is_named(capsys, sets, empty):
+    schema = {"id": pl.String, "features": pl.List(pl.Float32)}
+    rows = sets["g"].features.tolist()
+    for at in (0, 7):
+        pl.DataFrame({"id": IDS, "features": [*rows[:at], empty, *rows[at + 1 :]]}, schema=schema).write_parquet("x.parquet")
+        err = refused(capsys, "--generated", "x.parquet", *PAIR[2:])
+        assert f"Every row of x.parquet must have features. Got none for {IDS[at]!r}" in err
+
+
+def test_a_preset_with_another_estimator_says_so(capsys, sets):
+    found, _ = score(capsys, *PAIR, "--estimator", "biased")
+    assert {p for _, _, p in found} == {"paper, biased"}
+    want = distance(sets["g"].features, sets["r"].features, estimator="biased").value
+    assert found["TMMD", "g", "paper, biased"]["value"] == pytest.approx(want, abs=1e-9)
+    err = refused(capsys, *PAIR, "--presets", "grouped", "--estimator", "biased")
+    assert "Got the estimator biased. Drop one of the two" in err
+
+
+def test_copies_are_told_whatever_the_companions_say(capsys, sets):
+    copied = np.vstack([sets["r"].features[:5], sets["g"].features[5:]])
+    FeatureSet(IDS, copied, LABELS, GROUPS).save(Path("copy.npz"))
+    _, data = score(capsys, "--generated", "copy.npz", "--reference", "r.npz", "--permutations", "0")
+    told = [n for n in data["notes"] if n.startswith("copy: ")]
+    assert told == ["copy: 5 of 40 generated rows are bit for bit rows of the reference: a copy is not a generator"]
+
+
+def test_scores_of_two_references_are_kept_apart(capsys, sets):
+    sets["r"].take(IDS[:25]).save(Path("few.npz"))
+    args = (*PAIR[:2], *PAIR[4:], "--companions", "kid", "--presets", "grouped")
+    (one, data), (other, _) = (score(capsys, *args, "--reference", name) for name in ("r.npz", "few.npz"))
+    assert data["settings"]["digests"] == {"reference": sets["r"].digest}
+    assert data["settings"]["embeddings"]["g"] == {"file": "g.npz", "rows": 40, "digest": digest_file(Path("g.npz"))}
+    for key, s in one.items():
+        both = [Score.from_json(v) for v in (s, other[key])]
+        if key[0].startswith(("TMMD", "KID")):
+            assert s["reference"] == sets["r"].digest
+            with pytest.raises(PalpateError, match="must agree in reference"):
+                require_comparable(both)
+        else:
+            assert s["reference"] is None
+            require_comparable(both)
+
+
+def test_a_split_parts_the_generated_rows_as_well_by_id(capsys, sets):
+    test = IDS[15:]
+    sets["g"].take(test).save(Path("test.npz"))
+    FeatureSet(IDS, sets["g"].features).save(Path("whole.npz"))  # labels and groups come from the reference
+    args = ("--reference", "r.npz", "--split", "s.json", "--companions", "none", "--permutations", "0", "--presets", "grouped")
+    found, data = score(capsys, "--generated", "whole.npz", "test.npz", *args)
+    remark = "whole: 15 of 40 touches lie outside the split's test part, and were left out"
+    assert data["notes"] == [remark]
+    for metric in ("TMMD", "CI-TMMD"):
+        whole, part = found[metric, "whole", "grouped"], found[metric, "test", "grouped"]
+        assert (whole["n"], whole["value"]) == (25, part["value"])
+    sets["g"].take(IDS[:-1]).save(Path("lacks.npz"))
+    assert f"'lacks' must have every touch of the split's test part. Got 1 of 25 missing, first {IDS[-1]!r}" in refused(
+        capsys, "--generated", "lacks.npz", *args
+    )
+    own = [f"x{i}" for i in IDS]
+    FeatureSet(own, sets["g"].features, LABELS, GROUPS).save(Path("own.npz"))
+    found, data = score(capsys, "--generated", "own.npz", *args)
+    assert (found["TMMD", "own", "grouped"]["n"], data["notes"]) == (40, [])
+    FeatureSet([*IDS[:-1], "stray"], sets["g"].features).save(Path("stray.npz"))
+    err = refused(capsys, "--generated", "stray.npz", *PAIR[2:])
+    assert "gives labels and groups by id. Got 1 of 40 without, first 'stray'" in err
