@@ -9,7 +9,7 @@ from rich.console import Console
 from palpate.cli.scoring_tables import GEL, show
 from palpate.cli.terminal import Common, Terminal
 from palpate.core import Results, Score
-from palpate.report.remarks import INDEPENDENT
+from palpate.report.remarks import INDEPENDENT, NEARER
 
 SEEN = "The touch tower was trained on another split: it may have seen test touches"
 
@@ -86,11 +86,29 @@ def test_undefined_scores_are_told_by_what_is_known_of_their_column():
         ]
     )  # fmt: skip
     lines = text.splitlines()
-    assert "TMMD of b: Undefined: too few" in lines
-    assert "CI-TMMD: Undefined: no class. Left out: m1 (fewer than 4 samples)" in lines
+    assert "TMMD (grouped) of b: Undefined: too few" in lines
+    assert "CI-TMMD (grouped): Undefined: no class. Left out: m1 (fewer than 4 samples)" in lines
     assert "CI-TMMD →" not in text  # a column without any value is no row
     assert sum("undefined" in line for line in lines) == 1
     assert text.count(SEEN) == 1
+
+
+def test_undefined_scores_are_told_with_their_preset_if_any():
+    none = {"value": None, "note": "Undefined: no class"}
+    text = printed([scored("CI-TMMD", "a", preset="paper"), *(scored("CI-TMMD", "a", preset=p, **none) for p in ("grouped", "cmmd"))])
+    assert text.splitlines()[-1] == "CI-TMMD (grouped), CI-TMMD (cmmd): Undefined: no class"
+    assert "\nFID (touch): Undefined" in printed([scored("TMMD", "a", floor=0.1), scored("FID (touch)", "a", preset="", **none)])
+
+
+def test_a_difference_decided_by_the_distances_to_the_floor_says_so_once():
+    gapped = [delta("I-TMMD", *pair, higher_is_better=None) for pair in ("ab", "ac")]
+    for s in gapped:
+        s.details.update(gap=0.1, gap_interval=(-0.2, 0.4))
+    text = printed([delta("TMMD", "a", "b"), *gapped, delta("D-TMMD", "a", "b", higher_is_better=None)])
+    rows = [line.split() for line in text.splitlines() if "grouped" in line]
+    assert [row[-1] for row in rows] == ["0.05", "1", "1", "0.05"]
+    assert text.count(NEARER) == 1
+    assert text.splitlines()[-1].split(maxsplit=1) == ["1", NEARER]
 
 
 def test_contact_scores_show_what_the_empty_gel_has():
@@ -132,3 +150,22 @@ def test_tables_stay_readable_in_narrow_terminals(width):
     assert ("Left out in this width: null and n." in text) == (width < 100)
     assert any(line.startswith("TMMD ↓, grouped") for line in lines) == (width < 160)
     assert " ".join(text.split()).count(SEEN) == 1
+
+
+@pytest.mark.parametrize("width", [40, 50, 58])
+def test_a_narrow_terminal_keeps_the_names_of_a_difference_whole(width):
+    pairs = [("generated", "real, same material"), ("generated", "[b] other")]
+    text = printed([delta(m, *p, interval=(-1.102, -0.9051)) for m in ("TMMD", "FID") for p in pairs], width)
+    lines = [line.rstrip() for line in text.splitlines()]
+    assert max(map(len, lines[:13])) <= width
+    assert [k for k, line in enumerate(lines) if line == "generated - real, same material"] == [4, 9]
+    assert [k for k, line in enumerate(lines) if line == "generated - [b] other"] == [6, 11]
+    assert all("[-1.102, -0.9051]" in lines[k + 1] and "97.5 %" in lines[k + 1] for k in (4, 6, 9, 11))
+    assert [lines[3], lines[8]] == ["TMMD ↓, grouped", "FID ↓, grouped"]
+    left = "Left out in this width: Holm p. It is in the results of -o"
+    assert (left in " ".join(text.split())) == ("0.05" not in text) == (width == 40)
+
+
+def test_names_of_a_difference_stay_columns_where_there_is_room():
+    text = printed([delta("TMMD", "a", "b", interval=(-1.102, -0.9051))], 58)
+    assert re.search(r"^a +b +-1 ", text, re.M)

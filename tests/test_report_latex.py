@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate.core import Results, Score
-from palpate.report.latex import best_of, escape, latex_tables, number
+from palpate.report.latex import LONG, best_of, escape, latex_tables, number
+from palpate.report.remarks import NEARER
 
 ODD = r"a_b & 50% $x$ #1 {\input{/etc/passwd}} ~^ <b> [c]"
 
@@ -200,3 +201,30 @@ def test_scores_of_different_references_are_bold_by_their_own_differences():
     assert bold(text) == ["1.000", "0.200", "2.000", "0.600"]
     assert text.count(r"\begin{table}") == 4
     assert r"reference \texttt{111111111111}" in text
+
+
+def test_many_differences_break_over_pages():
+    def text(count):
+        return latex_tables(Results(title="t", scores=[delta("TMMD", "a", f"b_{k}", -1, (-2, -0.1)) for k in range(count)]))
+
+    short, long = text(LONG - 1), text(LONG)
+    assert short.count(r"\begin{table}") == 1
+    assert "longtable" not in short
+    assert r"\begin{table}" not in long
+    assert long.count(r"\begin{longtable}{lllrrrr}") == long.count(r"\end{longtable}") == 1
+    assert r"% Needs \usepackage{booktabs,longtable}" in long
+    assert [sum(row[0] == "metric" for row in cells(t)) for t in (short, long)] == [1, 2]  # again on each page
+    assert sum("b\\_" in row[2] for row in cells(long) if len(row) == 7) == LONG
+    order = [long.index(t) for t in (r"\caption{", r"\endfirsthead", r"\endhead", r"\endfoot", r"b\_0 ", r"\end{longtable}")]
+    assert order == sorted(order)
+    assert next(line for line in long.splitlines() if "caption" in line).endswith(r".} \\")
+
+
+@pytest.mark.parametrize("count", [1, LONG])
+def test_differences_decided_by_the_floor_have_a_letter(count):
+    gapped = [delta("I-TMMD", "a", f"b{k}", -1, (-2, -0.1), up=None, better="a") for k in range(count)]
+    for d in gapped:
+        d.details["gap"] = 0.1
+    text = latex_tables(Results(title="t", scores=[*gapped, delta("TMMD", "a", "b0", -1, (-2, -0.1))]))
+    assert [row[5] for row in cells(text) if row[0].endswith("arrow$")] == [r"$90.0\,\%$\textsuperscript{a}"] * count + [r"$90.0\,\%$"]
+    assert text.count(r"\textsuperscript{a}~" + escape(NEARER)) == 1

@@ -6,10 +6,10 @@ import pytest
 
 from palpate.cli import main
 from palpate.core import Results, Score
-from palpate.report import render_markdown, render_page, summary_lines
-from palpate.report.remarks import INDEPENDENT, Footnotes, few, left_out, no_floor, reason, remarks
+from palpate.report import render_markdown, render_page, summary_lines, tables
+from palpate.report.remarks import INDEPENDENT, NEARER, Footnotes, few, left_out, no_floor, reason, remarks
 from palpate.report.sides import sides
-from palpate.report.tables import GEL, parts, score_tables, settings_of
+from palpate.report.tables import GEL, heat_tables, parts, score_tables, settings_of
 
 ONE, TWO, THIRD = "1" * 64, "2" * 64, "3" * 64
 
@@ -87,6 +87,39 @@ def test_a_file_that_does_not_name_its_reference_stands_apart():
         "reference 11111111",
     ]
     assert len(score_tables([scored("TMMD", "a"), scored("TMMD", "b")])) == 1
+
+
+def test_matrices_name_the_reference_that_their_table_names():
+    def run(reference, **more):
+        matrix = {"matrix": [[0.0, 1.0], [1.0, 0.0]]}
+        return [scored("TMMD", "a", reference, **more), scored("D-TMMD", "a", details=matrix, **more)]
+
+    titles = [h.title for h in heat_tables([*run(ONE), *run(TWO)])]
+    assert titles == ["D-TMMD, a, grouped, reference 11111111", "D-TMMD, a, grouped, reference 22222222"]
+    assert [h.title for h in heat_tables(run(ONE))] == ["D-TMMD, a, grouped"]
+    assert [h.title[-14:] for h in heat_tables([*run(ONE, split="5" * 64), *run(ONE, split="6" * 64)])] == [
+        "split 55555555",
+        "split 66666666",
+    ]
+
+
+def test_differences_without_a_direction_are_said_to_be_of_distances_to_the_floor(tmp_path):
+    gap = {"a": "a", "b": "b", "gap": 0.1, "gap_interval": (-0.2, 0.4), "better": "b", "p_better": 0.3}
+    plain = {"a": "a", "b": "b", "better": "b", "p_better": 0.3}
+    scores = [
+        scored("TMMD difference", "a - b", ONE, details=plain), scored("I-TMMD difference", "a - b", details=gap, higher_is_better=None),
+        scored("CI-TMMD difference", "a - b", details=gap, higher_is_better=None),
+        scored("D-TMMD difference", "a - b", details=plain, higher_is_better=None),
+    ]  # fmt: skip
+    (table,) = score_tables(scores)
+    assert table.notes == [NEARER]
+    assert [c[0].footnotes for c in table.cells["a - b"].values()] == [[], [1], [1], []]
+    assert table.question.endswith(tables.NEARER)
+    assert tables.NEARER not in score_tables(scores[:1])[0].question
+    assert render_markdown(Results("t", scores=scores)).count("|a - floor|") == 1  # the note is escaped
+    assert (
+        render_page(Results("t", scores=scores), tmp_path, max_bytes=10**7).count("confidence and p are of |a - floor| - |b - floor|") == 2
+    )
 
 
 def test_differences_stand_with_their_reference():

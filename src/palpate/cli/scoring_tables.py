@@ -1,6 +1,7 @@
 """The tables of ``palpate score`` in the terminal: one of scores, one of paired differences, and below them what a reader must know, each sentence once.
 
-Where a table is wider than the terminal, the metrics become headings, and the columns that can be spared are left out and named.
+Where a table is wider than the terminal, the metrics become headings; where it still is, so do the two names of a difference, and the columns that
+can be spared are left out and named.
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None
     for s in scores:
         if s.value is None:
             text = ". ".join([reason(s), *(t for t in remarks(s) if t not in notes.texts)])
-            why.setdefault(text, []).append(s.metric if _column(s) not in known else f"{s.metric} of {s.subject}")
+            preset = _column(s)[1]
+            name = f"{s.metric} ({preset})" if preset else s.metric
+            why.setdefault(text, []).append(name if _column(s) not in known else f"{name} of {s.subject}")
     for text, metrics in why.items():
         terminal.print(f"{', '.join(dict.fromkeys(metrics))}: {text}")
     for remark in (r for r in results.notes if r not in said):
@@ -110,7 +113,7 @@ def _differences(scores: Sequence[Score], notes: Footnotes, frames: set[tuple[st
         ]  # fmt: skip
         rows.append((f"{metric} {ARROWS[s.higher_is_better]}", _column(s)[1], cells))
     heads = ("a", "b", "a - b", "95 % interval", "confidence that a is better", "Holm p", "note")
-    return Grid(heads, 2, frozenset(), rows)
+    return Grid(heads, 2, frozenset({"Holm p"}), rows)
 
 
 def _draw(grid: Grid, terminal: Terminal) -> None:
@@ -127,6 +130,8 @@ def _draw(grid: Grid, terminal: Terminal) -> None:
     if terminal.out.measure(wide, options=terminal.out.options.update(width=10_000)).maximum <= room:
         terminal.out.print(wide)
         return
+    if grid.left > 1 and not _fits(grid, keep, room):
+        keep = [k for k in keep if k >= grid.left]  # the names stand above the numbers
     spared = [grid.heads[k] for k in keep if grid.heads[k] in grid.spare]
     if spared and not _fits(grid, keep, room):
         keep = [k for k in keep if grid.heads[k] not in spared]
@@ -134,7 +139,8 @@ def _draw(grid: Grid, terminal: Terminal) -> None:
         spared = []
     _sections(grid, keep, terminal)
     if spared:
-        terminal.print(f"Left out in this width: {' and '.join(spared)}. They are in the results of -o, and in a wider window.")
+        are = "They are" if len(spared) > 1 else "It is"
+        terminal.print(f"Left out in this width: {' and '.join(spared)}. {are} in the results of -o, and in a wider window.")
 
 
 def _widths(grid: Grid, keep: Sequence[int]) -> list[int]:
@@ -151,9 +157,12 @@ def _fits(grid: Grid, keep: Sequence[int], room: int) -> bool:
 
 
 def _sections(grid: Grid, keep: Sequence[int], terminal: Terminal) -> None:
-    """The columns ``keep`` of a grid, each metric below a line of its own; names fold where even that is too wide."""
-    widths = _widths(grid, keep)
-    if not _fits(grid, keep, terminal.out.width):
+    """The columns ``keep`` of a grid, each metric below a line of its own; a name folds where even that is too wide.
+
+    Rows whose names are not among ``keep`` have them on a line of their own.
+    """
+    widths, named = _widths(grid, keep), keep[0] < grid.left
+    if named and not _fits(grid, keep, terminal.out.width):
         rest = sum(widths[grid.left :]) + 2 * (len(keep) - 1)
         names = max(4, (terminal.out.width - rest) // grid.left)
         widths[: grid.left] = [min(width, names) for width in widths[: grid.left]]
@@ -172,6 +181,11 @@ def _sections(grid: Grid, keep: Sequence[int], terminal: Terminal) -> None:
             terminal.out.print(table)
             terminal.out.print(escape(", ".join(filter(None, [metric, preset]))), style="bold")
             table, before = lines(), (metric, preset)
+        if not named:
+            if table.row_count:
+                terminal.out.print(table)
+            terminal.out.print(escape(" - ".join(cells[: grid.left])))
+            table = lines()
         table.add_row(*(escape(cells[k]) for k in keep))
     terminal.out.print(table)
 

@@ -21,6 +21,8 @@ from palpate.core.files import atomic_path
 COMPARABLE = ("metric", "estimator", "bandwidth", "scale", "settings", "encoder", "reference", "split")
 
 
+#: Rows of an array on disk that are looked at together.
+SLAB = 8192
 #: Arrow and words for ``Score.higher_is_better``.
 ARROWS: Mapping[bool | None, str] = {True: "↑", False: "↓", None: "→"}
 BETTER: Mapping[bool | None, str] = {True: "higher is better", False: "lower is better", None: "closer to the floor is better"}
@@ -128,15 +130,20 @@ def columns(scores: Iterable[Score]) -> dict[str, list[Score]]:
     return table
 
 
-def _finite_rows(features: np.ndarray, slab: int = 8192) -> np.ndarray:
+def _finite_rows(features: np.ndarray) -> np.ndarray:
     """(n,) whether all numbers of a row are finite; an array on disk is read in slabs, whose pages are given back."""
     out = np.ones(len(features), dtype=bool)
-    held = getattr(features, "_mmap", None)
-    for k in range(0, len(features), slab):
-        out[k : k + slab] = np.isfinite(features[k : k + slab]).all(axis=1)
-        if held is not None and hasattr(held, "madvise") and getattr(features, "mode", "c") != "c":  # own changes would be lost
-            held.madvise(mmap.MADV_DONTNEED)
+    for k in range(0, len(features), SLAB):
+        out[k : k + SLAB] = np.isfinite(features[k : k + SLAB]).all(axis=1)
+        _give_back(features)
     return out
+
+
+def _give_back(features: np.ndarray) -> None:
+    """Lets the system forget the pages of an array on disk that were read."""
+    held = getattr(features, "_mmap", None)
+    if held is not None and hasattr(held, "madvise") and getattr(features, "mode", "c") != "c":  # own changes would be lost
+        held.madvise(mmap.MADV_DONTNEED)
 
 
 def is_missing(name: Any) -> bool:
@@ -146,10 +153,10 @@ def is_missing(name: Any) -> bool:
 
 def _on_host(features: Any) -> np.ndarray:
     """A tensor without its graph, from any device; NumPy has no bfloat16."""
-    if hasattr(features, "detach"):
-        features = features.detach().cpu()
-        features = features.float() if str(features.dtype).endswith("bfloat16") else features
     try:
+        if hasattr(features, "detach"):
+            features = features.detach().cpu()
+            features = features.float() if str(features.dtype).endswith("bfloat16") else features
         return np.asarray(features)
     except (TypeError, ValueError, RuntimeError) as error:
         raise PalpateError("Features must turn into an array (n, d)", str(error).splitlines()[0], "Pass rows of one width") from None
@@ -179,6 +186,8 @@ class FeatureSet:
     def __post_init__(self) -> None:
         if not isinstance(self.features, np.ndarray):  # a tensor, or a list of rows
             object.__setattr__(self, "features", _on_host(self.features))
+        if self.features.dtype.kind not in "fiub":
+            raise PalpateError("Features must be numbers", f"dtype {self.features.dtype}", "Pass the encoder's output, one row an id")
         shape = self.features.shape
         if len(shape) != 2 or shape[0] != len(self.ids):
             raise PalpateError(f"Features must have shape ({len(self.ids)}, d), one row an id", f"shape {shape}", "Pass one row per id")
@@ -197,10 +206,14 @@ class FeatureSet:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of ids and features, in whatever order the rows are."""
-        order = np.argsort(np.array([str(i) for i in self.ids], dtype=str), kind="stable")
-        found = hashlib.sha256(json.dumps([str(self.features.dtype), self.features.shape[1], [str(self.ids[k]) for k in order]]).encode())
-        for k in range(0, len(order), 8192):
-            found.update(np.ascontiguousarray(self.features[order[k : k + 8192]]).tobytes())
+        rows: list[tuple[str, bytes]] = []
+        for k in range(0, len(self.features), SLAB):
+            slab = np.ascontiguousarray(self.features[k : k + SLAB], dtype="<f4")  # the same numbers in another type are the same
+            rows += [(str(i), hashlib.blake2b(row.tobytes(), digest_size=16).digest()) for i, row in zip(self.ids[k:], slab, strict=False)]
+            _give_back(self.features)
+        found = hashlib.sha256(str(self.features.shape[1]).encode())
+        for name, row in sorted(rows):
+            found.update(json.dumps(name).encode() + row)
         return found.hexdigest()
 
     def take(self, ids: Sequence[str]) -> FeatureSet:

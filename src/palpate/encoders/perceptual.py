@@ -138,11 +138,12 @@ def lpips_per_image(
     """
     generated, reference = (_array(name, v) for name, v in (("generated", generated), ("reference", reference)))
     _check(generated, reference)
+    mask = None if mask is None else _array("mask", mask)
     if mask is not None and (mask.shape != generated.shape[:3] or mask.dtype != bool):
         must = f"The mask must be of shape {generated.shape[:3]} and of truth values"
         raise PalpateError(must, f"shape {mask.shape}, dtype {mask.dtype}", "Pass one mask an image")
-    if batch < 1:
-        raise PalpateError("--batch must be at least 1", str(batch), "Pass e.g. --batch 64")
+    if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
+        raise PalpateError("batch must be a whole number of at least 1", repr(batch), "Pass e.g. batch=64")
     out = np.empty(len(generated), np.float64)
     device = network.get_buffer("shift").device
     with _exact():
@@ -186,7 +187,9 @@ def _array(name: str, images: Any) -> NDArray[Any]:
     try:
         return np.asarray(images.detach().cpu() if isinstance(images, Tensor) else images)
     except (TypeError, ValueError) as error:
-        raise PalpateError(f"The {name} images must be one array", str(error).splitlines()[0], "Stack them, of one size") from None
+        raise PalpateError(
+            f"The {name} {'images ' * (name != 'mask')}must be one array", str(error).splitlines()[0], "Stack them, of one size"
+        ) from None
 
 
 def _check(generated: NDArray[Any], reference: NDArray[Any]) -> None:

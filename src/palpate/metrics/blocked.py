@@ -96,14 +96,14 @@ def blocked_sums(
 def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> Any:
     """Rows of ``x`` in this order, formed in float64 and rounded once to the type that the sums need.
 
-    The Gaussian's are centred, which changes no distance; other kernels take rows as they are, in float64. ``smallest``: rows of the smallest
+    The Gaussian's are centred, which changes no distance, and in units of its bandwidth; other kernels take rows as they are, in float64. ``smallest``: rows of the smallest
     segment, over which float32 rounding must average away.
     """
     limit = kernel.radius_limit * (1.0 if smallest >= MANY_ROWS else FEW)
     if type(ops) is not Ops:  # on a device: one expression
         wide = ops.xp.astype(ops.xp.take(x, ops.xp.asarray(order, device=ops.device), axis=0), ops.xp.float64)  # type: ignore[attr-defined]
-        z = wide - ops.xp.mean(wide, axis=0) if isinstance(kernel, Gaussian) else wide  # type: ignore[attr-defined]
-        radius = float(ops.xp.max(ops.squares(z))) if len(order) else 0.0  # type: ignore[attr-defined]
+        z = (wide - ops.xp.mean(wide, axis=0)) / kernel.unit if isinstance(kernel, Gaussian) else wide  # type: ignore[attr-defined]
+        radius = kernel.unit**2 * float(ops.xp.max(ops.squares(z))) if len(order) else 0.0  # type: ignore[attr-defined]
         _require_known_distances(radius, kernel)
         single = x.dtype != ops.xp.float64 and len(order) > FLOAT64_BELOW and radius <= limit  # type: ignore[attr-defined]
         return ops.xp.astype(z, ops.xp.float32) if single else z  # type: ignore[attr-defined]
@@ -116,7 +116,7 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> An
     wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or radius > limit
     z = np.empty(x.shape, dtype=np.float64 if wide else np.float32)
     for at in slabs:
-        z[at] = x[order[at]] - mean
+        z[at] = (x[order[at]] - mean) / kernel.unit
     return z
 
 
@@ -126,9 +126,12 @@ def _require_known_distances(radius: float, kernel: Kernel) -> None:
     The limit of a kernel is where float32 keeps 1e-6; float64 has 2^29 times as much room.
     """
     if kernel.radius_limit > 0 and not radius <= kernel.radius_limit * 2.0**29:
-        got = f"rows up to {radius**0.5:.3g} from their mean"
+        far = radius**0.5
+        got = f"a row {far:.3g} from the mean, {far / (2 * kernel.radius_limit**0.5):.2g} bandwidths"
         raise PalpateError(
-            "The bandwidth must be wide enough for rounding to tell the rows' distances", got, "Normalise the rows, or pass a wider sigma"
+            "The bandwidth must be wide enough for rounding to tell the rows' distances",
+            got,
+            "Leave out what lies so far away, or pass a wider sigma",
         )
 
 
@@ -140,6 +143,7 @@ class _Run:
     ) -> None:
         self.kernel, self.ops, self.cell, n = kernel, ops, cell, len(cell)
         self.left, self.right = kernel.augment(z, ops)
+        self.radius = max((float(ops.numpy(ops.squares(z[k : k + SLAB])).max()) for k in range(0, n, SLAB)), default=0.0)
         block = max(1, min(block, max(SMALL_BLOCK, -(-n // 8))))  # an eighth of the rows: little of the diagonal blocks is done twice
         self.blocks = [slice(i, min(i + block, n)) for i in range(0, n, block)]
         self.ends = [(int(cell[at.start]), int(cell[at.stop - 1]) + 1) for at in self.blocks]
@@ -161,7 +165,7 @@ class _Run:
     def _block(self, pair: tuple[int, int]) -> tuple[Array, Array | None, list[tuple[int, Array, Array | None, float]]]:
         i, j = pair
         rows, columns = self.blocks[i], self.blocks[j]
-        k = self.kernel.values(self.left[rows] @ self.right[columns].T, self.ops)
+        k = self.kernel.values(self.left[rows] @ self.right[columns].T, self.ops, self.radius)
         if i == j:
             k = self.ops.clear_diagonal(k)
         across = self.ops.numpy(k @ self.marks[j])  # (rows, cells of j)

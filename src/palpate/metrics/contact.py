@@ -35,10 +35,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Score
-from palpate.metrics.checks import checked_choice, checked_images, checked_names, checked_positive
+from palpate.metrics.checks import checked_choice, checked_images, checked_names
 from palpate.metrics.compat import WINDOW, Convention
 from palpate.metrics.kernels import Array
-from palpate.metrics.masks import LEAST, Mask, checked_touches, mask_of, unit
+from palpate.metrics.masks import LEAST, Mask, checked_least, checked_touches, mask_of, unit
 from palpate.metrics.multiscale import fitting_scales, signed_maps, weighted_ms_ssim
 from palpate.metrics.pairwise import mean_score
 
@@ -159,7 +159,7 @@ class _Pairs:
     def of(cls, generated: Any, reference: Any, background: Any, generated_background: Any, markers: Markers, least: float) -> _Pairs:
         """Checks everything; errors as :func:`contact_per_image`."""
         checked_choice("markers", markers, ("skip", "keep"))
-        checked_positive(least=least)
+        checked_least(least)
         real, empty = checked_touches("reference", reference, background)
         made, own = checked_touches("generated", generated, background if generated_background is None else generated_background)
         made, real = checked_images(made, real)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate import __version__
-from palpate.core import FeatureSet, Score, rng_for
+from palpate.core import FeatureSet, PalpateError, Score, rng_for
 from palpate.metrics.checks import Floats, checked_level, checked_names, checked_whole, copies_across
 from palpate.metrics.gaussians import Array, Moments, distance_of_features, distance_of_moments
 from palpate.metrics.intervals import jackknife_errors, t_interval
@@ -59,6 +59,8 @@ def compare_fid(generators: Mapping[str, FeatureSet], reference: FeatureSet, **o
     Raises:
         PalpateError: if generators differ in ids, labels, groups or encoder, or as :func:`fid`.
     """
+    if unknown := sorted(set(options) - set(FidOptions.__annotations__)):
+        raise PalpateError(f"Options must be among {', '.join(FidOptions.__annotations__)}", ", ".join(unknown), "Check the spelling")
     found = {name: _fid(one, reference, subject=name, **options) for name, one in same_samples(generators).items()}
     differences: list[Score] = []
     for a, b in combinations(found.values(), 2):

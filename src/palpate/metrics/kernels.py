@@ -45,12 +45,17 @@ class Kernel(Protocol):
         """Largest ``max ||x - centre||^2`` for which float32 keeps 1e-6 (x1000)."""
         ...
 
+    @property
+    def unit(self) -> float:
+        """What rows are divided by before they are given to the rest."""
+        ...
+
     def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """Left and right factors (n, d'), so that ``left @ right.T`` is what :meth:`values` takes."""
         ...
 
-    def values(self, product: Any, ops: Ops) -> Any:
-        """Kernel values of a block, in place where the array library can."""
+    def values(self, product: Any, ops: Ops, radius: float) -> Any:
+        """Kernel values of a block, in place where the array library can; ``radius`` is the largest squared norm of a row."""
         ...
 
     def diagonal(self, x: Any, ops: Ops) -> Array:
@@ -87,16 +92,22 @@ class Gaussian:
         """The exponents stay below one half: sigma >= 2 for unit-norm features."""
         return 0.25 * min(self.sigmas) ** 2
 
+    @property
+    def unit(self) -> float:
+        """The first bandwidth."""
+        return self.sigmas[0]
+
     def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """``[x, -||x||^2 / 2, 1] . [y, 1, -||y||^2 / 2] = -||x - y||^2 / 2``, with norms of the same rounded rows."""
         norms, ones = -0.5 * ops.squares(x), ops.ones(len(x), x)
         return ops.columns(x, norms, ones), ops.columns(x, ones, norms)
 
-    def values(self, product: Any, ops: Ops) -> Any:
-        """``expm1(product / sigma^2)``, averaged over the bandwidths."""
+    def values(self, product: Any, ops: Ops, radius: float) -> Any:
+        """``expm1(product)``, averaged over the bandwidths; no two rows are farther apart than twice the radius."""
         first, *others = self.sigmas
-        rest = [ops.expm1_(product / (sigma * sigma)) for sigma in others]
-        k = ops.expm1_(ops.scale_(product, 1 / (first * first)))
+        factors = [(first / sigma) ** 2 for sigma in others]
+        rest = [ops.expm1_(product * f, -2 * radius * f) for f in factors]
+        k = ops.expm1_(product, -2 * radius)
         for other in rest:
             k += other
         return ops.scale_(k, 1 / len(self.sigmas))
@@ -137,13 +148,18 @@ class Polynomial:
         """Always float64: KID's values are far smaller than the kernel's rounding in float32."""
         return 0.0
 
+    @property
+    def unit(self) -> float:
+        """Rows are taken as they are."""
+        return 1.0
+
     def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """``[gamma x, coef0] . [y, 1]``."""
         gamma = 1 / x.shape[1] if self.gamma is None else self.gamma
         ones = ops.ones(len(x), x)
         return ops.columns(gamma * x, self.coef0 * ones), ops.columns(x, ones)
 
-    def values(self, product: Any, ops: Ops) -> Any:
+    def values(self, product: Any, ops: Ops, radius: float) -> Any:
         """The power."""
         k = product
         for _ in range(self.degree - 1):
@@ -171,11 +187,16 @@ class Linear:
         """Always float64."""
         return 0.0
 
+    @property
+    def unit(self) -> float:
+        """Rows are taken as they are."""
+        return 1.0
+
     def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """The rows themselves."""
         return x, x
 
-    def values(self, product: Any, ops: Ops) -> Any:
+    def values(self, product: Any, ops: Ops, radius: float) -> Any:
         """The product."""
         return product
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import checked_images, checked_positive
+from palpate.metrics.checks import checked_images
 from palpate.metrics.compat import as_images
 from palpate.metrics.kernels import Array
 
@@ -46,9 +46,15 @@ def contact_mask(touch: Any, background: Any, *, least: float = LEAST) -> Mask:
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or a ``least`` that is not positive.
     """
-    checked_positive(least=least)
+    checked_least(least)
     touch, background = checked_touches("touch", touch, background)
     return np.stack([mask_of(unit(t), unit(b), least)[0] for t, b in zip(touch, background, strict=True)])
+
+
+def checked_least(least: Any) -> None:
+    """Refuses a least change that is not inside (0, 1)."""
+    if not isinstance(least, int | float | np.number) or not 0 < least < 1:
+        raise PalpateError("least must lie in (0, 1), the scale of the images", repr(least), "Leave it out for 4 / 255")
 
 
 def mask_of(touch: Array, background: Array, least: float) -> tuple[Mask, Mask]:

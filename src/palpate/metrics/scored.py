@@ -146,15 +146,24 @@ def with_floor(one: Scored, floor: Scored) -> Scored:
     mine, theirs = one.score, floor.score
     classes = mine.details.get("classes")
     alike = classes == theirs.details.get("classes")
-    known = (same_units(one, floor) or mine.settings.get("halves") != "group") and alike
+    if mine.settings.get("halves") == "group":
+        same, what = same_units(one, floor), "groups"
+    else:  # a biased value falls as 1 / n
+        same, what = mine.estimator != "biased" or _sizes(mine) == _sizes(theirs), "numbers of samples"
+    known = same and alike
     details: dict[str, Any] = {}
     if "E" in mine.details:
         details["E_floor"] = theirs.details.get("E") if alike else _mean_excess(theirs, classes or [])
     if "E_ratio" in mine.details:
         details["E_ratio_floor"] = theirs.details.get("E_ratio") if alike else None
-    why = "" if known or mine.value is None else f"No floor: real touches of other {'groups' if alike else 'classes'} have another value"
+    why = "" if known or mine.value is None else f"No floor: real touches of other {what if alike else 'classes'} have another value"
     note = ". ".join(filter(None, [mine.note, why]))
     return replace(one, score=replace(mine, floor=theirs.value if known else None, details={**mine.details, **details}, note=note))
+
+
+def _sizes(score: Score) -> list[int]:
+    """How many samples a score is of, and each of its classes."""
+    return [score.n, *score.details.get("sizes", ())]
 
 
 def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:

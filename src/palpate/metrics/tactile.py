@@ -180,7 +180,8 @@ def ci_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
 def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     """CI-TMMD from a table."""
     kept, excluded = _usable(table, plan)
-    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "excluded": excluded}
+    sizes = table.whole_classes().totals.n[kept].astype(int).tolist()
+    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "sizes": sizes, "excluded": excluded}
     if not len(kept):
         note = "Undefined: no class can be cut into halves" + ("" if generated.labels is not None else " (the samples have no labels)")
         return scored("CI-TMMD", table, generated, plan, ("halves",), details=details, note=note, **halves_fields(plan))
@@ -258,7 +259,8 @@ def denominators(matrix: Array, denominator: str) -> Array:
 def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     """D-TMMD from a table."""
     kept, excluded = _usable(table, plan)
-    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "excluded": excluded}
+    sizes = table.whole_classes().totals.n[kept].astype(int).tolist()
+    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "sizes": sizes, "excluded": excluded}
     fields: dict[str, Any] = halves_fields(plan) | {"estimator": plan.estimator}
     settings = ("halves", "denominator", "aggregate")
     if len(kept) < 2:

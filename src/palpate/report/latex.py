@@ -3,7 +3,8 @@ r"""Scores as LaTeX tables for a paper: ``booktabs``, one table a family of metr
 Rows are subjects, columns are metrics with the arrow of the better direction; the interval stands below the value, and the p-value of a permutation test
 below that. A value is bold only where its generator is better than every other one by a paired difference whose interval leaves out 0: a best of
 overlapping values is nobody's. The caption says how the numbers were made; what a reader must know of single values (classes left out, intervals over
-frames) has a letter below the table. Text is escaped: no name can be a command. Needs ``\usepackage{booktabs}``.
+frames) has a letter below the table. Differences of many rows are a ``longtable``, since a float cannot break over pages. Text is escaped: no name
+can be a command. Needs ``\usepackage{booktabs}`` and, where it is used, ``longtable``: a comment at the head says so.
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ import re
 from collections.abc import Mapping, Sequence
 
 from palpate.core import Results, Score, short
-from palpate.report.remarks import Footnotes, reason, remarks
+from palpate.report.remarks import NEARER, Footnotes, by_gap, reason, remarks
 from palpate.report.sides import TAIL, sides
 from palpate.report.tables import gel_of, parts, score_tables
 from palpate.report.text import decimals, defined, setting_of
 
 #: First line of the file: how the command knows a file of its own.
 MARK = "% palpate: tables of scores"
+#: From so many differences on a table may break over pages.
+LONG = 40
 #: By whether higher is better; None: closer to the floor is.
 ARROWS = {True: r"$\uparrow$", False: r"$\downarrow$", None: r"$\rightarrow$"}
 #: What the name of E has more than that of its metric.
@@ -55,7 +58,7 @@ def latex_tables(results: Results) -> str:
         PalpateError: if two scores that would share a column were not made alike.
     """
     differences = [(s, side) for s, side in zip(results.scores, sides(results.scores).of, strict=True) if s.metric.endswith(TAIL)]
-    lines = [MARK, *(f"% {_comment(c)}" for c in results.commands), r"% Needs \usepackage{booktabs}.", ""]
+    lines: list[str] = []
     for table in score_tables(results.scores):
         if table.columns[0].metric.endswith(TAIL):
             continue
@@ -66,7 +69,9 @@ def latex_tables(results: Results) -> str:
             lines += _scores(table.title, tag, metrics, [s for s in members if s.metric in metrics], beside, results)
     for part in parts(results.scores):
         lines += _differences(part.title, part.scores, results) if part.differences else []
-    return "\n".join(lines).rstrip() + "\n"
+    needs = r"{booktabs,longtable}; longtable needs text of one column" if r"\begin{longtable}" in "\n".join(lines) else "{booktabs}"
+    head = [MARK, *(f"% {_comment(c)}" for c in results.commands), rf"% Needs \usepackage{needs}.", ""]
+    return "\n".join([*head, *lines]).rstrip() + "\n"
 
 
 def _comment(text: str) -> str:
@@ -185,7 +190,9 @@ def _same_verdict(difference: Score, column: Sequence[Score]) -> bool:
 
 
 def _differences(title: str, differences: Sequence[Score], results: Results) -> list[str]:
-    rows = [_row(["metric", "$a$", "$b$", "$a - b$", "interval", "$a$ better", "Holm $p$"]), r"\midrule"]
+    head = [_row(["metric", "$a$", "$b$", "$a - b$", "interval", "$a$ better", "Holm $p$"]), r"\midrule"]
+    rows: list[str] = []
+    mark = _raised([1])
     for d in differences:
         digits = decimals([v for v in (d.value, *(d.interval or ())) if v is not None])
         sure, p = d.details.get("p_better"), d.details.get("p_adjusted")
@@ -198,12 +205,18 @@ def _differences(title: str, differences: Sequence[Score], results: Results) -> 
                     escape(d.details["b"]),
                     number(d.value, digits),
                     f"$[{low}, {high}]$" if d.interval else "--",
-                    "--" if sure is None else _percent(sure),
+                    ("--" if sure is None else _percent(sure)) + (mark if by_gap(d) else ""),
                     "--" if p is None else _p(p),
                 ]
             )
         )
-    return _environment(title, "lllrrrr", rows, differences, results, differences=False)
+    below = [f"{mark}~{escape(NEARER)}"] if any(map(by_gap, differences)) else []
+    if len(rows) < LONG:
+        return _environment(title, "lllrrrr", [*head, *rows], differences, results, differences=False, below=below)
+    return [
+        r"\begin{longtable}{lllrrrr}", rf"{_caption(title, differences, results, differences=False)} \\", r"\toprule", *head, r"\endfirsthead",
+        r"\toprule", *head, r"\endhead", r"\bottomrule", r"\endfoot", *rows, r"\end{longtable}", *_below(below), "",
+    ]  # fmt: skip
 
 
 def _percent(share: float) -> str:
@@ -224,11 +237,22 @@ def _environment(
     differences: bool,
     below: Sequence[str] = (),
 ) -> list[str]:
-    caption = ". ".join([escape(title), *_made(members, differences), *(rf"Command: \texttt{{{escape(c)}}}" for c in results.commands[:1])])
+    caption = _caption(title, members, results, differences=differences)
     return [
-        r"\begin{table}", r"\centering", rf"\caption{{{caption}.}}", rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *rows, r"\bottomrule",
-        r"\end{tabular}", *([rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {'. '.join(t.rstrip('.') for t in below)}.}}"] if below else []), r"\end{table}", "",
+        r"\begin{table}", r"\centering", caption, rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *rows, r"\bottomrule",
+        r"\end{tabular}", *_below(below), r"\end{table}", "",
     ]  # fmt: skip
+
+
+def _caption(title: str, members: Sequence[Score], results: Results, *, differences: bool) -> str:
+    said = [escape(title), *_made(members, differences), *(rf"Command: \texttt{{{escape(c)}}}" for c in results.commands[:1])]
+    return rf"\caption{{{'. '.join(said)}.}}"
+
+
+def _below(texts: Sequence[str]) -> list[str]:
+    """The sentences below a table."""
+    said = ". ".join(t.rstrip(".") for t in texts)
+    return [rf"\par\smallskip\parbox{{\linewidth}}{{\footnotesize {said}.}}"] if texts else []
 
 
 def _made(members: Sequence[Score], differences: bool) -> list[str]:

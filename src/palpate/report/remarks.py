@@ -10,6 +10,8 @@ from palpate.report.text import defined
 
 #: Said of every interval over frames, in the words that the metrics use.
 INDEPENDENT = "The interval takes samples as independent; frames of one video are not: give groups"
+#: Said of differences of metrics without a direction, whose verdict is not that of the interval beside it.
+NEARER = "Which is nearer to the floor: confidence and p are of |a - floor| - |b - floor|"
 #: Names in a sentence; the others are counted.
 NAMES = 5
 #: How classes of samples without a label are called in ``details["excluded"]``.
@@ -44,7 +46,13 @@ def remarks(score: Score) -> list[str]:
     said += filter(None, [left_out(score)])
     if "as independent" in score.interval_method and INDEPENDENT not in said:
         said.append(INDEPENDENT)
+    said += [NEARER] if by_gap(score) else []
     return said if defined(score) else [text for text in said if text != INDEPENDENT]
+
+
+def by_gap(score: Score) -> bool:
+    """Whether a score is a difference that is decided by the distances of both to the floor."""
+    return score.higher_is_better is None and score.details.get("gap") is not None
 
 
 def left_out(score: Score) -> str:

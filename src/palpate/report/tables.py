@@ -13,7 +13,7 @@ from typing import Any
 from palpate.core import Results, Score, columns
 from palpate.core.score import ARROWS, BETTER
 from palpate.report.plots import Axis, axis_of
-from palpate.report.remarks import Footnotes, reason, remarks
+from palpate.report.remarks import Footnotes, by_gap, reason, remarks
 from palpate.report.sides import TAIL, Sides, sides
 from palpate.report.text import decimals, defined, interval_text, number, plain, setting_of
 
@@ -44,6 +44,8 @@ DIFFERENCES = (
     "Paired differences",
     "Which of two generators is better on the same samples? Values are a - b; where the interval leaves out 0 the difference is more than chance.",
 )
+#: Stands with that question where metrics without a direction have differences.
+NEARER = "For metrics with → that tells a from b, not which is better: the nearer to the floor is, and confidence and p are of |a - floor| - |b - floor|."
 
 
 @dataclass(frozen=True)
@@ -111,9 +113,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Part:
-    """Scores that stand in one table: its title and question, and the sides of the scores."""
+    """Scores that stand in one table: its title, what of it names split and reference ('' where all share them), its question, and the sides."""
 
     title: str
+    tail: str
     question: str
     scores: Sequence[Score]
     sides: frozenset[int]
@@ -209,12 +212,11 @@ def parts(scores: Sequence[Score]) -> list[Part]:
         title, question = family_of(scores[members[0]].metric)
         if preset:
             title += f", {preset}: {READINGS[preset]}" if preset in READINGS else f", {preset}"
-        if several and split:
-            title += f", split {split[:8]}"
-        for tail, some in _by_side(members, scores, at):
+        cut = f", split {split[:8]}" if several and split else ""
+        for side, some in _by_side(members, scores, at):
             first = not any(p.question == question for p in out)
             asked = question if first or place == len(FAMILIES) else ""
-            out.append(Part(title + tail, asked, [scores[k] for k in some], frozenset(at.of[k] for k in some)))
+            out.append(Part(title + cut + side, cut + side, asked, [scores[k] for k in some], frozenset(at.of[k] for k in some)))
     return out
 
 
@@ -253,7 +255,8 @@ def _table(part: Part) -> Table:
     subjects = list(dict.fromkeys(score.subject for score in part.scores))
     shared = [row for row in heads[0].made if len(heads) > 1 and all(row in h.made for h in heads)]
     heads = [replace(h, made=[row for row in h.made if row not in shared]) for h in heads]
-    question = " ".join(filter(None, [part.question, GEL if any(gel_of(s) is not None for s in part.scores) else ""]))
+    said = [NEARER if any(map(by_gap, part.scores)) else "", GEL if any(gel_of(s) is not None for s in part.scores) else ""]
+    question = " ".join(filter(None, [part.question, *said]))
     return Table(part.title, question, heads, subjects, cells, shared, notes.texts, part.sides)
 
 
@@ -285,8 +288,12 @@ def _square(matrix: Any) -> list[list[float | None]] | None:
 
 
 def heat_tables(scores: Sequence[Score]) -> list[Heat]:
-    """One heat table for each score whose details hold a square ``matrix`` (``classes`` or ``labels`` name its rows, else they are numbered)."""
+    """One heat table for each score whose details hold a square ``matrix`` (``classes`` or ``labels`` name its rows, else they are numbered).
+
+    Where the table that a score stands in is named by its reference or split, so is its matrix.
+    """
     tables: list[Heat] = []
+    tails = {id(score): part.tail for part in parts(scores) for score in part.scores}
     for score in scores:
         matrix = _square(score.details.get("matrix"))
         if matrix is None:
@@ -299,7 +306,7 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
         digits, top = min(3, decimals(seen)), max(seen, default=0.0) or 1.0
         tables.append(
             Heat(
-                ", ".join(filter(None, [score.metric, score.subject, str(score.settings.get("preset", ""))])),
+                ", ".join(filter(None, [score.metric, score.subject, str(score.settings.get("preset", ""))])) + tails[id(score)],
                 labels,
                 [[number(v, digits) for v in row] for row in matrix],
                 [[round(max(0.0, v or 0.0) / top, 3) for v in row] for row in matrix],
