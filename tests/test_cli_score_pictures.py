@@ -315,3 +315,21 @@ def test_a_stopped_run_goes_on_from_its_embeddings_and_leaves_nothing_when_done(
     for one in (found, again):
         assert {k: s["value"] for k, s in one.items()} == pytest.approx({k: s["value"] for k, s in plain.items()}, rel=1e-6, abs=1e-9)
     assert len(list(Path("kept").rglob("tactile-*.npy"))) == 3
+
+
+def test_other_pictures_of_the_same_name_size_and_time_are_embedded_again(capsys, tmp_path, monkeypatch, small_manifest, mini):
+    from palpate.encoders.towers import Towers
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Towers, "load", lambda *_, **__: mini)
+    small_manifest.save(Path("m/manifest.parquet"))
+    args = ("--generated", "a", "--reference", "m", "--encoder", "palpate/mini", "--companions", "none", "--permutations", "0")
+    values = []
+    for seed in (0, 1):
+        paint(tmp_path / "a", small_manifest.ids, seed, suffix=".bmp")
+        for file in (tmp_path / "a").rglob("*.bmp"):
+            os.utime(file, ns=(10**18, 10**18))
+        found, _ = score(capsys, *args, "--cache", "kept")
+        values.append(found["TMMD", "a", "grouped"]["value"])
+        assert values[-1] == pytest.approx(score(capsys, *args)[0]["TMMD", "a", "grouped"]["value"], rel=1e-6)
+    assert values[0] != values[1]

@@ -198,3 +198,38 @@ def test_a_split_parts_the_generated_rows_as_well_by_id(capsys, sets):
     FeatureSet([*IDS[:-1], "stray"], sets["g"].features).save(Path("stray.npz"))
     err = refused(capsys, "--generated", "stray.npz", *PAIR[2:])
     assert "gives labels and groups by id. Got 1 of 40 without, first 'stray'" in err
+
+
+def test_a_file_of_groups_without_groups_and_a_cache_inside_what_is_read_are_refused(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    for name in ("a", "r"):
+        x = rng.normal(size=(12, 4))
+        np.save(f"{name}.npy", x / np.linalg.norm(x, axis=1, keepdims=True))
+    Path("g.csv").write_text("id,material\n" + "".join(f"{k},Wood\n" for k in range(12)))
+    base = ("--generated", "a.npy", "--reference", "r.npy")
+    Path("pics").mkdir()
+    for extra, word in (
+        (("--groups", "g.csv"), "must have a column video"),
+        (("--cache", "c"), "--cache must go with pictures"),
+        (("--cache", "g.csv"), "--cache must be a folder of its own"),
+        (("--companions", "none", "fid"), "--companions must be none, or names"),
+    ):
+        status, _, err = call(capsys, *base, *extra)
+        assert (status, word in err) == (2, True), err
+    assert not Path("c").exists()
+    pictures = ("--generated", "pics", "--reference", "pics", "--companions", "psnr")
+    for extra, word in ((("--cache", "pics/c"), "a folder of its own"), (("--presets", "cmmd"), "--presets must go with features")):
+        status, _, err = call(capsys, *pictures, *extra)
+        assert (status, word in err) == (2, True), err
+
+
+def test_a_preset_that_is_named_twice_is_scored_once(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    for name in ("a", "r"):
+        x = rng.normal(size=(12, 4))
+        np.save(f"{name}.npy", x / np.linalg.norm(x, axis=1, keepdims=True))
+    args = ("--generated", "a.npy", "--reference", "r.npy", "--presets", "paper", "paper", "--companions", "none", "--permutations", "0")
+    _, data = score(capsys, *args)
+    assert [s["metric"] for s in data["scores"]].count("TMMD") == 1

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from palpate.core import FeatureSet
 from palpate.metrics import ci_tmmd, d_tmmd, four_scores, i_tmmd
 from test_metrics_tactile import change, keep, world
 
@@ -92,3 +93,19 @@ def test_a_generator_of_some_classes_has_the_floor_of_these(preset):
     unknown = four_scores(r, g, floor=g, preset=preset, permutations=0)  # and classes that no real touch shows have none
     assert unknown[2].details["E_floor"] is None
     assert unknown[2].floor is None
+
+
+@pytest.mark.parametrize("preset", ["cmmd", "paper-tables"])
+def test_biased_halves_have_a_floor_of_as_many_samples_alone(preset):
+    rng = np.random.default_rng(5)
+
+    def drawn(n, prefix):
+        x = rng.normal(size=(n, 6)) + 2
+        return FeatureSet([f"{prefix}{k}" for k in range(n)], x / np.linalg.norm(x, axis=1, keepdims=True), [f"m{k % 3}" for k in range(n)])
+
+    few, many, equal = drawn(60, "a"), drawn(240, "b"), drawn(60, "c")
+    for score in four_scores(few, many, floor=many, preset=preset, permutations=0)[1:]:
+        assert score.floor is None
+        assert "other numbers of samples" in score.note
+    assert all(s.floor is not None for s in four_scores(few, equal, floor=equal, preset=preset, permutations=0)[1:])
+    assert all(s.floor is not None for s in four_scores(few, many, floor=many, preset="paper", permutations=0)[1:])

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from palpate.core import FeatureSet, PalpateError
 from palpate.metrics import blocked, i_tmmd, mmd2
+from palpate.metrics.arrays import Ops
 from palpate.metrics.blocked import blocked_sums
 from palpate.metrics.intervals import random_halves_sd
 from palpate.metrics.kernels import Gaussian
@@ -247,3 +248,26 @@ def test_cpu_tensors_are_taken():
 def test_import_needs_no_torch():
     code = "import sys, palpate.metrics; sys.exit(any(m in sys.modules for m in ('torch', 'polars', 'PIL')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("least", [0.01, 0.02, 0.1, 0.5])
+def test_the_series_of_expm1_has_no_direction(least):
+    x = (-least * np.random.default_rng(0).random((300, 700))).astype(np.float32)
+    exact = np.expm1(x.astype(np.float64))
+    found = Ops().expm1_(x.copy(), -least)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, exact, rtol=3e-7, atol=6e-10)
+    assert abs((found - exact).mean()) < 2e-10 + 2e-9 * least  # NumPy's own errs by 5e-10 on some machines
+    x[0, 0] = -3
+    np.testing.assert_allclose(Ops().expm1_(x.copy(), -3.0), np.expm1(x), rtol=1e-6)
+
+
+@pytest.mark.parametrize("sigma", [8.0, 10.0])
+@pytest.mark.parametrize("rows", [(3000, 3000), (600, 1100)])
+def test_float32_keeps_its_promise_where_two_sets_are_far_apart(sigma, rows):
+    rng = np.random.default_rng(3)
+    x, y = (rng.normal(size=(n, 64)) + side * np.eye(64)[0] * 4 for n, side in zip(rows, (1, -1), strict=True))
+    x, y = ((v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32) for v in (x, y))
+    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    assert exact > 5
+    assert mmd2(x, y, sigma=sigma, backend="blocked") == pytest.approx(exact, abs=1e-6)

@@ -289,3 +289,23 @@ def test_an_excess_that_moments_do_not_bound_is_undefined(bound, note):
         return
     assert (found.value, found.interval, found.details["bound"]) == (3.0, (2.0, 4.0), bound)
     assert found.note == note
+
+
+def test_the_p_value_of_a_metric_without_direction_is_that_of_the_gap_to_the_floor(three):
+    r, generators = three
+    sets = {"near": generators["near"], "far": generators["far"]}
+    d = {x.metric: x for x in compare(sets, r, floor=r, permutations=0).differences}["I-TMMD difference"]
+    groups = sorted(set(r.groups))
+    value = lambda s: i_tmmd(s).value  # noqa: E731
+    design = i_tmmd(r).value / i_tmmd(r).details["E"]  # what E is multiplied by; leaving out a video keeps it
+    out = np.array([[design * i_tmmd(keep(s, np.array(s.groups) != g)).details["E"] for s in (*sets.values(), r)] for g in groups])
+    for name, got, values in (
+        ("p_value", d.details["gap"], np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2])),
+        ("p_difference", value(sets["near"]) - value(sets["far"]), out[:, 0] - out[:, 1]),
+    ):
+        error = np.sqrt(14 / 15 * ((values - values.mean()) ** 2).sum())
+        assert d.details[name] == pytest.approx(2 * stats.t.sf(abs(got) / error, 14), rel=1e-6)
+    assert d.details["p_adjusted"] == d.details["p_value"]
+    assert d.details["p_value"] == pytest.approx(2 * min(d.details["p_better"], 1 - d.details["p_better"]))
+    bare = {x.metric: x for x in compare(sets, r, permutations=0).differences}["I-TMMD difference"]
+    assert bare.details["p_value"] == pytest.approx(d.details["p_difference"])

@@ -66,7 +66,7 @@ class Options(Common):
     group: Literal["auto", "video", "touch", "object"] = "auto"
     """What stays together in halves and intervals; `auto` takes what the split kept whole, else the video."""
     cache: Path | None = None
-    """Folder that keeps embeddings and decoded pictures. Default: one beside -o, for a run that is stopped; removed at the end."""
+    """Folder that keeps embeddings of what was read (with MANIFEST those of the real touches). Default: one beside -o, for a run that is stopped; removed at the end."""
     controls: Annotated[bool, tyro.conf.FlagConversionOff] = True
     """With MANIFEST and --split: score the empty gel and real touches of the same material as well (True or False)."""
     seed: int = 0
@@ -79,7 +79,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.cli.scoring_tables import show
 
     _check(options)
-    inputs = [p for p in (options.manifest, options.reference, options.split, options.labels, options.groups, *options.generated) if p]
+    inputs = _inputs(options)
     if options.output:
         guard_output(options.output, inputs)
     if options.latex:
@@ -107,6 +107,11 @@ def _save(options: Options, results: Results) -> None:
         from palpate.report.latex import latex_tables
 
         write_text(options.latex, latex_tables(results))
+
+
+def _inputs(options: Options) -> list[Path]:
+    """Everything that is read."""
+    return [p for p in (options.manifest, options.reference, options.split, options.labels, options.groups, *options.generated) if p]
 
 
 def _cache(options: Options) -> Path | None:
@@ -162,6 +167,12 @@ def _check(options: Options) -> None:
         if getattr(options, flag) is not None and options.companions is not None and not set(kinds) & set(options.companions):
             fix = f"Add {kinds[0]} to --companions, or leave --{flag} out"
             raise PalpateError(f"--{flag} must have a score to make", f"--companions {' '.join(options.companions)}", fix)
+    if options.companions is not None and "none" in options.companions and len(options.companions) > 1:
+        raise PalpateError("--companions must be none, or names", " ".join(options.companions), "Leave none out, or all others")
+    if options.cache is not None and (
+        options.cache.is_file() or any(options.cache.resolve().is_relative_to(p.resolve()) for p in _inputs(options))
+    ):
+        raise PalpateError("--cache must be a folder of its own", str(options.cache), "Name another one, outside what is read")
     if options.permutations < 0:
         raise PalpateError("--permutations must not be negative", str(options.permutations), "0 makes none")
     if not options.sigma:

@@ -51,7 +51,7 @@ def score(options: Options, terminal: Terminal, cache: Path | None, progress: Pr
 
     split = None if options.split is None else Split.load(options.split)
     asked = Asked(
-        presets=options.presets or None, sigmas=sigmas(options), estimator=options.estimator, backend=options.backend,
+        presets=tuple(dict.fromkeys(options.presets)) or None, sigmas=sigmas(options), estimator=options.estimator, backend=options.backend,
         permutations=options.permutations, normalize={"check": "check", "yes": True, "no": False}[options.normalize], seed=options.seed,
         split=split.digest if split else None,
     )  # fmt: skip
@@ -92,10 +92,10 @@ def _columns(options: Options, group: str) -> Columns | None:
     """Labels and groups from one or two files."""
     labels = read_columns(options.labels, group) if options.labels else None
     groups = read_columns(options.groups, group) if options.groups else None
+    if groups is not None and groups.groups is None:
+        raise PalpateError(f"{options.groups} must have a column {group}", "only labels", "Pass it as --labels")
     if labels is None or groups is None or options.labels == options.groups:
         return labels or groups
-    if groups.groups is None:
-        raise PalpateError(f"{options.groups} must have a column {group}", "only labels", "Pass it as --labels")
     return replace(labels, groups=groups.of(labels.ids)[1])
 
 
@@ -159,6 +159,9 @@ def _of_pictures(
     if options.encoder is None and (options.companions is None or set(options.companions) <= {"none"}):
         fix = "Pass --encoder palpate/mini, a folder of palpate encoder or a hub id; or ask for scores of pixels alone: --companions ssim psnr"
         raise PalpateError("Pictures must have an encoder to be scored with", "no --encoder", fix)
+    if options.encoder is None and (options.presets or options.estimator):
+        given = "--presets" if options.presets else "--estimator"
+        raise PalpateError(f"{given} must go with features", "pictures without --encoder", "Pass --encoder palpate/mini, or leave it out")
     if options.encoder is not None or set(options.companions or ()) & {*ON_FEATURES, "lpips"}:
         require_extra("palpate score with an encoder")
     elif any(is_generated(p) for p in (*paths.values(), options.reference)) and importlib.util.find_spec("torch") is None:
@@ -288,7 +291,7 @@ def _refuse(options: Options, columns: Columns | None) -> None:
     pixels = [c for c in options.companions or () if c not in (*ON_FEATURES, "none")]
     if pixels:
         raise PalpateError(f"{pixels[0]} must have pictures", "embeddings", "Pass folders of images, or leave it out")
-    for name in ("encoder", "inception", "clip", "lpips"):
+    for name in ("encoder", "inception", "clip", "lpips", "cache"):
         if getattr(options, name) is not None:
             raise PalpateError(f"--{name} must go with pictures", "embeddings, which were made already", "Leave it out")
 

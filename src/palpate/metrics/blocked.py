@@ -25,8 +25,8 @@ from palpate.metrics.sums import PairSums, split_by
 
 #: Up to this many rows float64 costs nothing; few pairs would not average float32 rounding away.
 FLOAT64_BELOW = 1024
-#: In segments of fewer rows the features may reach only so much of the kernel's limit: sigma >= 9 for unit-norm features.
-MANY_ROWS, FEW = 512, 0.05
+#: In segments of fewer rows than the first number, features may reach only so much of the kernel's limit (0.05 is sigma >= 9 for unit norm).
+ROOM = ((16, 0.01), (512, 0.05))
 #: Blocks are not made smaller than this for speed; the caller may ask for less.
 SMALL_BLOCK = 256
 #: Up to this many items their sums with one another are kept (34 MB).
@@ -99,7 +99,7 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> An
     The Gaussian's are centred, which changes no distance, and in units of its bandwidth; other kernels take rows as they are, in float64. ``smallest``: rows of the smallest
     segment, over which float32 rounding must average away.
     """
-    limit = kernel.radius_limit * (1.0 if smallest >= MANY_ROWS else FEW)
+    limit = kernel.radius_limit * next((share for rows, share in ROOM if smallest < rows), 1.0)
     if type(ops) is not Ops:  # on a device: one expression
         wide = ops.xp.astype(ops.xp.take(x, ops.xp.asarray(order, device=ops.device), axis=0), ops.xp.float64)  # type: ignore[attr-defined]
         z = (wide - ops.xp.mean(wide, axis=0)) / kernel.unit if isinstance(kernel, Gaussian) else wide  # type: ignore[attr-defined]

@@ -9,7 +9,8 @@ probability of a hypothesis, and it is not adjusted for the number of pairs; ``p
 
 Metrics without reference have no better direction but towards the floor, what real touches score: collapse is lowest. There a is better where
 its distance to the floor is smaller, ``gap = |a - floor| - |b - floor|`` is what p_better and ``better`` speak of, and the floor is
-left-one-out along with the generators. Without a floor neither is given.
+left-one-out along with the generators, and the p-value is that of the gap (``p_difference`` is that of a - b). Without a floor neither
+is given, and the p-value is that of a - b.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
 
     Returns:
         ``details``: ``a``, ``b``, ``better`` (a name or None), ``p_better``, ``decided`` (whether the interval of what decides leaves out 0),
-        ``p_value``, and for metrics without reference ``gap`` and ``gap_interval``.
+        ``p_value``, and for metrics without reference ``gap``, ``gap_interval`` and ``p_difference``.
 
     Raises:
         PalpateError: if the two scores are of different settings.
@@ -182,11 +183,13 @@ def _decide(
     if x.higher_is_better is None:
         if floor is None or floor.score.value is None or x.value is None or y.value is None:
             return
-        if not same_units(a, floor):
+        if not same_units(a, floor) or x.details.get("classes") != floor.score.details.get("classes"):
             return
         value = abs(x.value - floor.score.value) - abs(y.value - floor.score.value)
-        found = _interval(value, np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates), x.level)
-        details |= {"gap": value, "gap_interval": found[0]}
+        gaps = np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates)
+        found = _interval(value, gaps, x.level)
+        p = None if found[0] is None else 2 * min(found[1], _interval(-value, gaps, x.level)[1])
+        details |= {"gap": value, "gap_interval": found[0], "p_difference": details["p_value"], "p_value": p}
     interval, below = found
     sign = -value if x.higher_is_better else value
     details["better"] = x.subject if sign < 0 else y.subject if sign > 0 else None
@@ -224,7 +227,13 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
         error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
         ahead, behind = (float(special.stdtr(df, s / error)) for s in (sign, -sign))  # either tail keeps its digits
         details |= {"p_better": ahead, "p_value": 2 * min(ahead, behind), "decided": not interval[0] <= 0 <= interval[1]}
-    note = "Undefined: no pair of images has a value" if value is None else "" if interval else "No interval: too few groups or images"
+    note = (
+        "Undefined: no pair of images has a value"
+        if value is None
+        else ""
+        if interval
+        else "No interval: one image or one group, or no variation between them"
+    )
     return replace(
         x,
         metric=f"{x.metric} difference",

@@ -21,7 +21,7 @@ from palpate.metrics.sums import PairSums
 from palpate.metrics.tables import Estimate, Table
 
 RANDOM_NOTE = (
-    "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; give groups for halves of whole videos"
+    "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; halves of whole videos do (preset grouped)"
 )
 
 

@@ -31,6 +31,12 @@ Images = NDArray[np.uint8]
 ON_PAIRS = ("ssim", "psnr", "ms-ssim", "contact", "lpips")
 #: Those that look at the gel without contact where it is known.
 ON_GEL = frozenset({"contact", "lpips"})
+#: What is said where it is not.
+NO_GEL = (
+    "Contact scores must have the gel without contact of every touch",
+    "touches without",
+    "Pass a manifest with the column background as --reference, or leave contact out of --companions",
+)
 #: Name of a contact score -> its field of :class:`palpate.metrics.contact.Contacts`.
 CONTACT = {
     "contact residual": "residual", "contact SSIM": "ssim", "contact PSNR": "psnr", "contact IoU": "iou", "contact MS-SSIM": "ms_ssim",
@@ -126,8 +132,7 @@ def _contact(
     pictures: Mapping[str, Images], real: Images, background: Images | None, compared: Sequence[str], common: Mapping[str, Any]
 ) -> Outcome:
     if background is None:
-        fix = "Pass a manifest with the column background as --reference, or leave contact out of --companions"
-        raise PalpateError("Contact scores must have the gel without contact of every touch", "touches without", fix)
+        raise PalpateError(*NO_GEL)
     found = {name: contact_scores(images, real, background, subject=name, **common) for name, images in pictures.items()}
     out = Outcome([s for scores in found.values() for s in scores])
     if len(compared) > 1:

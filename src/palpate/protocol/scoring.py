@@ -26,7 +26,7 @@ from palpate.encoders.towers import Towers
 from palpate.generate import Generated
 from palpate.protocol.companions import ON_GEL, Weights, picture_companions, split_off, standard_companions
 from palpate.protocol.comparing import BACKGROUND, REAL, SAME_MATERIAL, Asked, Outcome, against, compare_features, feature_companions
-from palpate.protocol.touches import TOUCH, Wanted, files_digest
+from palpate.protocol.touches import TOUCH, Wanted, files_digest, own_cache
 
 
 def score_generated(
@@ -119,6 +119,7 @@ def compare_generated(
     wanted = Wanted.of(companions, weights, encoder=True, background=gel)
     size = read_image(next(iter(generated.values())).paths[0]).size[0]
     real = load_images(test.paths("tactile"), size, progress=progress)
+    cache = None if cache is None else own_cache(cache, test, train)
     features = embed(test, towers, "touch", groups=group, cache=cache, keep_pixels=False, progress=progress)
     train_features = embed(train, towers, "touch", groups=group, cache=cache, keep_pixels=False, progress=progress)
     pictures = {name: load_images([folder.path(i) for i in test.ids], size, progress=progress) for name, folder in generated.items()}

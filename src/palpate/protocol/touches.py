@@ -22,7 +22,7 @@ from palpate.core import FeatureSet, PalpateError, Progress, digest_json, quiet,
 from palpate.data.images import cached_images, load_images, read_image
 from palpate.data.manifest import Manifest
 from palpate.metrics.pairwise import paired_by_id
-from palpate.protocol.companions import ON_GEL, ON_PAIRS, Weights, picture_companions, standard_companions
+from palpate.protocol.companions import NO_GEL, ON_GEL, ON_PAIRS, Weights, picture_companions, standard_companions
 from palpate.protocol.comparing import ON_FEATURES, Asked, Outcome, against, compare_features, feature_companions
 
 if TYPE_CHECKING:
@@ -128,6 +128,8 @@ def compare_touches(
     background = not reference.table["background"].null_count()
     wanted = Wanted.of(companions, weights, encoder=towers is not None, background=background)
     pairs = _paired(generators, reference, wanted)
+    if "contact" in wanted.pairs and pairs and not background:
+        raise PalpateError(*NO_GEL)
     sets = {name: _set(made, towers, group, cache, progress) for name, made in generators.items()}
     real = _set(reference, towers, group, cache, progress)
     out = Outcome()
@@ -156,14 +158,16 @@ def _set(touches: Manifest, towers: Towers | None, group: str, cache: Path | Non
     if towers is not None:
         from palpate.encoders.embed import embed
 
-        return embed(touches, towers, "touch", groups=group, cache=cache and _own(cache, touches), keep_pixels=False, progress=progress)
+        return embed(
+            touches, towers, "touch", groups=group, cache=cache and own_cache(cache, touches), keep_pixels=False, progress=progress
+        )
     column = lambda name: None if touches.table[name].null_count() == len(touches) else [v or "" for v in touches.column(name)]  # noqa: E731
     return FeatureSet(touches.ids, np.zeros((len(touches), 1), np.float32), column("material"), column(group))
 
 
-def _own(cache: Path, touches: Manifest) -> Path:
-    """A folder for one source of pictures: two generators may have files of one name, size and time."""
-    return cache / short(digest_json(str(touches.root.resolve())))
+def own_cache(cache: Path, *sources: Manifest) -> Path:
+    """A folder for the bytes of one source of pictures: two generators, or the same one a day later, may have files of one name, size and time."""
+    return cache / short(digest_json([files_digest(touches.ids, touches.paths("tactile")) for touches in sources]))
 
 
 def _paired(generators: Mapping[str, Manifest], reference: Manifest, wanted: Wanted) -> bool:
@@ -281,5 +285,5 @@ def _shape(path: Path) -> tuple[int, int]:
 def _load(touches: Manifest, column: str, size: int, folder: Path, progress: Progress) -> Images:
     """Pictures as squares; many of them in a file."""
     if len(touches) * size * size * 3 > HELD:
-        return cached_images(touches, column, size, _own(folder, touches), progress)
+        return cached_images(touches, column, size, own_cache(folder, touches), progress)
     return load_images(touches.paths(column), size, progress=progress)
