@@ -177,7 +177,7 @@ def test_small_images_and_bad_batches_are_refused(network):
     first, second = pairs(2, 32, 31)
     with pytest.raises(PalpateError, match=r"at least 32 x 32 for LPIPS\. Got 32 x 31"):
         lpips_per_image(first, second, network)
-    with pytest.raises(PalpateError, match="--batch must be at least 1"):
+    with pytest.raises(PalpateError, match="batch must be a whole number"):
         lpips_per_image(*pairs(2, 32, 32), network, batch=0)
 
 

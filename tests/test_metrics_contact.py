@@ -325,7 +325,7 @@ def spoilt(x, value):
         (MADE[0], REAL[0], REAL_BACKGROUND[0], {}, ["shape (n, h, w, 3)"]),
         (MADE[:, :10], REAL[:, :10], REAL_BACKGROUND[:, :10], {}, ["11 x 11", "10 x 48"]),
         (MADE, REAL, REAL_BACKGROUND, {"markers": "drop"}, ["markers", "skip, keep"]),
-        (MADE, REAL, REAL_BACKGROUND, {"least": 0}, ["least", "positive"]),
+        (MADE, REAL, REAL_BACKGROUND, {"least": 0}, ["least", "(0, 1)"]),
         ([[1], [1, 2]], REAL, REAL_BACKGROUND, {}, ["NumPy array"]),
     ],
 )
