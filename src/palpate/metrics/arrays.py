@@ -44,19 +44,31 @@ class Ops:
         """(n,) ones of the type of ``like``."""
         return np.ones(n, dtype=like.dtype)
 
-    def expm1_(self, x: Any, least: float) -> Any:
-        """``expm1`` of numbers from ``least`` to 0, in place.
+    def like(self, x: Any, other: Any) -> Any:
+        """``x`` in the type of ``other``."""
+        return x.astype(other.dtype)
+
+    def add_outer_(self, k: Any, rows: Any, columns: Any) -> Any:
+        """``k`` plus a number a row and a number a column, in place."""
+        k += rows[:, None]
+        k += columns
+        return k
+
+    def expm1_(self, x: Any, least: float, shift: tuple[Any, Any] | None = None) -> Any:
+        """``expm1`` of numbers from ``least`` to 0, in place, after ``shift`` was added: a number a row and a number a column.
 
         NumPy's in float32 errs by up to an ulp in one direction, which no number of pairs averages out: 1e-6 of MMD^2 at scale 1000. Near 0
         the series is summed instead, a few rows at a time, so that they stay in the cache; its rounding has no direction.
         """
         if x.dtype != np.float32 or not x.size or not least >= -SERIES:
-            return np.expm1(x, out=x)
+            return np.expm1(x if shift is None else self.add_outer_(x, *shift), out=x)
         terms = next(t for t in range(3, len(FACTORIALS)) if (-least) ** (t + 1) <= LEFT_OUT * FACTORIALS[t])
         step = max(1, CACHED // x.shape[-1])
         room = np.empty((step, *x.shape[1:]), x.dtype)
         for k in range(0, len(x), step):
             part = x[k : k + step]
+            if shift is not None:
+                self.add_outer_(part, shift[0][k : k + step], shift[1])
             rest = np.multiply(part, np.float32(1 / FACTORIALS[terms - 1]), out=room[: len(part)])
             for t in range(terms - 2, 0, -1):
                 rest += np.float32(1 / FACTORIALS[t])
@@ -147,9 +159,17 @@ class ArrayApiOps(Ops):
         """(n,) ones of the type of ``like``."""
         return self.xp.ones(n, dtype=like.dtype, device=self.device)
 
-    def expm1_(self, x: Any, least: float) -> Any:
+    def like(self, x: Any, other: Any) -> Any:
+        """``x`` in the type of ``other``."""
+        return self.xp.astype(x, other.dtype)
+
+    def add_outer_(self, k: Any, rows: Any, columns: Any) -> Any:
+        """``k`` plus a number a row and a number a column."""
+        return k + rows[:, None] + columns
+
+    def expm1_(self, x: Any, least: float, shift: tuple[Any, Any] | None = None) -> Any:
         """``expm1``."""
-        return self.xp.expm1(x)
+        return self.xp.expm1(x if shift is None else self.add_outer_(x, *shift))
 
     def scale_(self, x: Any, factor: float) -> Any:
         """``x * factor``."""

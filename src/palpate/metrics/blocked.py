@@ -1,7 +1,7 @@
 """Kernel sums from blocks of pairs, each block once; the N x N matrix never exists.
 
-* Rows are centred and rounded *once*; ``z`` is what came out. One product of augmented rows gives the exponent of the Gaussian, with
-  norms of the same rounded ``z``; ``expm1`` in place.
+* Rows are centred and rounded *once*; ``z`` is what came out. One product and norms of the same rounded ``z`` give the exponent of the
+  Gaussian; ``expm1`` in place.
 * Samples are sorted so that items are contiguous; a block is summed by products with indicator columns, and the sums are added up in
   float64. A sum in float32 thus never runs over more than one block, and its rounding errors average out over the rows.
 * Blocks below the diagonal are the transposes of those above. They are worked off in threads, and added up in a fixed order: the result does
@@ -31,7 +31,7 @@ ROOM = ((16, 0.01), (512, 0.05))
 SMALL_BLOCK = 256
 #: Up to this many items their sums with one another are kept (34 MB).
 MOST_ITEMS = 2048
-SLAB = 4096
+SLAB, SMALL = 4096, 512
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,12 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> An
     radius = max((float(((x[at] - mean) ** 2).sum(axis=1).max()) for at in slabs), default=0.0)
     _require_known_distances(radius, kernel)
     wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or radius > limit
-    z = np.empty(x.shape, dtype=np.float64 if wide else np.float32)
-    for at in slabs:
-        z[at] = (x[order[at]] - mean) / kernel.unit
+    z, room = np.empty(x.shape, dtype=np.float64 if wide else np.float32), np.empty((min(SMALL, len(order)), x.shape[1]))
+    for i in range(0, len(order), SMALL):  # through one small buffer: fresh memory costs more than the arithmetic
+        rows = room[: len(order[i : i + SMALL])]
+        np.subtract(x[order[i : i + SMALL]], mean, out=rows)
+        rows /= kernel.unit
+        z[i : i + SMALL] = rows
     return z
 
 
@@ -143,6 +146,7 @@ class _Run:
     ) -> None:
         self.kernel, self.ops, self.cell, n = kernel, ops, cell, len(cell)
         self.left, self.right = kernel.augment(z, ops)
+        self.shift = kernel.shift(z, ops)
         self.radius = max((float(ops.numpy(ops.squares(z[k : k + SLAB])).max()) for k in range(0, n, SLAB)), default=0.0)
         block = max(1, min(block, max(SMALL_BLOCK, -(-n // 8))))  # an eighth of the rows: little of the diagonal blocks is done twice
         self.blocks = [slice(i, min(i + block, n)) for i in range(0, n, block)]
@@ -165,7 +169,8 @@ class _Run:
     def _block(self, pair: tuple[int, int]) -> tuple[Array, Array | None, list[tuple[int, Array, Array | None, float]]]:
         i, j = pair
         rows, columns = self.blocks[i], self.blocks[j]
-        k = self.kernel.values(self.left[rows] @ self.right[columns].T, self.ops, self.radius)
+        shift = None if self.shift is None else (self.shift[rows], self.shift[columns])
+        k = self.kernel.values(self.left[rows] @ self.right[columns].T, self.ops, self.radius, shift)
         if i == j:
             k = self.ops.clear_diagonal(k)
         across = self.ops.numpy(k @ self.marks[j])  # (rows, cells of j)

@@ -51,11 +51,22 @@ class Kernel(Protocol):
         ...
 
     def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
-        """Left and right factors (n, d'), so that ``left @ right.T`` is what :meth:`values` takes."""
+        """Left and right factors (n, d'), whose product ``left @ right.T`` :meth:`values` takes."""
         ...
 
-    def values(self, product: Any, ops: Ops, radius: float) -> Any:
-        """Kernel values of a block, in place where the array library can; ``radius`` is the largest squared norm of a row."""
+    def shift(self, x: Any, ops: Ops) -> Any:
+        """(n,) what each row adds to its products, of the type of ``x``; or None."""
+        ...
+
+    def values(self, product: Any, ops: Ops, radius: float, shift: tuple[Any, Any] | None) -> Any:
+        """Kernel values of a block, in place where the array library can.
+
+        Args:
+            product: of some rows with others.
+            ops: of their library.
+            radius: the largest squared norm of a row.
+            shift: what :meth:`shift` gave for the rows on either side.
+        """
         ...
 
     def diagonal(self, x: Any, ops: Ops) -> Array:
@@ -98,16 +109,21 @@ class Gaussian:
         return self.sigmas[0]
 
     def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
-        """``[x, -||x||^2 / 2, 1] . [y, 1, -||y||^2 / 2] = -||x - y||^2 / 2``, with norms of the same rounded rows."""
-        norms, ones = -0.5 * ops.squares(x), ops.ones(len(x), x)
-        return ops.columns(x, norms, ones), ops.columns(x, ones, norms)
+        """The rows themselves."""
+        return x, x
 
-    def values(self, product: Any, ops: Ops, radius: float) -> Any:
-        """``expm1(product)``, averaged over the bandwidths; no two rows are farther apart than twice the radius."""
+    def shift(self, x: Any, ops: Ops) -> Any:
+        """``-||x||^2 / 2`` of the same rounded rows: ``x.y - ||x||^2 / 2 - ||y||^2 / 2 = -||x - y||^2 / 2``."""
+        return ops.like(-0.5 * ops.squares(x), x)
+
+    def values(self, product: Any, ops: Ops, radius: float, shift: tuple[Any, Any] | None) -> Any:
+        """``expm1(product + shifts)``, averaged over the bandwidths; no two rows are farther apart than twice the radius."""
         first, *others = self.sigmas
+        if others and shift is not None:
+            product, shift = ops.add_outer_(product, *shift), None
         factors = [(first / sigma) ** 2 for sigma in others]
         rest = [ops.expm1_(product * f, -2 * radius * f) for f in factors]
-        k = ops.expm1_(product, -2 * radius)
+        k = ops.expm1_(product, -2 * radius, shift)
         for other in rest:
             k += other
         return ops.scale_(k, 1 / len(self.sigmas))
@@ -159,7 +175,11 @@ class Polynomial:
         ones = ops.ones(len(x), x)
         return ops.columns(gamma * x, self.coef0 * ones), ops.columns(x, ones)
 
-    def values(self, product: Any, ops: Ops, radius: float) -> Any:
+    def shift(self, x: Any, ops: Ops) -> Any:
+        """Nothing."""
+        return
+
+    def values(self, product: Any, ops: Ops, radius: float, shift: tuple[Any, Any] | None) -> Any:
         """The power."""
         k = product
         for _ in range(self.degree - 1):
@@ -196,7 +216,11 @@ class Linear:
         """The rows themselves."""
         return x, x
 
-    def values(self, product: Any, ops: Ops, radius: float) -> Any:
+    def shift(self, x: Any, ops: Ops) -> Any:
+        """Nothing."""
+        return
+
+    def values(self, product: Any, ops: Ops, radius: float, shift: tuple[Any, Any] | None) -> Any:
         """The product."""
         return product
 
