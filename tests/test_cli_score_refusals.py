@@ -200,12 +200,17 @@ def test_a_split_parts_the_generated_rows_as_well_by_id(capsys, sets):
     assert "gives labels and groups by id. Got 1 of 40 without, first 'stray'" in err
 
 
-def test_a_file_of_groups_without_groups_and_a_cache_inside_what_is_read_are_refused(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def two_files():
+    """a.npy and r.npy: 12 unit rows each, here."""
     rng = np.random.default_rng(0)
     for name in ("a", "r"):
         x = rng.normal(size=(12, 4))
         np.save(f"{name}.npy", x / np.linalg.norm(x, axis=1, keepdims=True))
+
+
+def test_a_file_of_groups_without_groups_and_a_cache_inside_what_is_read_are_refused(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    two_files()
     Path("g.csv").write_text("id,material\n" + "".join(f"{k},Wood\n" for k in range(12)))
     base = ("--generated", "a.npy", "--reference", "r.npy")
     Path("pics").mkdir()
@@ -226,10 +231,7 @@ def test_a_file_of_groups_without_groups_and_a_cache_inside_what_is_read_are_ref
 
 def test_a_preset_that_is_named_twice_is_scored_once(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rng = np.random.default_rng(0)
-    for name in ("a", "r"):
-        x = rng.normal(size=(12, 4))
-        np.save(f"{name}.npy", x / np.linalg.norm(x, axis=1, keepdims=True))
+    two_files()
     args = ("--generated", "a.npy", "--reference", "r.npy", "--presets", "paper", "paper", "--companions", "none", "--permutations", "0")
     _, data = score(capsys, *args)
     assert [s["metric"] for s in data["scores"]].count("TMMD") == 1

@@ -42,7 +42,7 @@ class Options(Common):
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
     latex: Path | None = None
-    """Write the tables as LaTeX (booktabs)."""
+    """Write the tables as LaTeX (booktabs; longtable for many differences)."""
     presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ()
     """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole videos together. Default: both, or `paper` without groups."""
     sigma: tuple[str, ...] = ("10",)

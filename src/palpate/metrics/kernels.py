@@ -1,7 +1,7 @@
 """Kernels: what is summed over pairs, and how wide it is.
 
-Every kernel is given as a function of one matrix product of augmented features, so that a block of kernel values costs one product and
-one pass in place. A constant that is added to a kernel cancels in every MMD estimator; the Gaussian is therefore summed as
+Every kernel is given as a function of one matrix product, and a number a row, so that a block of kernel values costs one product and
+little more, in place. A constant that is added to a kernel cancels in every MMD estimator; the Gaussian is therefore summed as
 ``k - 1 = expm1(-||x - y||^2 / (2 sigma^2))``: on unit-norm features with sigma = 10, k lies in [0.98, 1], and sums of k itself in float32
 lose what matters.
 
@@ -80,7 +80,9 @@ class Kernel(Protocol):
 
 def checked_kernel(kernel: Any) -> None:
     """Refuses what is no kernel; None stands for the Gaussian of ``sigma``."""
-    if kernel is not None and not all(hasattr(kernel, name) for name in ("augment", "values", "diagonal", "settings")):
+    if kernel is not None and not all(
+        hasattr(kernel, name) for name in ("radius_limit", "unit", "augment", "shift", "values", "diagonal", "settings")
+    ):
         raise PalpateError(
             "kernel must be a kernel, e.g. Gaussian(), Polynomial() or Linear()", repr(kernel), "Import it from palpate.metrics"
         )

@@ -112,7 +112,8 @@ def prdc_rows(
     inside, note = _compare(sets[0], sets[1], progress), copies_note(copies_across(x, y), len(x))
     settings = {"k": k, "grouped": grouped, "normalize": normalize, "inside": "<"}
     common: dict[str, Any] = {
-        "subject": subject, "level": level, "estimator": "per-row mean", "n": len(x), "m": len(y), "encoder": generated.encoder, "reference": reference.digest,
+        "subject": subject, "level": level, "estimator": "per-row mean", "n": len(x), "m": len(y), "encoder": generated.encoder,
+        "reference": reference.digest,
         "split": split, "higher_is_better": True, "settings": settings,
     }  # fmt: skip
     rows = {

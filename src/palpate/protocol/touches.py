@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,7 +151,13 @@ def files_digest(ids: Sequence[str], paths: Sequence[Path]) -> str:
 
     The same for a copied folder, and free of the rounding of embeddings, which another machine rounds otherwise.
     """
-    return digest_json(sorted([i, hashlib.sha256(path.read_bytes()).hexdigest()] for i, path in zip(ids, paths, strict=True)))
+    return digest_json(sorted([i, _bytes_digest(path, path.stat().st_ctime_ns)] for i, path in zip(ids, paths, strict=True)))
+
+
+@lru_cache(maxsize=1 << 20)
+def _bytes_digest(path: Path, _changed: int) -> str:
+    """SHA-256 of a file, read once a run: several digests and caches ask for it. The time of its last change cannot be set back."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _set(touches: Manifest, towers: Towers | None, group: str, cache: Path | None, progress: Progress) -> FeatureSet:
