@@ -49,6 +49,16 @@ def test_every_generated_picture_is_compared_with_that_of_its_id(tmp_path, small
     assert {s.metric for s in found.scores} > compared
 
 
+@pytest.mark.parametrize("name", ["real", "background only", "real, same material"])
+def test_no_generator_bears_the_name_of_a_control(tmp_path, small_manifest, name):
+    ids = small_manifest.ids
+    split = Split.from_ids(train=ids[:16], test=ids[16:], rule={"group": "video"}, manifest=small_manifest.digest)
+    pictures(tmp_path / "made", ids[16:], 1)
+    folder = Generated(tmp_path / "made", {i: f"{i}.png" for i in ids[16:]})
+    with pytest.raises(PalpateError, match=f"name of a control. Got '{name}'"):
+        compare_generated(small_manifest, split, {name: folder}, Towers.load("palpate/mini"), Asked(presets=("paper",)))
+
+
 def test_the_digest_of_pictures_is_that_of_a_copy_and_not_that_of_others(tmp_path):
     pictures(tmp_path / "a", ["v/1", "v/2"], 0)
     shutil.copytree(tmp_path / "a", tmp_path / "b")

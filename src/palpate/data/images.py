@@ -29,6 +29,8 @@ Check = Literal["decode", "header", "none"]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 #: What Pillow raises for files that are cut, empty, or no images.
 BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, struct.error, zlib.error, Image.DecompressionBombError)
+#: What to do about unreadable files that are not being imported now.
+REFETCH = "Fetch these files again, or leave them out (palpate import does, with --skip-bad)"
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -206,7 +208,7 @@ def _fill(out: NDArray[np.uint8], paths: Sequence[Path], progress: Progress) -> 
         problems += [problem] if problem else []
         progress("decoding images", done, len(rows))
     if problems:
-        raise ProblemsError(sorted(problems, key=lambda p: p.where), "Fetch these files again, or import with --skip-bad")
+        raise ProblemsError(sorted(problems, key=lambda p: p.where), REFETCH)
 
 
 def _mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:

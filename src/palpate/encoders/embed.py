@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, Problem, ProblemsError, Progress, digest_json, quiet, short
 from palpate.data.captions import caption
-from palpate.data.images import cached_images, load_images
+from palpate.data.images import REFETCH, cached_images, load_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.preprocess import Preprocess, to_unit
 from palpate.encoders.towers import TOWERS, Towers
@@ -166,7 +166,7 @@ def _embed_files(paths: Sequence[Path], towers: Towers, tower: str, batch: int, 
                 out[start : start + batch] = _forward(images, towers, tower, preprocess)
             progress(f"embedding {tower}", min(start + batch, len(paths)), len(paths))
     if problems:
-        raise ProblemsError(problems, "Fetch these files again, or import with --skip-bad")
+        raise ProblemsError(problems, REFETCH)
     return out
 
 

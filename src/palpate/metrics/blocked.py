@@ -96,8 +96,8 @@ def blocked_sums(
 def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> Any:
     """Rows of ``x`` in this order, formed in float64 and rounded once to the type that the sums need.
 
-    The Gaussian's are centred, which changes no distance, and in units of its bandwidth; other kernels take rows as they are, in float64. ``smallest``: rows of the smallest
-    segment, over which float32 rounding must average away.
+    The Gaussian's are centred, which changes no distance, and in units of its bandwidth; other kernels take rows as they are, in float64.
+    ``smallest``: rows of the smallest segment, over which float32 rounding must average away.
     """
     limit = kernel.radius_limit * next((share for rows, share in ROOM if smallest < rows), 1.0)
     if type(ops) is not Ops:  # on a device: one expression
@@ -145,7 +145,7 @@ class _Run:
         self, z: Any, cell: Index, cells: int, kernel: Kernel, block: int, ops: Ops, sets: list[NDArray[np.bool_]], *, by_row: bool = False
     ) -> None:
         self.kernel, self.ops, self.cell, n = kernel, ops, cell, len(cell)
-        self.left, self.right = kernel.augment(z, ops)
+        self.left, self.right = kernel.factors(z, ops)
         self.shift = kernel.shift(z, ops)
         self.radius = max((float(ops.numpy(ops.squares(z[k : k + SLAB])).max()) for k in range(0, n, SLAB)), default=0.0)
         block = max(1, min(block, max(SMALL_BLOCK, -(-n // 8))))  # an eighth of the rows: little of the diagonal blocks is done twice

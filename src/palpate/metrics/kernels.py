@@ -50,7 +50,7 @@ class Kernel(Protocol):
         """What rows are divided by before they are given to the rest."""
         ...
 
-    def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
+    def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """Left and right factors (n, d'), whose product ``left @ right.T`` :meth:`values` takes."""
         ...
 
@@ -80,9 +80,8 @@ class Kernel(Protocol):
 
 def checked_kernel(kernel: Any) -> None:
     """Refuses what is no kernel; None stands for the Gaussian of ``sigma``."""
-    if kernel is not None and not all(
-        hasattr(kernel, name) for name in ("radius_limit", "unit", "augment", "shift", "values", "diagonal", "settings")
-    ):
+    needs = ("bandwidth", "radius_limit", "unit", "factors", "shift", "values", "diagonal", "settings")
+    if kernel is not None and not all(hasattr(kernel, name) for name in needs):
         raise PalpateError(
             "kernel must be a kernel, e.g. Gaussian(), Polynomial() or Linear()", repr(kernel), "Import it from palpate.metrics"
         )
@@ -110,7 +109,7 @@ class Gaussian:
         """The first bandwidth."""
         return self.sigmas[0]
 
-    def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
+    def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """The rows themselves."""
         return x, x
 
@@ -171,7 +170,7 @@ class Polynomial:
         """Rows are taken as they are."""
         return 1.0
 
-    def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
+    def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """``[gamma x, coef0] . [y, 1]``."""
         gamma = 1 / x.shape[1] if self.gamma is None else self.gamma
         ones = ops.ones(len(x), x)
@@ -214,7 +213,7 @@ class Linear:
         """Rows are taken as they are."""
         return 1.0
 
-    def augment(self, x: Any, ops: Ops) -> tuple[Any, Any]:
+    def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """The rows themselves."""
         return x, x
 

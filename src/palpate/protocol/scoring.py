@@ -107,7 +107,7 @@ def compare_generated(
         progress: told what is being done.
 
     Raises:
-        PalpateError: as :func:`score_generated`, and for companions whose weights are missing.
+        PalpateError: as :func:`score_generated`, for a generator with a control's name, and for companions whose weights are missing.
     """
     asked, weights = replace(asked, split=split.digest), weights or Weights()
     test, train = manifest.part(split, "test"), manifest.part(split, "train")
@@ -115,6 +115,8 @@ def compare_generated(
         require_same_ids(name, folder.ids, test.ids)
     if not generated:
         raise PalpateError("There must be generated touches to score", "none", "Pass --generated")
+    if clash := sorted({BACKGROUND, SAME_MATERIAL, REAL} & set(generated)):
+        raise PalpateError("Generators must not bear the name of a control", repr(clash[0]), "Give it another name")
     gel = not test.table["background"].null_count()
     wanted = Wanted.of(companions, weights, encoder=True, background=gel)
     size = read_image(next(iter(generated.values())).paths[0]).size[0]
