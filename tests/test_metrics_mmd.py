@@ -250,13 +250,13 @@ def test_import_needs_no_torch():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("least", [0.01, 0.02, 0.1, 0.5])
+@pytest.mark.parametrize("least", [0.01, 0.02, 0.1, 0.13])
 def test_the_series_of_expm1_has_no_direction(least):
     x = (-least * np.random.default_rng(0).random((300, 700))).astype(np.float32)
     exact = np.expm1(x.astype(np.float64))
     found = Ops().expm1_(x.copy(), -least)
     assert found.dtype == np.float32
-    np.testing.assert_allclose(found, exact, rtol=3e-7, atol=6e-10)
+    np.testing.assert_allclose(found, exact, rtol=3e-7, atol=3e-11)
     assert abs((found - exact).mean()) < 2e-10 + 2e-9 * least  # NumPy's own errs by 5e-10 on some machines
     x[0, 0] = -3
     np.testing.assert_allclose(Ops().expm1_(x.copy(), -3.0), np.expm1(x), rtol=1e-6)

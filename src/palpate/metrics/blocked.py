@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from palpate.core import PalpateError
 from palpate.metrics.arrays import Ops, ops_of
-from palpate.metrics.kernels import Array, Gaussian, Index, Kernel
+from palpate.metrics.kernels import Array, Index, Kernel
 from palpate.metrics.sums import PairSums, split_by
 
 #: Up to this many rows float64 costs nothing; few pairs would not average float32 rounding away.
 FLOAT64_BELOW = 1024
-#: In segments of fewer rows than the first number, features may reach only so much of the kernel's limit (0.05 is sigma >= 9 for unit norm).
-ROOM = ((16, 0.01), (512, 0.05))
+#: In segments of fewer rows than the first number, features may reach only so much of the kernel's limit (0.2 is sigma >= 9 for unit norm).
+ROOM = ((16, 0.04), (512, 0.2))
 #: Blocks are not made smaller than this for speed; the caller may ask for less.
 SMALL_BLOCK = 256
 #: Up to this many items their sums with one another are kept (34 MB).
@@ -96,24 +96,22 @@ def blocked_sums(
 def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> Any:
     """Rows of ``x`` in this order, formed in float64 and rounded once to the type that the sums need.
 
-    The Gaussian's are centred, which changes no distance, and in units of its bandwidth; other kernels take rows as they are, in float64.
-    ``smallest``: rows of the smallest segment, over which float32 rounding must average away.
+    Rows of a stationary kernel are centred, which changes no value, and all are in units of the kernel. ``smallest``: rows of the smallest
+    segment, over which float32 rounding must average away.
     """
-    limit = kernel.radius_limit * next((share for rows, share in ROOM if smallest < rows), 1.0)
+    limit = kernel.radius_limit * next((share for rows, share in ROOM if smallest < rows), 1.0) if kernel.single else 0.0
     if type(ops) is not Ops:  # on a device: one expression
         wide = ops.xp.astype(ops.xp.take(x, ops.xp.asarray(order, device=ops.device), axis=0), ops.xp.float64)  # type: ignore[attr-defined]
-        z = (wide - ops.xp.mean(wide, axis=0)) / kernel.unit if isinstance(kernel, Gaussian) else wide  # type: ignore[attr-defined]
+        z = ((wide - ops.xp.mean(wide, axis=0)) if kernel.stationary else wide) / kernel.unit  # type: ignore[attr-defined]
         radius = kernel.unit**2 * float(ops.xp.max(ops.squares(z))) if len(order) else 0.0  # type: ignore[attr-defined]
         _require_known_distances(radius, kernel)
         single = x.dtype != ops.xp.float64 and len(order) > FLOAT64_BELOW and radius <= limit  # type: ignore[attr-defined]
         return ops.xp.astype(z, ops.xp.float32) if single else z  # type: ignore[attr-defined]
     slabs = [slice(i, i + SLAB) for i in range(0, len(order), SLAB)]
-    if not isinstance(kernel, Gaussian):
-        return x[order].astype(np.float64)
-    mean = x.mean(axis=0, dtype=np.float64)
+    mean = x.mean(axis=0, dtype=np.float64) if kernel.stationary else np.zeros(x.shape[1])
     radius = max((float(((x[at] - mean) ** 2).sum(axis=1).max()) for at in slabs), default=0.0)
     _require_known_distances(radius, kernel)
-    wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or radius > limit
+    wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or not radius <= limit
     z, room = np.empty(x.shape, dtype=np.float64 if wide else np.float32), np.empty((min(SMALL, len(order)), x.shape[1]))
     for i in range(0, len(order), SMALL):  # through one small buffer: fresh memory costs more than the arithmetic
         rows = room[: len(order[i : i + SMALL])]
@@ -126,11 +124,11 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> An
 def _require_known_distances(radius: float, kernel: Kernel) -> None:
     """Refuses rows so far from their mean that a product cannot tell distances of a bandwidth in float64.
 
-    The limit of a kernel is where float32 keeps 1e-6; float64 has 2^29 times as much room.
+    The limit of a kernel is where float32 keeps 1e-6; float64 has 2^29 times as much room, and a coarser value is better than none up to there.
     """
-    if kernel.radius_limit > 0 and not radius <= kernel.radius_limit * 2.0**29:
+    if not radius <= kernel.radius_limit * 2.0**31:
         far = radius**0.5
-        got = f"a row {far:.3g} from the mean, {far / (2 * kernel.radius_limit**0.5):.2g} bandwidths"
+        got = f"a row {far:.3g} from the mean, {far / (4 * kernel.radius_limit**0.5):.2g} bandwidths"
         raise PalpateError(
             "The bandwidth must be wide enough for rounding to tell the rows' distances",
             got,

@@ -41,13 +41,23 @@ class Kernel(Protocol):
         ...
 
     @property
-    def radius_limit(self) -> float:
-        """Largest ``max ||x - centre||^2`` for which float32 keeps 1e-6 (x1000)."""
+    def stationary(self) -> bool:
+        """Whether it depends on differences of rows alone: they are then centred before they are given to the rest."""
         ...
 
     @property
     def unit(self) -> float:
         """What rows are divided by before they are given to the rest."""
+        ...
+
+    @property
+    def single(self) -> bool:
+        """Whether float32 serves at all."""
+        ...
+
+    @property
+    def radius_limit(self) -> float:
+        """Largest ``max ||x - centre||^2`` for which float32 keeps 1e-6 (x1000); 2^31 times that is too much for float64."""
         ...
 
     def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
@@ -79,9 +89,9 @@ class Kernel(Protocol):
 
 
 def checked_kernel(kernel: Any) -> None:
-    """Refuses what is no kernel; None stands for the Gaussian of ``sigma``."""
-    needs = ("bandwidth", "radius_limit", "unit", "factors", "shift", "values", "diagonal", "settings")
-    if kernel is not None and not all(hasattr(kernel, name) for name in needs):
+    """Refuses what is no kernel, the class of one too; None stands for the Gaussian of ``sigma``."""
+    needs = ("bandwidth", "stationary", "unit", "single", "radius_limit", "factors", "shift", "values", "diagonal", "settings")
+    if kernel is not None and (isinstance(kernel, type) or not all(hasattr(kernel, name) for name in needs)):
         raise PalpateError(
             "kernel must be a kernel, e.g. Gaussian(), Polynomial() or Linear()", repr(kernel), "Import it from palpate.metrics"
         )
@@ -99,15 +109,37 @@ class Gaussian:
     sigmas: tuple[float, ...] = (10.0,)
     name: str = "gaussian"
 
-    @property
-    def radius_limit(self) -> float:
-        """The exponents stay below one half: sigma >= 2 for unit-norm features."""
-        return 0.25 * min(self.sigmas) ** 2
+    #: Differences alone count.
+    stationary = True
+
+    def __post_init__(self) -> None:
+        try:
+            several = tuple(float(sigma) for sigma in self.sigmas)
+        except (TypeError, ValueError):
+            several = ()
+        if not several or not all(np.isfinite(s) and 1e-100 < s < 1e100 for s in several):
+            got = repr(self.sigmas[0] if isinstance(self.sigmas, tuple) and len(self.sigmas) == 1 else self.sigmas)
+            raise PalpateError("sigma must be positive", got, "Pass e.g. sigma=10, or Gaussian((5.0, 10.0))")
+        object.__setattr__(self, "sigmas", several)
 
     @property
     def unit(self) -> float:
         """The first bandwidth."""
         return self.sigmas[0]
+
+    @property
+    def single(self) -> bool:
+        """Not where float32 rounds the squared ratio of two bandwidths, which moves all pairs in one direction."""
+        return all(float(np.float32(f)) == f for f in self._ratios)
+
+    @property
+    def radius_limit(self) -> float:
+        """The exponents stay below one eighth: sigma >= 4 for unit-norm features."""
+        return min(self.sigmas) ** 2 / 16
+
+    @property
+    def _ratios(self) -> list[float]:
+        return [(self.unit / sigma) ** 2 for sigma in self.sigmas[1:]]
 
     def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """The rows themselves."""
@@ -119,15 +151,14 @@ class Gaussian:
 
     def values(self, product: Any, ops: Ops, radius: float, shift: tuple[Any, Any] | None) -> Any:
         """``expm1(product + shifts)``, averaged over the bandwidths; no two rows are farther apart than twice the radius."""
-        first, *others = self.sigmas
-        if others and shift is not None:
+        ratios = self._ratios
+        if ratios and shift is not None:
             product, shift = ops.add_outer_(product, *shift), None
-        factors = [(first / sigma) ** 2 for sigma in others]
-        rest = [ops.expm1_(product * f, -2 * radius * f) for f in factors]
+        rest = [ops.expm1_(product * f, -2 * radius * f) for f in ratios]
         k = ops.expm1_(product, -2 * radius, shift)
         for other in rest:
             k += other
-        return ops.scale_(k, 1 / len(self.sigmas))
+        return ops.divide_(k, len(self.sigmas))
 
     def diagonal(self, x: Any, ops: Ops) -> Array:
         """Zeros: k(x, x) = 1."""
@@ -152,6 +183,9 @@ class Polynomial:
     coef0: float = 1.0
     bandwidth: float | None = None
 
+    #: Rows are taken as they are, in float64: KID's values are far smaller than the kernel's rounding in float32.
+    stationary, unit, single, radius_limit = False, 1.0, False, float("inf")
+
     def __post_init__(self) -> None:
         if isinstance(self.degree, bool) or not isinstance(self.degree, int | np.integer) or self.degree < 1:
             raise PalpateError("The degree of a polynomial kernel must be a whole number from 1 on", repr(self.degree), "KID's is 3")
@@ -159,16 +193,6 @@ class Polynomial:
             value = getattr(self, name)
             if not (name == "gamma" and value is None) and not (isinstance(value, int | float | np.number) and np.isfinite(value)):
                 raise PalpateError(f"{name} of a polynomial kernel must be a finite number", repr(value), "Leave it out for KID's")
-
-    @property
-    def radius_limit(self) -> float:
-        """Always float64: KID's values are far smaller than the kernel's rounding in float32."""
-        return 0.0
-
-    @property
-    def unit(self) -> float:
-        """Rows are taken as they are."""
-        return 1.0
 
     def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """``[gamma x, coef0] . [y, 1]``."""
@@ -203,15 +227,8 @@ class Linear:
 
     bandwidth: float | None = None
 
-    @property
-    def radius_limit(self) -> float:
-        """Always float64."""
-        return 0.0
-
-    @property
-    def unit(self) -> float:
-        """Rows are taken as they are."""
-        return 1.0
+    #: Rows are taken as they are, in float64.
+    stationary, unit, single, radius_limit = False, 1.0, False, float("inf")
 
     def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """The rows themselves."""
@@ -253,13 +270,7 @@ def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) 
             raise PalpateError('sigma must be positive, several of that, "median" or "multi"', repr(sigma), "Pass e.g. sigma=10")
         middle = median_distance(x, groups)
         return Gaussian(tuple(f * middle for f in (FACTORS if sigma == "multi" else (1.0,))), f"gaussian, {sigma}")
-    try:
-        several = tuple(float(s) for s in (sigma if isinstance(sigma, Sequence) else np.atleast_1d(np.asarray(sigma, dtype=np.float64))))
-    except (TypeError, ValueError):
-        several = ()
-    if not several or not all(np.isfinite(s) and 1e-100 < s < 1e100 for s in several):
-        raise PalpateError("sigma must be positive", f"{sigma!r}", "Pass e.g. sigma=10")
-    return Gaussian(several)
+    return Gaussian(tuple(sigma) if isinstance(sigma, Sequence | np.ndarray) and np.ndim(sigma) else (sigma,))  # type: ignore[arg-type]
 
 
 def median_distance(x: Any, groups: Sequence[str] | Index | None = None, rows: int = MEDIAN_ROWS) -> float:

@@ -9,8 +9,8 @@ probability of a hypothesis, and it is not adjusted for the number of pairs; ``p
 
 Metrics without reference have no better direction but towards the floor, what real touches score: collapse is lowest. There a is better where
 its distance to the floor is smaller, ``gap = |a - floor| - |b - floor|`` is what p_better and ``better`` speak of, and the floor is
-left-one-out along with the generators, and the p-value is that of the gap (``p_difference`` is that of a - b). Without a floor neither
-is given, and the p-value is that of a - b.
+left-one-out along with the generators, and the p-value is that of the gap (``p_difference`` is that of a - b). Without a floor, or with one
+of other videos, classes or numbers of samples, neither is given, and the p-value is that of a - b.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
 from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Options, plan_for
-from palpate.metrics.scored import Scored, excess_of, require_one_encoder, same_units, with_floor
+from palpate.metrics.scored import Scored, excess_of, not_comparable, require_one_encoder, with_floor
 from palpate.metrics.tables import build_table
 from palpate.metrics.tactile import floors_of, four_of, tmmd_of
 
@@ -183,7 +183,7 @@ def _decide(
     if x.higher_is_better is None:
         if floor is None or floor.score.value is None or x.value is None or y.value is None:
             return
-        if not same_units(a, floor) or x.details.get("classes") != floor.score.details.get("classes"):
+        if list(a.units) != list(floor.units) or not_comparable(a, floor):  # the floor is left-one-out along with the generators
             return
         value = abs(x.value - floor.score.value) - abs(y.value - floor.score.value)
         gaps = np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates)
@@ -220,7 +220,7 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
     value = float(kept.mean()) if len(kept) else None
     interval, method = mean_interval(kept, names, x.level)
     sign = (value or 0.0) * (1 if x.higher_is_better else -1)
-    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "p_better": None, "p_value": None, "better": None}
+    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "p_better": None, "p_value": None, "better": None, "decided": False}
     details["better"] = x.subject if sign > 0 else y.subject if sign < 0 else None
     if interval is not None and value is not None:
         df = (len(kept) if names is None else len(set(names))) - 1

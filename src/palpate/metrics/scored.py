@@ -27,6 +27,8 @@ RANDOM_NOTE = (
 
 #: A bound at scale 1000 from which it is told.
 TOLD = 1e-4
+#: Floors are of designs that differ by less: what it changes is far below the noise of any floor.
+ALIKE = 0.01
 UNBOUNDED = 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
 
 
@@ -37,14 +39,17 @@ class Scored:
     Attributes:
         score: the score.
         replicates: (G,) the value without each unit.
-        units: (G,) names of the units; empty where classes were left out instead.
+        units: (G,) names of the units; of the classes where those were left out (``details["left_out"]`` is ``"class"`` then).
         excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
+        design: what the value depends on beside the features: of halves of whole groups how their sizes turn E into dist^2
+            (:class:`palpate.metrics.halves.Design`), of other biased values the numbers of samples; empty where it depends on neither.
     """
 
     score: Score
     replicates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     units: Sequence[str] = ()
     excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    design: Array = field(default_factory=lambda: np.zeros(0), repr=False)
 
 
 def scored(
@@ -55,6 +60,7 @@ def scored(
     settings: Sequence[str],
     *,
     found: Estimate | None = None,
+    design: Array | None = None,
     bound: float = 0.0,
     limit: float | None = None,
     details: dict[str, Any],
@@ -70,6 +76,7 @@ def scored(
         plan: for subject, split, level, scale, and the options named in ``settings``.
         settings: options that bear on this metric.
         found: its first value is the score's; None for an undefined one.
+        design: as :class:`Scored`; default empty.
         bound: the value is within this of the exact one, rounding aside.
         limit: the largest bound that leaves a value; default: as much as a distance can be.
         details: kept with the score.
@@ -89,7 +96,7 @@ def scored(
         note = note or "Undefined: an average over no pairs"
     elif interval is None:
         note = ". ".join(filter(None, [note, "No interval: too few groups or samples to leave one out"]))
-    details = plain(details) | {
+    details = plain(details) | ({"left_out": "class"} if found and found.of_classes else {}) | {
         "unit": table.unit, "backend": table.sums.backend, "bound": plain(bound) if value is not None else None, "version": __version__,
     }  # fmt: skip
     score = Score(
@@ -98,10 +105,12 @@ def scored(
         settings={**table.kernel.settings(), **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)}},
         **{k: plain(v) for k, v in rest.items()},
     )  # fmt: skip
+    design = np.zeros(0) if design is None else design
     if found is None or not len(found.units):
-        return Scored(score)
+        return Scored(score, design=design)
+    names = details["classes"] if found.of_classes else table.names
     excess = found.replicates[:, 1] if "E" in details else np.zeros(0)
-    return Scored(score, found.replicates[:, 0], [table.names[int(u)] for u in found.units], excess)
+    return Scored(score, found.replicates[:, 0], [names[int(u)] for u in found.units], excess, design)
 
 
 def excess_of(one: Scored) -> Scored | None:
@@ -118,7 +127,7 @@ def excess_of(one: Scored) -> Scored | None:
     interval, note = (interval if known else None), "" if known else UNBOUNDED
     if known and bound > TOLD * score.scale / 1000:
         note = within(bound)
-    kept = {name: d[name] for name in ("unit", "units", "backend", "version", "classes", "excluded") if name in d}
+    kept = {name: d[name] for name in ("unit", "left_out", "units", "backend", "version", "classes", "excluded") if name in d}
     found = replace(
         score, metric=f"{score.metric} E", value=d["E"] if known else None, interval=None if interval is None else (interval[0], interval[1]),
         null=None, interval_method=score.interval_method if interval else "", floor=d.get("E_floor"), estimator="unbiased", seed=None,
@@ -132,38 +141,39 @@ def within(bound: float) -> str:
     return f"Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments"
 
 
-def same_units(a: Scored, floor: Scored) -> bool:
-    """Whether two sets have the same units (videos), so that values that depend on their number may stand side by side."""
-    return list(a.units) == list(floor.units)
+def not_comparable(one: Scored, floor: Scored) -> str:
+    """Why real touches like these give another value of this metric than those the generator was asked for; '' if they do not.
+
+    Halves of whole groups grow with the share of pairs inside groups, which falls with the number of groups and rises with the samples in
+    each; a biased value falls as 1 / n; a mean over classes has a floor over the same classes alone.
+    """
+    mine, theirs = one.score, floor.score
+    if mine.details.get("classes") != theirs.details.get("classes"):
+        return "other classes"
+    by_group = mine.settings.get("halves") == "group"
+    if by_group and list(one.units) != list(floor.units):
+        return "other groups"
+    if one.design.shape != floor.design.shape or not np.allclose(one.design, floor.design, rtol=ALIKE, atol=0):
+        return "other numbers of samples" + (" a group" if by_group else "")
+    return ""
 
 
 def with_floor(one: Scored, floor: Scored) -> Scored:
     """The score beside that of real touches: its value where it is comparable, and E, which does not depend on the number of groups.
 
-    A mean over classes has a floor over the same classes alone: E of CI-TMMD that of the real touches of the generator's classes, D-TMMD and
-    its E_ratio none where the classes differ.
+    E of CI-TMMD has that of the real touches of the generator's classes, E_ratio of D-TMMD none where the classes differ.
     """
     mine, theirs = one.score, floor.score
-    classes = mine.details.get("classes")
-    alike = classes == theirs.details.get("classes")
-    if mine.settings.get("halves") == "group":
-        same, what = same_units(one, floor), "groups"
-    else:  # a biased value falls as 1 / n
-        same, what = mine.estimator != "biased" or _sizes(mine) == _sizes(theirs), "numbers of samples"
-    known = same and alike
+    why = not_comparable(one, floor)
+    alike = mine.details.get("classes") == theirs.details.get("classes")
     details: dict[str, Any] = {}
     if "E" in mine.details:
-        details["E_floor"] = theirs.details.get("E") if alike else _mean_excess(theirs, classes or [])
+        details["E_floor"] = theirs.details.get("E") if alike else _mean_excess(theirs, mine.details.get("classes") or [])
     if "E_ratio" in mine.details:
         details["E_ratio_floor"] = theirs.details.get("E_ratio") if alike else None
-    why = "" if known or mine.value is None else f"No floor: real touches of other {what if alike else 'classes'} have another value"
-    note = ". ".join(filter(None, [mine.note, why]))
-    return replace(one, score=replace(mine, floor=theirs.value if known else None, details={**mine.details, **details}, note=note))
-
-
-def _sizes(score: Score) -> list[int]:
-    """How many samples a score is of, and each of its classes."""
-    return [score.n, *score.details.get("sizes", ())]
+    said = "" if not why or mine.value is None else f"No floor: real touches of {why} have another value"
+    note = ". ".join(filter(None, [mine.note, said]))
+    return replace(one, score=replace(mine, floor=None if why else theirs.value, details={**mine.details, **details}, note=note))
 
 
 def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:

@@ -156,7 +156,7 @@ def _bound(table: Table, plan: Plan) -> float:
 class Estimate:
     """A statistic with its jackknife: values (K,), standard errors (K,), their degrees of freedom, the method in words.
 
-    ``replicates`` (G, K) are the values without each unit, ``units`` (G,) the units; empty where classes were left out instead.
+    ``replicates`` (G, K) are the values without each of the G that were left out; ``units`` (G,) are the units, or classes (``of_classes``).
     """
 
     values: Array
@@ -165,6 +165,7 @@ class Estimate:
     method: str
     replicates: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     units: Index = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+    of_classes: bool = False
 
     def interval(self, k: int, level: float) -> Interval | None:
         """Interval of value k, or None where it has none."""
@@ -196,4 +197,4 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     first = jackknife_errors(replicates)
     errors = np.concatenate([first, np.full(len(over_units.values) - len(first), np.nan)])
     method = f"leave-one-class-out jackknife, t, {classes - 1} df (a class has too few {unit}s to leave one out)"
-    return Estimate(over_units.values, errors, classes - 1, method)
+    return Estimate(over_units.values, errors, classes - 1, method, replicates, rest, of_classes=True)

@@ -131,9 +131,17 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     }
     note = f"Undefined: {reason} (n = {n})" if reason else halves_note(plan, sums, grouped=table.grouped)
     return scored(
-        "I-TMMD", table, generated, plan, ("halves",), found=None if reason else found, bound=_halves_bound(sums, plan)[0],
+        "I-TMMD", table, generated, plan, ("halves",), found=None if reason else found, design=_design(design, sums, plan),
+        bound=_halves_bound(sums, plan)[0],
         null=null_band(centre, sd), details=details, note=note, **halves_fields(plan),
     )  # fmt: skip
+
+
+def _design(design: Design, sums: PairSums, plan: Plan) -> Array:
+    """What the value depends on beside the features, see :class:`palpate.metrics.scored.Scored`."""
+    if plan.halves == "group":
+        return np.concatenate([design.own, design.rest])
+    return whole_sets(sums.totals).n if plan.estimator == "biased" else np.zeros(0)
 
 
 def _halves_bound(sums: PairSums, plan: Plan) -> Array:
@@ -180,8 +188,7 @@ def ci_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
 def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     """CI-TMMD from a table."""
     kept, excluded = _usable(table, plan)
-    sizes = table.whole_classes().totals.n[kept].astype(int).tolist()
-    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "sizes": sizes, "excluded": excluded}
+    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "excluded": excluded}
     if not len(kept):
         note = "Undefined: no class can be cut into halves" + ("" if generated.labels is not None else " (the samples have no labels)")
         return scored("CI-TMMD", table, generated, plan, ("halves",), details=details, note=note, **halves_fields(plan))
@@ -208,7 +215,7 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         "units": sums.units,
     }
     return scored(
-        "CI-TMMD", table, generated, plan, ("halves",), found=found, bound=float(_halves_bound(sums, plan).mean()),
+        "CI-TMMD", table, generated, plan, ("halves",), found=found, design=_design(design, sums, plan), bound=float(_halves_bound(sums, plan).mean()),
         null=null_band(centre, sd), details=details, note=halves_note(plan, sums, grouped=table.grouped), **halves_fields(plan),
     )  # fmt: skip
 
@@ -259,8 +266,7 @@ def denominators(matrix: Array, denominator: str) -> Array:
 def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     """D-TMMD from a table."""
     kept, excluded = _usable(table, plan)
-    sizes = table.whole_classes().totals.n[kept].astype(int).tolist()
-    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "sizes": sizes, "excluded": excluded}
+    details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "excluded": excluded}
     fields: dict[str, Any] = halves_fields(plan) | {"estimator": plan.estimator}
     settings = ("halves", "denominator", "aggregate")
     if len(kept) < 2:
@@ -301,7 +307,8 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         why = "within two standard errors of 0" if np.isfinite(errors).all() else "of unknown error (too few groups)"
         note = f"Denominators {why}, so the ratio is unreliable: {', '.join(unstable)}"
     return scored(
-        "D-TMMD", table, generated, plan, settings, found=found, bound=bound, limit=1.0, details=details, note=note, **fields,
+        "D-TMMD", table, generated, plan, settings, found=found, design=_design(design, sums, plan), bound=bound, limit=1.0,
+        details=details, note=note, **fields,
     )  # fmt: skip
 
 
@@ -341,8 +348,9 @@ def four_scores(
         generated: features of generated touches, with labels (for CI and D) and groups.
         reference: features of the real test touches.
         floor: real touches on which the three reference-free metrics are computed for ``Score.floor``; usually ``reference``. With halves of
-            whole groups their values depend on the number of groups: ``Score.floor`` is given where the groups are the same, and the floor of
-            what does not depend on it, ``details["E_floor"]``, for any groups of the same classes.
+            whole groups their values depend on the number of groups and of samples in each, biased ones on the number of samples:
+            ``Score.floor`` is given where these are the same (within 1 %, else a note says why not), and the floor of what does not depend on
+            them, ``details["E_floor"]``, for any groups of the same classes.
         **options: see :class:`Options`; the same for all four.
 
     Raises:
