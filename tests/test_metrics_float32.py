@@ -39,7 +39,7 @@ def test_sets_that_are_as_far_apart_as_can_be(rows, sigma, side, monkeypatch):
     got = mmd2(x, y, sigma=sigma, backend="blocked")
     exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
     assert types == [np.float32, np.float64]
-    assert exact > 2
+    assert exact > 1
     assert got == pytest.approx(exact, abs=4e-7)
 
 
