@@ -3,6 +3,7 @@
 import itertools
 import json
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -167,6 +168,26 @@ def test_every_slab_counts_in_the_digest():
     assert FeatureSet(ids, other).digest != digest
 
 
+def test_numbers_that_are_equal_have_one_digest():
+    ids = ["a", "b"]
+    digest = FeatureSet(ids, np.array([[0.0, 1.0], [1.0, 0.0]])).digest
+    assert FeatureSet(ids, np.array([[-0.0, 1.0], [1.0, -0.0]])).digest == digest
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert FeatureSet(ids, np.array([[1e300, 1.0], [1.0, 0.0]])).digest != digest
+    assert FeatureSet([], np.zeros((0, 3))).digest != FeatureSet([], np.zeros((0, 4))).digest
+
+
+def test_tensors_of_half_precision_are_widened_and_it_is_said():
+    torch = pytest.importorskip("torch")
+    rows = torch.eye(2)
+    with pytest.warns(UserWarning, match="bfloat16 features were widened to float32; their rounding stays"):
+        assert FeatureSet(["a", "b"], rows.bfloat16()).features.dtype == np.float32
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        FeatureSet(["a", "b"], rows)
+
+
 def test_features_name_the_bad_row_and_round_trip(tmp_path):
     x = np.eye(3, dtype=np.float32)
     features = FeatureSet(["a", "b", "c"], x, labels=["w", "w", "g"], groups=["v", "v", "u"], encoder="e")
@@ -175,7 +196,7 @@ def test_features_name_the_bad_row_and_round_trip(tmp_path):
     assert again.labels == ["g", "w"]
     assert again.encoder == "e"
     assert np.array_equal(again.features, x[[2, 0]])
-    with pytest.raises(PalpateError, match="first 'b'"):
+    with pytest.raises(PalpateError, match=r"NaN or infinity in 1 row \(1: 'b'\)"):
         FeatureSet(["a", "b", "c"], np.where(np.arange(3)[:, None] == 1, np.nan, x))
     with pytest.raises(PalpateError, match="without, first 'z'"):
         features.take(["z"])

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from palpate.core import FeatureSet
-from palpate.metrics import ci_tmmd, d_tmmd, four_scores, i_tmmd
+from palpate.metrics import ci_tmmd, compare, d_tmmd, four_scores, i_tmmd
 from test_metrics_tactile import change, keep, world
 
 OFF_DIAGONAL = {"denominator": "mean_off_diagonal"}
@@ -109,3 +110,79 @@ def test_biased_halves_have_a_floor_of_as_many_samples_alone(preset):
         assert "other numbers of samples" in score.note
     assert all(s.floor is not None for s in four_scores(few, equal, floor=equal, preset=preset, permutations=0)[1:])
     assert all(s.floor is not None for s in four_scores(few, many, floor=many, preset="paper", permutations=0)[1:])
+
+
+def videos_of(per_video, *, videos=12, spread=0.5, draw=0, prefix="", classes=2):
+    """Frames of videos whose centres are the same in every draw; ``per_video`` frames each."""
+    centres = np.random.default_rng(99).normal(size=(videos, 8)) * 0.3 + 2
+    number = np.repeat(np.arange(videos), per_video)
+    x = centres[number] + spread * np.random.default_rng(draw).normal(size=(len(number), 8))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    ids = [f"{prefix}v{v:02d}/{k}" for k, v in enumerate(number)]
+    return FeatureSet(ids, x, [f"m{v % classes}" for v in number], [f"v{v:02d}" for v in number])
+
+
+@pytest.mark.parametrize("options", [{}, {"estimator": "biased"}])
+def test_halves_of_whole_videos_have_a_floor_of_as_many_frames_alone(options):
+    """The same videos with other numbers of frames have another share of pairs inside videos, so another value for the same E."""
+    few, many, equal = (videos_of(n, draw=k, prefix=str(k)) for k, n in enumerate((2, 40, 2)))
+    for score in four_scores(few, many, floor=many, permutations=0, **options)[1:]:
+        assert score.floor is None
+        assert "No floor: real touches of other numbers of samples a group have another value" in score.note
+        assert score.metric == "D-TMMD" or score.details["E_floor"] is not None
+    for score in four_scores(few, equal, floor=equal, permutations=0, **options)[1:]:
+        assert score.floor is not None
+        assert "No floor" not in score.note
+    whole = videos_of([200] * 12)
+    one_less = whole.take([i for i in whole.ids if not i.endswith("/0")])
+    near, exact = (four_scores(whole, s, floor=s, permutations=0, **options)[1] for s in (one_less, whole))
+    assert near.floor == pytest.approx(exact.floor, rel=0.02)  # a frame in 2,400 is nothing
+    lost = four_scores(whole, videos_of([150] * 12), floor=videos_of([150] * 12), permutations=0, **options)[1]
+    assert (lost.floor is None) == ("estimator" in options)  # unbiased values of many frames hardly depend on how many
+
+
+def test_floors_over_classes_of_other_sizes_are_none():
+    few, other = (videos_of(frames, draw=k, prefix=str(k)) for k, frames in enumerate(([4, 12] * 6, [12, 4] * 6)))
+    assert len(few.ids) == len(other.ids)
+    for preset in ("cmmd", "paper-tables"):
+        own, *of_classes = four_scores(few, other, floor=other, preset=preset, permutations=0)[1:]
+        assert own.floor is not None
+        assert [s.floor for s in of_classes] == [None, None]
+
+
+@pytest.mark.parametrize("options", [{"preset": "cmmd"}, {"preset": "paper-tables"}, {}])
+def test_no_generator_is_nearer_to_a_floor_that_is_none(options):
+    right, collapsed = videos_of(3, draw=1, prefix="a"), videos_of(3, draw=2, prefix="a", spread=0.1)
+    many, equal = videos_of(40, draw=3, prefix="b"), videos_of(3, draw=4, prefix="c")
+    for real, known in ((many, False), (equal, True)):
+        found = compare({"right": right, "collapsed": collapsed}, real, floor=real, permutations=0, **options)
+        for d in found.differences[1:3]:
+            assert (d.details["better"] is not None) == known
+            assert ("gap" in d.details) == known
+            assert d.details["p_value"] is not None
+        for d in found.excess.differences:  # E does not depend on the number of frames
+            assert d.details["better"] is not None
+    some = videos_of(3, draw=4, prefix="c", classes=3)  # and other classes
+    found = compare({"right": right, "collapsed": collapsed}, some, floor=some, permutations=0, **options)
+    assert ["gap" in d.details for d in found.differences] == [False, True, False, False]
+
+
+def test_where_classes_are_left_out_so_they_are_of_differences():
+    """Two videos a class: none can be left out, but a class can, of both generators at once."""
+    a, r = (world(9, classes=5, videos=2, frames=3, draw=k) for k in (1, 2))
+    b = change(world(9, classes=5, videos=2, frames=3, draw=3), ids=a.ids)
+    found = compare({"a": a, "b": b}, r, floor=r, permutations=0)
+    one, two, real = ([v["value"] for v in ci_tmmd(s).details["per_class"].values()] for s in (a, b, r))
+    delta = np.subtract(one, two)
+    d = found.differences[2]
+    error = delta.std(ddof=1) / np.sqrt(5)
+    reach = stats.t.ppf(0.975, 4) * error
+    assert (d.metric, d.value) == ("CI-TMMD difference", pytest.approx(delta.mean(), abs=1e-9))
+    assert d.interval == pytest.approx((delta.mean() - reach, delta.mean() + reach), abs=1e-9)
+    assert d.interval_method == "paired leave-one-class-out jackknife, t, 4 df"
+    assert found.scores[2].details["left_out"] == "class"
+    gap = abs(np.mean(one) - np.mean(real)) - abs(np.mean(two) - np.mean(real))
+    assert d.details["gap"] == pytest.approx(gap, abs=1e-9)
+    assert d.details["gap_interval"] is not None
+    assert found.differences[3].interval is not None
+    assert found.excess.differences[1].interval is not None

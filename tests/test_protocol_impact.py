@@ -320,7 +320,7 @@ def test_bad_input_is_refused_in_words() -> None:
     refuse(r"shape \(24, d\)", good, features={"x": np.zeros(24)})
     refuse("numbers in at least one column", good, features={"x": np.zeros((24, 0))})
     refuse("numbers in at least one column", good, features={"x": np.full((24, 2), "a")})
-    refuse("NaN or infinity in 1 row, first 'v0.0/1'", good, features={"x": np.where(np.arange(24)[:, None] == 1, np.nan, 1.0)})
+    refuse(r"NaN or infinity in 1 row \(1: 'v0.0/1'\)", good, features={"x": np.where(np.arange(24)[:, None] == 1, np.nan, 1.0)})
     refuse("without, first", good, features={"x": FeatureSet(good.ids[:20], np.zeros((20, 2), np.float32))})
     refuse("vision or tactile", good, features="pixels")
 

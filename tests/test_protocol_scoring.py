@@ -1,17 +1,20 @@
 """Pictures and ids: whose picture is compared with which, whose video it has, and which real touches a score was made against."""
 
+import os
 import shutil
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from PIL import Image
 
-from palpate.core import PalpateError, Split
+from palpate.core import PalpateError, Split, require_comparable
 from palpate.data.manifest import Manifest
 from palpate.encoders.towers import Towers
 from palpate.generate import Generated
 from palpate.metrics import ssim
+from palpate.protocol import touches as touches_module
 from palpate.protocol.comparing import Asked
 from palpate.protocol.embeddings import Columns
 from palpate.protocol.score_inputs import completed, read_touches
@@ -100,3 +103,35 @@ def test_videos_and_materials_are_taken_by_id_and_never_lost_for_one_stray_pictu
     assert completed(made, group="video", like=bare).ids == made.ids
     pictures(tmp_path / "own", ["1", "2"], 1)  # names of their own
     assert completed(read_touches(tmp_path / "own"), group="video", like=like).column("video") == [None, None]
+
+
+def test_contacts_are_those_against_the_gel_of_now(small_manifest, tmp_path, monkeypatch):
+    """Decoded pictures in a cache are of the bytes of now, also the empty gel's, whatever name, size and time it has."""
+    monkeypatch.setattr(touches_module, "HELD", 0)
+    root = tmp_path / "gel"
+    root.mkdir()
+    some = small_manifest.take(small_manifest.ids[:4])
+    paths = []
+    for k, path in enumerate(some.paths("background")):
+        paths.append(root / f"{k}.bmp")
+        Image.open(path).save(paths[-1])
+    real = Manifest(some.table.with_columns(pl.Series("background", [str(p) for p in paths])), some.root)
+    made = Manifest(some.table.with_columns(pl.Series("tactile", list(reversed(some.table["tactile"].to_list())))), some.root)
+
+    def scores(cache):
+        found = compare_touches({"g": made}, real, None, Asked(), companions=("contact",), cache=cache).scores
+        assert len(found) == 5
+        return found
+
+    for path in paths:
+        os.utime(path, (10**9, 10**9))
+    before, cache = scores(None), tmp_path / "cache"
+    assert [s.value for s in scores(cache)] == [s.value for s in before]
+    for path in paths:
+        Image.open(path).point(lambda v: min(255, v + 40)).save(path)
+        os.utime(path, (10**9, 10**9))
+    after = scores(None)
+    assert [s.value for s in after] != [s.value for s in before]
+    assert [s.value for s in scores(cache)] == [s.value for s in after]
+    with pytest.raises(PalpateError, match="agree in settings"):  # another gel, another contact
+        require_comparable([before[0], after[0]])

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import mmap
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -156,7 +157,9 @@ def _on_host(features: Any) -> np.ndarray:
     try:
         if hasattr(features, "detach"):
             features = features.detach().cpu()
-            features = features.float() if str(features.dtype).endswith("bfloat16") else features
+            if str(features.dtype).endswith("bfloat16"):
+                warnings.warn("bfloat16 features were widened to float32; their rounding stays", stacklevel=4)
+                features = features.float()
         return np.asarray(features)
     except (TypeError, ValueError, RuntimeError) as error:
         raise PalpateError("Features must turn into an array (n, d)", str(error).splitlines()[0], "Pass rows of one width") from None
@@ -174,7 +177,7 @@ class FeatureSet:
         encoder: digest of the encoder that made them.
 
     Raises:
-        PalpateError: on unequal lengths, a wrong shape, or values that are not finite (the first such row is named).
+        PalpateError: on unequal lengths, a wrong shape, or values that are not finite (the first such rows are named).
     """
 
     ids: Sequence[str]
@@ -197,18 +200,17 @@ class FeatureSet:
                 raise PalpateError(f"{name} must have one entry a row ({shape[0]})", f"{len(column)}", f"Pass {name} in the order of ids")
         bad = np.flatnonzero(~_finite_rows(self.features))
         if bad.size:
-            raise PalpateError(
-                "Features must be finite",
-                f"NaN or infinity in {bad.size} row{'s' * (bad.size != 1)}, first {self.ids[int(bad[0])]!r}",
-                "Check the images of those ids",
-            )
+            named = ", ".join(f"{int(k)}: {self.ids[int(k)]!r}" for k in bad[:5]) + ", ..." * (bad.size > 5)
+            got = f"NaN or infinity in {bad.size} row{'s' * (bad.size != 1)} ({named})"
+            raise PalpateError("Features must be finite", got, "Check what those rows were made from")
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of ids and features, in whatever order the rows are."""
+        """SHA-256 of ids and features as float32, in whatever order and type the rows are."""
         rows: list[tuple[str, bytes]] = []
         for k in range(0, len(self.features), SLAB):
-            slab = np.ascontiguousarray(self.features[k : k + SLAB], dtype="<f4")  # the same numbers in another type are the same
+            with np.errstate(over="ignore"):
+                slab = np.ascontiguousarray(self.features[k : k + SLAB], dtype="<f4") + np.float32(0)  # one zero: -0 equals it
             rows += [(str(i), hashlib.blake2b(row.tobytes(), digest_size=16).digest()) for i, row in zip(self.ids[k:], slab, strict=False)]
             _give_back(self.features)
         found = hashlib.sha256(str(self.features.shape[1]).encode())

@@ -25,7 +25,7 @@ from palpate.metrics.sums import PairSums, split_by
 
 #: Up to this many rows float64 costs nothing; few pairs would not average float32 rounding away.
 FLOAT64_BELOW = 1024
-#: In segments of fewer rows than the first number, features may reach only so much of the kernel's limit (0.2 is sigma >= 9 for unit norm).
+#: In segments of fewer distinct rows than the first number, features may reach only so much of the kernel's limit (0.2 is sigma >= 9 for unit norm).
 ROOM = ((16, 0.04), (512, 0.2))
 #: Blocks are not made smaller than this for speed; the caller may ask for less.
 SMALL_BLOCK = 256
@@ -70,7 +70,7 @@ def blocked_sums(
     """
     ops = ops_of(x)
     order = np.lexsort((unit, segment))
-    z = centred(x, order, kernel, ops, int(np.bincount(segment)[np.unique(segment)].min(initial=len(segment))))
+    z = centred(x, order, kernel, ops, segment)
     segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
     start = np.flatnonzero(np.r_[True, (np.diff(segment) != 0) | (np.diff(unit) != 0)]) if len(order) else np.zeros(0, np.intp)
     own = kernel.diagonal(z, ops)
@@ -93,26 +93,22 @@ def blocked_sums(
     return Sweep(sums, run.spread)
 
 
-def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> Any:
+def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, segment: Index) -> Any:
     """Rows of ``x`` in this order, formed in float64 and rounded once to the type that the sums need.
 
-    Rows of a stationary kernel are centred, which changes no value, and all are in units of the kernel. ``smallest``: rows of the smallest
-    segment, over which float32 rounding must average away.
+    Rows of a stationary kernel are centred, which changes no value, and all are in units of the kernel. float32 rounding must average away
+    over the distinct rows of each segment (N,).
     """
-    limit = kernel.radius_limit * next((share for rows, share in ROOM if smallest < rows), 1.0) if kernel.single else 0.0
     if type(ops) is not Ops:  # on a device: one expression
         wide = ops.xp.astype(ops.xp.take(x, ops.xp.asarray(order, device=ops.device), axis=0), ops.xp.float64)  # type: ignore[attr-defined]
         z = ((wide - ops.xp.mean(wide, axis=0)) if kernel.stationary else wide) / kernel.unit  # type: ignore[attr-defined]
-        radius = kernel.unit**2 * float(ops.xp.max(ops.squares(z))) if len(order) else 0.0  # type: ignore[attr-defined]
-        _require_known_distances(radius, kernel)
-        single = x.dtype != ops.xp.float64 and len(order) > FLOAT64_BELOW and radius <= limit  # type: ignore[attr-defined]
+        single = x.dtype != ops.xp.float64 and _single(kernel.unit**2 * ops.numpy(ops.squares(z)), segment[order], kernel)  # type: ignore[attr-defined]
         return ops.xp.astype(z, ops.xp.float32) if single else z  # type: ignore[attr-defined]
     slabs = [slice(i, i + SLAB) for i in range(0, len(order), SLAB)]
     mean = x.mean(axis=0, dtype=np.float64) if kernel.stationary else np.zeros(x.shape[1])
-    radius = max((float(((x[at] - mean) ** 2).sum(axis=1).max()) for at in slabs), default=0.0)
-    _require_known_distances(radius, kernel)
-    wide = x.dtype == np.float64 or len(x) <= FLOAT64_BELOW or not radius <= limit
-    z, room = np.empty(x.shape, dtype=np.float64 if wide else np.float32), np.empty((min(SMALL, len(order)), x.shape[1]))
+    squares = np.concatenate([((x[at] - mean) ** 2).sum(axis=1) for at in slabs]) if slabs else np.zeros(0)
+    single = _single(squares, segment, kernel) and x.dtype != np.float64
+    z, room = np.empty(x.shape, dtype=np.float32 if single else np.float64), np.empty((min(SMALL, len(order)), x.shape[1]))
     for i in range(0, len(order), SMALL):  # through one small buffer: fresh memory costs more than the arithmetic
         rows = room[: len(order[i : i + SMALL])]
         np.subtract(x[order[i : i + SMALL]], mean, out=rows)
@@ -121,11 +117,16 @@ def centred(x: Any, order: Index, kernel: Kernel, ops: Ops, smallest: int) -> An
     return z
 
 
-def _require_known_distances(radius: float, kernel: Kernel) -> None:
-    """Refuses rows so far from their mean that a product cannot tell distances of a bandwidth in float64.
+def _single(squares: Array, segment: Index, kernel: Kernel) -> bool:
+    """Whether float32 keeps 1e-6, given squared norms of rows and their segments.
 
-    The limit of a kernel is where float32 keeps 1e-6; float64 has 2^29 times as much room, and a coarser value is better than none up to there.
+    The limit of a kernel is where it does over many rows; float64 has 2^29 times as much room, and a coarser value is better than none up to
+    there. Rows of equal norm are taken for copies of one another, whose rounding does not average away.
+
+    Raises:
+        PalpateError: on rows so far from their mean that a product cannot tell distances of a bandwidth in float64.
     """
+    radius = float(squares.max(initial=0.0))
     if not radius <= kernel.radius_limit * 2.0**31:
         far = radius**0.5
         got = f"a row {far:.3g} from the mean, {far / (4 * kernel.radius_limit**0.5):.2g} bandwidths"
@@ -134,6 +135,13 @@ def _require_known_distances(radius: float, kernel: Kernel) -> None:
             got,
             "Leave out what lies so far away, or pass a wider sigma",
         )
+    if not kernel.single or len(squares) <= FLOAT64_BELOW:
+        return False
+    order = np.lexsort((squares, segment))
+    new = np.r_[True, (np.diff(squares[order]) != 0) | (np.diff(segment[order]) != 0)]
+    distinct = np.bincount(segment[order][new])
+    smallest = int(distinct[distinct > 0].min())
+    return radius <= kernel.radius_limit * next((share for rows, share in ROOM if smallest < rows), 1.0)
 
 
 class _Run:

@@ -110,7 +110,8 @@ def checked_pair(x: Any, y: Any, *, normalize: Normalize, least: int, names: tup
     x, y = as_array(names[0], x), as_array(names[1], y)
     if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
         got = f"{x.shape[1]} and {y.shape[1]}"
-        raise PalpateError(f"{names[0]} and {names[1]} must have the same width", got, "Embed both with the same encoder")
+        second = names[1][:1].lower() + names[1][1:] if names[1].startswith("The ") else names[1]
+        raise PalpateError(f"{names[0]} and {second} must have the same width", got, "Embed both with the same encoder")
     homes = [f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}".strip() if is_foreign(v) else "numpy" for v in (x, y)]
     if homes[0] != homes[1]:
         must = f"{names[0]} and {names[1]} must be arrays of one library on one device"

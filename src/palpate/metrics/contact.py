@@ -38,7 +38,7 @@ from palpate.core import PalpateError, Score
 from palpate.metrics.checks import checked_choice, checked_images, checked_names
 from palpate.metrics.compat import WINDOW, Convention
 from palpate.metrics.kernels import Array
-from palpate.metrics.masks import LEAST, Mask, checked_least, checked_touches, mask_of, unit
+from palpate.metrics.masks import LEAST, Mask, checked_least, checked_touches, mask_of, pictures_digest, unit
 from palpate.metrics.multiscale import fitting_scales, signed_maps, weighted_ms_ssim
 from palpate.metrics.pairwise import mean_score
 
@@ -229,7 +229,10 @@ def contact_scores(generated: Any, reference: Any, background: Any, **options: U
     note = f"{no_contact['count']} of {len(bare)} real touches show no contact, left out of the mean" if bare.any() else ""
     size = [int(v) for v in np.shape(reference)[1:3]]
     settings = {"markers": given.get("markers", "skip"), "least": round(float(given.get("least", LEAST)), 6), "size": size}
-    settings |= {"generated_background": "real" if given.get("generated_background") is None else "own"}
+    settings |= {
+        "generated_background": "real" if given.get("generated_background") is None else "own",
+        "background": pictures_digest(background),
+    }
     touched, scales = ~bare, fitting_scales(size)
     beside = {
         "contact residual": {"empty": 1.0, "per_real_energy": _mean(found.per_real_energy[touched])},

@@ -154,7 +154,7 @@ def distance(
     Returns:
         The value; blocked: float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9 (up to 1e-6 where rows lie hundreds to
         ten thousand bandwidths from their mean; farther ones are refused). Rounding errors average out over rows and columns that
-        differ; where most rows are copies or near-copies of a few, float32 leaves up to 1e-6 of the value.
+        differ: copies are counted once before float32 is taken, but a set of near-copies of few rows may have up to 1e-5.
 
     Raises:
         PalpateError: on features that :func:`palpate.metrics.checks.checked_features` refuses, fewer than two rows for

@@ -152,7 +152,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     if value is None:
         note = "Undefined: one of the two scores is"
     elif not a.units or list(a.units) != list(b.units):
-        note = "No interval: the two scores share no units to leave out"
+        note = "No interval: the two scores share no units to leave out" if a.units else "No interval: there is nothing to leave out"
     else:
         method = f"paired leave-one-{x.details.get('left_out', x.details['unit'])}-out jackknife, t, {len(a.units) - 1} df"
         interval, ahead = _interval(value, a.replicates - b.replicates, x.level)

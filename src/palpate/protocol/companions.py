@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet
 from palpate.metrics import psnr, psnr_per_image, ssim, ssim_per_image
 from palpate.metrics.contact import contact_per_image, contact_pictures, contact_scores
-from palpate.metrics.masks import LEAST
+from palpate.metrics.masks import LEAST, pictures_digest
 from palpate.metrics.multiscale import ms_ssim, ms_ssim_per_image
 from palpate.metrics.paired import mean_differences
 from palpate.metrics.pairwise import mean_score
@@ -179,7 +179,8 @@ def _lpips(
         keep(
             "contact LPIPS",
             {name: on_contact(images) for name, images in pictures.items()},
-            settings | {"markers": "skip", "least": round(LEAST, 6), "generated_background": "real"},
+            settings
+            | {"markers": "skip", "least": round(LEAST, 6), "generated_background": "real", "background": pictures_digest(background)},
             note=f"{bare} of {len(real)} real touches show no contact, left out of the mean" if bare else "",
             details={"empty": float(np.nanmean(empty)) if bare < len(real) else None},
         )

@@ -172,9 +172,9 @@ def _set(touches: Manifest, towers: Towers | None, group: str, cache: Path | Non
     return FeatureSet(touches.ids, np.zeros((len(touches), 1), np.float32), column("material"), column(group))
 
 
-def own_cache(cache: Path, *sources: Manifest) -> Path:
+def own_cache(cache: Path, *sources: Manifest, column: str = "tactile") -> Path:
     """A folder for the bytes of one source of pictures: two generators, or the same one a day later, may have files of one name, size and time."""
-    return cache / short(digest_json([files_digest(touches.ids, touches.paths("tactile")) for touches in sources]))
+    return cache / short(digest_json([files_digest(touches.ids, touches.paths(column)) for touches in sources]))
 
 
 def _paired(generators: Mapping[str, Manifest], reference: Manifest, wanted: Wanted) -> bool:
@@ -292,5 +292,5 @@ def _shape(path: Path) -> tuple[int, int]:
 def _load(touches: Manifest, column: str, size: int, folder: Path, progress: Progress) -> Images:
     """Pictures as squares; many of them in a file."""
     if len(touches) * size * size * 3 > HELD:
-        return cached_images(touches, column, size, own_cache(folder, touches), progress)
+        return cached_images(touches, column, size, own_cache(folder, touches, column=column), progress)
     return load_images(touches.paths(column), size, progress=progress)
