@@ -2,6 +2,7 @@
 
 import io
 import re
+from collections import Counter
 
 import pytest
 from rich.console import Console
@@ -169,3 +170,44 @@ def test_a_narrow_terminal_keeps_the_names_of_a_difference_whole(width):
 def test_names_of_a_difference_stay_columns_where_there_is_room():
     text = printed([delta("TMMD", "a", "b", interval=(-1.102, -0.9051))], 58)
     assert re.search(r"^a +b +-1 ", text, re.M)
+
+
+@pytest.mark.parametrize("width", range(24, 130))
+def test_no_number_and_no_heading_is_ever_cut(width):
+    """Whatever the width: the numbers are those of the wide tables, and only columns that are named are missing."""
+    more = {"interval": (-0.05023, 0.06412), "null": (-0.1118, 0.03005), "floor": 0.05706, "details": {"p_value": 0.0123}, "note": SEEN}
+    scores = [scored("TMMD", name, value, **more) for name, value in (("ours", 0.7319), ("real, same material", 0.2753))]
+    scores.append(delta("TMMD", "ours", "real, same material", interval=(-0.004784, -0.002442), note=SEEN))
+    text, wide = (" ".join(printed(scores, w).split()).replace("95 % interval", "interval") for w in (width, 250))
+    spared: list[str] = []
+    for heads, numbers in {"null and n": ["-0.1118", "0.03005", "120"], "Holm p": ["0.05"]}.items():
+        spared += numbers if f"Left out in this width: {heads}." in text else []
+    found, wanted = (Counter(re.findall(r"-?\d[\d.]*", t)) for t in (text, wide))
+    assert found == Counter({number: count for number, count in wanted.items() if number not in spared})
+    heads = ("value", "interval", "p", "floor", "note", "a - b", *(() if spared else ("null", "n", "Holm p")))
+    assert [head for head in heads if not re.search(rf"(?<!\w){head}(?!\w)", text)] == []
+    assert "…" not in text
+    assert width > 40 or text.count("note: 1") == 3  # a mark is not taken for a size
+
+
+def test_a_subject_stands_above_its_numbers_where_there_is_no_room_beside_them():
+    score = scored("TMMD", "real, same material", floor=0.1, interval=(-0.05023, 0.06412))
+    wide, narrow = ([line.split("  ")[0].rstrip() for line in printed([score], width).splitlines()] for width in (60, 50))
+    assert wide[:3] == ["subject", "TMMD ↓, grouped", "real, same material"]
+    assert narrow[1:3] == ["TMMD ↓, grouped", "real, same material"]
+    assert "subject" not in narrow
+    assert "  value: 1" in printed([score], 30).splitlines()
+
+
+def test_differences_of_a_metric_stand_together():
+    pairs = [("a", "b"), ("a", "c"), ("b", "c")]
+    text = printed([delta(metric, *pair) for pair in pairs for metric in ("I-TMMD", "I-TMMD E", "SSIM")], 70)
+    lines = [line.split() for line in text.splitlines()]
+    assert [line[0] for line in lines if line[-1:] == ["grouped"]] == ["I-TMMD", "I-TMMD", "SSIM"]
+    assert [tuple(line[:2]) for line in lines if "97.5" in line] == pairs * 3
+
+
+def test_a_note_loses_no_letter_in_the_narrowest_terminal():
+    text = printed([scored("TMMD", "a", floor=0.1, note="Denominators near 0")], 10)
+    assert "…" not in text
+    assert "".join(text.split()).endswith("1Denominatorsnear0")

@@ -44,8 +44,8 @@ def cells(text):
 def test_no_text_is_a_command(text):
     out = escape(text)
     assert "\n" not in out
-    known = r"\\(textbackslash|textasciitilde|textasciicircum|textless|textgreater|textbar|textquotedbl|textasciigrave)\{\}|\\[{}$&#%_]"
-    rest = re.sub(r"\$(-|\\sigma|\\times)\$|\{[\[\]]\}|-\{\}", "", re.sub(known, "", out))
+    known = r"\\(textbackslash|textasciitilde|textasciicircum|textless|textgreater|textbar|char34|`)\{\}|\\[{}$&#%_]"
+    rest = re.sub(r"\$(-|\^2|\\(sigma|times|pm|cdot|rightarrow))\$|\{[\[\]]\}|-\{\}", "", re.sub(known, "", out))
     assert not re.search(r"[\\{}$&#%_~^]", rest.replace("~", "" if "\u00a0" in text else "~"))
 
 
@@ -57,6 +57,29 @@ def test_odd_names_and_commands_stay_text():
     assert [line for line in text.splitlines() if r"\end{table}" in line] == [r"% palpate score --seed 1 \end{table}", r"\end{table}"]
     assert r"palpate score -{}-seed 1 \textbackslash{}end\{table\}" in text
     assert text.startswith("% palpate")
+
+
+def test_text_compiles_in_the_fonts_that_latex_starts_with():
+    """These commands are those that pdfLaTeX has in OT1 without any package, and before textcomp was part of it."""
+    assert escape('"a" `b` <|> ±1 · 2² → x') == (
+        r"\char34{}a\char34{} \`{}b\`{} \textless{}\textbar{}\textgreater{} $\pm$1 $\cdot$ 2$^2$ $\rightarrow$ x"
+    )
+    assert escape("cafe\u0301") == "café"
+    assert escape("a\x85b") == "a b"
+
+
+@pytest.mark.parametrize(
+    ("name", "needs"),
+    [
+        ("Žluťoučký kůň, naïve Straße… “x” – ±2²σ", []),
+        ("łąka «x»", [r"% Needs \usepackage[T1]{fontenc} for «, », ą, or LuaLaTeX or XeLaTeX."]),
+        ("日本 ą", ["% pdfLaTeX does not have 日, 本: needs LuaLaTeX or XeLaTeX, and a font that has them."]),
+        ("≤Ωабвг", ["% pdfLaTeX does not have Ω, а, б, в, г and 1 more: needs LuaLaTeX or XeLaTeX, and a font that has them."]),
+    ],
+)
+def test_the_head_says_what_foreign_letters_need(name, needs):
+    text = latex_tables(Results(title="t", scores=[make("TMMD", name, 1.0)]))
+    assert text.splitlines()[1 : text.splitlines().index("")] == [r"% Needs \usepackage{booktabs}.", *needs]
 
 
 @pytest.mark.parametrize(

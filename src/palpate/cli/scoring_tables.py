@@ -1,17 +1,19 @@
 """The tables of ``palpate score`` in the terminal: one of scores, one of paired differences, and below them what a reader must know, each sentence once.
 
-Where a table is wider than the terminal, the metrics become headings; where it still is, so do the two names of a difference, and the columns that
-can be spared are left out and named.
+Where a table is wider than the terminal, the metrics become headings; where it still is, so do the names, and the columns that can be spared are left
+out and named. Where even that is too wide, each number has a line of its own: none is ever cut.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 from rich.cells import cell_len
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from palpate.cli.terminal import Terminal
 from palpate.core import Results, Score
@@ -58,6 +60,7 @@ def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None
     if notes.texts:
         below = Table.grid(padding=(0, 2, 0, 0))
         below.add_column(justify="right")
+        below.add_column(overflow="fold")
         for k, text in enumerate(notes.texts, 1):
             below.add_row(str(k), escape(text))
         terminal.out.print()
@@ -99,9 +102,10 @@ def _scores(scores: Sequence[Score], notes: Footnotes, told: set[str]) -> Grid:
 
 
 def _differences(scores: Sequence[Score], notes: Footnotes, frames: set[tuple[str, str]]) -> Grid:
-    """The differences; ``frames`` are the columns whose intervals take samples as independent."""
+    """The differences, one metric below the other; ``frames`` are the columns whose intervals take samples as independent."""
+    order = list(dict.fromkeys(map(_column, scores)))
     rows: list[tuple[str, str, Sequence[str]]] = []
-    for s in scores:
+    for s in sorted(scores, key=lambda s: order.index(_column(s))):
         metric, d = s.metric.removesuffix(TAIL), s.details
         ahead = confidence(s)
         known = [t for t in remarks(s) if t not in ahead]
@@ -130,15 +134,13 @@ def _draw(grid: Grid, terminal: Terminal) -> None:
     if terminal.out.measure(wide, options=terminal.out.options.update(width=10_000)).maximum <= room:
         terminal.out.print(wide)
         return
-    if grid.left > 1 and not _fits(grid, keep, room):
-        keep = [k for k in keep if k >= grid.left]  # the names stand above the numbers
-    spared = [grid.heads[k] for k in keep if grid.heads[k] in grid.spare]
-    if spared and not _fits(grid, keep, room):
-        keep = [k for k in keep if grid.heads[k] not in spared]
-    else:
-        spared = []
-    _sections(grid, keep, terminal)
-    if spared:
+    above = [k for k in keep if k >= grid.left]  # the names stand above the numbers
+    needed = [k for k in keep if grid.heads[k] not in grid.spare]
+    # Two names go before any number, one after those that can be spared.
+    layouts = (keep, above if grid.left > 1 else needed, [k for k in above if k in needed])
+    shown = next((some for some in layouts if _fits(grid, some, room)), above)
+    _sections(grid, shown, terminal)
+    if spared := [grid.heads[k] for k in above if k not in shown]:
         are = "They are" if len(spared) > 1 else "It is"
         terminal.print(f"Left out in this width: {' and '.join(spared)}. {are} in the results of -o, and in a wider window.")
 
@@ -157,37 +159,36 @@ def _fits(grid: Grid, keep: Sequence[int], room: int) -> bool:
 
 
 def _sections(grid: Grid, keep: Sequence[int], terminal: Terminal) -> None:
-    """The columns ``keep`` of a grid, each metric below a line of its own; a name folds where even that is too wide.
+    """The columns ``keep`` of a grid, each metric below a line of its own, and so the names that are not among them; as lists where that is too wide."""
+    fits, widths, heads = _fits(grid, keep, terminal.out.width), _widths(grid, keep), [_short(head) for head in grid.heads]
 
-    Rows whose names are not among ``keep`` have them on a line of their own.
-    """
-    widths, named = _widths(grid, keep), keep[0] < grid.left
-    if named and not _fits(grid, keep, terminal.out.width):
-        rest = sum(widths[grid.left :]) + 2 * (len(keep) - 1)
-        names = max(4, (terminal.out.width - rest) // grid.left)
-        widths[: grid.left] = [min(width, names) for width in widths[: grid.left]]
-
-    def lines() -> Table:
-        table = Table(box=None, pad_edge=False, show_header=False)
+    def line(cells: Sequence[str], style: str = "") -> None:
+        # Not a row of a rich table: that cuts the numbers of a column that it makes narrower.
+        padded: list[str] = []
         for k, width in zip(keep, widths, strict=True):
-            justify = "left" if k < grid.left or grid.heads[k] == "note" else "right"
-            table.add_column(justify=justify, width=width, overflow="fold", no_wrap=k >= grid.left)
-        return table
+            space = " " * (width - cell_len(cells[k]))
+            padded.append(cells[k] + space if k < grid.left or grid.heads[k] == "note" else space + cells[k])
+        terminal.out.print(Text("  ".join(padded).rstrip(), style), soft_wrap=True)
 
-    table, before = lines(), None
-    table.add_row(*(_short(grid.heads[k]) for k in keep), style="bold")
-    for metric, preset, cells in grid.rows:
-        if (metric, preset) != before:
-            terminal.out.print(table)
-            terminal.out.print(escape(", ".join(filter(None, [metric, preset]))), style="bold")
-            table, before = lines(), (metric, preset)
-        if not named:
-            if table.row_count:
-                terminal.out.print(table)
-            terminal.out.print(escape(" - ".join(cells[: grid.left])))
-            table = lines()
-        table.add_row(*(escape(cells[k]) for k in keep))
-    terminal.out.print(table)
+    if fits:
+        line(heads, "bold")
+    for (metric, preset), rows in groupby(grid.rows, key=lambda row: row[:2]):
+        terminal.out.print(Text(", ".join(filter(None, [metric, preset])), "bold"))
+        for *_, cells in rows:
+            if keep[0] >= grid.left:
+                terminal.out.print(Text(" - ".join(cells[: grid.left])))
+            if fits:
+                line(cells)
+            else:
+                _list([(heads[k], cells[k]) for k in keep if cells[k]], terminal)
+
+
+def _list(cells: Sequence[tuple[str, str]], terminal: Terminal) -> None:
+    """Numbers beside their heads, or below them where that is too wide."""
+    for head, cell in cells:
+        beside = f"  {head}: {cell}"
+        for text in [beside] if cell_len(beside) <= terminal.out.width else [f"  {head}:", f"  {cell}"]:
+            terminal.out.print(Text(text))
 
 
 def _marks(notes: Footnotes, said: Sequence[str]) -> str:

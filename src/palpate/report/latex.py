@@ -4,17 +4,18 @@ Rows are subjects, columns are metrics with the arrow of the better direction; t
 below that. A value is bold only where its generator is better than every other one by a paired difference whose interval leaves out 0: a best of
 overlapping values is nobody's. The caption says how the numbers were made; what a reader must know of single values (classes left out, intervals over
 frames) has a letter below the table. Differences of many rows are a ``longtable``, since a float cannot break over pages. Text is escaped: no name
-can be a command. Needs ``\usepackage{booktabs}`` and, where it is used, ``longtable``: a comment at the head says so.
+can be a command. Needs ``\usepackage{booktabs}`` and, where they are used, ``longtable`` and fonts for foreign letters: comments at the head say so.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 
 from palpate.core import Results, Score, short
-from palpate.report.remarks import NEARER, Footnotes, by_gap, reason, remarks
+from palpate.report.remarks import NEARER, Footnotes, by_gap, few, reason, remarks
 from palpate.report.sides import TAIL, sides
 from palpate.report.tables import gel_of, parts, score_tables
 from palpate.report.text import decimals, defined, setting_of
@@ -27,19 +28,24 @@ LONG = 40
 ARROWS = {True: r"$\uparrow$", False: r"$\downarrow$", None: r"$\rightarrow$"}
 #: What the name of E has more than that of its metric.
 _EXCESS = re.compile(r"(?<=-TMMD) E\b")
+#: Each compiles with the fonts that LaTeX starts with (OT1), in T1 and in LuaLaTeX; ``\textquotedbl`` would not.
 _SPECIAL = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "`": r"\textasciigrave{}",
-    "σ": r"$\sigma$", "×": r"$\times$", "−": "$-$", "–": "--", "\u00a0": "~", "[": "{[}", "]": "{]}",
+    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\char34{}", "`": r"\`{}",
+    "σ": r"$\sigma$", "×": r"$\times$", "±": r"$\pm$", "·": r"$\cdot$", "²": "$^2$", "→": r"$\rightarrow$", "−": "$-$", "–": "--", "\u00a0": "~",
+    "[": "{[}", "]": "{]}",
 }  # fmt: skip
+#: Letters and signs that pdfLaTeX has in T1 fonts only, and all that it does not have.
+_T1 = re.compile("[«»ÐÞðþĄąĐđĘęĮįŊŋŲų‚„‹›]")
+_FOREIGN = re.compile("[^\x00-\x7f\xa1-ſȘșȚț‐-‖‘-‚“-„†‡•…‰‹›€™]|[ĦħĸĿŀŉŦŧſ]")
 
 
 def escape(text: str) -> str:
     """Plain text as LaTeX that prints it; control characters and line ends become spaces.
 
-    The breaks of ligatures keep ``--seed`` of a command two hyphens.
+    The breaks of ligatures keep ``--seed`` of a command two hyphens. Accents are made one with their letters, since pdfLaTeX has no others.
     """
-    plain = re.sub(r"[\x00-\x1f\x7f\u2028\u2029]", " ", text)
+    plain = re.sub(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]", " ", unicodedata.normalize("NFC", text))
     return re.sub("-(?=-)", "-{}", "".join(_SPECIAL.get(c, c) for c in plain))
 
 
@@ -70,8 +76,16 @@ def latex_tables(results: Results) -> str:
     for part in parts(results.scores):
         lines += _differences(part.title, part.scores, results) if part.differences else []
     needs = r"{booktabs,longtable}; longtable needs text of one column" if r"\begin{longtable}" in "\n".join(lines) else "{booktabs}"
-    head = [MARK, *(f"% {_comment(c)}" for c in results.commands), rf"% Needs \usepackage{needs}.", ""]
+    head = [MARK, *(f"% {_comment(c)}" for c in results.commands), rf"% Needs \usepackage{needs}.", *_fonts("".join(lines)), ""]
     return "\n".join([*head, *lines]).rstrip() + "\n"
+
+
+def _fonts(text: str) -> list[str]:
+    """What the letters of a text need besides, as a comment."""
+    if found := sorted(set(_FOREIGN.findall(text))):
+        return [f"% pdfLaTeX does not have {few(found)}: needs LuaLaTeX or XeLaTeX, and a font that has them."]
+    found = sorted(set(_T1.findall(text)))
+    return [rf"% Needs \usepackage[T1]{{fontenc}} for {few(found)}, or LuaLaTeX or XeLaTeX."] if found else []
 
 
 def _comment(text: str) -> str:
