@@ -333,3 +333,51 @@ def test_other_pictures_of_the_same_name_size_and_time_are_embedded_again(capsys
         values.append(found["TMMD", "a", "grouped"]["value"])
         assert values[-1] == pytest.approx(score(capsys, *args)[0]["TMMD", "a", "grouped"]["value"], rel=1e-6)
     assert values[0] != values[1]
+
+
+def test_a_manifest_is_embedded_again_when_a_real_picture_is_another_one(capsys, tmp_path, monkeypatch, small_manifest, mini):
+    from palpate.encoders.towers import Towers
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Towers, "load", lambda *_, **__: mini)
+    small_manifest.save(Path("m/manifest.parquet"))
+    ids = small_manifest.ids
+    split = Split.from_ids(train=ids[:16], test=ids[16:], rule={"group": "video"}, manifest=small_manifest.digest)
+    split.save(Path("s.json"))
+    paint(tmp_path / "g" / "images", ids[16:], 1)
+    index = {"format": "palpate-generated/1", "complete": True, "settings": {}, "digest": "", "notice": "", "skipped": []}
+    Path("g/index.json").write_text(json.dumps(index | {"images": {i: f"{i}.png" for i in ids[16:]}}))
+    args = ("m", "--split", "s.json", "--encoder", "palpate/mini", "--generated", "g", "--companions", "none", "--permutations", "0")
+    changing = [small_manifest.take([ids[0], ids[-1]]).paths("tactile")[k] for k in (0, 1)]  # of train, which is the floor, and of test
+
+    def rewrite(path: Path, seed: int) -> int:
+        picture = np.random.default_rng(seed).integers(90, 160, (32, 32, 3)).astype(np.uint8)
+        Image.fromarray(picture).save(path, compress_level=0)  # of one size
+        os.utime(path, ns=(10**18, 10**18))
+        return path.stat().st_size
+
+    sizes, seen = {rewrite(path, 0) for path in changing}, []
+    for k in range(3):
+        if k:
+            sizes.add(rewrite(changing[k - 1], k))
+        told = [score(capsys, *args, "--controls", "False", *more)[0]["TMMD", "g", "grouped"] for more in (("--cache", "kept"), ())]
+        assert [told[0][name] for name in ("value", "floor")] == pytest.approx([told[1][name] for name in ("value", "floor")], rel=1e-6)
+        seen.append((told[0]["value"], told[0]["floor"]))
+    assert len(sizes) == 1
+    assert seen[1][0] == seen[0][0]  # a train touch changes the floor alone
+    assert len({floor for _, floor in seen}) == 3
+    assert seen[2][0] != seen[1][0]
+
+
+def test_contact_scores_without_the_gel_are_refused_before_anything_is_embedded(capsys, tmp_path, monkeypatch, mini):
+    from palpate.encoders.towers import Towers
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Towers, "load", lambda *_, **__: mini)
+    calls = []
+    monkeypatch.setattr(Towers, "encode", lambda *_, **__: calls.append(1))
+    for seed, name in enumerate(("real", "made")):
+        paint(tmp_path / name, ["1", "2", "3"], seed)
+    args = ("--generated", "made", "--reference", "real", "--encoder", "palpate/mini", "--companions", "contact")
+    status, out, err = call(capsys, *args)
+    assert (status, out, "must have the gel without contact" in err, calls) == (2, "", True, []), err

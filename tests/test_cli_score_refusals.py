@@ -1,11 +1,13 @@
 """``palpate score``: what it refuses before it computes, in words of its own options, and what it keeps where a disk fails."""
 
 import errno
+import json
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from PIL import Image
 
 from palpate.cli import scoring_runs, scoring_tables
 from palpate.core import FeatureSet, PalpateError, Results, Score, Split
@@ -104,6 +106,49 @@ def test_options_that_would_do_nothing_are_refused(capsys, sets):
     pl.DataFrame({"id": IDS, "touch": GROUPS}).write_csv("touches.csv")
     found, _ = score(capsys, *PAIR[:2], *PAIR[2:], "--group", "touch", "--groups", "touches.csv", "--presets", "grouped")
     assert found["TMMD", "g", "grouped"]["value"] is not None
+
+
+def test_groups_are_those_of_the_column_that_was_asked_for(capsys, sets):
+    objects = [f"o{k // 10}" for k in range(len(IDS))]
+    pl.DataFrame({"id": IDS, "material": LABELS, "video": GROUPS, "object": objects}).write_csv("o.csv")
+    pl.DataFrame({"id": IDS, "material": LABELS}).write_csv("l.csv")
+    for name in "gr":
+        FeatureSet(IDS, sets[name].features, LABELS, objects).save(Path(f"{name}o.npz"))
+    rest = ("--companions", "none", "--permutations", "0", "--presets", "grouped")
+    plain = ("--generated", "g.npy", "--reference", "r.npy", *rest)
+    want, _ = score(capsys, "--generated", "go.npz", "--reference", "ro.npz", "--names", "g", *rest)
+    videos, data = score(capsys, *plain, "--labels", "o.csv")
+    assert data["settings"]["options"]["group"] == "video"
+    for args in (
+        (*plain, "--labels", "o.csv"),
+        (*plain, "--labels", "l.csv", "--groups", "o.csv"),
+        (*PAIR[:4], *rest, "--labels", "o.csv"),
+    ):
+        found, data = score(capsys, *args, "--group", "object")
+        assert data["settings"]["options"]["group"] == "object"
+        assert found["TMMD", "g", "grouped"]["value"] == want["TMMD", "g", "grouped"]["value"] != videos["TMMD", "g", "grouped"]["value"]
+    for args, words in (
+        (
+            ("--labels", "o.csv", "--group", "touch"),
+            "--group touch with embeddings and o.csv, which has the columns id, material, video, object",
+        ),
+        (("--groups", "o.csv", "--group", "touch"), "o.csv must have a column touch. Got columns id, material, video, object"),
+        (("--labels", "l.csv", "--group", "video"), "--group video with embeddings and l.csv, which has the columns id, material"),
+        (("--group", "video"), "--group video with embeddings alone"),
+    ):
+        assert words in refused(capsys, *plain, *args)
+    found, data = score(capsys, *PAIR, "--labels", "l.csv", "--group", "video")  # which the files have
+    assert found["TMMD", "g", "grouped"]["value"] == videos["TMMD", "g", "grouped"]["value"]
+
+
+def test_a_bug_is_an_object_of_json_as_well(capsys, sets, monkeypatch):
+    monkeypatch.setattr(scoring_runs, "score", lambda *_: 1 / 0)
+    status, out, err = call(capsys, *PAIR, "--json")
+    assert (status, "this is a bug in palpate" in err) == (70, True)
+    assert json.loads(out) == {
+        "error": "ZeroDivisionError", "must": "palpate must not fail of itself", "got": "division by zero",
+        "fix": "Report the traceback on standard error",
+    }  # fmt: skip
 
 
 def test_a_plain_folder_beside_a_manifest_is_pointed_to_the_reference(capsys, sets):
@@ -224,7 +269,14 @@ def test_a_file_of_groups_without_groups_and_a_cache_inside_what_is_read_are_ref
         assert (status, word in err) == (2, True), err
     assert not Path("c").exists()
     pictures = ("--generated", "pics", "--reference", "pics", "--companions", "psnr")
-    for extra, word in ((("--cache", "pics/c"), "a folder of its own"), (("--presets", "cmmd"), "--presets must go with features")):
+    for extra, word in (
+        (("--cache", "pics/c"), "a folder of its own"),
+        (("--presets", "cmmd"), "--presets must go with features"),
+        (("--estimator", "biased"), "--estimator must go with features"),
+        (("--sigma", "3"), "--sigma must go with features"),
+        (("--backend", "moments"), "--backend must go with features"),
+        (("--permutations", "7"), "--permutations must go with features"),
+    ):
         status, _, err = call(capsys, *pictures, *extra)
         assert (status, word in err) == (2, True), err
 
@@ -235,3 +287,29 @@ def test_a_preset_that_is_named_twice_is_scored_once(capsys, tmp_path, monkeypat
     args = ("--generated", "a.npy", "--reference", "r.npy", "--presets", "paper", "paper", "--companions", "none", "--permutations", "0")
     _, data = score(capsys, *args)
     assert [s["metric"] for s in data["scores"]].count("TMMD") == 1
+
+
+def test_options_of_features_are_neither_taken_nor_written_down_for_pixels(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(("real", "made")):
+        Path(name).mkdir()
+        for k, picture in enumerate(np.random.default_rng(seed).integers(90, 160, (3, 32, 32, 3)).astype(np.uint8), 1):
+            Image.fromarray(picture).save(f"{name}/{k}.png")
+    base = ("--generated", "made", "--reference", "real", "--companions")
+    _, data = score(capsys, *base, "psnr")
+    assert data["settings"]["options"] == {"group": "video", "seed": 0}
+    found, data = score(capsys, *base, "cmmd", "--clip", "palpate/mini", "--backend", "moments", "--permutations", "7")
+    assert data["settings"]["options"] == {"group": "video", "seed": 0, "backend": "moments", "permutations": 7}
+    cmmd = found["CMMD (CLIP)", "made", "cmmd"]["details"]
+    assert (cmmd["backend"], cmmd["p_value"] is None) == ("moments", False)
+    for extra, words in (
+        (("cmmd", "--clip", "palpate/mini", "--sigma", "3"), "--sigma must go with features"),
+        (("psnr", "--group", "touch"), "--group touch with pictures alone"),
+    ):
+        status, out, err = call(capsys, *base, *extra)
+        assert (status, out, words in err) == (2, "", True), err
+    Path("c.csv").write_text("id,material,touch\n1,m,a\n2,m,a\n3,m,b\n")
+    _, data = score(capsys, *base, "psnr", "--group", "touch", "--labels", "c.csv")
+    assert data["settings"]["options"]["group"] == "touch"
+    status, _, err = call(capsys, *base, "psnr", "--group", "video", "--labels", "c.csv")
+    assert (status, "--group video with pictures and c.csv, which has the columns id, material, touch" in err) == (2, True), err

@@ -11,8 +11,8 @@ from palpate.metrics.intervals import mean_interval
 from palpate.metrics.neighbours import prdc_rows
 from palpate.metrics.paired import mean_differences
 from palpate.protocol import comparing
-from palpate.protocol.comparing import Asked, Outcome, against, compare_features, confidence, feature_companions
-from palpate.protocol.embeddings import known_to, left_out, part_of
+from palpate.protocol.comparing import Asked, Outcome, against, compare_features, confidence, feature_companions, left_out, part_of
+from palpate.protocol.embeddings import known_to
 
 VIDEOS, FRAMES, D = 10, 4, 3
 IDS = [f"v{v}/{k}" for v in range(VIDEOS) for k in range(FRAMES)]

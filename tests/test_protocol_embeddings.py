@@ -1,7 +1,9 @@
 """Embeddings from files: every kind gives the same set, and what is no such file is refused with a reason."""
 
+import datetime
 import json
 import pickle
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ import polars as pl
 import pytest
 
 from palpate.core import FeatureSet, PalpateError
-from palpate.protocol.embeddings import Columns, read_columns, read_embeddings
+from palpate.protocol.embeddings import Columns, is_embeddings, read_columns, read_embeddings
 
 IDS = ["v0/1", "007", 'odd "name", [x]', "grün"]
 LABELS, GROUPS = ["Wood", "Wood", "Brick", ""], ["v0", "v0", "v1", "v1"]
@@ -62,7 +64,8 @@ def test_a_fixed_width_column_and_what_the_safetensors_package_writes(tmp_path):
 
 def test_bfloat16_is_widened_bit_for_bit(tmp_path):
     high = (X.view(np.uint32) >> 16).astype(np.uint16)  # truncated to the upper half: what bfloat16 is
-    found = read_embeddings(safe(tmp_path / "x.safetensors", high, "BF16", {})).features
+    with pytest.warns(UserWarning, match=r"features in .*x\.safetensors: bfloat16 features were widened to float32; their rounding stays"):
+        found = read_embeddings(safe(tmp_path / "x.safetensors", high, "BF16", {})).features
     assert found.dtype == np.float32
     assert np.array_equal(found.view(np.uint32), X.view(np.uint32) & 0xFFFF0000)
 
@@ -78,7 +81,11 @@ def test_npy_is_mapped_and_its_rows_numbered(tmp_path):
 def test_columns_complete_what_a_file_lacks(tmp_path):
     (tmp_path / "c.csv").write_text("id,material,video\n" + "\n".join(f"{k:03d},m{k % 2},v{k // 2}" for k in (3, 2, 1, 0)))
     columns = read_columns(tmp_path / "c.csv")
-    assert columns == Columns(tmp_path / "c.csv", ["003", "002", "001", "000"], ["m1", "m0", "m1", "m0"], ["v1", "v1", "v0", "v0"])
+    names = ["id", "material", "video"]
+    want = Columns(
+        tmp_path / "c.csv", ["003", "002", "001", "000"], ["m1", "m0", "m1", "m0"], ["v1", "v1", "v0", "v0"], "video", False, names
+    )
+    assert columns == want
     np.savez(tmp_path / "x.npz", features=X, ids=np.array(["000", "001", "002", "003"]), labels=np.array(list("abcd")))
     found = read_embeddings(tmp_path / "x.npz", columns)
     assert (found.labels, found.groups) == (["a", "b", "c", "d"], ["v0", "v0", "v1", "v1"])  # its own labels stay
@@ -90,6 +97,25 @@ def test_columns_complete_what_a_file_lacks(tmp_path):
     np.savez(tmp_path / "w.npz", features=X, ids=np.array(["000", "001", "002", "other"]))
     with pytest.raises(PalpateError, match="1 of 4 that are not, first 'other'"):
         read_embeddings(tmp_path / "w.npz", columns)
+
+
+def test_a_column_of_groups_that_was_asked_for_is_never_another_one(tmp_path):
+    (tmp_path / "c.csv").write_text("id,material,video,object\n" + "".join(f"{k},m,v{k},o\n" for k in range(4)))
+    read = lambda *how, **more: read_columns(tmp_path / "c.csv", *how, **more)  # noqa: E731
+    assert (read("touch").groups, read("touch").group) == (["v0", "v1", "v2", "v3"], "video")
+    assert (read("touch", asked=True).groups, read("touch", asked=True).group) == (None, None)
+    np.savez(tmp_path / "x.npz", features=X, ids=np.array(list("0123")), groups=np.array(list("abcd")))
+    assert read_embeddings(tmp_path / "x.npz", read("object")).groups == list("abcd")  # its own stay
+    assert read_embeddings(tmp_path / "x.npz", read("object", asked=True)).groups == ["o"] * 4
+    assert read_embeddings(tmp_path / "x.npz", read("touch", asked=True)).groups == list("abcd")
+
+
+def test_half_precision_is_widened_once_and_said(tmp_path):
+    np.save(tmp_path / "x.npy", X.astype(np.float16))
+    with pytest.warns(UserWarning, match=r"features in .*x\.npy: float16 features were widened to float32; their rounding stays"):
+        found = read_embeddings(tmp_path / "x.npy").feature_set()
+    assert found.features.dtype == np.float32
+    assert np.array_equal(found.features, X.astype(np.float16))
 
 
 @pytest.mark.parametrize(("text", "word"), [
@@ -137,7 +163,7 @@ def test_nan_is_named_by_id_and_file(tmp_path):
     bad = X.copy()
     bad[2, 1] = np.nan
     np.savez(tmp_path / "x.npz", features=bad, ids=np.array(IDS))
-    with pytest.raises(PalpateError, match=r"x\.npz: Features must be finite. Got NaN or infinity in 1 row, first 'odd"):
+    with pytest.raises(PalpateError, match=r"x\.npz: Features must be finite. Got NaN or infinity in 1 row \(\d+: 'odd"):
         read_embeddings(tmp_path / "x.npz").feature_set()
 
 
@@ -158,7 +184,9 @@ def test_damaged_and_lying_files_are_refused(tmp_path):
     wrong = {
         "beyond": header(data_offsets=[0, 4800], shape=[400, 3]), "size": header(shape=[4, 4]), "negative": header(shape=[-4, -3]),
         "start": header(data_offsets=[-8, 40]), "none": {"features": None}, "ids": {"__metadata__": {"ids": '{"a": 1}'}},
-        "numbers": {"__metadata__": {"ids": "[1, 2, 3, 4]"}}, "kind": header(dtype="I32"),
+        "numbers": {"__metadata__": {"ids": "[1, 2, 3, 4]"}}, "kind": header(dtype="I32"), "about": {"__metadata__": [1]},
+        "encoder": {"__metadata__": {"encoder": 5}}, "encoders": {"__metadata__": {"encoder": ["q"]}}, "half": header(shape=[4.5, 3]),
+        "endless": header(shape=[float("inf"), 3]), "offset": header(data_offsets=[0.0, 48.0]),
     }  # fmt: skip
     for name, entry in wrong.items():
         cases[f"{name}.safetensors"] = b""
@@ -181,7 +209,50 @@ def test_damaged_and_lying_files_are_refused(tmp_path):
         "absent.npy",
         "x.txt",
     )
+    np.savez_compressed(tmp_path / "deflated.npz", features=X)
+    for name, at, byte in (("coding.npz", 8, 99), ("secret.npz", 6, 1), ("stream.npz", None, 255)):  # of the zip: method, flags, data
+        data = bytearray((tmp_path / "deflated.npz").read_bytes())
+        with zipfile.ZipFile(tmp_path / "deflated.npz") as file:
+            start = 30 + len(file.infolist()[0].filename) + int.from_bytes(data[28:30], "little")
+        index = data.index(b"PK\x01\x02")
+        for k in [start, start + 1] if at is None else [at, index + at + 2]:
+            data[k] = byte
+        (tmp_path / name).write_bytes(data)
+    more = (*more, "coding.npz", "secret.npz", "stream.npz")
     (tmp_path / "x.txt").write_text("1 2 3")
     for name in (*cases, *more):
         with pytest.raises(PalpateError, match=name.replace(".", r"\.")):
             read_embeddings(tmp_path / name)
+
+
+@pytest.mark.parametrize("features", [{"features": [[1.0, 0.0]]}, {"f0": [1.0], "f1": [0.0]}])
+def test_a_file_without_rows_says_so(tmp_path, features):
+    pl.DataFrame({"id": ["a"], **features}).head(0).write_parquet(tmp_path / "x.parquet")
+    safe(tmp_path / "x.safetensors", X[:0], "F32", {})
+    np.savez(tmp_path / "x.npz", features=X[:0])
+    for name in ("x.parquet", "x.safetensors", "x.npz"):
+        with pytest.raises(PalpateError, match=rf"{name} must hold at least one row\. Got none"):
+            read_embeddings(tmp_path / name)
+
+
+@pytest.mark.parametrize("column", [[["a"], ["b"]], [b"\xff", b"a"], [datetime.timedelta(1), datetime.timedelta(2)]])
+@pytest.mark.parametrize("name", ["id", "material", "video"])
+def test_names_that_are_no_text_are_refused(tmp_path, column, name):
+    path = tmp_path / "x.parquet"
+    pl.DataFrame({"id": ["a", "b"], "material": ["a", "b"], "features": [[1.0], [1.0]]} | {name: column}).write_parquet(path)
+    for read in (read_embeddings, read_columns):
+        with pytest.raises(PalpateError, match=rf"The column {name} in .*x\.parquet must be text, or numbers\. Got"):
+            read(path)
+
+
+def test_a_panic_of_polars_is_told_as_a_damaged_file(tmp_path, monkeypatch):
+    def panic(*_, **__):
+        raise pl.exceptions.PanicException("capacity overflow")
+
+    pl.DataFrame({"id": ["a"], "material": ["a"], "features": [[1.0]]}).write_parquet(tmp_path / "x.parquet")
+    monkeypatch.setattr(pl, "read_parquet", panic)
+    for read in (read_embeddings, read_columns):
+        with pytest.raises(PalpateError, match=r"x\.parquet must be .*Got capacity overflow"):
+            read(tmp_path / "x.parquet")
+    monkeypatch.setattr(pl, "read_parquet_metadata", panic)
+    assert is_embeddings(tmp_path / "x.parquet")

@@ -21,9 +21,11 @@ from palpate.protocol.comparing import (
     against,
     compare_features,
     feature_companions,
+    left_out,
+    part_of,
     require_one_encoder,
 )
-from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, known_to, left_out, part_of, read_columns, read_embeddings
+from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, known_to, read_columns, read_embeddings
 from palpate.protocol.streamed import stream_tmmd
 
 if TYPE_CHECKING:
@@ -90,13 +92,24 @@ def _named(options: Options) -> dict[str, Path]:
 
 def _columns(options: Options, group: str) -> Columns | None:
     """Labels and groups from one or two files."""
-    labels = read_columns(options.labels, group) if options.labels else None
-    groups = read_columns(options.groups, group) if options.groups else None
+    asked = options.group != "auto"
+    labels = read_columns(options.labels, group, asked=asked) if options.labels else None
+    groups = read_columns(options.groups, group, asked=asked) if options.groups else None
     if groups is not None and groups.groups is None:
-        raise PalpateError(f"{options.groups} must have a column {group}", "only labels", "Pass it as --labels")
+        got = f"columns {', '.join(groups.names)}"
+        raise PalpateError(f"{options.groups} must have a column {group}", got, "Add it, or pass the file as --labels")
     if labels is None or groups is None or options.labels == options.groups:
         return labels or groups
-    return replace(labels, groups=groups.of(labels.ids)[1])
+    return replace(labels, groups=groups.of(labels.ids)[1], group=groups.group)
+
+
+def _require_group(options: Options, columns: Columns | None, held: bool, what: str) -> None:
+    """Refuses a ``--group`` that neither a columns file nor the input itself (``held``) has."""
+    if options.group == "auto" or held or (columns is not None and columns.groups is not None):
+        return
+    got = f"{what} alone" if columns is None else f"{what} and {columns.path}, which has the columns {', '.join(columns.names)}"
+    must = "--group must have a file whose column it names: --groups or --labels"
+    raise PalpateError(must, f"--group {options.group} with {got}", "Leave it out, or add the column")
 
 
 def _of_split(
@@ -159,9 +172,9 @@ def _of_pictures(
     if options.encoder is None and (options.companions is None or set(options.companions) <= {"none"}):
         fix = "Pass --encoder palpate/mini, a folder of palpate encoder or a hub id; or ask for scores of pixels alone: --companions ssim psnr"
         raise PalpateError("Pictures must have an encoder to be scored with", "no --encoder", fix)
-    if options.encoder is None and (options.presets or options.estimator):
-        given = "--presets" if options.presets else "--estimator"
-        raise PalpateError(f"{given} must go with features", "pictures without --encoder", "Pass --encoder palpate/mini, or leave it out")
+    if idle := [name for name in _unused(options) if getattr(options, name) != getattr(type(options), name)]:  # not what it is by default
+        fix = "Pass --encoder palpate/mini, or leave it out"
+        raise PalpateError(f"--{idle[0]} must go with features", "pictures without --encoder", fix)
     if options.encoder is not None or set(options.companions or ()) & {*ON_FEATURES, "lpips"}:
         require_extra("palpate score with an encoder")
     elif any(is_generated(p) for p in (*paths.values(), options.reference)) and importlib.util.find_spec("torch") is None:
@@ -171,6 +184,7 @@ def _of_pictures(
     if not len(reference):
         raise PalpateError("There must be reference touches", "none in the test part", "Check the split")
     made = {name: completed(read_touches(p), group=group, columns=columns, like=whole) for name, p in paths.items()}
+    _require_group(options, columns, any(one.table[group].count() for one in (whole, *made.values())), "pictures")
     remarks: list[str] = []
     for name, one in made.items() if split else ():
         if (part := part_of(name, one.ids, reference.ids, whole.ids)) is not None:
@@ -198,8 +212,16 @@ def _of_pictures(
         progress=progress,
     )
     found.remarks += remarks
-    settings = {"digests": digests, "encoder": options.encoder or "none", "options": _said(asked, group)}
+    said = {name: v for name, v in _said(asked, group).items() if name not in _unused(options)}
+    settings = {"digests": digests, "encoder": options.encoder or "none", "options": said}
     return _results(found, paths, settings, terminal, touch_gallery(reference, next(iter(made.values())), options.seed))
+
+
+def _unused(options: Options) -> tuple[str, ...]:
+    """Options that pictures without an encoder have no use for; CMMD of a CLIP has a bandwidth of its own, but takes the last two."""
+    if options.encoder is not None:
+        return ()
+    return ("presets", "estimator", "sigma", "normalize", *(() if "cmmd" in (options.companions or ()) else ("backend", "permutations")))
 
 
 def _of_embeddings(
@@ -213,9 +235,12 @@ def _of_embeddings(
 ) -> Results:
     """Files of embeddings."""
     assert options.reference is not None
-    _refuse(options, columns)
+    _refuse(options)
     reference = read_embeddings(options.reference, columns)
     made = {name: read_embeddings(path, columns) for name, path in paths.items()}
+    own = any(one.groups is not None for one in (reference, *made.values()))
+    _require_group(options, columns, own and options.group == "video", "embeddings")  # what a file has itself is videos
+    group = columns.group if columns is not None and columns.group else "video"
     for name, one in made.items():
         if one.features.shape[1] != reference.features.shape[1]:
             got = f"{one.features.shape[1]} and {reference.features.shape[1]}"
@@ -236,7 +261,7 @@ def _of_embeddings(
         name: {"file": str(one.path), "rows": len(one.features), "digest": digest_file(one.path)}
         for name, one in {**made, REFERENCE: reference}.items()
     }
-    return _results(found, paths, {"digests": digests, "embeddings": files, "options": _said(asked, "video")}, terminal, [])
+    return _results(found, paths, {"digests": digests, "embeddings": files, "options": _said(asked, group)}, terminal, [])
 
 
 def _compare_embeddings(
@@ -283,11 +308,8 @@ def _refuse_normalize(options: Options) -> None:
         raise PalpateError(must, f"{options.normalize} with pictures, whose features have unit length", "Leave it out")
 
 
-def _refuse(options: Options, columns: Columns | None) -> None:
+def _refuse(options: Options) -> None:
     """Options that embeddings have no use for."""
-    if options.group not in ("auto", "video") and columns is None:
-        must = "--group must have a file whose column it names: --groups or --labels"
-        raise PalpateError(must, f"--group {options.group} with embeddings alone", "Leave it out")
     pixels = [c for c in options.companions or () if c not in (*ON_FEATURES, "none")]
     if pixels:
         raise PalpateError(f"{pixels[0]} must have pictures", "embeddings", "Pass folders of images, or leave it out")

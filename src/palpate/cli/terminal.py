@@ -294,9 +294,12 @@ def run_verb(name: str, args: Sequence[str]) -> int:
             f"\npalpate {name}: stopped. Run the same command again: with an output or a cache it goes on from what is done.\n"
         )
         return INTERRUPTED
-    except Exception:  # our own mistake: the traceback helps to report it, and the status differs from a failed check
+    except Exception as bug:  # our own mistake: the traceback helps to report it, and the status differs from a failed check
         traceback.print_exc()
         sys.stderr.write(f"palpate {name}: this is a bug in palpate; please report the lines above.\n")
+        if as_json:
+            told = PalpateError("palpate must not fail of itself", str(bug), "Report the traceback on standard error").to_json()
+            sys.stdout.write(json.dumps(told | {"error": type(bug).__name__}, indent=1) + "\n")
         return BUG
 
 

@@ -6,7 +6,7 @@ two of them share a column.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -325,3 +325,35 @@ def require_one_encoder(name: str, one: FeatureSet, reference: FeatureSet) -> No
     if one.encoder is not None and reference.encoder is not None and one.encoder != reference.encoder:
         got = f"digests {one.encoder[:12]} and {reference.encoder[:12]}"
         raise PalpateError(f"{name!r} and the reference must come from one encoder", got, "Embed both with the same encoder")
+
+
+def part_of(name: str, ids: Sequence[str], wanted: Sequence[str], known: Collection[str]) -> list[str] | None:
+    """Those of a generator's ids that lie in the scored part of a split.
+
+    Args:
+        name: the generator.
+        ids: its ids.
+        wanted: ids of the scored part.
+        known: ids of all parts.
+
+    Returns:
+        A part of ``ids``, or None where no id is among ``known``: names of the generator's own, which no split can part.
+
+    Raises:
+        PalpateError: if ids of the scored part are missing.
+    """
+    known, held, part = set(known), set(ids), set(wanted)
+    if known.isdisjoint(held):
+        return None
+    if missing := [i for i in wanted if i not in held]:
+        got = f"{len(missing)} of {len(wanted)} missing, first {missing[0]!r}"
+        raise PalpateError(
+            f"{name!r} must have every touch of the split's test part", got, "Generate these too, or pass the split it is of"
+        )
+    return [i for i in ids if i in part]
+
+
+def left_out(name: str, all_ids: Sequence[str], kept: Sequence[str]) -> list[str]:
+    """A remark on the touches that :func:`part_of` leaves out, if there are any."""
+    n = len(all_ids) - len(kept)
+    return [f"{name}: {n} of {len(all_ids)} touches lie outside the split's test part, and were left out"] if n else []

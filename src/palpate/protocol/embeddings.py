@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import json
 import math
-import zipfile
+import warnings
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -69,14 +69,17 @@ class Embeddings:
         return self.labels is None and self.groups is None and len(self.features) > STREAMED
 
     def feature_set(self, prefix: str = "") -> FeatureSet:
-        """As a set; rows without ids are called ``<prefix><number>``.
+        """As a set; rows without ids are called ``<prefix><number>``. Half precision is widened, with a warning.
 
         Raises:
-            PalpateError: on NaN or infinity (the row is named).
+            PalpateError: on NaN or infinity (the rows are named).
         """
-        ids = list(self.ids) if self.ids is not None else [f"{prefix}{k}" for k in range(len(self.features))]
+        x, ids = self.features, list(self.ids) if self.ids is not None else [f"{prefix}{k}" for k in range(len(self.features))]
+        if x.dtype.itemsize < 4:  # once, here: every metric would do so again, and say so
+            _say_widened(self.path, "float16")
+            x = x.astype(np.float32)
         try:
-            return FeatureSet(ids, self.features, self.labels, self.groups, self.encoder)
+            return FeatureSet(ids, x, self.labels, self.groups, self.encoder)
         except PalpateError as error:
             raise PalpateError(f"{self.path}: {error.must}", error.got, error.fix) from None
 
@@ -89,12 +92,18 @@ class Columns:
         path: the file.
         ids: in the order of its rows.
         labels, groups: one an id, or None where there is no such column.
+        group: name of the column of groups, or None.
+        asked: whether it was asked for by name: it then goes before the groups that a file of embeddings has itself.
+        names: all columns of the file.
     """
 
     path: Path
     ids: Sequence[str]
     labels: Sequence[str] | None = None
     groups: Sequence[str] | None = None
+    group: str | None = None
+    asked: bool = False
+    names: Sequence[str] = ()
 
     def of(self, ids: Sequence[str]) -> tuple[list[str] | None, list[str] | None]:
         """Labels and groups of ``ids``, in that order.
@@ -131,38 +140,6 @@ def known_to(what: str, ids: Sequence[str], known: Collection[str], lost: str) -
     return not strange
 
 
-def part_of(name: str, ids: Sequence[str], wanted: Sequence[str], known: Collection[str]) -> list[str] | None:
-    """Those of a generator's ids that lie in the scored part of a split.
-
-    Args:
-        name: the generator.
-        ids: its ids.
-        wanted: ids of the scored part.
-        known: ids of all parts.
-
-    Returns:
-        A part of ``ids``, or None where no id is among ``known``: names of the generator's own, which no split can part.
-
-    Raises:
-        PalpateError: if ids of the scored part are missing.
-    """
-    known, held, part = set(known), set(ids), set(wanted)
-    if known.isdisjoint(held):
-        return None
-    if missing := [i for i in wanted if i not in held]:
-        got = f"{len(missing)} of {len(wanted)} missing, first {missing[0]!r}"
-        raise PalpateError(
-            f"{name!r} must have every touch of the split's test part", got, "Generate these too, or pass the split it is of"
-        )
-    return [i for i in ids if i in part]
-
-
-def left_out(name: str, all_ids: Sequence[str], kept: Sequence[str]) -> list[str]:
-    """A remark on the touches that :func:`part_of` leaves out, if there are any."""
-    n = len(all_ids) - len(kept)
-    return [f"{name}: {n} of {len(all_ids)} touches lie outside the split's test part, and were left out"] if n else []
-
-
 def is_embeddings(path: Path) -> bool:
     """Whether a path is a file of embeddings; False for pictures of touches.
 
@@ -184,7 +161,7 @@ def _is_manifest(path: Path) -> bool:
     try:
         with open(path, "rb") as file:
             return "palpate.format" in pl.read_parquet_metadata(file)
-    except Exception:  # no Parquet file at all: told when it is read
+    except (Exception, pl.exceptions.PanicException):  # no Parquet file at all: told when it is read
         return False
 
 
@@ -211,15 +188,16 @@ def read_embeddings(path: Path, columns: Columns | None = None) -> Embeddings:
     return found if columns is None else _completed(found, columns)
 
 
-def read_columns(path: Path, group: str = "video") -> Columns:
+def read_columns(path: Path, group: str = "video", *, asked: bool = False) -> Columns:
     """A columns file: CSV with a heading, or Parquet.
 
     Args:
         path: the file.
         group: name of the column of groups that is looked for first.
+        asked: whether it was asked for by name: no other column is then taken in its place.
 
     Raises:
-        PalpateError: if the file is missing or unreadable, has no ``id``, double or empty ids, or neither labels nor groups.
+        PalpateError: if the file is missing or unreadable, has no ``id``, double or empty ids, neither labels nor groups, or no names in these.
     """
     import polars as pl
 
@@ -229,14 +207,13 @@ def read_columns(path: Path, group: str = "video") -> Columns:
     try:
         # Without inference: 007 stays a name.
         table = pl.read_parquet(path, glob=False) if path.suffix == ".parquet" else pl.read_csv(path, infer_schema=False, glob=False)
-    except Exception as error:  # polars raises several kinds
-        got = (str(error).splitlines() or [type(error).__name__])[0]
-        raise PalpateError(f"{path} must be a CSV or Parquet file", got, fix) from None
-    names = [_first(table.columns, options) for options in (LABELS, (group, *GROUPS))]
+    except (Exception, pl.exceptions.PanicException) as error:  # polars raises several kinds
+        raise PalpateError(f"{path} must be a CSV or Parquet file", _first_line(error), fix) from None
+    names = [_first(table.columns, options) for options in (LABELS, (group,) if asked else (group, *GROUPS))]
     if "id" not in table.columns or not any(names):
         raise PalpateError(f"{path} must have a column id, and material or {group}", f"columns {', '.join(table.columns)}", fix)
-    labels, groups = (_texts(table[name]) if name else None for name in names)
-    found = Columns(path, _texts(table["id"]), labels, groups)
+    labels, groups = (_texts(path, table[name]) if name else None for name in names)
+    found = Columns(path, _texts(path, table["id"]), labels, groups, names[1], asked, table.columns)
     _require_ids(path, found.ids)
     return found
 
@@ -250,7 +227,8 @@ def _completed(found: Embeddings, columns: Columns) -> Embeddings:
             raise PalpateError(f"{found.path}, which has no ids, must have as many rows as {columns.path}", got, fix)
         ids = columns.ids
     labels, groups = columns.of(ids)
-    return replace(found, ids=ids, labels=found.labels or labels, groups=found.groups or groups)
+    own = None if columns.asked and groups is not None else found.groups
+    return replace(found, ids=ids, labels=found.labels or labels, groups=own or groups)
 
 
 def _check(found: Embeddings) -> None:
@@ -260,7 +238,7 @@ def _check(found: Embeddings) -> None:
     if x.ndim != 2 or x.shape[1] == 0:
         raise PalpateError(f"The features in {path} must have shape (n, d)", f"shape {x.shape}", "Save one row a sample")
     if not len(x):
-        raise PalpateError(f"{path} must hold at least one row", "none", "Check what wrote it")
+        raise _without_rows(path)
     for name in ("ids", "labels", "groups"):
         column = getattr(found, name)
         if column is not None and len(column) != len(x):
@@ -277,15 +255,26 @@ def _require_ids(path: Path, ids: Sequence[str]) -> None:
         raise PalpateError(f"Every id in {path} must stand once", f"{len(double)} that do not, first {double[0]!r}", "Keep one row an id")
 
 
+def _without_rows(path: Path) -> PalpateError:
+    return PalpateError(f"{path} must hold at least one row", "none", "Check what wrote it")
+
+
+def _say_widened(path: Path, kind: str) -> None:
+    warnings.warn(f"The features in {path}: {kind} features were widened to float32; their rounding stays", stacklevel=3)
+
+
 def _unreadable(path: Path, kind: str, error: BaseException) -> PalpateError:
-    got = (str(error).splitlines() or [type(error).__name__])[0]
-    return PalpateError(f"{path} must be a whole {kind} without pickles", got, "Write it again")
+    return PalpateError(f"{path} must be a whole {kind} without pickles", _first_line(error), "Write it again")
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _read_npy(path: Path) -> Embeddings:
     try:
         return Embeddings(path, np.load(path, mmap_mode="r", allow_pickle=False))
-    except (ValueError, EOFError, OSError, TypeError, SyntaxError) as error:
+    except Exception as error:  # of its header, which is parsed as Python
         raise _unreadable(path, ".npy file", error) from None
 
 
@@ -293,7 +282,7 @@ def _read_npz(path: Path) -> Embeddings:
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in ("features", "ids", "labels", "groups", "encoder") if name in data}
-    except (ValueError, EOFError, OSError, KeyError, TypeError, SyntaxError, AttributeError, zipfile.BadZipFile) as error:
+    except Exception as error:  # NumPy, zipfile and zlib raise many kinds
         raise _unreadable(path, ".npz file", error) from None
     if "features" not in arrays:
         raise PalpateError(f"{path} must hold an array 'features'", "none of that name", "Save it with palpate.core.FeatureSet.save")
@@ -312,10 +301,16 @@ def _read_safetensors(path: Path) -> Embeddings:
                 raise ValueError(f"a header of {length} bytes in a file of {size}")
             header = json.loads(file.read(length))
         entry, about = header["features"], header.get("__metadata__", {})
-        kind, shape, (start, end) = entry["dtype"], tuple(int(v) for v in entry["shape"]), entry["data_offsets"]
+        kind, shape, (start, end) = entry["dtype"], tuple(entry["shape"]), entry["data_offsets"]
+        if not (isinstance(about, dict) and all(isinstance(v, str) for v in about.values())):
+            raise ValueError("__metadata__ that is no map of text to text")
+        if not all(type(v) is int for v in (*shape, start, end)):
+            raise ValueError(f"features of shape {list(shape)} in bytes {start} to {end}, which must be whole numbers")
         if kind not in SAFE_TYPES:
             raise PalpateError(f"The features in {path} must be one of {', '.join(SAFE_TYPES)}", str(kind), "Save them as F32")
         dtype = SAFE_TYPES[kind]
+        if shape[:1] == (0,):
+            raise _without_rows(path)
         if min(shape, default=0) < 1 or end - start != math.prod(shape) * dtype.itemsize or not 0 <= start <= end <= size - 8 - length:
             raise ValueError(f"features of shape {shape} in bytes {start} to {end}")
         array: NDArray[Any] = np.memmap(path, dtype=dtype, mode="r", offset=8 + length + start, shape=shape)
@@ -328,6 +323,7 @@ def _read_safetensors(path: Path) -> Embeddings:
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise _unreadable(path, ".safetensors file", error) from None
     if kind == "BF16":
+        _say_widened(path, "bfloat16")
         array = (array.astype(np.uint32) << 16).view(np.float32)
     return Embeddings(path, array, columns["ids"], columns["labels"], columns["groups"], about.get("encoder"))
 
@@ -339,12 +335,14 @@ def _read_parquet(path: Path) -> Embeddings:
         with open(path, "rb") as file:
             about = pl.read_parquet_metadata(file)
         table = pl.read_parquet(path, glob=False)  # a path may hold brackets
-    except Exception as error:  # polars raises several kinds
+    except (Exception, pl.exceptions.PanicException) as error:  # polars raises several kinds
         raise _unreadable(path, "Parquet file", error) from None
     if "id" not in table.columns:
         raise PalpateError(f"{path} must have a column id", f"columns {', '.join(table.columns[:8])}", "Add it: what pairs the samples")
-    labels, groups = (_texts(table[n]) if (n := _first(table.columns, options)) else None for options in (LABELS, GROUPS))
-    return Embeddings(path, _parquet_features(path, table), _texts(table["id"]), labels, groups, about.get("encoder"))
+    if not len(table):
+        raise _without_rows(path)
+    labels, groups = (_texts(path, table[n]) if (n := _first(table.columns, options)) else None for options in (LABELS, GROUPS))
+    return Embeddings(path, _parquet_features(path, table), _texts(path, table["id"]), labels, groups, about.get("encoder"))
 
 
 def _parquet_features(path: Path, table: Any) -> NDArray[Any]:
@@ -378,7 +376,11 @@ def _first(columns: Sequence[str], options: Sequence[str]) -> str | None:
     return next((name for name in options if name in columns), None)
 
 
-def _texts(column: Any) -> list[str]:
+def _texts(path: Path, column: Any) -> list[str]:
     import polars as pl
 
-    return column.cast(pl.String).fill_null("").to_list()
+    try:
+        return column.cast(pl.String).fill_null("").to_list()
+    except pl.exceptions.PolarsError:
+        must = f"The column {column.name} in {path} must be text, or numbers"
+        raise PalpateError(must, str(column.dtype), "Write one name a row") from None
