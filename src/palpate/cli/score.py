@@ -90,10 +90,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     with _told(terminal) as told, terminal.progress() as progress:
         results = scoring_runs.score(options, terminal, cache, progress)
     results = replace(results, notes=[*results.notes, *told])
-    try:
-        show(results, terminal, said=[] if terminal.silent else told)  # before saving: a disk that fails loses nothing
-    finally:  # nor does a reader of a pipe that goes away
-        _save(options, results)
+    show(results, terminal, said=[] if terminal.silent else told)  # before saving: a disk that fails loses nothing
+    _save(options, results)
     if cache is not None and options.cache is None:
         shutil.rmtree(cache, ignore_errors=True)
     return results.to_json()

@@ -179,7 +179,8 @@ def _of_pictures(
         require_extra("palpate score with an encoder")
     elif any(is_generated(p) for p in (*paths.values(), options.reference)) and importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "all", "Reading a folder of palpate generate")
-    whole = completed(read_touches(options.reference), group=group, columns=columns)
+    found_real = read_touches(options.reference)
+    whole = completed(found_real, group=group, columns=columns)
     reference, train = (whole, None) if split is None else (whole.part(split, "test"), whole.part(split, "train"))
     if not len(reference):
         raise PalpateError("There must be reference touches", "none in the test part", "Check the split")
@@ -212,7 +213,8 @@ def _of_pictures(
         progress=progress,
     )
     found.remarks += remarks
-    said = {name: v for name, v in _said(asked, group).items() if name not in _unused(options)}
+    filled = columns.group if columns is not None and not found_real.table[group].count() else None  # under auto by another name
+    said = {name: v for name, v in _said(asked, filled or group).items() if name not in _unused(options)}
     settings = {"digests": digests, "encoder": options.encoder or "none", "options": said}
     return _results(found, paths, settings, terminal, touch_gallery(reference, next(iter(made.values())), options.seed))
 
@@ -240,15 +242,17 @@ def _of_embeddings(
     made = {name: read_embeddings(path, columns) for name, path in paths.items()}
     own = any(one.groups is not None for one in (reference, *made.values()))
     _require_group(options, columns, own and options.group == "video", "embeddings")  # what a file has itself is videos
-    group = columns.group if columns is not None and columns.group else "video"
+    group = columns.group if columns is not None and columns.group and (columns.asked or not own) else "video"
     for name, one in made.items():
         if one.features.shape[1] != reference.features.shape[1]:
             got = f"{one.features.shape[1]} and {reference.features.shape[1]}"
             raise PalpateError(f"{name!r} and the reference must have features of one width", got, "Embed both with the same encoder")
+    said = _said(asked, group)
     if any(one.streamed for one in (*made.values(), reference)):
         if split is not None or options.companions not in (None, ("none",)):
             got = "--split" if split else "--companions"
             raise PalpateError("So many rows without groups are streamed, for TMMD alone", got, "Pass --groups, or leave it out")
+        del said["permutations"]  # none are made
         found = stream_tmmd({name: one.features for name, one in made.items()}, reference.features, asked, progress=progress)
         found = against(found, digest_file(reference.path))
     else:
@@ -261,7 +265,7 @@ def _of_embeddings(
         name: {"file": str(one.path), "rows": len(one.features), "digest": digest_file(one.path)}
         for name, one in {**made, REFERENCE: reference}.items()
     }
-    return _results(found, paths, {"digests": digests, "embeddings": files, "options": _said(asked, group)}, terminal, [])
+    return _results(found, paths, {"digests": digests, "embeddings": files, "options": said}, terminal, [])
 
 
 def _compare_embeddings(

@@ -51,6 +51,17 @@ class Common:
     quiet: QuietFlag = False
 
 
+class _Console(Console):
+    """Rich's, but a reader that goes away (``palpate score ... | head``) ends nothing: files are written, and the status stays what it is."""
+
+    def on_broken_pipe(self) -> None:
+        """Is silent from here on."""
+        self.quiet = True
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self.file.fileno())
+        os.close(nowhere)
+
+
 class Terminal:
     """Where a verb writes: results on standard output, progress and remarks on standard error."""
 
@@ -59,8 +70,8 @@ class Terminal:
         self.json = options.as_json
         self.silent = options.quiet
         # Piped text is not wrapped: digests and paths must stay whole.
-        self.out = Console(highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400)
-        self.err = Console(stderr=True, highlight=False, quiet=self.silent)
+        self.out = _Console(highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400)
+        self.err = _Console(stderr=True, highlight=False, quiet=self.silent)
 
     def say(self, line: str) -> None:
         """A remark on standard error."""

@@ -90,9 +90,9 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         norms[k : k + SLAB] = np.sqrt(ops.numpy(ops.squares(x[k : k + SLAB])))
         release(x)
     if (bad := ~np.isfinite(norms)).any():
-        raise PalpateError(f"{name} must be finite", f"NaN or infinity in {rows_text(bad)}", "Check the images of those rows")
+        raise PalpateError(f"{name} must be finite", f"NaN or infinity in {rows_text(bad)}", "Check what those rows were made from")
     if normalize is not False and (bad := norms == 0).any():
-        raise PalpateError(f"{name} must have no zero vector", f"zeros in {rows_text(bad)}", "Check the images of those rows")
+        raise PalpateError(f"{name} must have no zero vector", f"zeros in {rows_text(bad)}", "Check what those rows were made from")
     if normalize is True:
         return ops.divide_rows(x, norms)
     if normalize == "check" and (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
