@@ -2,9 +2,6 @@
 
 import errno
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -66,25 +63,6 @@ def test_a_disk_that_fails_loses_no_scores(capsys, sets, monkeypatch):
     monkeypatch.setattr(Results, "save", fail)
     status, out, err = call(capsys, *PAIR, "-o", "o.json", "-q")
     assert (status, "TMMD" in out, "The disk must have room for o.json" in err) == (2, True, True)
-
-
-def without_reader(*args):
-    """The status of a process that writes into a pipe which nobody reads, and what it says on standard error."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    done = subprocess.run([sys.executable, "-m", "palpate", *args], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
-    os.close(writer)
-    return done.returncode, done.stderr
-
-
-def test_a_reader_that_goes_away_loses_no_file_and_no_status(sets):
-    assert without_reader("score", *PAIR, "-o", "o.json", "--latex", "o.tex", "-q") == (0, "")
-    assert Results.load(Path("o.json")).scores
-    assert Path("o.tex").is_file()
-    assert not Path(".o.json.work").exists()
-    for name in ("train", "test"):
-        Path(f"{name}.txt").write_text("a/0000000001.jpg,3\n")
-    assert without_reader("audit", "train.txt", "test.txt", "--fail-over", "0.5", "-q")[0] == 1
 
 
 def test_no_generator_bears_the_name_of_a_control_or_of_the_reference(capsys, sets):

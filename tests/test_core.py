@@ -200,6 +200,9 @@ def test_features_name_the_bad_row_and_round_trip(tmp_path):
         FeatureSet(["a", "b", "c"], np.where(np.arange(3)[:, None] == 1, np.nan, x))
     with pytest.raises(PalpateError, match="without, first 'z'"):
         features.take(["z"])
+    column = pytest.importorskip("pandas").Series(["a", "b"], index=[5, 6])
+    with pytest.raises(PalpateError, match=r"1 row \(1: 'b'\)"):
+        FeatureSet(column, np.array([[1.0], [np.nan]]))
 
 
 def test_results_round_trip(tmp_path):

@@ -135,6 +135,9 @@ def test_halves_of_whole_videos_have_a_floor_of_as_many_frames_alone(options):
         assert "No floor" not in score.note
     whole = videos_of([200] * 12)
     one_less = whole.take([i for i in whole.ids if not i.endswith("/0")])
+    assert (
+        four_scores(whole, videos_of([190] * 12), floor=videos_of([190] * 12), permutations=0, estimator="biased")[1].floor is None
+    )  # 5 %
     near, exact = (four_scores(whole, s, floor=s, permutations=0, **options)[1] for s in (one_less, whole))
     assert near.floor == pytest.approx(exact.floor, rel=0.02)  # a frame in 2,400 is nothing
     lost = four_scores(whole, videos_of([150] * 12), floor=videos_of([150] * 12), permutations=0, **options)[1]
@@ -186,3 +189,28 @@ def test_where_classes_are_left_out_so_they_are_of_differences():
     assert d.details["gap_interval"] is not None
     assert found.differences[3].interval is not None
     assert found.excess.differences[1].interval is not None
+    assert [s.details["left_out"] for s in found.excess.scores if s.metric == "CI-TMMD E"] == ["class", "class"]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 6])
+def test_sets_that_leave_out_other_things_are_compared_over_classes(seed):
+    """A generator whose classes hardly separate has no D-TMMD without some videos; the same generator's classes can still be left out."""
+    rng, of = np.random.default_rng(seed), np.repeat(np.arange(16), 3)
+
+    def drawn(apart):
+        x = (0.4 * rng.normal(size=(16, 8)) + 1 + apart * np.eye(8)[np.arange(16) % 4])[of] + 0.3 * rng.normal(size=(48, 8))
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        return FeatureSet([f"{k}" for k in range(48)], x, [f"m{v % 4}" for v in of], [f"v{v:02d}" for v in of])
+
+    mixed_up, fine, r = drawn(0), drawn(1), drawn(1)
+    one, two = (four_scores(s, r, floor=r, permutations=0)[3] for s in (mixed_up, fine))
+    assert ("left_out" in one.details, "left_out" in two.details) == (True, False)
+    assert one.floor == two.floor == d_tmmd(r).value  # the same videos
+    found = compare({"a": mixed_up, "b": fine}, r, floor=r, permutations=0).differences[3]
+    assert found.interval_method == "paired leave-one-class-out jackknife, t, 3 df"
+    assert found.details["gap_interval"] is not None
+    others = change(r, groups=[f"other {g}" for g in r.groups])
+    for s in (mixed_up, fine):
+        score = four_scores(s, others, floor=others, permutations=0)[3]
+        assert score.floor is None
+        assert "No floor: real touches of other groups" in score.note

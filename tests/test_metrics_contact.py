@@ -49,6 +49,12 @@ def test_the_mask_is_the_square_and_little_more():
     np.testing.assert_array_equal(contact_mask((touch * 255).round().astype(np.uint8), (background * 255).round().astype(np.uint8)), mask)
 
 
+def test_the_digest_of_gels_is_one_for_all_processes():
+    gels = np.concatenate([gel(1, 16, level) for level in (0.2, 0.5, 0.6, 0.7, 0.8, 0.9)])
+    assert masks.pictures_digest(gels) == masks.pictures_digest(gels[::-1]) == "988fd396bc9f00be"
+    assert masks.pictures_digest(np.rint(gels * 255).astype(np.uint8)) == masks.pictures_digest(np.rint(gels * 255) / 255)
+
+
 def test_nothing_touched_is_an_empty_mask():
     rng = np.random.default_rng(1)
     background = gel(4, 64)
@@ -289,6 +295,13 @@ def test_single_scores_directions_intervals_and_settings():
         with pytest.raises(PalpateError, match="settings"):
             require_comparable([scores[0], contact_residual(made, real, background, **options)])
     require_comparable([scores[0], contact_residual(real, real, background, subject="real")])
+    turned = slice(None, None, -1)
+    require_comparable([scores[0], contact_residual(made[turned], real[turned], background[turned])])
+    some = contact_residual(made[:2], real[:2], background[:2])
+    assert (
+        some.settings["background"]
+        == contact_residual(*(np.concatenate([v[:2]] * 2) for v in (made, real, background))).settings["background"]
+    )
     grey = [v.mean(axis=3, keepdims=True) for v in (made, real, background)]
     assert 0 < contact_residual(*grey).value < 2
 

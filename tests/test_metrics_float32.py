@@ -66,21 +66,51 @@ def test_tensors_take_float32_under_the_same_rule(sigma, wanted):
         assert str(blocked.centred(rows, order, kernel, ops_of(rows), order // 600).dtype).removeprefix("torch.") == wanted
 
 
+def with_copies(x, distinct):
+    """All other rows become copies of the first."""
+    return x[np.where(np.arange(len(x)) < distinct, np.arange(len(x)), 0)]
+
+
 @pytest.mark.parametrize("library", ["numpy", "torch"])
-@pytest.mark.parametrize("kinds", [1, 2, 20])
-def test_copies_of_few_rows_do_not_average_rounding_away(kinds, library, monkeypatch):
-    """A generator that has collapsed to a few images, beside real touches."""
+@pytest.mark.parametrize("both", [False, True])
+@pytest.mark.parametrize(("distinct", "sigma", "single"), [(1, 10.0, False), (1, 30.0, False), (520, 10.0, False), (1500, 10.0, True)])
+def test_copies_of_few_rows_do_not_average_rounding_away(distinct, sigma, single, both, library, monkeypatch):
+    """A generator that has collapsed to an image, for all or most of its touches, beside real ones; and two of them."""
     xp = pytest.importorskip(library)
     x, y = two_ends(1500, -np.eye(64)[0], 0.1)
-    x = x[np.arange(1500) % kinds]
+    x, y = with_copies(x, distinct), with_copies(y, distinct) if both else y
     types = taken(monkeypatch)
-    got = mmd2(*(xp.asarray(v) for v in (x, y)), sigma=8.0, backend="blocked")
-    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=8.0, backend="blocked", normalize=False)
-    assert "float64" in str(types[0])
-    assert got == pytest.approx(exact, abs=1e-9 if kinds == 1 else 1e-6)
-    types.clear()
-    mmd2(*two_ends(1500, -np.eye(64)[0], 0.1), sigma=8.0, backend="blocked")
-    assert types == [np.float32]
+    got = mmd2(*(xp.asarray(v) for v in (x, y)), sigma=sigma, backend="blocked")
+    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    assert str(types[0]).removeprefix("torch.") == ("float32" if single else "float64")
+    assert got == pytest.approx(exact, abs=4e-7)
+
+
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+@pytest.mark.parametrize("spread", [1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("sigma", [6.0, 9.0])
+def test_near_copies_are_summed_without_a_direction(spread, sigma, library, monkeypatch):
+    """Sums of near-equal numbers in float32 are rounded in one direction here."""
+    xp = pytest.importorskip(library)
+    x, y = two_ends(3000, np.eye(768)[1], spread, d=768)
+    types = taken(monkeypatch)
+    got = mmd2(*(xp.asarray(v) for v in (x, y)), sigma=sigma, backend="blocked")
+    assert "float32" in str(types[0])
+    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    assert got == pytest.approx(exact, abs=1e-6)
+
+
+def test_copies_are_counted_in_every_segment():
+    """Rows of one norm in two segments are no copies of one another; in one they are."""
+    x = np.concatenate([np.eye(1200, dtype=np.float32)[:600]] * 2)
+    kernel, order = Gaussian((30.0,)), np.arange(1200)
+    spread = x + 0.01 * np.random.default_rng(0).normal(size=x[:600].shape).astype(np.float32)[order % 600]
+    for rows, segment, wanted in (
+        (spread, order // 600, np.float32),
+        (spread[order % 20], order // 600, np.float32),
+        (spread[order % 15], order // 600, np.float64),
+    ):
+        assert blocked.centred(rows, order, kernel, ops_of(rows), segment).dtype == wanted
 
 
 class Scaled:
@@ -125,7 +155,7 @@ def test_a_kernel_without_something_is_refused(name):
         distance(unit_rows(0, 30, 5), unit_rows(1, 20, 5), kernel=part())
 
 
-@pytest.mark.parametrize("sigmas", [(), (0.0,), (-1.0,), (float("nan"),), (float("inf"),), ("ten",), 10.0, None])
+@pytest.mark.parametrize("sigmas", [(), (0.0,), (-1.0,), (float("nan"),), (float("inf"),), ("ten",), "55", 10**400, None])
 def test_a_gaussian_without_bandwidths_is_refused(sigmas):
     with pytest.raises(PalpateError, match="sigma must be positive"):
         Gaussian(sigmas)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core import PalpateError, require_comparable, seed_for
-from palpate.metrics import ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
+from palpate.metrics import Gaussian, Linear, Polynomial, ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
 from palpate.metrics.streaming import CITMMD, DTMMD, ITMMD, TMMD
 from palpate.metrics.streaming_states import Batch
 from test_metrics_mmd import loop_mmd
@@ -316,6 +316,26 @@ def test_one_set_without_the_other():
     assert feed(ITMMD(), g).compute().floor is None
     with pytest.raises(PalpateError, match="floor"):
         feed(feed(ITMMD(), g), change(sets()[1], groups=None), real=True).compute()
+
+
+@pytest.mark.parametrize("cls", [ITMMD, CITMMD, DTMMD])
+def test_sums_have_the_floor_of_as_many_samples_of_the_same_classes_alone(cls):
+    """A biased value falls as 1 / n; features say so as well."""
+    g, more = world(0, classes=3, videos=4, frames=10), world(0, classes=3, videos=4, frames=40, draw=1)
+    fewer_classes = world(0, classes=2, videos=6, frames=10, draw=1)
+    for preset, real, known in (("cmmd", g, True), ("cmmd", more, False), ("paper", more, True), ("cmmd", fewer_classes, cls is ITMMD)):
+        score = both(cls(preset=preset, **MODES["sums"]), g, real).compute()
+        assert score.value is not None
+        assert (score.floor is not None) == known, (preset, score.note)
+        assert ("No floor" in score.note) != known
+        assert not {k: v for k, v in score.details.items() if k == "left_out" or (k.endswith("_interval") and v is not None)}
+        assert all(v.get("interval") is None for v in score.details.values() if isinstance(v, dict))
+
+
+def test_sums_take_no_other_kernel():
+    for kernel in (Linear(), Polynomial(), Gaussian((5.0,))):
+        with pytest.raises(PalpateError, match=r"has the Gaussian kernel.*Pass sigma"):
+            TMMD(keep="sums", centre=np.full(6, 0.4), kernel=kernel)
 
 
 @pytest.mark.parametrize("mode", MODES)

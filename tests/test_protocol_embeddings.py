@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from palpate.core import FeatureSet, PalpateError
-from palpate.protocol.embeddings import Columns, is_embeddings, read_columns, read_embeddings
+from palpate.protocol.embeddings import Columns, is_embeddings, read_columns, read_embeddings, read_together
 
 IDS = ["v0/1", "007", 'odd "name", [x]', "grün"]
 LABELS, GROUPS = ["Wood", "Wood", "Brick", ""], ["v0", "v0", "v1", "v1"]
@@ -108,6 +108,22 @@ def test_a_column_of_groups_that_was_asked_for_is_never_another_one(tmp_path):
     assert read_embeddings(tmp_path / "x.npz", read("object")).groups == list("abcd")  # its own stay
     assert read_embeddings(tmp_path / "x.npz", read("object", asked=True)).groups == ["o"] * 4
     assert read_embeddings(tmp_path / "x.npz", read("touch", asked=True)).groups == list("abcd")
+
+
+def test_files_that_are_read_together_have_groups_of_one_kind_and_know_which(tmp_path):
+    (tmp_path / "c.csv").write_text("id,group\n" + "".join(f"{k},t{k}\n" for k in range(4)))
+    columns, ids = read_columns(tmp_path / "c.csv"), np.array(list("0123"))
+    np.savez(tmp_path / "own.npz", features=X, ids=ids, groups=np.array(list("abcd")))
+    np.savez(tmp_path / "bare.npz", features=X, ids=ids)
+    np.save(tmp_path / "none.npy", X)
+
+    def read(*names, how=columns):
+        found = read_together({name: next(tmp_path.glob(f"{name}.np*")) for name in names}, how)
+        return [(one.groups and "".join(one.groups), one.column) for one in found.values()]
+
+    assert read("own") == read("own", how=None) == [("abcd", None)]
+    assert read("own", "bare", "none") == [("t0t1t2t3", "group")] * 3
+    assert read("own", "bare", how=None) == [("abcd", None), (None, None)]
 
 
 def test_half_precision_is_widened_once_and_said(tmp_path):

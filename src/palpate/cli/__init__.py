@@ -60,7 +60,21 @@ def main(argv: list[str] | None = None) -> int:
         0 done; 1 a check failed (``audit --fail-over``); 2 a user's mistake, told in one line; 70 a bug of ours;
         130 stopped by Ctrl-C.
     """
-    args = sys.argv[1:] if argv is None else argv
+    from palpate.cli.streams import steady
+
+    with steady():
+        try:
+            try:
+                return _run(sys.argv[1:] if argv is None else argv)
+            finally:
+                sys.stdout.flush()
+        except OSError as error:  # files that fail are told by their verb
+            got = f"standard output must take what is printed. Got {error.strerror}. Free some space, or send it elsewhere."
+            sys.stderr.write(f"palpate: {got}\n")
+            return USER_ERROR
+
+
+def _run(args: list[str]) -> int:
     if not args or args[0] in ("-h", "--help", "help"):
         sys.stdout.write(usage())
         return OK if args else USER_ERROR

@@ -90,8 +90,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     with _told(terminal) as told, terminal.progress() as progress:
         results = scoring_runs.score(options, terminal, cache, progress)
     results = replace(results, notes=[*results.notes, *told])
-    show(results, terminal, said=[] if terminal.silent else told)  # before saving: a disk that fails loses nothing
-    _save(options, results)
+    try:
+        show(results, terminal, said=[] if terminal.silent else told)  # before saving: a disk that fails loses nothing
+    finally:  # nor does one behind standard output
+        _save(options, results)
     if cache is not None and options.cache is None:
         shutil.rmtree(cache, ignore_errors=True)
     return results.to_json()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +25,12 @@ from palpate.protocol.comparing import (
     part_of,
     require_one_encoder,
 )
-from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, known_to, read_columns, read_embeddings
+from palpate.protocol.embeddings import Columns, Embeddings, is_embeddings, known_to, read_columns, read_together
 from palpate.protocol.streamed import stream_tmmd
 
 if TYPE_CHECKING:
     from palpate.cli.score import Options
+    from palpate.data.manifest import Manifest
 
 #: What a companion's features are called where they came as a file.
 GIVEN = "embeddings"
@@ -81,6 +82,8 @@ def _named(options: Options) -> dict[str, Path]:
     if len(set(names)) < len(names) or "" in names:
         fix = "Pass --names, one for each entry of --generated: they stand in the tables"
         raise PalpateError("Generators must differ in name", ", ".join(map(repr, names)), fix)
+    if odd := [name for name in names if name != _utf8(name)]:
+        raise PalpateError("Names of generators must be UTF-8", ascii(odd[0]), "Pass --names: they stand in the tables")
     taken = (BACKGROUND, SAME_MATERIAL, REAL) if options.manifest is not None else (REFERENCE,)
     if clash := [name for name in names if name in taken]:
         must = f"No generator may be called {' or '.join(map(repr, taken))}: real touches or controls beside it bear that name"
@@ -103,10 +106,14 @@ def _columns(options: Options, group: str) -> Columns | None:
     return replace(labels, groups=groups.of(labels.ids)[1], group=groups.group)
 
 
-def _require_group(options: Options, columns: Columns | None, held: bool, what: str) -> None:
-    """Refuses a ``--group`` that neither a columns file nor the input itself (``held``) has."""
-    if options.group == "auto" or held or (columns is not None and columns.groups is not None):
+def _require_group(options: Options, columns: Columns | None, held: Mapping[Path, bool], what: str) -> None:
+    """Refuses a ``--group`` that neither a columns file nor every input itself (path -> whether it is ``held``) has."""
+    bare = [path for path, own in held.items() if not own]
+    if options.group == "auto" or not bare or (columns is not None and columns.groups is not None):
         return
+    if len(bare) < len(held):
+        got = f"--group {options.group} and none in {bare[0]}"
+        raise PalpateError("--group must be known of every file", got, "Leave it out, or pass a file with that column as --groups")
     got = f"{what} alone" if columns is None else f"{what} and {columns.path}, which has the columns {', '.join(columns.names)}"
     must = "--group must have a file whose column it names: --groups or --labels"
     raise PalpateError(must, f"--group {options.group} with {got}", "Leave it out, or add the column")
@@ -135,11 +142,16 @@ def _of_split(
     assert options.manifest is not None
     assert options.encoder is not None
     _refuse_normalize(options)
+    _require_utf8((options.manifest, *paths.values()))
     if plain := next((path for path in paths.values() if not is_generated(path)), None):
         fix = f"Score other pictures with --reference {options.manifest} --split {options.split} --encoder {options.encoder}"
         raise PalpateError("With MANIFEST, --generated must be folders of palpate generate", f"{plain}, which has no index of one", fix)
     folders = {name: Generated.load(path) for name, path in paths.items()}
     manifest, towers = Manifest.load(options.manifest), Towers.load(options.encoder)
+    empty = [part for part in ("test", "train") if not manifest.part(split, part).table[group].count()]
+    if options.group != "auto" and empty:
+        got = f"--group {group} and no value in the {empty[0]} part of {options.manifest}"
+        raise PalpateError("--group must name a column with values", got, "Leave it out, or fill the column of the manifest")
     found = compare_generated(
         manifest, split, folders, towers, replace(asked, presets=asked.presets_for(grouped=True)), group=group,
         controls=options.controls, companions=options.companions, weights=_weights(options), cache=cache, progress=progress,
@@ -169,6 +181,7 @@ def _of_pictures(
 
     assert options.reference is not None
     _refuse_normalize(options)
+    _require_utf8((options.reference, *paths.values()))
     if options.encoder is None and (options.companions is None or set(options.companions) <= {"none"}):
         fix = "Pass --encoder palpate/mini, a folder of palpate encoder or a hub id; or ask for scores of pixels alone: --companions ssim psnr"
         raise PalpateError("Pictures must have an encoder to be scored with", "no --encoder", fix)
@@ -179,17 +192,19 @@ def _of_pictures(
         require_extra("palpate score with an encoder")
     elif any(is_generated(p) for p in (*paths.values(), options.reference)) and importlib.util.find_spec("torch") is None:
         raise MissingExtraError("torch", "all", "Reading a folder of palpate generate")
-    found_real = read_touches(options.reference)
+    found_real, found_made = read_touches(options.reference), {name: read_touches(p) for name, p in paths.items()}
+    _require_one_kind({options.reference: found_real, **{paths[n]: one for n, one in found_made.items()}}, group, columns)
     whole = completed(found_real, group=group, columns=columns)
     reference, train = (whole, None) if split is None else (whole.part(split, "test"), whole.part(split, "train"))
     if not len(reference):
         raise PalpateError("There must be reference touches", "none in the test part", "Check the split")
-    made = {name: completed(read_touches(p), group=group, columns=columns, like=whole) for name, p in paths.items()}
-    _require_group(options, columns, any(one.table[group].count() for one in (whole, *made.values())), "pictures")
+    made = {name: completed(one, group=group, columns=columns, like=whole) for name, one in found_made.items()}
     remarks: list[str] = []
     for name, one in made.items() if split else ():
         if (part := part_of(name, one.ids, reference.ids, whole.ids)) is not None:
             made[name], remarks = one.take(part), [*remarks, *left_out(name, one.ids, part)]
+    every = {options.reference: reference, **{paths[name]: one for name, one in made.items()}}
+    _require_group(options, columns, {path: bool(one.table[group].count()) for path, one in every.items()}, "pictures")
     towers, digests = None, dict[str, Any]({"split": split.digest} if split else {})
     if options.encoder is not None:
         from palpate.encoders.towers import Towers
@@ -219,6 +234,14 @@ def _of_pictures(
     return _results(found, paths, settings, terminal, touch_gallery(reference, next(iter(made.values())), options.seed))
 
 
+def _require_one_kind(found: Mapping[Path, Manifest], group: str, columns: Columns | None) -> None:
+    """Refuses touches with groups of their own beside others whose groups would be those of a column of another name."""
+    own = [path for path, one in found.items() if one.table[group].count()]
+    if columns is not None and columns.group not in (None, group) and 0 < len(own) < len(found):
+        got = f"column {group} of {own[0]} and column {columns.group} of {columns.path}"
+        raise PalpateError("All groups must be of one kind", got, f"Call that column {group} if it means the same, or leave it out")
+
+
 def _unused(options: Options) -> tuple[str, ...]:
     """Options that pictures without an encoder have no use for; CMMD of a CLIP has a bandwidth of its own, but takes the last two."""
     if options.encoder is not None:
@@ -238,11 +261,11 @@ def _of_embeddings(
     """Files of embeddings."""
     assert options.reference is not None
     _refuse(options)
-    reference = read_embeddings(options.reference, columns)
-    made = {name: read_embeddings(path, columns) for name, path in paths.items()}
-    own = any(one.groups is not None for one in (reference, *made.values()))
-    _require_group(options, columns, own and options.group == "video", "embeddings")  # what a file has itself is videos
-    group = columns.group if columns is not None and columns.group and (columns.asked or not own) else "video"
+    made = read_together({REFERENCE: options.reference, **paths}, columns)
+    group = next((one.column for one in made.values() if one.column), "video")  # what a file has itself is videos
+    reference = made.pop(REFERENCE)
+    held = {one.path: group == options.group and _grouped(one, reference) for one in (reference, *made.values())}
+    _require_group(options, columns, held, "embeddings")
     for name, one in made.items():
         if one.features.shape[1] != reference.features.shape[1]:
             got = f"{one.features.shape[1]} and {reference.features.shape[1]}"
@@ -252,6 +275,9 @@ def _of_embeddings(
         if split is not None or options.companions not in (None, ("none",)):
             got = "--split" if split else "--companions"
             raise PalpateError("So many rows without groups are streamed, for TMMD alone", got, "Pass --groups, or leave it out")
+        if options.permutations not in (0, type(options).permutations):
+            got = f"{options.permutations} with so many rows without groups, which are streamed"
+            raise PalpateError("--permutations must go with rows that are held", got, "Leave it out, or pass --groups")
         del said["permutations"]  # none are made
         found = stream_tmmd({name: one.features for name, one in made.items()}, reference.features, asked, progress=progress)
         found = against(found, digest_file(reference.path))
@@ -262,7 +288,7 @@ def _of_embeddings(
     known = (("encoder", encoder), ("split", split.digest if split else None), (REFERENCE, compared))
     digests = {name: v for name, v in known if v}
     files = {
-        name: {"file": str(one.path), "rows": len(one.features), "digest": digest_file(one.path)}
+        name: {"file": _utf8(str(one.path)), "rows": len(one.features), "digest": digest_file(one.path)}
         for name, one in {**made, REFERENCE: reference}.items()
     }
     return _results(found, paths, {"digests": digests, "embeddings": files, "options": said}, terminal, [])
@@ -306,6 +332,11 @@ def _compare_embeddings(
     return found
 
 
+def _grouped(one: Embeddings, reference: Embeddings) -> bool:
+    """Whether rows have groups: their own, or those of the reference by id."""
+    return one.groups is not None or (reference.groups is not None and set(one.ids or ("",)) <= set(reference.ids or ()))
+
+
 def _refuse_normalize(options: Options) -> None:
     if options.normalize != "check":
         must = "--normalize must go with embeddings"
@@ -337,6 +368,17 @@ def _said(asked: Asked, group: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _utf8(text: str) -> str:
+    """A path as it can be written down, whatever bytes it has."""
+    return text.encode(errors="surrogateescape").decode(errors="replace")
+
+
+def _require_utf8(paths: Iterable[Path]) -> None:
+    """Refuses folders of pictures that the gallery could not name."""
+    if odd := [path for path in paths if (full := str(path.resolve())) != _utf8(full)]:
+        raise PalpateError("Paths of pictures must be UTF-8", ascii(str(odd[0])), "Rename the folder: a report finds its pictures by it")
+
+
 def _results(found: Outcome, paths: Mapping[str, Path], settings: dict[str, Any], terminal: Terminal, gallery: Any) -> Results:
     found = found.said()
     scores = [
@@ -344,5 +386,5 @@ def _results(found: Outcome, paths: Mapping[str, Path], settings: dict[str, Any]
     ]
     return Results(
         title=f"Scores of {', '.join(paths)}", scores=scores, gallery=gallery, settings=settings,
-        notes=found.remarks, commands=[terminal.command],
+        notes=found.remarks, commands=[_utf8(terminal.command)],
     )  # fmt: skip

@@ -51,17 +51,6 @@ class Common:
     quiet: QuietFlag = False
 
 
-class _Console(Console):
-    """Rich's, but a reader that goes away (``palpate score ... | head``) ends nothing: files are written, and the status stays what it is."""
-
-    def on_broken_pipe(self) -> None:
-        """Is silent from here on."""
-        self.quiet = True
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, self.file.fileno())
-        os.close(nowhere)
-
-
 class Terminal:
     """Where a verb writes: results on standard output, progress and remarks on standard error."""
 
@@ -70,8 +59,8 @@ class Terminal:
         self.json = options.as_json
         self.silent = options.quiet
         # Piped text is not wrapped: digests and paths must stay whole.
-        self.out = _Console(highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400)
-        self.err = _Console(stderr=True, highlight=False, quiet=self.silent)
+        self.out = Console(highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400)
+        self.err = Console(stderr=True, highlight=False, quiet=self.silent)
 
     def say(self, line: str) -> None:
         """A remark on standard error."""
@@ -269,6 +258,12 @@ def _file_error(error: OSError) -> PalpateError:
     )
 
 
+def _write_json(data: Any) -> None:
+    """On standard output, as it is read back whatever letters the stream has."""
+    plain = not (sys.stdout.encoding or "").lower().replace("-", "").startswith("utf")
+    sys.stdout.write(json.dumps(data, indent=1, ensure_ascii=plain, allow_nan=False) + "\n")
+
+
 def run_verb(name: str, args: Sequence[str]) -> int:
     """Runs one verb with its arguments; see :func:`palpate.cli.main` for the exit statuses."""
     _set_threads()
@@ -287,18 +282,15 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         answer = module.run(options, terminal)
         result, status = answer if isinstance(answer, tuple) else (answer, OK)
         if as_json:
-            sys.stdout.write(json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+            _write_json(result)
         return int(status)
-    except BrokenPipeError:  # the reader of a pipe went away: not an error of ours
-        sys.stderr.close()
-        return OK
     except (PalpateError, OSError) as caught:
         error = caught if isinstance(caught, PalpateError) else _file_error(caught)
         sys.stderr.write(f"palpate {name}: {error}\n")
         if isinstance(error, ProblemsError):
             _list_problems(error.problems, lambda line: sys.stderr.write(f"{line}\n"))
         if as_json:
-            sys.stdout.write(json.dumps(error.to_json(), indent=1, ensure_ascii=False) + "\n")
+            _write_json(error.to_json())
         return USER_ERROR
     except KeyboardInterrupt:
         sys.stderr.write(
@@ -310,7 +302,7 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         sys.stderr.write(f"palpate {name}: this is a bug in palpate; please report the lines above.\n")
         if as_json:
             told = PalpateError("palpate must not fail of itself", str(bug), "Report the traceback on standard error").to_json()
-            sys.stdout.write(json.dumps(told | {"error": type(bug).__name__}, indent=1) + "\n")
+            _write_json(told | {"error": type(bug).__name__})
         return BUG
 
 

@@ -215,7 +215,7 @@ def _mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
     """The cached array if the file is there and has the right type and shape."""
     try:
         array = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):
+    except Exception:  # a damaged header is parsed as Python, and fails in many ways
         return None
     return array if array.shape == shape and array.dtype == np.uint8 else None
 

@@ -90,11 +90,13 @@ class Ops:
         np.fill_diagonal(k, 0)
         return k
 
-    def indicator(self, cell: NDArray[np.intp], cells: int, like: Any) -> Any:
-        """(n, cells) one-hot columns of the type of ``like``."""
-        out = np.zeros((len(cell), cells), dtype=like.dtype)
-        out[np.arange(len(cell)), cell] = 1
-        return out
+    def sum_rows(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(R, m) sums over the runs of rows that begin at ``starts`` (R,), in float64: near-equal numbers in float32 are rounded in one direction."""
+        return np.stack([k[a:b].sum(axis=0, dtype=np.float64) for a, b in zip(starts, [*starts[1:], len(k)], strict=True)])
+
+    def sum_columns(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(n, R) sums over runs of columns, in float64."""
+        return np.add.reduceat(k, starts, axis=1, dtype=np.float64)
 
     def row_squares(self, k: Any) -> NDArray[np.float64]:
         """(n,) sums of squares of the rows of a block."""
@@ -181,9 +183,15 @@ class ArrayApiOps(Ops):
         """A square block without its diagonal."""
         return k * (1 - self.xp.eye(k.shape[0], dtype=k.dtype, device=self.device))
 
-    def indicator(self, cell: NDArray[np.intp], cells: int, like: Any) -> Any:
-        """(n, cells) one-hot columns of the type of ``like``."""
-        return self.xp.astype(self.xp.asarray(super().indicator(cell, cells, np.empty(0, np.float32)), device=self.device), like.dtype)
+    def sum_rows(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(R, m) sums over runs of rows, in float64: one product."""
+        number = np.repeat(np.arange(len(starts)), np.diff([*starts, k.shape[0]]))
+        marks = self.xp.asarray((number == np.arange(len(starts))[:, None]).astype(np.float64), device=self.device)
+        return self.numpy(marks @ self.xp.astype(k, self.xp.float64))
+
+    def sum_columns(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(n, R) sums over runs of columns, in float64."""
+        return self.sum_rows(k.T, starts).T
 
     def row_squares(self, k: Any) -> NDArray[np.float64]:
         """(n,) sums of squares of the rows of a block."""

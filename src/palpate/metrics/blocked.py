@@ -2,8 +2,8 @@
 
 * Rows are centred and rounded *once*; ``z`` is what came out. One product and norms of the same rounded ``z`` give the exponent of the
   Gaussian; ``expm1`` in place.
-* Samples are sorted so that items are contiguous; a block is summed by products with indicator columns, and the sums are added up in
-  float64. A sum in float32 thus never runs over more than one block, and its rounding errors average out over the rows.
+* Samples are sorted so that items are contiguous; a block is summed run by run, in float64. What float32 rounds are single values,
+  and their errors average out over the pairs.
 * Blocks below the diagonal are the transposes of those above. They are worked off in threads, and added up in a fixed order: the result does
   not depend on how many threads there are.
 
@@ -25,8 +25,9 @@ from palpate.metrics.sums import PairSums, split_by
 
 #: Up to this many rows float64 costs nothing; few pairs would not average float32 rounding away.
 FLOAT64_BELOW = 1024
-#: In segments of fewer distinct rows than the first number, features may reach only so much of the kernel's limit (0.2 is sigma >= 9 for unit norm).
-ROOM = ((16, 0.04), (512, 0.2))
+#: In segments of effectively fewer rows than the first number, features may reach only so much of the kernel's limit (0.2 is sigma >= 9 for
+#: unit norm); where copies leave fewer than ``FEW``, none.
+ROOM, FEW = ((16, 0.04), (512, 0.2)), 16
 #: Blocks are not made smaller than this for speed; the caller may ask for less.
 SMALL_BLOCK = 256
 #: Up to this many items their sums with one another are kept (34 MB).
@@ -121,7 +122,8 @@ def _single(squares: Array, segment: Index, kernel: Kernel) -> bool:
     """Whether float32 keeps 1e-6, given squared norms of rows and their segments.
 
     The limit of a kernel is where it does over many rows; float64 has 2^29 times as much room, and a coarser value is better than none up to
-    there. Rows of equal norm are taken for copies of one another, whose rounding does not average away.
+    there. Rows of equal norm are taken for copies of one another, whose rounding does not average away: rows count as their effective
+    number (sum w)^2 / sum w^2 (Kish 1965), w copies of each.
 
     Raises:
         PalpateError: on rows so far from their mean that a product cannot tell distances of a bandwidth in float64.
@@ -137,11 +139,15 @@ def _single(squares: Array, segment: Index, kernel: Kernel) -> bool:
         )
     if not kernel.single or len(squares) <= FLOAT64_BELOW:
         return False
-    order = np.lexsort((squares, segment))
-    new = np.r_[True, (np.diff(squares[order]) != 0) | (np.diff(segment[order]) != 0)]
-    distinct = np.bincount(segment[order][new])
-    smallest = int(distinct[distinct > 0].min())
-    return radius <= kernel.radius_limit * next((share for rows, share in ROOM if smallest < rows), 1.0)
+    norms = squares.astype(np.float32)
+    order = np.lexsort((norms, segment))
+    new = np.flatnonzero(np.r_[True, (np.diff(norms[order]) != 0) | (np.diff(segment[order]) != 0)])
+    copies, of = np.diff(np.r_[new, len(order)]), segment[order][new]
+    rows, twice = (np.bincount(of, weights=copies.astype(np.float64) ** p) for p in (1, 2))
+    rows, effective = rows[rows > 0], (rows**2 / np.maximum(twice, 1))[rows > 0]
+    if (effective < np.minimum(rows, FEW)).any():
+        return False
+    return radius <= kernel.radius_limit * next((share for least, share in ROOM if effective.min() < least), 1.0)
 
 
 class _Run:
@@ -150,14 +156,14 @@ class _Run:
     def __init__(
         self, z: Any, cell: Index, cells: int, kernel: Kernel, block: int, ops: Ops, sets: list[NDArray[np.bool_]], *, by_row: bool = False
     ) -> None:
-        self.kernel, self.ops, self.cell, n = kernel, ops, cell, len(cell)
+        self.kernel, self.ops, n = kernel, ops, len(cell)
         self.left, self.right = kernel.factors(z, ops)
         self.shift = kernel.shift(z, ops)
         self.radius = max((float(ops.numpy(ops.squares(z[k : k + SLAB])).max()) for k in range(0, n, SLAB)), default=0.0)
         block = max(1, min(block, max(SMALL_BLOCK, -(-n // 8))))  # an eighth of the rows: little of the diagonal blocks is done twice
         self.blocks = [slice(i, min(i + block, n)) for i in range(0, n, block)]
-        self.ends = [(int(cell[at.start]), int(cell[at.stop - 1]) + 1) for at in self.blocks]
-        self.marks = [ops.indicator(cell[at] - a, b - a, z) for at, (a, b) in zip(self.blocks, self.ends, strict=True)]
+        self.starts = [np.flatnonzero(np.r_[True, np.diff(cell[at]) != 0]) for at in self.blocks]
+        self.cells = [cell[at][first] for at, first in zip(self.blocks, self.starts, strict=True)]
         self.rows = np.zeros((n, cells)) if by_row else np.zeros((0, cells))
         self.items = np.zeros((0, 0)) if by_row else np.zeros((cells, cells))
         self.sets = sets
@@ -179,8 +185,8 @@ class _Run:
         k = self.kernel.values(self.left[rows] @ self.right[columns].T, self.ops, self.radius, shift)
         if i == j:
             k = self.ops.clear_diagonal(k)
-        across = self.ops.numpy(k @ self.marks[j])  # (rows, cells of j)
-        back = self.ops.numpy(k.T @ self.marks[i]) if i != j and len(self.rows) else None
+        across = self.ops.sum_columns(k, self.starts[j]) if len(self.rows) else self.ops.sum_rows(k, self.starts[i])
+        back = self.ops.sum_rows(k, self.starts[i]).T if i != j and len(self.rows) else None
         inside: list[tuple[int, Array, Array | None, float]] = []
         for s, run in enumerate(self.ranges):
             a, b = (slice(max(run.start, at.start) - at.start, min(run.stop, at.stop) - at.start) for at in (rows, columns))
@@ -189,21 +195,17 @@ class _Run:
                 ones = self.ops.ones(part.shape[1], part), self.ops.ones(part.shape[0], part)
                 sums = self.ops.numpy(part @ ones[0]), None if i == j else self.ops.numpy(ones[1] @ part)
                 inside.append((s, *sums, float(self.ops.row_squares(part).sum()) * (1 if i == j else 2)))
-        if len(self.rows):
-            return across, back, inside
-        starts = np.flatnonzero(np.r_[True, np.diff(self.cell[rows]) != 0])
-        return np.add.reduceat(across, starts, axis=0), None, inside
+        return across if len(self.rows) else np.add.reduceat(across, self.starts[j], axis=1), back, inside
 
     def _add(self, i: int, j: int, across: Array, back: Array | None, inside: list[tuple[int, Array, Array | None, float]]) -> None:
-        (a, b), (c, d) = self.ends[i], self.ends[j]
         if len(self.rows):
-            self.rows[self.blocks[i], c:d] += across
+            self.rows[self.blocks[i], self.cells[j]] += across
             if back is not None:
-                self.rows[self.blocks[j], a:b] += back
+                self.rows[self.blocks[j], self.cells[i]] += back
         else:
-            self.items[a:b, c:d] += across
+            self.items[np.ix_(self.cells[i], self.cells[j])] += across
             if i != j:
-                self.items[c:d, a:b] += across.T
+                self.items[np.ix_(self.cells[j], self.cells[i])] += across.T
         for s, right, down, squares in inside:
             start = self.ranges[s].start
             for at, sums in ((self.blocks[i], right), (self.blocks[j], down)):

@@ -154,7 +154,7 @@ def _note(n: int, d: int, value: float, limit: float | None, lacking: bool) -> s
     if n <= d:
         text = f"Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"
     elif limit is not None:
-        text = "Biased upwards at this size; the JSON has the extrapolation to infinitely many samples (infinity)"
+        text = "Biased upwards at this size; its details have the extrapolation to infinitely many samples (infinity)"
     else:
         text = "Biased upwards, the more the fewer samples: compare at equal sizes alone"
     return text + ". No interval: too few groups or samples to leave some out" * lacking

@@ -13,7 +13,7 @@ lose what matters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -102,7 +102,7 @@ class Gaussian:
     """``mean over sigmas of exp(-||x - y||^2 / (2 sigma^2)) - 1``; the diagonal is exactly 0.
 
     Attributes:
-        sigmas: bandwidths, each positive.
+        sigmas: bandwidths, each positive; a number is one.
         name: how it was asked for: ``"gaussian"``, or with ``"median"`` or ``"multi"``.
     """
 
@@ -113,9 +113,10 @@ class Gaussian:
     stationary = True
 
     def __post_init__(self) -> None:
+        given: Any = self.sigmas
         try:
-            several = tuple(float(sigma) for sigma in self.sigmas)
-        except (TypeError, ValueError):
+            several = tuple(float(sigma) for sigma in (given if np.iterable(given) else (given,))) if not isinstance(given, str) else ()
+        except (TypeError, ValueError, OverflowError, RuntimeError):
             several = ()
         if not several or not all(np.isfinite(s) and 1e-100 < s < 1e100 for s in several):
             got = repr(self.sigmas[0] if isinstance(self.sigmas, tuple) and len(self.sigmas) == 1 else self.sigmas)
@@ -270,7 +271,7 @@ def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) 
             raise PalpateError('sigma must be positive, several of that, "median" or "multi"', repr(sigma), "Pass e.g. sigma=10")
         middle = median_distance(x, groups)
         return Gaussian(tuple(f * middle for f in (FACTORS if sigma == "multi" else (1.0,))), f"gaussian, {sigma}")
-    return Gaussian(tuple(sigma) if isinstance(sigma, Sequence | np.ndarray) and np.ndim(sigma) else (sigma,))  # type: ignore[arg-type]
+    return Gaussian(tuple(sigma) if isinstance(sigma, Iterable) and np.iterable(sigma) else (sigma,))  # type: ignore[arg-type]
 
 
 def median_distance(x: Any, groups: Sequence[str] | Index | None = None, rows: int = MEDIAN_ROWS) -> float:

@@ -106,10 +106,13 @@ def unit(image: NDArray[Any]) -> Array:
 
 
 def pictures_digest(images: Any) -> str:
-    """Sixteen digits for a stack of pictures (n, h, w, c), in whatever order and type: contacts against other empty gels are not comparable."""
+    """Sixteen digits for the different pictures of a stack (n, h, w, c), in whatever order and type.
+
+    Contacts against other empty gels are not comparable.
+    """
     images = as_images("background", images)
     rows = (np.rint(unit(image) * 65535).astype("<u2").tobytes() for image in images)
-    return hashlib.sha256(b"".join(sorted(hashlib.sha256(row).digest() for row in rows))).hexdigest()[:16]
+    return hashlib.sha256(b"".join(sorted({hashlib.sha256(row).digest() for row in rows}))).hexdigest()[:16]
 
 
 def checked_touches(name: str, touch: Any, background: Any) -> tuple[NDArray[Any], NDArray[Any]]:

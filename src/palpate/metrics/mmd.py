@@ -153,8 +153,8 @@ def distance(
 
     Returns:
         The value; blocked: float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9 (up to 1e-6 where rows lie hundreds to
-        ten thousand bandwidths from their mean; farther ones are refused). Rounding errors average out over rows and columns that
-        differ: copies are counted once before float32 is taken, but a set of near-copies of few rows may have up to 1e-5.
+        ten thousand bandwidths from their mean; farther ones are refused). What float32 rounds averages out over pairs that
+        differ; where copies leave few of those, float64 is taken (near-copies that share one large coordinate may leave 2e-6 where sigma is 4).
 
     Raises:
         PalpateError: on features that :func:`palpate.metrics.checks.checked_features` refuses, fewer than two rows for

@@ -27,7 +27,7 @@ from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
 from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Options, plan_for
-from palpate.metrics.scored import Scored, excess_of, not_comparable, require_one_encoder, with_floor
+from palpate.metrics.scored import Scored, excess_of, left_out_alike, not_comparable, require_one_encoder, with_floor
 from palpate.metrics.tables import build_table
 from palpate.metrics.tactile import floors_of, four_of, tmmd_of
 
@@ -143,8 +143,11 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     Raises:
         PalpateError: if the two scores are of different settings.
     """
-    x, y = a.score, b.score
-    require_comparable([x, y])
+    require_comparable([a.score, b.score])
+    a, b, *rest = left_out_alike(a, b, *([floor] if floor is not None and not not_comparable(a, floor) else []))
+    if rest and list(a.units) != list(rest[0].units):
+        a, b = left_out_alike(a, b)
+    x, y, floor = a.score, b.score, rest[0] if rest else None
     names = ("better", "p_better", "p_value")
     details: dict[str, Any] = {"a": x.subject, "b": y.subject, "decided": False} | dict.fromkeys(names)
     interval, method, note = None, "", ""
@@ -183,7 +186,7 @@ def _decide(
     if x.higher_is_better is None:
         if floor is None or floor.score.value is None or x.value is None or y.value is None:
             return
-        if list(a.units) != list(floor.units) or not_comparable(a, floor):  # the floor is left-one-out along with the generators
+        if list(a.units) != list(floor.units):  # the floor is left-one-out along with the generators
             return
         value = abs(x.value - floor.score.value) - abs(y.value - floor.score.value)
         gaps = np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates)

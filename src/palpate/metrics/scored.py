@@ -39,10 +39,12 @@ class Scored:
     Attributes:
         score: the score.
         replicates: (G,) the value without each unit.
-        units: (G,) names of the units; of the classes where those were left out (``details["left_out"]`` is ``"class"`` then).
+        units: (G,) names of the units; see :func:`over_classes` for the other choice.
         excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
         design: what the value depends on beside the features: of halves of whole groups how their sizes turn E into dist^2
             (:class:`palpate.metrics.halves.Design`), of other biased values the numbers of samples; empty where it depends on neither.
+        groups: names of all units that the set has.
+        without_class: (C, 2 or more) the value without each class, and what ``excess`` has; empty with fewer than three classes.
     """
 
     score: Score
@@ -50,6 +52,8 @@ class Scored:
     units: Sequence[str] = ()
     excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     design: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    groups: Sequence[str] = ()
+    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
 
 
 def scored(
@@ -96,7 +100,7 @@ def scored(
         note = note or "Undefined: an average over no pairs"
     elif interval is None:
         note = ". ".join(filter(None, [note, "No interval: too few groups or samples to leave one out"]))
-    details = plain(details) | ({"left_out": "class"} if found and found.of_classes else {}) | {
+    details = plain(details) | {
         "unit": table.unit, "backend": table.sums.backend, "bound": plain(bound) if value is not None else None, "version": __version__,
     }  # fmt: skip
     score = Score(
@@ -108,9 +112,33 @@ def scored(
     design = np.zeros(0) if design is None else design
     if found is None or not len(found.units):
         return Scored(score, design=design)
-    names = details["classes"] if found.of_classes else table.names
+    names = [table.names[int(u)] for u in found.units]
     excess = found.replicates[:, 1] if "E" in details else np.zeros(0)
-    return Scored(score, found.replicates[:, 0], [names[int(u)] for u in found.units], excess, design)
+    one = Scored(score, found.replicates[:, 0], names, excess, design, names, found.without_class)
+    return over_classes(one) if found.of_classes else one
+
+
+def over_classes(one: Scored) -> Scored:
+    """The same score with classes left out in turn instead of units, where there are enough of them; ``details["left_out"]`` says so.
+
+    For classes that cannot spare a unit, and for comparisons with a set that has such classes.
+    """
+    if not len(one.without_class):
+        return one
+    details = {**one.score.details, "left_out": "class"}
+    excess = one.without_class[:, 1] if "E" in details else np.zeros(0)
+    return replace(
+        one, score=replace(one.score, details=details), replicates=one.without_class[:, 0], units=details["classes"], excess=excess
+    )
+
+
+def left_out_alike(*some: Scored) -> Sequence[Scored]:
+    """The same scores with the same units left out, or the same classes; as they are where neither can be."""
+    alike = lambda sets: all(list(one.units) == list(sets[0].units) for one in sets)  # noqa: E731
+    if alike(some):
+        return some
+    by_class = [over_classes(one) for one in some]
+    return by_class if alike(by_class) else some
 
 
 def excess_of(one: Scored) -> Scored | None:
@@ -133,7 +161,7 @@ def excess_of(one: Scored) -> Scored | None:
         null=None, interval_method=score.interval_method if interval else "", floor=d.get("E_floor"), estimator="unbiased", seed=None,
         note=note, details=kept | {"bound": bound if known else None},
     )  # fmt: skip
-    return Scored(found, one.excess, one.units if len(one.excess) else ())
+    return Scored(found, one.excess, one.units if len(one.excess) else (), groups=one.groups, without_class=one.without_class[:, 1:])
 
 
 def within(bound: float) -> str:
@@ -151,7 +179,7 @@ def not_comparable(one: Scored, floor: Scored) -> str:
     if mine.details.get("classes") != theirs.details.get("classes"):
         return "other classes"
     by_group = mine.settings.get("halves") == "group"
-    if by_group and list(one.units) != list(floor.units):
+    if by_group and list(one.groups) != list(floor.groups):
         return "other groups"
     if one.design.shape != floor.design.shape or not np.allclose(one.design, floor.design, rtol=ALIKE, atol=0):
         return "other numbers of samples" + (" a group" if by_group else "")

@@ -186,18 +186,19 @@ class StreamingMetric:
         return with_floor(one, self._of(build_table(real, None, plan, grouped=grouped, median_of=real), real, plan)).score
 
     def _from_sums(self, state: SumState) -> Score:
-        score, by = self._one_set(state, real=False), state.checked_hash(state.hashed)
-        floor = self._one_set(state, real=True).value if state.rows(real=True) else None
+        one, by = self._one_set(state, real=False), state.checked_hash(state.hashed)
+        score = one.score
         note = score.note if score.value is None else ". ".join(filter(None, [SUMS_NOTE, HALVES_NOTE[by]]))
-        score = replace(score, floor=floor, note=note, settings={**score.settings, "halves": f"hashed by {by}"})
+        one = replace(one, score=replace(score, note=note, settings={**score.settings, "halves": f"hashed by {by}"}))
+        score = (with_floor(one, self._one_set(state, real=True)) if state.rows(real=True) else one).score
         if self.plan.estimator != "biased":
             return score
         return replace(score, null=None, details={k: v for k, v in score.details.items() if k != "z"})  # its centre is that of equal halves
 
-    def _one_set(self, state: SumState, *, real: bool) -> Score:
+    def _one_set(self, state: SumState, *, real: bool) -> Scored:
         table, small, sizes = state.table(real=real)
-        score = self._of(table, sized(state.rows(real=real), labelled=self.by_class, encoder=self.encoder), self.plan).score
-        return without_units(score, {"halves": dict(zip(table.classes, sizes, strict=True))}, small)
+        one = self._of(table, sized(state.rows(real=real), labelled=self.by_class, encoder=self.encoder), self.plan)
+        return replace(one, score=without_units(one.score, {"halves": dict(zip(table.classes, sizes, strict=True))}, small))
 
 
 class TMMD(StreamingMetric):
@@ -259,6 +260,8 @@ def plan_of_sums(options: Options, *, halves: bool) -> Plan:
     if "grouped" in (options.get("preset"), options.get("estimator")):
         raise PalpateError('keep="sums" cannot leave out pairs of one group', "the grouped estimator", fix)
     sigma = options.get("sigma", 10.0)
+    if (kernel := options.get("kernel")) is not None:
+        raise PalpateError('keep="sums" has the Gaussian kernel', f"kernel={kernel!r}", 'Pass sigma, or keep="features"')
     if isinstance(sigma, str) or np.ndim(sigma) > 0:
         raise PalpateError('keep="sums" must know its one bandwidth beforehand', f"sigma={sigma!r}", fix)
     bare: Options = {**options, "permutations": 0, "backend": "moments"}
@@ -299,7 +302,12 @@ def checked_centre(centre: Any) -> np.ndarray:
 
 def without_units(score: Score, details: Mapping[str, Any], small: Sequence[str]) -> Score:
     """A score of sums: without what leaves out units, and with the true reason why classes are excluded."""
-    found: dict[str, Any] = {**score.details, "unit": None, "units": None, **details}
+    found: dict[str, Any] = {k: v for k, v in score.details.items() if k != "left_out"} | {"unit": None, "units": None, **details}
+    for name, value in found.items():
+        if name.endswith("_interval"):
+            found[name] = None
+        elif isinstance(value, dict) and "interval" in value:
+            found[name] = {**value, "interval": None}
     note = UNBOUNDED.replace('backend="blocked"', 'keep="features"') if score.note == UNBOUNDED else score.note
     if "excluded" in found:
         found["excluded"] = {**found["excluded"], **dict.fromkeys(small, "fewer than two samples in a half")}

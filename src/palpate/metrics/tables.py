@@ -7,7 +7,7 @@ the jackknife computes the same statistic on the totals without each unit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -156,7 +156,8 @@ def _bound(table: Table, plan: Plan) -> float:
 class Estimate:
     """A statistic with its jackknife: values (K,), standard errors (K,), their degrees of freedom, the method in words.
 
-    ``replicates`` (G, K) are the values without each of the G that were left out; ``units`` (G,) are the units, or classes (``of_classes``).
+    ``replicates`` (G, K) are the values without each unit, ``units`` (G,) the units. ``without_class`` (C, 4) are the first four without each
+    class, empty with fewer than three; the errors are theirs where ``of_classes``.
     """
 
     values: Array
@@ -165,6 +166,7 @@ class Estimate:
     method: str
     replicates: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     units: Index = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
     of_classes: bool = False
 
     def interval(self, k: int, level: float) -> Interval | None:
@@ -190,11 +192,13 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     statistic must be defined for fewer classes; only they get errors then.
     """
     over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
-    if np.isfinite(over_units.errors[0]) or classes < 3:
+    if classes < 3:
         return over_units
     rest = np.arange(classes)
-    replicates = leave_one_out((take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:4])
-    first = jackknife_errors(replicates)
+    found = leave_one_out((take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:4])
+    if np.isfinite(over_units.errors[0]):
+        return replace(over_units, without_class=found)
+    first = jackknife_errors(found)
     errors = np.concatenate([first, np.full(len(over_units.values) - len(first), np.nan)])
     method = f"leave-one-class-out jackknife, t, {classes - 1} df (a class has too few {unit}s to leave one out)"
-    return Estimate(over_units.values, errors, classes - 1, method, replicates, rest, of_classes=True)
+    return replace(over_units, errors=errors, df=classes - 1, method=method, without_class=found, of_classes=True)

@@ -22,7 +22,7 @@ import json
 import math
 import warnings
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,7 @@ class Embeddings:
         ids: n names, or None where the file has none.
         labels, groups: n names each, or None.
         encoder: digest, or None.
+        column: of the columns file that gave the groups; None for groups of the file itself.
     """
 
     path: Path
@@ -62,6 +63,7 @@ class Embeddings:
     labels: Sequence[str] | None = None
     groups: Sequence[str] | None = None
     encoder: str | None = None
+    column: str | None = None
 
     @property
     def streamed(self) -> bool:
@@ -218,6 +220,15 @@ def read_columns(path: Path, group: str = "video", *, asked: bool = False) -> Co
     return found
 
 
+def read_together(paths: Mapping[str, Path], columns: Columns | None = None) -> dict[str, Embeddings]:
+    """Files that are compared, as :func:`read_embeddings`; groups are all their own, or, where a file has none, all of ``columns``."""
+    found = {name: read_embeddings(path) for name, path in paths.items()}
+    if columns is None:
+        return found
+    columns = replace(columns, asked=columns.asked or any(one.groups is None for one in found.values()))
+    return {name: _completed(one, columns) for name, one in found.items()}
+
+
 def _completed(found: Embeddings, columns: Columns) -> Embeddings:
     ids = found.ids
     if ids is None:
@@ -227,8 +238,10 @@ def _completed(found: Embeddings, columns: Columns) -> Embeddings:
             raise PalpateError(f"{found.path}, which has no ids, must have as many rows as {columns.path}", got, fix)
         ids = columns.ids
     labels, groups = columns.of(ids)
-    own = None if columns.asked and groups is not None else found.groups
-    return replace(found, ids=ids, labels=found.labels or labels, groups=own or groups)
+    found = replace(found, ids=ids, labels=found.labels or labels)
+    if groups is None or (found.groups is not None and not columns.asked):
+        return found
+    return replace(found, groups=groups, column=columns.group)
 
 
 def _check(found: Embeddings) -> None:
