@@ -111,6 +111,10 @@ def test_cache_is_mapped_reused_and_renewed_when_a_file_changes(tmp_path):
     assert file.stat().st_mtime_ns == stamp
     file.write_bytes(file.read_bytes()[:200])  # a cut cache is not trusted
     assert np.array_equal(cached_images(manifest, "tactile", 16, cache), cached_images(manifest, "tactile", 16))
+    for damage in (b"{(((", b"0000"):  # nor one whose header, which is parsed as Python, is none
+        whole = file.read_bytes()
+        file.write_bytes(whole[:10] + damage + whole[10 + len(damage) :])
+        assert np.array_equal(cached_images(manifest, "tactile", 16, cache), cached_images(manifest, "tactile", 16))
     write_image(tmp_path / "d" / "1.png", 9)
     os.utime(tmp_path / "d" / "1.png", ns=(1, 1))
     assert number(cached_images(manifest, "tactile", 64, cache)[1]) == 9

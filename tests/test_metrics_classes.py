@@ -214,3 +214,22 @@ def test_sets_that_leave_out_other_things_are_compared_over_classes(seed):
         score = four_scores(s, others, floor=others, permutations=0)[3]
         assert score.floor is None
         assert "No floor: real touches of other groups" in score.note
+
+
+def test_the_excess_over_classes_is_that_of_the_classes():
+    """E of real touches without some video is unknown (a class has videos of one frame), so classes are left out, of their E and not of their distance."""
+    a, b = (change(world(3, classes=4, videos=3, frames=4, draw=k), ids=world(3, classes=4, videos=3, frames=4).ids) for k in (1, 2))
+    r = world(3, classes=4, videos=3, frames=4, draw=4)
+    lone = [f"c0v{v}/000" for v in (1, 2)]
+    r = r.take([i for i in r.ids if not i.startswith(("c0v1", "c0v2")) or i in lone])
+    found = {d.metric: d for d in compare({"a": a, "b": b}, r, floor=r, permutations=0).excess.differences}["CI-TMMD E difference"]
+    one, two, real = (np.array([v["E"] for v in ci_tmmd(s).details["per_class"].values()]) for s in (a, b, r))
+    without = lambda v: np.array([np.delete(v, c).mean() for c in range(4)])  # noqa: E731
+    gaps = abs(without(one) - without(real)) - abs(without(two) - without(real))
+    gap, error = abs(one.mean() - real.mean()) - abs(two.mean() - real.mean()), np.sqrt(3 / 4 * ((gaps - gaps.mean()) ** 2).sum())
+    reach = stats.t.ppf(0.975, 3) * error
+    assert found.details["gap"] == pytest.approx(gap, abs=1e-9)
+    assert found.details["gap_interval"] == pytest.approx((gap - reach, gap + reach), abs=1e-9)
+    others = change(r, groups=[f"other {g}" for g in r.groups])
+    found = compare({"a": a, "b": b}, others, floor=others, permutations=0).excess.differences
+    assert ["gap" in d.details for d in found] == [False, False]

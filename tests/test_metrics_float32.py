@@ -100,6 +100,16 @@ def test_near_copies_are_summed_without_a_direction(spread, sigma, library, monk
     assert got == pytest.approx(exact, abs=1e-6)
 
 
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+def test_runs_of_near_equal_numbers_are_summed_in_float64(library):
+    xp = pytest.importorskip(library)
+    k = (0.1 + 1e-9 * np.random.default_rng(0).random((900, 1000))).astype(np.float32)
+    starts, wide = np.array([0, 1, 400]), k.astype(np.float64)
+    ops, given = ops_of(xp.asarray(k)), xp.asarray(k)
+    np.testing.assert_allclose(ops.sum_rows(given, starts), np.add.reduceat(wide, starts, axis=0), rtol=1e-12)
+    np.testing.assert_allclose(ops.sum_columns(given, starts), np.add.reduceat(wide, starts, axis=1), rtol=1e-12)
+
+
 def test_copies_are_counted_in_every_segment():
     """Rows of one norm in two segments are no copies of one another; in one they are."""
     x = np.concatenate([np.eye(1200, dtype=np.float32)[:600]] * 2)
@@ -155,7 +165,7 @@ def test_a_kernel_without_something_is_refused(name):
         distance(unit_rows(0, 30, 5), unit_rows(1, 20, 5), kernel=part())
 
 
-@pytest.mark.parametrize("sigmas", [(), (0.0,), (-1.0,), (float("nan"),), (float("inf"),), ("ten",), "55", 10**400, None])
+@pytest.mark.parametrize("sigmas", [(), (0.0,), (-1.0,), (float("nan"),), (float("inf"),), ("ten",), "55", b"55", True, 10**400, None])
 def test_a_gaussian_without_bandwidths_is_refused(sigmas):
     with pytest.raises(PalpateError, match="sigma must be positive"):
         Gaussian(sigmas)

@@ -318,18 +318,43 @@ def test_one_set_without_the_other():
         feed(feed(ITMMD(), g), change(sets()[1], groups=None), real=True).compute()
 
 
+def one_by_one(s):
+    """Without groups: halves are dealt by id."""
+    return change(s, groups=None)
+
+
 @pytest.mark.parametrize("cls", [ITMMD, CITMMD, DTMMD])
-def test_sums_have_the_floor_of_as_many_samples_of_the_same_classes_alone(cls):
-    """A biased value falls as 1 / n; features say so as well."""
-    g, more = world(0, classes=3, videos=4, frames=10), world(0, classes=3, videos=4, frames=40, draw=1)
-    fewer_classes = world(0, classes=2, videos=6, frames=10, draw=1)
-    for preset, real, known in (("cmmd", g, True), ("cmmd", more, False), ("paper", more, True), ("cmmd", fewer_classes, cls is ITMMD)):
-        score = both(cls(preset=preset, **MODES["sums"]), g, real).compute()
+def test_sums_have_the_floor_of_the_same_groups_classes_and_numbers_alone(cls):
+    """A biased value falls as 1 / n, and halves of whole groups depend on the groups; features say so as well."""
+    g, drawn_again = world(0, classes=3, videos=4, frames=10), world(0, classes=3, videos=4, frames=10, draw=1)
+    more, fewer_classes = world(0, classes=3, videos=4, frames=40, draw=1), world(0, classes=2, videos=6, frames=10, draw=1)
+    others = change(drawn_again, groups=[f"other {v}" for v in g.groups])
+    swapped = change(drawn_again, groups=[v if k else "c0v1" for k, v in enumerate(g.groups)])  # a frame in another video
+    for preset, made, real, known in (
+        ("cmmd", g, drawn_again, True), ("paper", g, drawn_again, True), ("cmmd", g, more, False), ("paper", g, more, False),
+        ("paper", g, others, False), ("paper", g, swapped, False), ("cmmd", g, fewer_classes, False),
+        ("cmmd", one_by_one(g), one_by_one(drawn_again), True), ("cmmd", one_by_one(g), one_by_one(more), False),
+        ("paper", one_by_one(g), one_by_one(more), True), ("paper", one_by_one(g), one_by_one(fewer_classes), cls is ITMMD),
+    ):  # fmt: skip
+        score = both(cls(preset=preset, **MODES["sums"]), made, real).compute()
         assert score.value is not None
         assert (score.floor is not None) == known, (preset, score.note)
         assert ("No floor" in score.note) != known
         assert not {k: v for k, v in score.details.items() if k == "left_out" or (k.endswith("_interval") and v is not None)}
         assert all(v.get("interval") is None for v in score.details.values() if isinstance(v, dict))
+
+
+def test_groups_of_sums_are_known_after_a_reset_and_a_merge():
+    g, r = world(0, classes=3, videos=4, frames=10), world(0, classes=3, videos=4, frames=10, draw=1)
+    options = {"preset": "paper", "reset_real_features": False, **MODES["sums"]}
+    metric = both(ITMMD(**options), g, r)
+    want = metric.compute()
+    metric.reset()
+    assert feed(metric, g).compute() == want
+    halves = [g.take(g.ids[:50]), g.take(g.ids[50:])]
+    first, second = (feed(ITMMD(**options), part) for part in halves)
+    assert feed(first, r, real=True).compute().floor is None  # not all groups yet
+    assert first.merge(second).compute().floor == pytest.approx(want.floor, abs=1e-9)
 
 
 def test_sums_take_no_other_kernel():

@@ -148,7 +148,7 @@ def _of_split(
         raise PalpateError("With MANIFEST, --generated must be folders of palpate generate", f"{plain}, which has no index of one", fix)
     folders = {name: Generated.load(path) for name, path in paths.items()}
     manifest, towers = Manifest.load(options.manifest), Towers.load(options.encoder)
-    empty = [part for part in ("test", "train") if not manifest.part(split, part).table[group].count()]
+    empty = [part for part in ("test", "train") if len(one := manifest.part(split, part)) and not one.table[group].count()]
     if options.group != "auto" and empty:
         got = f"--group {group} and no value in the {empty[0]} part of {options.manifest}"
         raise PalpateError("--group must name a column with values", got, "Leave it out, or fill the column of the manifest")

@@ -25,7 +25,7 @@ class Steady:
         try:
             self._attempt(text)
         except UnicodeEncodeError:
-            coding = self.stream.encoding or "ascii"
+            coding = getattr(self.stream, "encoding", None) or "ascii"
             self._attempt(text.encode(coding, "replace").decode(coding))
         return len(text)
 
@@ -44,9 +44,12 @@ class Steady:
 
     def _give_up(self, error: OSError) -> None:
         """What is still held, and what comes, goes nowhere: else it would fail again when the process ends."""
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, self.stream.fileno())
-        os.close(nowhere)
+        nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+        try:
+            os.dup2(nowhere.fileno(), self.stream.fileno())
+            nowhere.close()
+        except (OSError, ValueError):  # a stream in memory, or a closed one, has no file
+            self.stream = nowhere
         if self.told and not isinstance(error, BrokenPipeError):
             raise error
 

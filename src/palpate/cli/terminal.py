@@ -260,7 +260,7 @@ def _file_error(error: OSError) -> PalpateError:
 
 def _write_json(data: Any) -> None:
     """On standard output, as it is read back whatever letters the stream has."""
-    plain = not (sys.stdout.encoding or "").lower().replace("-", "").startswith("utf")
+    plain = not (getattr(sys.stdout, "encoding", None) or "").lower().replace("-", "").startswith("utf")
     sys.stdout.write(json.dumps(data, indent=1, ensure_ascii=plain, allow_nan=False) + "\n")
 
 

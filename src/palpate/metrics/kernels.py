@@ -115,7 +115,11 @@ class Gaussian:
     def __post_init__(self) -> None:
         given: Any = self.sigmas
         try:
-            several = tuple(float(sigma) for sigma in (given if np.iterable(given) else (given,))) if not isinstance(given, str) else ()
+            several = (
+                tuple(float(sigma) for sigma in (given if np.iterable(given) else (given,)))
+                if not isinstance(given, str | bytes | bool)
+                else ()
+            )
         except (TypeError, ValueError, OverflowError, RuntimeError):
             several = ()
         if not several or not all(np.isfinite(s) and 1e-100 < s < 1e100 for s in several):

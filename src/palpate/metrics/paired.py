@@ -145,8 +145,6 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     """
     require_comparable([a.score, b.score])
     a, b, *rest = left_out_alike(a, b, *([floor] if floor is not None and not not_comparable(a, floor) else []))
-    if rest and list(a.units) != list(rest[0].units):
-        a, b = left_out_alike(a, b)
     x, y, floor = a.score, b.score, rest[0] if rest else None
     names = ("better", "p_better", "p_value")
     details: dict[str, Any] = {"a": x.subject, "b": y.subject, "decided": False} | dict.fromkeys(names)

@@ -42,7 +42,7 @@ class Scored:
         units: (G,) names of the units; see :func:`over_classes` for the other choice.
         excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
         design: what the value depends on beside the features: of halves of whole groups how their sizes turn E into dist^2
-            (:class:`palpate.metrics.halves.Design`), of other biased values the numbers of samples; empty where it depends on neither.
+            (:class:`palpate.metrics.halves.Design`), of other biased values 1/m + 1/m' of the halves; empty where it depends on neither.
         groups: names of all units that the set has.
         without_class: (C, 2 or more) the value without each class, and what ``excess`` has; empty with fewer than three classes.
     """
@@ -186,13 +186,14 @@ def not_comparable(one: Scored, floor: Scored) -> str:
     return ""
 
 
-def with_floor(one: Scored, floor: Scored) -> Scored:
+def with_floor(one: Scored, floor: Scored, why: str = "") -> Scored:
     """The score beside that of real touches: its value where it is comparable, and E, which does not depend on the number of groups.
 
-    E of CI-TMMD has that of the real touches of the generator's classes, E_ratio of D-TMMD none where the classes differ.
+    E of CI-TMMD has that of the real touches of the generator's classes, E_ratio of D-TMMD none where the classes differ. ``why``: what else
+    the real touches are of, where the two are known not to be comparable.
     """
     mine, theirs = one.score, floor.score
-    why = not_comparable(one, floor)
+    why = not_comparable(one, floor) or why
     alike = mine.details.get("classes") == theirs.details.get("classes")
     details: dict[str, Any] = {}
     if "E" in mine.details:

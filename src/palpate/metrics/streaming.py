@@ -190,7 +190,10 @@ class StreamingMetric:
         score = one.score
         note = score.note if score.value is None else ". ".join(filter(None, [SUMS_NOTE, HALVES_NOTE[by]]))
         one = replace(one, score=replace(score, note=note, settings={**score.settings, "halves": f"hashed by {by}"}))
-        score = (with_floor(one, self._one_set(state, real=True)) if state.rows(real=True) else one).score
+        if state.rows(real=True):
+            why = "" if state.same_groups else "other groups, or of other numbers of samples a group,"
+            one = with_floor(one, self._one_set(state, real=True), why)
+        score = one.score
         if self.plan.estimator != "biased":
             return score
         return replace(score, null=None, details={k: v for k, v in score.details.items() if k != "z"})  # its centre is that of equal halves

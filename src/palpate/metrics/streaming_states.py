@@ -30,6 +30,8 @@ from palpate.metrics.tables import Table
 
 HEAD = 8
 #: What of Moments adds up; ``rho`` is a maximum.
+#: A group's number is below this: sums of half a billion rows are exact.
+MARKS = 1 << 24
 SUMS = ("n", "zeroth", "first", "second", "fourth", "diagonal")
 
 
@@ -220,15 +222,15 @@ class Layout:
         own = self.count // self.sets if self.halves else 1
         return slice(own * real, own * (real + 1))
 
-    def items(self, n: int, **columns: Unpack[Columns]) -> tuple[Index, str]:
-        """(n,) item of each row, and what was hashed: ``"group"``, ``"sample"`` or ``""``.
+    def items(self, n: int, **columns: Unpack[Columns]) -> tuple[Index, Array]:
+        """(n,) item of each row, and what :attr:`SumState.hashed` grows by.
 
         Raises:
             PalpateError: on labels that are not among the classes, rows without id and group, real touches where none are summed.
         """
         real = bool(columns.get("real", False))
         if not self.halves:
-            return np.full(n, int(real), dtype=np.intp), ""
+            return np.full(n, int(real), dtype=np.intp), np.zeros(4)
         if real and self.sets == 1:
             raise PalpateError('A metric with keep="sums" must be told of real touches', "real=True", "Pass floor=True to the constructor")
         label = np.zeros(n, dtype=np.intp)
@@ -247,7 +249,10 @@ class Layout:
             raise PalpateError('keep="sums" must know the id or the group of every sample', "neither", "Pass ids=, or groups= (videos)")
         half = {key: seed_for(self.seed, "half", key) & 1 for key in set(keys)}
         side = np.array([half[key] for key in keys], dtype=np.intp)
-        return self.part(real).start + 2 * label + side, "group" if groups is not None else "sample"
+        mark = {key: seed_for(0, "mark", key) % MARKS for key in half} if groups is not None else {}
+        marks = float(sum(mark[key] for key in keys)) if mark else 0.0
+        grows = np.array([n * (groups is not None), n * (groups is None), marks * (not real), marks * real], dtype=np.float64)
+        return self.part(real).start + 2 * label + side, grows
 
 
 @dataclass
@@ -258,13 +263,14 @@ class SumState:
         layout: what the items are.
         centre: (d,) subtracted from every row; None: the mean of the first batch, from then on.
         moments: the sums; None before the first row where the centre is not given.
-        hashed: (2,) rows dealt to halves by their group, and by their id.
+        hashed: (4,) rows dealt to halves by their group, and by their id; and of each set the sum over rows of a number made of the group, which
+            is equal for the same groups with as many rows each. It is added up as all sums are, and exact for half a billion rows.
     """
 
     layout: Layout
     centre: Array | None = None
     moments: Moments | None = None
-    hashed: Array = field(default_factory=lambda: np.zeros(2))
+    hashed: Array = field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
         if self.moments is None and self.centre is not None:
@@ -278,8 +284,8 @@ class SumState:
             raise PalpateError("The features of all updates must have the same width", got, "Embed all with the same encoder")
         if not len(x):
             return
-        item, by = self.layout.items(len(x), **columns)
-        hashed = self.hashed + len(x) * np.array([by == "group", by == "sample"])
+        item, grows = self.layout.items(len(x), **columns)
+        hashed = self.hashed + grows
         self.checked_hash(hashed)
         if self.moments is None:
             self.moments = Moments.empty(centre_of([x]), self.layout.sigma, self.layout.count)
@@ -293,7 +299,7 @@ class SumState:
         Raises:
             PalpateError: if both ways.
         """
-        if (hashed > 0).all():
+        if (hashed[:2] > 0).all():
             got = f"{hashed[0]:.0f} rows by group and {hashed[1]:.0f} by id"
             raise PalpateError("Halves must be dealt by group always, or by id always", got, "Give groups with every update, or with none")
         return "group" if hashed[0] else "sample" if hashed[1] else ""
@@ -301,13 +307,14 @@ class SumState:
     def reset(self, *, keep_real: bool) -> None:
         """Back to nothing; of real touches only unless they are kept (``rho`` then stays, as a bound may)."""
         if self.moments is None or not (keep_real and self.rows(real=True)):
-            self.hashed, self.moments = np.zeros(2), None
+            self.hashed, self.moments = np.zeros(4), None
             self.__post_init__()
             return
         own = self.layout.part(False)
         for name in SUMS:
             getattr(self.moments, name)[own] = 0
-        self.hashed *= self.rows(real=True) / max(self.hashed.sum(), 1)
+        self.hashed[:2] *= self.rows(real=True) / max(self.hashed[:2].sum(), 1)
+        self.hashed[2] = 0
 
     def merge(self, other: SumState) -> SumState:
         """The sums of both."""
@@ -315,6 +322,11 @@ class SumState:
         hashed = self.hashed + other.hashed
         self.checked_hash(hashed)
         return SumState(self.layout, self.centre, found[0].merge(found[1:]) if found else None, hashed)
+
+    @property
+    def same_groups(self) -> bool:
+        """Whether both sets have the same groups with as many rows each, as far as their sums tell; True where ids were hashed."""
+        return bool(self.hashed[2] == self.hashed[3])
 
     def rows(self, *, real: bool) -> int:
         """Rows of a set."""

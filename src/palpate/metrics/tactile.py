@@ -131,17 +131,18 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     }
     note = f"Undefined: {reason} (n = {n})" if reason else halves_note(plan, sums, grouped=table.grouped)
     return scored(
-        "I-TMMD", table, generated, plan, ("halves",), found=None if reason else found, design=_design(design, sums, plan),
+        "I-TMMD", table, generated, plan, ("halves",), found=None if reason else found, design=_design(design, sizes, plan),
         bound=_halves_bound(sums, plan)[0],
         null=null_band(centre, sd), details=details, note=note, **halves_fields(plan),
     )  # fmt: skip
 
 
-def _design(design: Design, sums: PairSums, plan: Plan) -> Array:
-    """What the value depends on beside the features, see :class:`palpate.metrics.scored.Scored`."""
+def _design(design: Design, sizes: Array, plan: Plan) -> Array:
+    """What the value depends on beside the features, see :class:`palpate.metrics.scored.Scored`; ``sizes`` (K, 2) of the halves."""
     if plan.halves == "group":
         return np.concatenate([design.own, design.rest])
-    return whole_sets(sums.totals).n if plan.estimator == "biased" else np.zeros(0)
+    with np.errstate(divide="ignore"):
+        return (1 / sizes).sum(axis=1) if plan.estimator == "biased" else np.zeros(0)
 
 
 def _halves_bound(sums: PairSums, plan: Plan) -> Array:
@@ -215,7 +216,7 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         "units": sums.units,
     }
     return scored(
-        "CI-TMMD", table, generated, plan, ("halves",), found=found, design=_design(design, sums, plan), bound=float(_halves_bound(sums, plan).mean()),
+        "CI-TMMD", table, generated, plan, ("halves",), found=found, design=_design(design, sizes, plan), bound=float(_halves_bound(sums, plan).mean()),
         null=null_band(centre, sd), details=details, note=halves_note(plan, sums, grouped=table.grouped), **halves_fields(plan),
     )  # fmt: skip
 
@@ -276,6 +277,7 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     sums = table.class_halves(kept)
 
     design = design_of(sums.totals, plan)
+    sizes = halves_of(whole_sets(sums.totals).n) if table.sizes is None else table.sizes[1 + kept]
 
     def statistic(t: Totals) -> Array:
         matrix = d_matrix(t, plan, design)
@@ -307,7 +309,7 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         why = "within two standard errors of 0" if np.isfinite(errors).all() else "of unknown error (too few groups)"
         note = f"Denominators {why}, so the ratio is unreliable: {', '.join(unstable)}"
     return scored(
-        "D-TMMD", table, generated, plan, settings, found=found, design=_design(design, sums, plan), bound=bound, limit=1.0,
+        "D-TMMD", table, generated, plan, settings, found=found, design=_design(design, sizes, plan), bound=bound, limit=1.0,
         details=details, note=note, **fields,
     )  # fmt: skip
 
