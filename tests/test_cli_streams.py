@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.cli import main
 from palpate.core import FeatureSet, Results
 
 NOPE = ("score", "--generated", "nope.npy", "--reference", "nope.npy")
@@ -87,3 +88,31 @@ def test_letters_that_a_stream_lacks_are_question_marks_and_json_stays_whole(her
     assert row.split()[:4] == ["TMMD", "?", "grouped", "gr?n"]
     done = palpate(*SCORE, "--names", "grün", "--json", **ascii_only)
     assert (done.returncode, {s["subject"] for s in json.loads(done.stdout.decode("ascii"))["scores"]}) == (0, {"grün"})
+
+
+class Plain:
+    """A stream that somebody put in the place of standard output: neither a coding nor a file."""
+
+    def __init__(self, error=None):
+        self.said, self.error = "", error
+
+    def write(self, text):
+        if self.error is not None:
+            raise self.error
+        self.said += text
+
+    def flush(self):
+        pass
+
+    def isatty(self):
+        return False
+
+
+def test_a_stream_need_not_be_a_file(monkeypatch, capsys):
+    out = Plain()
+    monkeypatch.setattr("sys.stdout", out)
+    assert main(["score", "--generated", "nope.npy", "--reference", "nope.npy", "--json"]) == 2
+    assert json.loads(out.said)["must"]
+    monkeypatch.setattr("sys.stdout", Plain(OSError(5, "Input/output error")))
+    assert main(["--help"]) == 2
+    assert "Got Input/output error" in capsys.readouterr().err

@@ -48,7 +48,7 @@ class Steady:
         try:
             os.dup2(nowhere.fileno(), self.stream.fileno())
             nowhere.close()
-        except (OSError, ValueError):  # a stream in memory, or a closed one, has no file
+        except (OSError, ValueError, AttributeError):  # a stream in memory, or a closed one, has no file
             self.stream = nowhere
         if self.told and not isinstance(error, BrokenPipeError):
             raise error
