@@ -31,6 +31,7 @@ from palpate.protocol.streamed import stream_tmmd
 if TYPE_CHECKING:
     from palpate.cli.score import Options
     from palpate.data.manifest import Manifest
+    from palpate.encoders.towers import Towers
 
 #: What a companion's features are called where they came as a file.
 GIVEN = "embeddings"
@@ -132,7 +133,6 @@ def _of_split(
     """The test part of a split, beside controls."""
     require_extra("palpate score")
     from palpate.data.manifest import Manifest
-    from palpate.encoders.towers import Towers
     from palpate.generate import Generated
     from palpate.protocol.score_inputs import is_generated
     from palpate.protocol.scoring import compare_generated
@@ -147,7 +147,7 @@ def _of_split(
         fix = f"Score other pictures with --reference {options.manifest} --split {options.split} --encoder {options.encoder}"
         raise PalpateError("With MANIFEST, --generated must be folders of palpate generate", f"{plain}, which has no index of one", fix)
     folders = {name: Generated.load(path) for name, path in paths.items()}
-    manifest, towers = Manifest.load(options.manifest), Towers.load(options.encoder)
+    manifest, towers = Manifest.load(options.manifest), _towers(options.encoder, terminal)
     empty = [part for part in ("test", "train") if len(one := manifest.part(split, part)) and not one.table[group].count()]
     if options.group != "auto" and empty:
         got = f"--group {group} and no value in the {empty[0]} part of {options.manifest}"
@@ -207,9 +207,7 @@ def _of_pictures(
     _require_group(options, columns, {path: bool(one.table[group].count()) for path, one in every.items()}, "pictures")
     towers, digests = None, dict[str, Any]({"split": split.digest} if split else {})
     if options.encoder is not None:
-        from palpate.encoders.towers import Towers
-
-        towers = Towers.load(options.encoder)
+        towers = _towers(options.encoder, terminal)
         digests["touch tower"] = towers.digest("touch")
     from palpate.protocol.touches import compare_touches, files_digest
 
@@ -232,6 +230,13 @@ def _of_pictures(
     said = {name: v for name, v in _said(asked, filled or group).items() if name not in _unused(options)}
     settings = {"digests": digests, "encoder": options.encoder or "none", "options": said}
     return _results(found, paths, settings, terminal, touch_gallery(reference, next(iter(made.values())), options.seed))
+
+
+def _towers(encoder: str, terminal: Terminal) -> Towers:
+    terminal.say(f"Loading {encoder} ...")  # torch and its friends take seconds to import
+    from palpate.encoders.towers import Towers
+
+    return Towers.load(encoder)
 
 
 def _require_one_kind(found: Mapping[Path, Manifest], group: str, columns: Columns | None) -> None:

@@ -200,7 +200,8 @@ class FeatureSet:
                 raise PalpateError(f"{name} must have one entry a row ({shape[0]})", f"{len(column)}", f"Pass {name} in the order of ids")
         bad = np.flatnonzero(~_finite_rows(self.features))
         if bad.size:
-            named = ", ".join(f"{int(k)}: {list(self.ids)[int(k)]!r}" for k in bad[:5]) + ", ..." * (bad.size > 5)
+            names = list(self.ids)  # a column of pandas may be numbered otherwise
+            named = ", ".join(f"{int(k)}: {names[int(k)]!r}" for k in bad[:5]) + ", ..." * (bad.size > 5)
             got = f"NaN or infinity in {bad.size} row{'s' * (bad.size != 1)} ({named})"
             raise PalpateError("Features must be finite", got, "Check what those rows were made from")
 

@@ -13,7 +13,7 @@ lose what matters.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -113,18 +113,13 @@ class Gaussian:
     stationary = True
 
     def __post_init__(self) -> None:
-        given: Any = self.sigmas
-        try:
-            several = (
-                tuple(float(sigma) for sigma in (given if np.iterable(given) else (given,)))
-                if not isinstance(given, str | bytes | bool)
-                else ()
-            )
+        given: Any = self.sigmas if np.iterable(self.sigmas) else (self.sigmas,)
+        try:  # the characters of a word are no bandwidths, nor is True
+            several = () if isinstance(self.sigmas, str | bytes | bool) else tuple(float(sigma) for sigma in given)
         except (TypeError, ValueError, OverflowError, RuntimeError):
             several = ()
         if not several or not all(np.isfinite(s) and 1e-100 < s < 1e100 for s in several):
-            got = repr(self.sigmas[0] if isinstance(self.sigmas, tuple) and len(self.sigmas) == 1 else self.sigmas)
-            raise PalpateError("sigma must be positive", got, "Pass e.g. sigma=10, or Gaussian((5.0, 10.0))")
+            raise PalpateError("sigma must be positive", repr(self.sigmas), "Pass e.g. sigma=10, or Gaussian((5.0, 10.0))")
         object.__setattr__(self, "sigmas", several)
 
     @property
@@ -275,7 +270,7 @@ def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) 
             raise PalpateError('sigma must be positive, several of that, "median" or "multi"', repr(sigma), "Pass e.g. sigma=10")
         middle = median_distance(x, groups)
         return Gaussian(tuple(f * middle for f in (FACTORS if sigma == "multi" else (1.0,))), f"gaussian, {sigma}")
-    return Gaussian(tuple(sigma) if isinstance(sigma, Iterable) and np.iterable(sigma) else (sigma,))  # type: ignore[arg-type]
+    return Gaussian(sigma)  # type: ignore[arg-type]
 
 
 def median_distance(x: Any, groups: Sequence[str] | Index | None = None, rows: int = MEDIAN_ROWS) -> float:

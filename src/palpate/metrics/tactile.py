@@ -216,7 +216,8 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         "units": sums.units,
     }
     return scored(
-        "CI-TMMD", table, generated, plan, ("halves",), found=found, design=_design(design, sizes, plan), bound=float(_halves_bound(sums, plan).mean()),
+        "CI-TMMD", table, generated, plan, ("halves",), found=found, design=_design(design, sizes, plan),
+        bound=float(_halves_bound(sums, plan).mean()),
         null=null_band(centre, sd), details=details, note=halves_note(plan, sums, grouped=table.grouped), **halves_fields(plan),
     )  # fmt: skip
 
