@@ -26,8 +26,16 @@ def make_lists(folder):
     sizes = {"train": 91_982, "test": 29_879}
     while any(len(parts[p]) < sizes[p] for p in parts):
         start, video = int(rng.integers(0, 40_000)), int(rng.integers(0, 126))
-        part = "test" if len(parts["train"]) >= sizes["train"] or (len(parts["test"]) < sizes["test"] and rng.random() < 0.25) else "train"
-        parts[part] += [f"video{video:03d}/{start * 100 + k:010d}.jpg,{video % 19}" for k in range(min(27, sizes[part] - len(parts[part])))]
+        part = (
+            "test"
+            if len(parts["train"]) >= sizes["train"]
+            or (len(parts["test"]) < sizes["test"] and rng.random() < 0.25)
+            else "train"
+        )
+        parts[part] += [
+            f"video{video:03d}/{start * 100 + k:010d}.jpg,{video % 19}"
+            for k in range(min(27, sizes[part] - len(parts[part])))
+        ]
     for part, rows in parts.items():
         rows = sorted(set(rows))
         rng.shuffle(rows)
@@ -38,7 +46,14 @@ def ours(train, test):
     from palpate.leakage.audit import audit_lists
 
     audit, _ = audit_lists(train, test)
-    return [audit.test_samples, audit.groups_shared, audit.test_samples_in_shared_groups, audit.gap_min, audit.gap_median, audit.gap_max]
+    return [
+        audit.test_samples,
+        audit.groups_shared,
+        audit.test_samples_in_shared_groups,
+        audit.gap_min,
+        audit.gap_median,
+        audit.gap_max,
+    ]
 
 
 def reference(train, test):
@@ -73,7 +88,9 @@ def peak_mb():
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("lists", nargs="?", type=Path)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--one", choices=["ours", "reference"], help=argparse.SUPPRESS)
@@ -98,7 +115,12 @@ def main():
                 function(train, test)
                 times.append(time.perf_counter() - start)
             seconds[name] = statistics.median(times)
-            peak = subprocess.run([sys.executable, __file__, str(folder), "--one", name], capture_output=True, text=True, check=True).stdout
+            peak = subprocess.run(
+                [sys.executable, __file__, str(folder), "--one", name],
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout
             print(f"{name:10} {seconds[name]:6.3f} s   peak {float(peak):6.0f} MB   {facts[name]}")
         assert facts["ours"] == facts["reference"], "the two disagree"
         print(

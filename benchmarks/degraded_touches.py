@@ -1,6 +1,6 @@
 """Touches of the procedural world, degraded in controlled ways at growing strengths: what ``metric_degradations.py`` scores.
 
-A :class:`Scene` is one world: reference, perfect generator, empty gel and training touches, with features of the shipped touch tower. What a
+A :class:`Scene` is one world: reference, perfect generator, empty gel and training touches, with features of the shipped tactile encoder. What a
 degradation draws depends on the world and its kind alone, so that a stronger one changes what the weaker one changed, and more.
 """
 
@@ -22,7 +22,7 @@ STRENGTHS = {
     "dropped materials": (0.1, 0.2, 0.4, 0.6, 0.8),
     "wrong material": (0.1, 0.25, 0.5, 0.75, 1.0),
     "new videos": (0.1, 0.25, 0.5, 0.75, 1.0),
-    "memorised videos": (0.1, 0.25, 0.5, 0.75, 1.0),
+    "memorized videos": (0.1, 0.25, 0.5, 0.75, 1.0),
     "empty gel": (0.1, 0.25, 0.5, 0.75, 1.0),
     "faint contact": (0.1, 0.25, 0.5, 0.75, 0.9),
     "blur": (0.5, 0.75, 1.0, 2.0, 4.0),
@@ -36,7 +36,7 @@ MEANING = {
     "dropped materials": "this share of the materials is never shown; touches of the others stand for them",
     "wrong material": "this share of the touches is of another material; over all, each material is as frequent as before",
     "new videos": "no degradation: this share of the touches is of other videos of the right material; what ranks it takes other objects for worse ones",
-    "memorised videos": "this share of the touches is replayed from one training video of the right material",
+    "memorized videos": "this share of the touches is replayed from one training video of the right material",
     "empty gel": "this share of the touches is the empty gel of the right video",
     "faint contact": "contact minus background is this much weaker in all touches",
     "blur": "Gaussian blur, sigma in pixels of 64",
@@ -62,10 +62,16 @@ class Scene:
     compared: dict = field(default_factory=dict)  # pair -> what its pictures score
 
 
-def make_scene(seed, towers, materials=MATERIALS, videos=VIDEOS, size=64):
+def make_scene(seed, encoders, materials=MATERIALS, videos=VIDEOS, size=64):
     """Renders and embeds a world; a material's last videos are the training ones."""
     options = WorldOptions(
-        seed=seed, size=size, materials=materials, objects_per_material=2 * videos, touches_per_video=6, frames_per_touch=2, sensors=2
+        seed=seed,
+        size=size,
+        materials=materials,
+        objects_per_material=2 * videos,
+        touches_per_video=6,
+        frames_per_touch=2,
+        sensors=2,
     )
     found = {name: [] for name in ("made", "real", "empty", "own", "label", "video")}
     train, seen = {name: [] for name in options.names}, dict.fromkeys(options.names, 0)
@@ -73,26 +79,38 @@ def make_scene(seed, towers, materials=MATERIALS, videos=VIDEOS, size=64):
         video, material = Video(options, plan), plan.object_of(0).material
         seen[material] += 1
         if seen[material] > videos:
-            train[material] += [video.tactile(f) for touch in range(3) for f in contact_frames(options, touch)]
+            train[material] += [
+                video.tactile(f) for touch in range(3) for f in contact_frames(options, touch)
+            ]
             continue
         for touch in range(0, options.touches_per_video, 2):
-            pairs = zip(contact_frames(options, touch), contact_frames(options, touch + 1), strict=True)
+            pairs = zip(
+                contact_frames(options, touch), contact_frames(options, touch + 1), strict=True
+            )
             backs = [video.tactile(first_contact(options, t) - 4) for t in (touch, touch + 1)]
             for a, b in pairs:
-                row = (video.tactile(b), video.tactile(a), *backs, options.names.index(material), plan.index)
+                row = (
+                    video.tactile(b),
+                    video.tactile(a),
+                    *backs,
+                    options.names.index(material),
+                    plan.index,
+                )
                 for name, value in zip(found, row, strict=True):
                     found[name].append(value)
     arrays = {name: np.array(values) for name, values in found.items()}
     scene = Scene(seed, train=np.array([train[m] for m in options.names]), **arrays)
     for name in ("made", "real"):
-        scene.features[name] = embed_images(getattr(scene, name), towers)
+        scene.features[name] = embed_images(getattr(scene, name), encoders)
     backs, of = np.unique(scene.own, axis=0, return_inverse=True)
-    scene.features["own"] = embed_images(backs, towers)[of.reshape(-1)]
-    scene.features["train"] = embed_images(scene.train.reshape(-1, *scene.real.shape[1:]), towers).reshape(*scene.train.shape[:2], -1)
+    scene.features["own"] = embed_images(backs, encoders)[of.reshape(-1)]
+    scene.features["train"] = embed_images(
+        scene.train.reshape(-1, *scene.real.shape[1:]), encoders
+    ).reshape(*scene.train.shape[:2], -1)
     return scene
 
 
-def degraded(scene, kind, strength, towers):
+def degraded(scene, kind, strength, encoders):
     """(features, images or None) of a degraded generator; what is drawn depends on the world and the kind alone, so that strengths are nested."""
     rng = rng_for(scene.seed, "metric degradations", kind)
     images, f, n = scene.made, scene.features["made"].astype(np.float64), len(scene.label)
@@ -105,15 +123,21 @@ def degraded(scene, kind, strength, towers):
         return unit(f.mean(axis=0) + (1 - strength) * (f - f.mean(axis=0))), None
     if kind == "unstable over videos":
         names, of = np.unique(scene.video, return_inverse=True)
-        return unit(f + strength * spread * unit(rng.normal(size=(len(names), f.shape[1])))[of]), None
+        return unit(
+            f + strength * spread * unit(rng.normal(size=(len(names), f.shape[1])))[of]
+        ), None
     if kind == "faint contact":
-        images = np.clip(np.rint(scene.own + (1 - strength) * (images.astype(np.float64) - scene.own)), 0, 255).astype(np.uint8)
-        return embed_images(images, towers), images
+        images = np.clip(
+            np.rint(scene.own + (1 - strength) * (images.astype(np.float64) - scene.own)), 0, 255
+        ).astype(np.uint8)
+        return embed_images(images, encoders), images
     if kind == "blur":
         images = np.stack([ndimage.gaussian_filter(i, (strength, strength, 0)) for i in images])
-        return embed_images(images, towers), images
+        return embed_images(images, encoders), images
     if kind == "empty gel":
-        return np.where(chosen[:, None], scene.features["own"], f), np.where(chosen[:, None, None, None], scene.own, images)
+        return np.where(chosen[:, None], scene.features["own"], f), np.where(
+            chosen[:, None, None, None], scene.own, images
+        )
     material, touch = scene.label.copy(), rng.integers(scene.train.shape[1], size=n)
     if kind == "dropped materials":
         order = rng.permutation(scene.train.shape[0])
@@ -122,11 +146,13 @@ def degraded(scene, kind, strength, towers):
         material = rng.choice(left, size=n)
     elif kind == "wrong material":
         material[chosen] = scene.label[exchange(rng, scene.label, np.flatnonzero(chosen))]
-    elif kind == "memorised videos":
+    elif kind == "memorized videos":
         touch %= scene.train.shape[1] // VIDEOS  # of the first training video
     elif kind in ("class collapse", "full collapse"):
         touch[:] = 0
-        material = material if kind == "class collapse" else np.full(n, rng.integers(scene.train.shape[0]))
+        material = (
+            material if kind == "class collapse" else np.full(n, rng.integers(scene.train.shape[0]))
+        )
     return np.where(chosen[:, None], scene.features["train"][material, touch], f), np.where(
         chosen[:, None, None, None], scene.train[material, touch], images
     )

@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from palpate.leakage.background import planar
 from palpate.leakage.descriptors import DRAFT, search_vectors, thumbnail
-from palpate.leakage.pool import FLOOR, quantised
+from palpate.leakage.pool import FLOOR, quantized
 from palpate.leakage.verify import band_pass, even
 
 CHUNK = 64
@@ -37,18 +37,24 @@ def bare(files):
 
 def ours(files):
     pixels = np.stack([thumbnail(file) for file in files])
-    plates = quantised(even(band_pass(planar(pixels)), FLOOR["vision"]))
+    plates = quantized(even(band_pass(planar(pixels)), FLOOR["vision"]))
     return pixels, plates, search_vectors(plates)
 
 
 def forge(folder, count):
     rng = np.random.default_rng(0)
-    small = [ndimage.gaussian_filter(rng.standard_normal((120, 160, 3)), (s, s, 0)) for s in (1, 2, 4, 8)]
+    small = [
+        ndimage.gaussian_filter(rng.standard_normal((120, 160, 3)), (s, s, 0)) for s in (1, 2, 4, 8)
+    ]
     for k in range(count):
         field = np.roll(small[k % 4] / small[k % 4].std(), (k * 7 % 120, k * 13 % 160), (0, 1))
-        big = Image.fromarray(np.clip(128 + 40 * field, 0, 255).astype(np.uint8)).resize((640, 480), Image.Resampling.BICUBIC)
+        big = Image.fromarray(np.clip(128 + 40 * field, 0, 255).astype(np.uint8)).resize(
+            (640, 480), Image.Resampling.BICUBIC
+        )
         noisy = np.asarray(big).astype(np.int16) + rng.integers(-6, 7, (480, 640, 1), np.int16)
-        Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8)).save(folder / f"{k:06d}.jpg", quality=90)
+        Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8)).save(
+            folder / f"{k:06d}.jpg", quality=90
+        )
 
 
 def main():
@@ -58,14 +64,19 @@ def main():
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary, ProcessPoolExecutor(options.processes, multiprocessing.get_context("spawn")) as pool:
+    with (
+        tempfile.TemporaryDirectory() as temporary,
+        ProcessPoolExecutor(options.processes, multiprocessing.get_context("spawn")) as pool,
+    ):
         folder = options.folder or Path(temporary)
         if options.folder is None:
             forge(folder, options.files)
         files = sorted(folder.rglob("*.jpg"))[: options.files]
         chunks = [files[k : k + CHUNK] for k in range(0, len(files), CHUNK)]
         best = {}
-        for _ in range(options.repeats + 1):  # the first round starts the processes and warms the disk
+        for _ in range(
+            options.repeats + 1
+        ):  # the first round starts the processes and warms the disk
             for work in (bare, ours):
                 start = time.perf_counter()
                 for _ in pool.map(work, chunks):
@@ -73,9 +84,13 @@ def main():
                 seconds = time.perf_counter() - start
                 best[work.__name__] = min(best.get(work.__name__, np.inf), seconds)
     rate = {name: len(files) / seconds for name, seconds in best.items()}
-    print(f"{len(files)} files, {options.processes} processes: bare {rate['bare']:.0f}/s, with hashing {rate['ours']:.0f}/s")
+    print(
+        f"{len(files)} files, {options.processes} processes: bare {rate['bare']:.0f}/s, with hashing {rate['ours']:.0f}/s"
+    )
     print(f"time with hashing / bare = {best['ours'] / best['bare']:.3f} (asked: at most 1.3)")
-    print(f"peak memory of the parent {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    print(
+        f"peak memory of the parent {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB"
+    )
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@
 Each seed forges a train and a test part (tests/leakage_forge.py: 60 videos of 9 kinds of surface, 128 px, 4 samples each) and plants near-duplicates (brightness
 +-5 %, JPEG quality 60, shifts up to 4 px, and combinations) across videos, the same sample, the same bytes, shared videos and frames 3 apart. Near-duplicates are
 judged twice: with videos known, and with all metadata dropped. Rows that are near-duplicates by nature (same bytes, same sample) count as such; frames 3
-apart, which may or may not be, are left out of that judgement. Peak memory is the process's.
+apart, which may or may not be, are left out of that judgment. Peak memory is the process's.
 """
 
 import argparse
@@ -27,17 +27,21 @@ from palpate.data.manifest import Manifest
 from palpate.leakage.audit import Pictures, inspect_parts
 from palpate.leakage.near import near_duplicates
 
-DROPPED = ("video", "touch", "object", "session", "material", "sensor", "domain")
+DROPPED = ("video", "contact", "object", "session", "material", "sensor", "domain")
 
 
 def anonymous(manifest):
-    table = manifest.table.with_columns(pl.lit(None, pl.String).alias(c) for c in DROPPED).with_columns(frame=pl.lit(None, pl.Int64))
+    table = manifest.table.with_columns(
+        pl.lit(None, pl.String).alias(c) for c in DROPPED
+    ).with_columns(frame=pl.lit(None, pl.Int64))
     return Manifest(table, manifest.root)
 
 
 def counts(flag, truth, use=None):
     use = np.ones(len(flag), bool) if use is None else use
-    return np.array([(flag & truth & use).sum(), (flag & ~truth & use).sum(), (~flag & truth & use).sum()])
+    return np.array(
+        [(flag & truth & use).sum(), (flag & ~truth & use).sum(), (~flag & truth & use).sum()]
+    )
 
 
 def judge(leaky, processes):
@@ -45,7 +49,9 @@ def judge(leaky, processes):
     truth = {kind: leaky.truth(kind) for kind in leaky.planted}
     same, copied = truth["identical sample"], truth["identical bytes"]
     alike, spared = truth["near-duplicate"] | same | copied, truth["time gap"]
-    found = inspect_parts(leaky.train, leaky.test, group="video", pictures=Pictures(processes=processes)).table
+    found = inspect_parts(
+        leaky.train, leaky.test, group="video", pictures=Pictures(processes=processes)
+    ).table
     column = lambda name: found[name].to_numpy().astype(bool)  # noqa: E731
     out = {
         "identical sample": counts(column("identical_sample_flag"), same),
@@ -54,9 +60,11 @@ def judge(leaky, processes):
         "time gap": counts(column("time_gap_flag"), same | spared),
     }
     missed = Counter()
-    for modality in ("vision", "touch"):
+    for modality in ("vision", "tactile"):
         known = column(f"near_duplicate_{modality}_flag")
-        hidden = near_duplicates(anonymous(leaky.train), anonymous(leaky.test), modality, processes=processes).flag
+        hidden = near_duplicates(
+            anonymous(leaky.train), anonymous(leaky.test), modality, processes=processes
+        ).flag
         out[f"near-duplicate {modality}, videos known"] = counts(known, alike, ~spared)
         out[f"near-duplicate {modality}, no metadata"] = counts(hidden, alike, ~spared)
         for flag, how in ((known, "known"), (hidden, "hidden")):
@@ -81,7 +89,9 @@ def main():
     total, missed, samples, seconds = {}, Counter(), 0, 0.0
     for seed in range(options.first, options.first + options.seeds):
         with tempfile.TemporaryDirectory() as folder:
-            leaky = forge(Path(folder), seed, size=options.size, look=options.look, materials=materials)
+            leaky = forge(
+                Path(folder), seed, size=options.size, look=options.look, materials=materials
+            )
             samples += len(leaky.test)
             start = time.perf_counter()
             found, lost = judge(leaky, options.processes)
@@ -92,7 +102,9 @@ def main():
     print(
         f"{options.seeds} seeds from {options.first}, {samples} test samples, {options.size} px, {options.look}, {seconds:.0f} s of audits"
     )
-    print(f"{'planted kind':44s} {'planted':>8s} {'found':>6s} {'wrong':>6s} {'precision':>10s} {'recall':>8s}")
+    print(
+        f"{'planted kind':44s} {'planted':>8s} {'found':>6s} {'wrong':>6s} {'precision':>10s} {'recall':>8s}"
+    )
     for kind, (right, wrong, lost) in total.items():
         print(
             f"{kind:44s} {right + lost:8d} {right:6d} {wrong:6d} {right / max(1, right + wrong):10.4f} {right / max(1, right + lost):8.4f}"

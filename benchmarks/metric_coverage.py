@@ -4,7 +4,7 @@
     python benchmarks/metric_coverage.py --write docs/metric_coverage.md   # writes them
     python benchmarks/metric_coverage.py --replicates 100                  # a quick look
 
-Frames of a video are drawn as ``normalised(mean + class + video + frame)``: Gaussian effects in 16 dimensions, unit-norm rows. A replicate draws new
+Frames of a video are drawn as ``normalized(mean + class + video + frame)``: Gaussian effects in 16 dimensions, unit-norm rows. A replicate draws new
 videos of 3 to 8 frames; a generator adds a shift, or nothing under the null. ``paired``: generated and real frames are of the same videos, whose
 effects they share with a correlation of 0.7 (that is how a generator is scored on a test set); ``unpaired``: of different videos.
 
@@ -56,16 +56,28 @@ class Model:
         unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)  # noqa: E731
         mean = unit(rng.normal(size=width))
         away = rng.normal(size=width)
-        return cls(mean, SPREAD["class"] * unit(rng.normal(size=(classes, width))), SHIFT * unit(away - mean * (away @ mean)))
+        return cls(
+            mean,
+            SPREAD["class"] * unit(rng.normal(size=(classes, width))),
+            SHIFT * unit(away - mean * (away @ mean)),
+        )
 
     def videos(self, rng, count):
         """(count, d) effects of videos."""
-        return rng.normal(size=(count, len(self.mean))) * self.spread["video"] / np.sqrt(len(self.mean))
+        return (
+            rng.normal(size=(count, len(self.mean)))
+            * self.spread["video"]
+            / np.sqrt(len(self.mean))
+        )
 
     def frames(self, rng, effects, labels, sizes, shift=0.0):
         """Rows of unit norm: ``sizes[v]`` frames of each video."""
         of = np.repeat(np.arange(len(sizes)), sizes)
-        noise = rng.normal(size=(len(of), len(self.mean))) * self.spread["frame"] / np.sqrt(len(self.mean))
+        noise = (
+            rng.normal(size=(len(of), len(self.mean)))
+            * self.spread["frame"]
+            / np.sqrt(len(self.mean))
+        )
         rows = self.mean + shift * self.shift + self.classes[labels[of]] + effects[of] + noise
         return rows / np.linalg.norm(rows, axis=1, keepdims=True), of
 
@@ -91,7 +103,9 @@ def truth_of(model, sigma=10.0, videos=TRUTH_VIDEOS, seed=1):
     c = len(model.classes)
 
     def sample(labels, shift=0.0):
-        rows, _ = model.frames(rng, model.videos(rng, len(labels)), labels, np.full(len(labels), 2), shift)
+        rows, _ = model.frames(
+            rng, model.videos(rng, len(labels)), labels, np.full(len(labels), 2), shift
+        )
         return rows[0::2], rows[1::2]
 
     def excess(first, second):
@@ -101,15 +115,22 @@ def truth_of(model, sigma=10.0, videos=TRUTH_VIDEOS, seed=1):
 
     def apart(x, y):  # x and y of different videos; blocks where moments are too coarse
         if sigma < 5:
-            parts = zip(np.array_split(x, len(x) // 4000), np.array_split(y, len(x) // 4000), strict=True)
+            parts = zip(
+                np.array_split(x, len(x) // 4000), np.array_split(y, len(x) // 4000), strict=True
+            )
             return np.mean([distance(a, b, kernel=Gaussian((sigma,))).value for a, b in parts])
         return distance(x, y, sigma=sigma, tolerance=1e-3).value
 
     any_class = sample(rng.integers(c, size=videos))
-    shifted = {size: apart(sample(rng.integers(c, size=videos), size)[0], any_class[0]) for size in (1.0, SECOND)}
+    shifted = {
+        size: apart(sample(rng.integers(c, size=videos), size)[0], any_class[0])
+        for size in (1.0, SECOND)
+    }
     each = [sample(np.full(videos // c, k)) for k in range(c)]
     between = np.array([[0.0 if a is b else apart(a[0], b[0]) for b in each] for a in each])
-    return Truth({0.0: 0.0} | shifted, excess(*any_class), np.array([excess(*s) for s in each]), between)
+    return Truth(
+        {0.0: 0.0} | shifted, excess(*any_class), np.array([excess(*s) for s in each]), between
+    )
 
 
 def share(sizes):
@@ -120,7 +141,12 @@ def share(sizes):
 
 def feature_set(rows, of, labels, prefix, groups=True):
     names = [f"{prefix}{v}" for v in of]
-    return FeatureSet([f"{prefix}{k}" for k in range(len(rows))], rows, [str(c) for c in labels[of]], names if groups else None)
+    return FeatureSet(
+        [f"{prefix}{k}" for k in range(len(rows))],
+        rows,
+        [str(c) for c in labels[of]],
+        names if groups else None,
+    )
 
 
 def draw_pair(model, rng, videos, paired, shift):
@@ -173,7 +199,9 @@ class Tally:
         return float(self.covered.mean())
 
 
-def tally_tmmd(model, truth, videos, paired, replicates, seed, permutations=199, frames=0, sigma=10.0):
+def tally_tmmd(
+    model, truth, videos, paired, replicates, seed, permutations=199, frames=0, sigma=10.0
+):
     """TMMD with a shift, and p-values without one; the first ``frames`` replicates also without groups."""
     tallies = {name: Tally() for name in ("TMMD", "TMMD, frames", "TMMD null", "TMMD null, frames")}
     rejected = {"videos": [], "frames": []}
@@ -195,7 +223,16 @@ def tally_tmmd(model, truth, videos, paired, replicates, seed, permutations=199,
 
 def tally_halves(model, truth, videos, replicates, seed, frames=0):
     """I-, CI- and D-TMMD and what is invariant of them, by groups."""
-    names = ("I-TMMD", "I-TMMD: E", "CI-TMMD", "CI-TMMD: E", "D: mean inter-class", "D: E_ratio", "D-TMMD", "D: mean inter-class, frames")
+    names = (
+        "I-TMMD",
+        "I-TMMD: E",
+        "CI-TMMD",
+        "CI-TMMD: E",
+        "D: mean inter-class",
+        "D: E_ratio",
+        "D-TMMD",
+        "D: mean inter-class, frames",
+    )
     tallies = {name: Tally() for name in names}
     for r in range(replicates):
         rng = rng_for(seed, "metric coverage", f"halves {videos} {r}")
@@ -208,12 +245,22 @@ def tally_halves(model, truth, videos, replicates, seed, frames=0):
         one, ratio = ci_tmmd(made), d_tmmd(made)
         tallies["CI-TMMD"].add(one.value, one.interval, own.mean())
         tallies["CI-TMMD: E"].add(one.details["E"], one.details["E_interval"], truth.own.mean())
-        tallies["D-TMMD"].add(ratio.value, ratio.interval, own.mean() / (own.mean() + truth.between.sum(axis=1).mean()))
+        tallies["D-TMMD"].add(
+            ratio.value,
+            ratio.interval,
+            own.mean() / (own.mean() + truth.between.sum(axis=1).mean()),
+        )
         if ratio.details["E_ratio"] is not None:  # given where the classes are apart
-            tallies["D: E_ratio"].add(ratio.details["E_ratio"], ratio.details["E_ratio_interval"], truth.own.mean() / truth.inter)
+            tallies["D: E_ratio"].add(
+                ratio.details["E_ratio"],
+                ratio.details["E_ratio_interval"],
+                truth.own.mean() / truth.inter,
+            )
         tallies["D: mean inter-class"].add(*ratio.details["inter"].values(), truth.inter)
         if r < frames:
-            tallies["D: mean inter-class, frames"].add(*inter_class(*without_groups(made), False), truth.inter)
+            tallies["D: mean inter-class, frames"].add(
+                *inter_class(*without_groups(made), False), truth.inter
+            )
     return tallies
 
 
@@ -222,7 +269,11 @@ def inter_class(made, grouped):
     plan = plan_for({}, grouped=grouped)
     table = build_table(made, None, plan, grouped=grouped)
     sums = table.class_halves(np.arange(len(table.classes)))
-    found = class_estimate(sums, lambda t: np.array([denominators(d_matrix(t, plan), "mean_off_diagonal").mean()]), table.unit)
+    found = class_estimate(
+        sums,
+        lambda t: np.array([denominators(d_matrix(t, plan), "mean_off_diagonal").mean()]),
+        table.unit,
+    )
     return float(found.values[0]), found.interval(0, plan.level)
 
 
@@ -234,7 +285,10 @@ def tally_difference(model, truth, videos, replicates, seed, shifts=(1.0, SECOND
         labels, real = rng.integers(len(model.classes), size=videos), model.videos(rng, videos)
         sizes = rng.integers(FRAMES[0], FRAMES[1] + 1, size=videos)
         shared = FIDELITY * real + np.sqrt(1 - FIDELITY**2) * model.videos(rng, videos)
-        sets = [feature_set(*model.frames(rng, shared, labels, sizes, shift), labels, "v") for shift in shifts]
+        sets = [
+            feature_set(*model.frames(rng, shared, labels, sizes, shift), labels, "v")
+            for shift in shifts
+        ]
         reference = feature_set(*model.frames(rng, real, labels, sizes), labels, "v")
         found = compare({"a": sets[0], "b": sets[1]}, reference, permutations=0)
         delta, scores = found.differences[0], (found.scores[0], found.scores[4])
@@ -264,7 +318,10 @@ def coverage_row(name, design, tally):
     )
 
 
-COVERAGE_HEAD = ["| quantity | videos | truth | bias | sd | mean half-width | covered | 92 to 99 % |", "|---|---|---|---|---|---|---|---|"]
+COVERAGE_HEAD = [
+    "| quantity | videos | truth | bias | sd | mean half-width | covered | 92 to 99 % |",
+    "|---|---|---|---|---|---|---|---|",
+]
 
 
 def tables(videos, replicates, frames, seed, say):
@@ -275,26 +332,38 @@ def tables(videos, replicates, frames, seed, say):
     grouped, flat, rejections = [], [], []
     for count in videos:
         for kind in KINDS:
-            found, rejected = tally_tmmd(model, truth, count, kind == "paired", replicates, seed, frames=frames)
+            found, rejected = tally_tmmd(
+                model, truth, count, kind == "paired", replicates, seed, frames=frames
+            )
             design = f"{count}, {kind}"
             grouped += [
-                coverage_row(label, design, found[name]) for label, name in (("TMMD", "TMMD"), ("TMMD under the null", "TMMD null"))
+                coverage_row(label, design, found[name])
+                for label, name in (("TMMD", "TMMD"), ("TMMD under the null", "TMMD null"))
             ]
             flat += [
                 coverage_row("TMMD" + tail, design, found["TMMD" + key + ", frames"])
                 for tail, key in (("", ""), (" under the null", " null"))
             ]
-            cells = [f"{rate(rejected[k])} | {verdict(rejected[k], REJECTION)}" for k in ("videos", "frames")]
+            cells = [
+                f"{rate(rejected[k])} | {verdict(rejected[k], REJECTION)}"
+                for k in ("videos", "frames")
+            ]
             rejections.append(f"| {design} | {' | '.join(cells)} |")
             say(f"TMMD {design}")
     for count in videos:
-        found, _ = tally_tmmd(model, near, count, True, replicates // 2, seed, permutations=0, sigma=1.0)
+        found, _ = tally_tmmd(
+            model, near, count, True, replicates // 2, seed, permutations=0, sigma=1.0
+        )
         grouped.append(coverage_row("TMMD, sigma 1", f"{count}, paired", found["TMMD"]))
     say("TMMD, sigma 1")
     halves, widths = [], []
     for count in videos:
         found = tally_halves(model, truth, count, replicates, seed, frames)
-        flat.append(coverage_row("D: mean inter-class", str(count), found.pop("D: mean inter-class, frames")))
+        flat.append(
+            coverage_row(
+                "D: mean inter-class", str(count), found.pop("D: mean inter-class, frames")
+            )
+        )
         halves += [coverage_row(name, str(count), tally) for name, tally in found.items()]
         say(f"halves {count}")
     for count in videos:
@@ -303,38 +372,67 @@ def tables(videos, replicates, frames, seed, say):
         say(f"difference {count}: {wider:.2f}")
         widths[-1] += f" {wider:.1f} |"
     return [
-        "## Intervals that leave out whole videos", "", *COVERAGE_HEAD, *grouped, *halves, "",
-        "## Intervals that leave out frames (no groups given)", "",
-        "`preset=\"paper\"` on the same features without their groups: the unbiased estimator, frames taken as independent. The score says so in its note.", "",
-        *COVERAGE_HEAD, *flat, "",
-        "## Two generators on the same videos", "",
+        "## Intervals that leave out whole videos",
+        "",
+        *COVERAGE_HEAD,
+        *grouped,
+        *halves,
+        "",
+        "## Intervals that leave out frames (no groups given)",
+        "",
+        '`preset="paper"` on the same features without their groups: the unbiased estimator, frames taken as independent. The score says so in its note.',
+        "",
+        *COVERAGE_HEAD,
+        *flat,
+        "",
+        "## Two generators on the same videos",
+        "",
         f"`palpate.metrics.compare`: one generator with the shift and one with {SECOND} of it, which share the effects of the videos. The last column says how many times wider the root of the sum "
-        "of the squared widths of the two intervals is.", "",
-        COVERAGE_HEAD[0] + " unpaired width / paired |", COVERAGE_HEAD[1] + "---|", *widths, "",
-        "## Permutation tests of a true null at 5 %", "",
-        "| videos | whole videos: rejected | 3 to 8 % | frames: rejected | 3 to 8 % |", "|---|---|---|---|---|", *rejections, "",
-    ]  # fmt: skip
+        "of the squared widths of the two intervals is.",
+        "",
+        COVERAGE_HEAD[0] + " unpaired width / paired |",
+        COVERAGE_HEAD[1] + "---|",
+        *widths,
+        "",
+        "## Permutation tests of a true null at 5 %",
+        "",
+        "| videos | whole videos: rejected | 3 to 8 % | frames: rejected | 3 to 8 % |",
+        "|---|---|---|---|---|",
+        *rejections,
+        "",
+    ]
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--videos", type=int, nargs="+", default=[12, 24, 40])
     parser.add_argument("--replicates", type=int, default=600)
-    parser.add_argument("--frames", type=int, default=300, help="replicates that are also scored without groups")
+    parser.add_argument(
+        "--frames", type=int, default=300, help="replicates that are also scored without groups"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", type=Path, help="Markdown file to write")
     asked = parser.parse_args()
     started = time.process_time()
-    say = lambda text: print(f"{time.process_time() - started:6.0f} s  {text}", file=sys.stderr, flush=True)  # noqa: E731
+    say = lambda text: print(
+        f"{time.process_time() - started:6.0f} s  {text}", file=sys.stderr, flush=True
+    )
     body = tables(asked.videos, asked.replicates, asked.frames, asked.seed, say)
     options = f"--videos {' '.join(map(str, asked.videos))} --replicates {asked.replicates} --frames {asked.frames} --seed {asked.seed}"
-    command = "python benchmarks/metric_coverage.py" + (f" --write {asked.write}" if asked.write else "")
+    command = "python benchmarks/metric_coverage.py" + (
+        f" --write {asked.write}" if asked.write else ""
+    )
     head = [
-        "# Whether the error bars of the metrics are true", "",
+        "# Whether the error bars of the metrics are true",
+        "",
         f"Written by `{command} {options}`, {datetime.datetime.now(tz=datetime.UTC).date()}. The model and the truth are described in that script: synthetic unit-norm "
-        f"features, {WIDTH} dimensions, {CLASSES} classes, videos of {FRAMES[0]} to {FRAMES[1]} frames, sigma = 10 unless said; all values times 1000.", "",
-        "`covered`: the share of replicates whose 95 % interval holds the truth, with its own 95 % interval. `bias` and `sd` are of the estimate about the truth.", "",
-    ]  # fmt: skip
+        f"features, {WIDTH} dimensions, {CLASSES} classes, videos of {FRAMES[0]} to {FRAMES[1]} frames, sigma = 10 unless said; all values times 1000.",
+        "",
+        "`covered`: the share of replicates whose 95 % interval holds the truth, with its own 95 % interval. `bias` and `sd` are of the estimate about the truth.",
+        "",
+    ]
     text = "\n".join([*head, *body]).rstrip() + "\n"
     if asked.write:
         asked.write.write_text(text, encoding="utf-8")

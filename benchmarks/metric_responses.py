@@ -4,7 +4,7 @@
     python benchmarks/metric_responses.py --write docs/metric_responses.md   # writes them
     python benchmarks/metric_responses.py --draws 2                          # a quick look
 
-Frames are drawn as ``normalised(mean + class + video + frame)``, Gaussian effects in 64 dimensions, unit-norm rows: ten classes, eight videos of each, ten
+Frames are drawn as ``normalized(mean + class + video + frame)``, Gaussian effects in 64 dimensions, unit-norm rows: ten classes, eight videos of each, ten
 frames of a video. The reference is drawn so; a generator is scored on the same videos, whose effects it shares with a correlation of 0.7, and
 deviates in one respect.
 """
@@ -30,7 +30,7 @@ GENERATORS = {
     "half the spread": {"class": 0.225, "video": 0.2, "frame": 0.2},
     "more frame noise": {"frame": 0.7},
     "little frame noise": {"frame": 0.1},
-    "memorised videos: one a class": {"video": 0.0, "frame": 0.1},
+    "memorized videos: one a class": {"video": 0.0, "frame": 0.1},
     "unstable over videos": {"video": 0.7},
     "classes confused: half the labels wrong": {"confused": 0.5},
     "classes indistinguishable": {"class": 0.0},
@@ -48,7 +48,7 @@ def draw(rng, change=None, videos=VIDEOS, frames=FRAMES, classes=CLASSES):
     """(generated, reference) feature sets; ``change`` is an entry of :data:`GENERATORS`."""
     of = {"shift": 0.0, "confused": 0.0} | SPREAD | (change or {})
     noise = lambda n: rng.normal(size=(n, WIDTH)) / np.sqrt(WIDTH)  # noqa: E731
-    mean, centres = unit(rng.normal(size=WIDTH)), unit(rng.normal(size=(classes, WIDTH)))
+    mean, centers = unit(rng.normal(size=WIDTH)), unit(rng.normal(size=(classes, WIDTH)))
     label = np.repeat(np.arange(classes), videos)
     real = noise(len(label))
     made = FIDELITY * real + np.sqrt(1 - FIDELITY**2) * noise(len(label))
@@ -57,23 +57,42 @@ def draw(rng, change=None, videos=VIDEOS, frames=FRAMES, classes=CLASSES):
     shown = label[index].copy()
     wrong = rng.random(len(shown)) < of["confused"]
     shown[wrong] = rng.integers(classes, size=int(wrong.sum()))
-    rows = mean + of["shift"] * away + of["class"] * centres[shown] + of["video"] * made[index] + of["frame"] * noise(len(index))
-    true = mean + SPREAD["class"] * centres[label[index]] + SPREAD["video"] * real[index] + SPREAD["frame"] * noise(len(index))
+    rows = (
+        mean
+        + of["shift"] * away
+        + of["class"] * centers[shown]
+        + of["video"] * made[index]
+        + of["frame"] * noise(len(index))
+    )
+    true = (
+        mean
+        + SPREAD["class"] * centers[label[index]]
+        + SPREAD["video"] * real[index]
+        + SPREAD["frame"] * noise(len(index))
+    )
     ids = [f"s{k:05d}" for k in rng.permutation(len(index))]  # a name says nothing of the video
     names = [f"v{v}" for v in index]
-    return tuple(FeatureSet(ids, unit(x), [str(c) for c in label[index]], names) for x in (rows, true))
+    return tuple(
+        FeatureSet(ids, unit(x), [str(c) for c in label[index]], names) for x in (rows, true)
+    )
 
 
 def by_video(made):
     """The same set with names in the order of class, video and frame: what ``ordered`` halves cut."""
-    return FeatureSet([f"s{k:05d}" for k in range(len(made.ids))], made.features, made.labels, made.groups)
+    return FeatureSet(
+        [f"s{k:05d}" for k in range(len(made.ids))], made.features, made.labels, made.groups
+    )
 
 
 def cell(values, digits=3):
     values = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
     if not np.isfinite(values).any():
         return "undefined"
-    tail = "" if np.isfinite(values).all() else f" (undefined {int((~np.isfinite(values)).sum())} of {len(values)})"
+    tail = (
+        ""
+        if np.isfinite(values).all()
+        else f" (undefined {int((~np.isfinite(values)).sum())} of {len(values)})"
+    )
     return f"{np.nanmean(values):.{digits}f} ± {np.nanstd(values):.{digits}f}{tail}"
 
 
@@ -111,9 +130,20 @@ def generator_tables(draws, seed, say):
     ]
     paper = [(f"{m}, {p}", 4) for p in ("paper", "cmmd", "paper-tables") for m in ("I", "CI", "D")]
     lines = []
-    for title, columns in (("### Whole videos (`grouped`)", wide), ("### The other presets", paper)):
-        lines += [title, "", f"| generator | {' | '.join(name for name, _ in columns)} |", "|---" * (len(columns) + 1) + "|"]
-        lines += [f"| {name} | {' | '.join(cell(row[column], digits) for column, digits in columns)} |" for name, row in found.items()]
+    for title, columns in (
+        ("### Whole videos (`grouped`)", wide),
+        ("### The other presets", paper),
+    ):
+        lines += [
+            title,
+            "",
+            f"| generator | {' | '.join(name for name, _ in columns)} |",
+            "|---" * (len(columns) + 1) + "|",
+        ]
+        lines += [
+            f"| {name} | {' | '.join(cell(row[column], digits) for column, digits in columns)} |"
+            for name, row in found.items()
+        ]
         lines.append("")
     return lines
 
@@ -127,8 +157,12 @@ def all_halves(n=8, seed=0):
         halves = [np.array(h) for h in itertools.combinations(range(n), n // 2) if 0 in h]
         kernel = np.exp(-((x[:, None] - x[None]) ** 2).sum(axis=-1) / 200)
         off = kernel[~np.eye(n, dtype=bool)].mean()
-        for j, (estimator, expected) in enumerate((("unbiased", 0.0), ("biased", 1000 * 2 / (n // 2) * (1 - off)))):
-            mean = np.mean([mmd2(x[h], x[np.setdiff1d(np.arange(n), h)], estimator=estimator) for h in halves])
+        for j, (estimator, expected) in enumerate(
+            (("unbiased", 0.0), ("biased", 1000 * 2 / (n // 2) * (1 - off)))
+        ):
+            mean = np.mean(
+                [mmd2(x[h], x[np.setdiff1d(np.arange(n), h)], estimator=estimator) for h in halves]
+            )
             worst[j] = max(worst[j], abs(float(mean) - expected))
     return worst
 
@@ -139,8 +173,15 @@ def halves_table(halvings, seed):
         "| generator | unbiased: mean over halvings ± its error | sd, observed | sd, closed form | biased: mean | closed form | whole videos | z |",
         "|---|" + "---|" * 7,
     ]
-    for name in ("good", "unstable over videos", "classes indistinguishable", "memorised videos: one a class"):
-        made, _ = draw(rng_for(seed, "metric responses", "halves"), GENERATORS[name], videos=4, frames=5)
+    for name in (
+        "good",
+        "unstable over videos",
+        "classes indistinguishable",
+        "memorized videos: one a class",
+    ):
+        made, _ = draw(
+            rng_for(seed, "metric responses", "halves"), GENERATORS[name], videos=4, frames=5
+        )
         scores = [i_tmmd(made, preset="paper", seed=k) for k in range(halvings)]
         values = np.array([s.value for s in scores])
         biased = [i_tmmd(made, preset="cmmd", seed=k) for k in range(halvings // 8)]
@@ -155,12 +196,29 @@ def halves_table(halvings, seed):
 
 def size_table(draws, seed):
     """Numbers of videos and frames: what depends on them."""
-    columns = ("I, paper", "I, cmmd", "I, grouped", "I: E", "z", "CI, cmmd", "CI, grouped", "CI: E", "D, cmmd", "D, grouped", "D: E_ratio")
-    lines = [f"| videos a class, frames | n | {' | '.join(columns)} |", "|---" * (len(columns) + 2) + "|"]
+    columns = (
+        "I, paper",
+        "I, cmmd",
+        "I, grouped",
+        "I: E",
+        "z",
+        "CI, cmmd",
+        "CI, grouped",
+        "CI: E",
+        "D, cmmd",
+        "D, grouped",
+        "D: E_ratio",
+    )
+    lines = [
+        f"| videos a class, frames | n | {' | '.join(columns)} |",
+        "|---" * (len(columns) + 2) + "|",
+    ]
     for videos, frames in ((2, 10), (4, 10), (8, 10), (16, 10), (8, 3), (8, 20)):
         row = {name: [] for name in columns}
         for k in range(draws):
-            made, _ = draw(rng_for(seed, "metric responses", f"size {k}"), videos=videos, frames=frames)
+            made, _ = draw(
+                rng_for(seed, "metric responses", f"size {k}"), videos=videos, frames=frames
+            )
             for preset in ("paper", "cmmd", "grouped"):
                 for metric, score in (
                     ("I", i_tmmd(made, preset=preset)),
@@ -169,11 +227,21 @@ def size_table(draws, seed):
                 ):
                     if f"{metric}, {preset}" in row:
                         row[f"{metric}, {preset}"].append(score.value)
-                    for key, name in (("E", f"{metric}: E"), ("E_ratio", "D: E_ratio"), ("z", "z" if metric == "I" else "")):
-                        if preset == "grouped" and name in row and score.details.get(key) is not None:
+                    for key, name in (
+                        ("E", f"{metric}: E"),
+                        ("E_ratio", "D: E_ratio"),
+                        ("z", "z" if metric == "I" else ""),
+                    ):
+                        if (
+                            preset == "grouped"
+                            and name in row
+                            and score.details.get(key) is not None
+                        ):
                             row[name].append(score.details[key])
         n = videos * frames * CLASSES
-        lines.append(f"| {videos}, {frames} | {n} | {' | '.join(cell(row[name]) for name in columns)} |")
+        lines.append(
+            f"| {videos}, {frames} | {n} | {' | '.join(cell(row[name]) for name in columns)} |"
+        )
     return [*lines, ""]
 
 
@@ -197,9 +265,14 @@ def sigma_tables(seed):
     rng = rng_for(seed, "metric responses", "modes")
     real = flat(modes(rng, 512, 1024), "r")
     away = unit(rng.normal(size=256))
-    cases = {f"{count} of 512 modes": flat(modes(rng, count, 1024), "g") for count in (512, 256, 64, 8)}
+    cases = {
+        f"{count} of 512 modes": flat(modes(rng, count, 1024), "g") for count in (512, 256, 64, 8)
+    }
     cases["512 modes, mean moved by 0.1"] = flat(unit(modes(rng, 512, 1024) + 0.1 * away), "g")
-    lines = [f"| generator | ‖Δ mean‖² x 9.9 | {' | '.join(f'sigma {s}' for s in SIGMAS)} |", "|---" * (len(SIGMAS) + 2) + "|"]
+    lines = [
+        f"| generator | ‖Δ mean‖² x 9.9 | {' | '.join(f'sigma {s}' for s in SIGMAS)} |",
+        "|---" * (len(SIGMAS) + 2) + "|",
+    ]
     for name, made in cases.items():
         shift = 9.9 * float(((made.features.mean(axis=0) - real.features.mean(axis=0)) ** 2).sum())
         scores = [tmmd(made, real, sigma=s, permutations=99) for s in SIGMAS]
@@ -219,7 +292,10 @@ def sigma_tables(seed):
         "D (not scaled)": lambda s: d_tmmd(made, sigma=s).value,
         "D: E_ratio (not scaled)": lambda s: d_tmmd(made, sigma=s).details["E_ratio"],
     }
-    lines += [f"| {name} | {' | '.join(f'{f(s):.3f}' for s in SIGMAS if not isinstance(s, str))} |" for name, f in ask.items()]
+    lines += [
+        f"| {name} | {' | '.join(f'{f(s):.3f}' for s in SIGMAS if not isinstance(s, str))} |"
+        for name, f in ask.items()
+    ]
     return [*lines, ""]
 
 
@@ -227,44 +303,61 @@ def tables(draws, halvings, seed, say):
     worst = all_halves()
     say("halves enumerated")
     lines = [
-        "## What each metric responds to", "",
+        "## What each metric responds to",
+        "",
         f"{CLASSES} classes, {VIDEOS} videos each, {FRAMES} frames a video; mean ± standard deviation over {draws} draws of everything. Lower is called better. For `paper-tables` the ids are in "
-        "the order of class, video and frame, as sorted file names are; for the others they are shuffled.", "",
+        "the order of class, video and frame, as sorted file names are; for the others they are shuffled.",
+        "",
         *generator_tables(draws, seed, say),
-        "## Random halves carry no signal", "",
+        "## Random halves carry no signal",
+        "",
         f"Over *all* halves of eight samples, five data sets: the mean of the unbiased dist² is 0 to {worst[0]:.0e}, that of the biased one is its closed form (2/m) 1000 (1 - mean k) "
-        f"to {worst[1]:.0e}. Below: {halvings} random halvings of 200 samples (biased: an eighth of that) of one data set.", "",
+        f"to {worst[1]:.0e}. Below: {halvings} random halvings of 200 samples (biased: an eighth of that) of one data set.",
+        "",
         *halves_table(halvings, seed),
-        "## Numbers of videos and frames", "", f"The good generator; mean ± standard deviation over {draws} draws.", "",
+        "## Numbers of videos and frames",
+        "",
+        f"The good generator; mean ± standard deviation over {draws} draws.",
+        "",
         *size_table(draws, seed),
-    ]  # fmt: skip
+    ]
     say("sizes")
     lines += [
-        "## What a bandwidth sees", "",
+        "## What a bandwidth sees",
+        "",
         "TMMD (unbiased, no groups, 1024 samples in 256 dimensions) of a generator that shows some of 512 modes `±e_k`, each as likely as the others: the expected mean is 0 for all of them. In brackets the p-value of a "
-        "permutation test with 99 relabellings, so that 0.01 is the least. The median distance and its multiples are those of the reference.", "",
+        "permutation test with 99 relabelings, so that 0.01 is the least. The median distance and its multiples are those of the reference.",
+        "",
         *sigma_tables(seed),
-    ]  # fmt: skip
+    ]
     say("sigma")
     return lines
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--halvings", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", type=Path, help="Markdown file to write")
     asked = parser.parse_args()
     started = time.process_time()
-    say = lambda text: print(f"{time.process_time() - started:6.0f} s  {text}", file=sys.stderr, flush=True)  # noqa: E731
+    say = lambda text: print(
+        f"{time.process_time() - started:6.0f} s  {text}", file=sys.stderr, flush=True
+    )
     body = tables(asked.draws, asked.halvings, asked.seed, say)
-    command = "python benchmarks/metric_responses.py" + (f" --write {asked.write}" if asked.write else "")
+    command = "python benchmarks/metric_responses.py" + (
+        f" --write {asked.write}" if asked.write else ""
+    )
     head = [
-        "# What the metrics respond to", "",
+        "# What the metrics respond to",
+        "",
         f"Written by `{command} --draws {asked.draws} --halvings {asked.halvings} --seed {asked.seed}`, {datetime.datetime.now(tz=datetime.UTC).date()}. Synthetic unit-norm features of {WIDTH} dimensions "
-        "with effects of class, video and frame; the model stands in that script. sigma = 10 and scale 1000 unless said.", "",
-    ]  # fmt: skip
+        "with effects of class, video and frame; the model stands in that script. sigma = 10 and scale 1000 unless said.",
+        "",
+    ]
     text = "\n".join([*head, *body]).rstrip() + "\n"
     if asked.write:
         asked.write.write_text(text, encoding="utf-8")

@@ -36,11 +36,21 @@ def features(n, d, seed, start=0):
     """(n, d) unit rows, float32, with a common mean, class and video effects; rows ``start`` to ``start + n`` of the set ``seed``."""
     out = np.empty((n, d), np.float32)
     fixed = np.random.default_rng(0)
-    base, classes, videos = fixed.normal(size=d) + 1, 0.4 * fixed.normal(size=(CLASSES, d)), 0.3 * fixed.normal(size=(VIDEOS, d))
+    base, classes, videos = (
+        fixed.normal(size=d) + 1,
+        0.4 * fixed.normal(size=(CLASSES, d)),
+        0.3 * fixed.normal(size=(VIDEOS, d)),
+    )
     for k in range(0, n, 10_000):
         rng = np.random.default_rng([seed, start + k])
         video = (start + k + np.arange(min(10_000, n - k))) % VIDEOS
-        x = base + classes[video % CLASSES] + videos[video] + 0.3 * rng.normal(size=(len(video), d)) + 0.1 * seed * np.linspace(-1, 1, d)
+        x = (
+            base
+            + classes[video % CLASSES]
+            + videos[video]
+            + 0.3 * rng.normal(size=(len(video), d))
+            + 0.1 * seed * np.linspace(-1, 1, d)
+        )
         out[k : k + len(x)] = x / np.linalg.norm(x, axis=1, keepdims=True)
     return out
 
@@ -63,7 +73,10 @@ def cmmd_formula(x, y):
     def mean(a, b, p, q):
         return np.mean(np.exp(-gamma * (-2 * (a @ b.T) + p[:, None] + q[None, :])))
 
-    return float(np.float32(1000) * (mean(x, x, x_sq, x_sq) + mean(y, y, y_sq, y_sq) - 2 * mean(x, y, x_sq, y_sq)))
+    return float(
+        np.float32(1000)
+        * (mean(x, x, x_sq, x_sq) + mean(y, y, y_sq, y_sq) - 2 * mean(x, y, x_sq, y_sq))
+    )
 
 
 def ours(backend, estimator="biased"):
@@ -79,7 +92,12 @@ def four_metrics(x, y):
 
     ids, video = [f"{k:06d}" for k in range(len(x))], np.arange(len(x)) % VIDEOS
     sets = [
-        FeatureSet(ids[: len(v)], v, [f"c{g % CLASSES:02d}" for g in video[: len(v)]], [f"v{g:03d}" for g in video[: len(v)]])
+        FeatureSet(
+            ids[: len(v)],
+            v,
+            [f"c{g % CLASSES:02d}" for g in video[: len(v)]],
+            [f"v{g:03d}" for g in video[: len(v)]],
+        )
         for v in (x, y)
     ]
     scores = four_scores(*sets, permutations=1000, backend="blocked")
@@ -98,7 +116,12 @@ def torch_fidelity(kernel):
     def run(x, y):
         from torch_fidelity.metric_kid import kernel_mmd
 
-        options = {"kid_kernel_poly_degree": 3, "kid_kernel_poly_gamma": None, "kid_kernel_poly_coef0": 1, "kid_kernel_rbf_sigma": 10.0}
+        options = {
+            "kid_kernel_poly_degree": 3,
+            "kid_kernel_poly_gamma": None,
+            "kid_kernel_poly_coef0": 1,
+            "kid_kernel_rbf_sigma": 10.0,
+        }
         return float(kernel_mmd(x, y, kid_kernel=kernel, **options))
 
     return run
@@ -156,7 +179,10 @@ def measure(name, n, m, d, repeats):
         for _ in range(repeats):
             cpu, clock = time.process_time(), time.perf_counter()
             value = run(x, y)
-            best, wall = min(best, time.process_time() - cpu), min(wall, time.perf_counter() - clock)
+            best, wall = (
+                min(best, time.process_time() - cpu),
+                min(wall, time.perf_counter() - clock),
+            )
     return {"name": name, "cpu": best, "wall": wall, "mib": peak.extra, "value": value}
 
 
@@ -176,10 +202,20 @@ def truth(x, y, rows=512):
 
 def in_a_process(arguments, threads):
     """Runs this file again and reads its last line."""
-    env = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
-    done = subprocess.run([sys.executable, __file__, *arguments], env=env, capture_output=True, text=True, check=False)
+    env = os.environ | {
+        "OMP_NUM_THREADS": str(threads),
+        "OPENBLAS_NUM_THREADS": str(threads),
+        "MKL_NUM_THREADS": str(threads),
+    }
+    done = subprocess.run(
+        [sys.executable, __file__, *arguments], env=env, capture_output=True, text=True, check=False
+    )
     if done.returncode:
-        return {"error": done.stderr.strip().splitlines()[-1] if done.stderr.strip() else f"exit {done.returncode}"}
+        return {
+            "error": done.stderr.strip().splitlines()[-1]
+            if done.stderr.strip()
+            else f"exit {done.returncode}"
+        }
     return json.loads(done.stdout.strip().splitlines()[-1])
 
 
@@ -192,12 +228,31 @@ def beside_the_peers(chosen):
             found.append({"name": name, "error": "not installed"})
             continue
         row = in_a_process(
-            ["--one", name, "--n", str(chosen.n), "--m", str(chosen.m or chosen.n), "--d", str(chosen.d), "--repeats", str(chosen.repeats)],
+            [
+                "--one",
+                name,
+                "--n",
+                str(chosen.n),
+                "--m",
+                str(chosen.m or chosen.n),
+                "--d",
+                str(chosen.d),
+                "--repeats",
+                str(chosen.repeats),
+            ],
             chosen.threads,
         )
-        row["name"] = name if needs is None else f"{name} ({importlib.metadata.version(needs.replace('_', '-'))})"
+        row["name"] = (
+            name
+            if needs is None
+            else f"{name} ({importlib.metadata.version(needs.replace('_', '-'))})"
+        )
         found.append(row)
-        print(row.get("error") or f"{name}: {row['cpu']:.2f} CPU s, {row['wall']:.2f} s, {row['mib']:.0f} MiB, {row['value']}", flush=True)
+        print(
+            row.get("error")
+            or f"{name}: {row['cpu']:.2f} CPU s, {row['wall']:.2f} s, {row['mib']:.0f} MiB, {row['value']}",
+            flush=True,
+        )
     return found
 
 
@@ -241,7 +296,9 @@ def gpu(chosen):
 
     from palpate.metrics import distance
 
-    x, y = (torch.from_numpy(features(chosen.n, chosen.d, seed)).to(chosen.device) for seed in (0, 1))
+    x, y = (
+        torch.from_numpy(features(chosen.n, chosen.d, seed)).to(chosen.device) for seed in (0, 1)
+    )
     wait = torch.cuda.synchronize if chosen.device.startswith("cuda") else lambda: None
     side, flops = 8192, 0.0
     a = torch.rand(side, side, device=chosen.device)
@@ -260,7 +317,9 @@ def gpu(chosen):
         wait()
         best = min(best, time.perf_counter() - start)
     needed = (2 * chosen.n) ** 2 * chosen.d  # half of all pairs, two operations each
-    name = torch.cuda.get_device_name() if chosen.device.startswith("cuda") else platform.processor()
+    name = (
+        torch.cuda.get_device_name() if chosen.device.startswith("cuda") else platform.processor()
+    )
     return {
         "device": name,
         "n": chosen.n,
@@ -275,15 +334,25 @@ def gpu(chosen):
 def table(rows, exact):
     """Markdown of :func:`beside_the_peers`."""
     base = next(r["cpu"] for r in rows if r["name"] == "palpate, blocked")
-    lines = ["| run | CPU s | x blocked | extra MiB | value | error against float64 |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| run | CPU s | x blocked | extra MiB | value | error against float64 |",
+        "|---|---|---|---|---|---|",
+    ]
     for r in rows:
         if "error" in r:
             lines.append(f"| {r['name']} | {r['error']} | | | | |")
             continue
-        same = r["value"] is not None and "polynomial" not in r["name"] and "RBF" not in r["name"] and "four" not in r["name"]
+        same = (
+            r["value"] is not None
+            and "polynomial" not in r["name"]
+            and "RBF" not in r["name"]
+            and "four" not in r["name"]
+        )
         error = f"{r['value'] - exact:+.1e}" if same else "-"
         value = "-" if r["value"] is None else f"{r['value']:.6g}"
-        lines.append(f"| {r['name']} | {r['cpu']:.2f} | {r['cpu'] / base:.2f} | {r['mib']:.0f} | {value} | {error} |")
+        lines.append(
+            f"| {r['name']} | {r['cpu']:.2f} | {r['cpu'] / base:.2f} | {r['mib']:.0f} | {value} | {error} |"
+        )
     return "\n".join(lines)
 
 
@@ -303,14 +372,19 @@ def main():
     parser.add_argument("--one-disk", nargs=2, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.one:
-        print(json.dumps(measure(chosen.one, chosen.n, chosen.m or chosen.n, chosen.d, chosen.repeats)))
+        print(
+            json.dumps(
+                measure(chosen.one, chosen.n, chosen.m or chosen.n, chosen.d, chosen.repeats)
+            )
+        )
         return
     if chosen.one_disk:
         print(json.dumps(one_disk(chosen.one_disk)))
         return
     command = f"python benchmarks/metrics.py {' '.join(a for a in sys.argv[1:] if not a.startswith(chosen.folder or chr(0)) and a != '--folder')}".strip()
     parts = [
-        "# Speed and memory of the metrics\n\nMade by a committed command; do not edit by hand.\n\n    " + command,
+        "# Speed and memory of the metrics\n\nMade by a committed command; do not edit by hand.\n\n    "
+        + command,
         f"{platform.machine()}, {chosen.threads} thread(s), NumPy {np.__version__}, {datetime.date.today().isoformat()}.",
     ]
     if "peers" in chosen.parts:

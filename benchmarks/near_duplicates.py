@@ -51,18 +51,27 @@ ALL = ("videos", "images", "images-128", "clips", "descriptors", "isotropic")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--n", type=int, default=50_000)
     parser.add_argument("--kinds", nargs="+", default=ALL, choices=ALL)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--queries", type=int, default=40, help="queries timed for imagededup's compiled search; a tenth of them for its Python search"
+        "--queries",
+        type=int,
+        default=40,
+        help="queries timed for imagededup's compiled search; a tenth of them for its Python search",
     )
-    parser.add_argument("--imagededup", type=Path, help="folder of the unpacked wheel, if it is not installed")
+    parser.add_argument(
+        "--imagededup", type=Path, help="folder of the unpacked wheel, if it is not installed"
+    )
     parser.add_argument("--scaling", action="store_true")
-    parser.add_argument("--child", nargs=4, metavar=("TASK", "FEATURES", "RADIUS", "OUT"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--child", nargs=4, metavar=("TASK", "FEATURES", "RADIUS", "OUT"), help=argparse.SUPPRESS
+    )
     args = parser.parse_args()
     if args.child:
         child(args)
@@ -110,7 +119,11 @@ def clip_frames(size, mode):
     """The real clips' vision frames at a small size, or None where data or PyAV are missing."""
     from PIL import Image
 
-    root = Path(os.environ.get("PALPATE_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    root = Path(
+        os.environ.get(
+            "PALPATE_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"
+        )
+    )
     files = sorted(root.glob("touch_and_go/clips/dataset/*/video.mp4"))
     try:
         import av
@@ -121,7 +134,10 @@ def clip_frames(size, mode):
         with av.open(str(file)) as video:
             frames += [
                 np.asarray(
-                    Image.fromarray(f.to_ndarray(format="rgb24")).convert(mode).resize((size, size), Image.Resampling.BOX), np.float32
+                    Image.fromarray(f.to_ndarray(format="rgb24"))
+                    .convert(mode)
+                    .resize((size, size), Image.Resampling.BOX),
+                    np.float32,
                 )
                 for f in video.decode(video=0)
             ]
@@ -134,7 +150,9 @@ def varied(frames, n, side, rng):
     for start in range(0, n, 1000):
         which = np.arange(start, min(start + 1000, n)) % len(frames)
         shift = rng.integers(0, room + 1, size=(len(which), 2))
-        cut = np.stack([frames[w, a : a + side, b : b + side] for w, (a, b) in zip(which, shift, strict=True)])
+        cut = np.stack(
+            [frames[w, a : a + side, b : b + side] for w, (a, b) in zip(which, shift, strict=True)]
+        )
         gain = rng.uniform(0.95, 1.05, size=(len(which),) + (1,) * (cut.ndim - 1))
         yield start, cut * gain + rng.normal(scale=2, size=cut.shape)
 
@@ -146,10 +164,14 @@ def clip_features(n, rng):
     frames = clip_frames(72, "L")
     if frames is None:
         return None
-    order = np.argsort(np.add.outer(np.arange(11) ** 2, np.arange(11) ** 2).ravel(), kind="stable")[1:65]
+    order = np.argsort(np.add.outer(np.arange(11) ** 2, np.arange(11) ** 2).ravel(), kind="stable")[
+        1:65
+    ]
     out = np.empty((n, 64))
     for start, cut in varied(frames, n, 64, rng):
-        out[start : start + len(cut)] = dctn(cut, axes=(1, 2), norm="ortho")[:, :11, :11].reshape(len(cut), -1)[:, order]
+        out[start : start + len(cut)] = dctn(cut, axes=(1, 2), norm="ortho")[:, :11, :11].reshape(
+            len(cut), -1
+        )[:, order]
     return out
 
 
@@ -157,14 +179,17 @@ def audit_vectors(n, rng):
     """What the audit searches: vectors of band-passed thumbnails of varied real frames."""
     from palpate.leakage.background import planar
     from palpate.leakage.descriptors import search_vectors
-    from palpate.leakage.pool import quantised
+    from palpate.leakage.pool import quantized
     from palpate.leakage.verify import band_pass
 
     frames = clip_frames(36, "YCbCr")
     if frames is None:
         return None
     return np.concatenate(
-        [search_vectors(quantised(band_pass(planar(np.clip(cut, 0, 255).astype(np.uint8))))) for _, cut in varied(frames, n, 32, rng)]
+        [
+            search_vectors(quantized(band_pass(planar(np.clip(cut, 0, 255).astype(np.uint8)))))
+            for _, cut in varied(frames, n, 32, rng)
+        ]
     )
 
 
@@ -177,7 +202,9 @@ def child(args):
     call = TASKS[task]
     if args.imagededup:
         sys.path.insert(0, str(args.imagededup))
-    call(x[:2000] if not task.startswith("imagededup") else x[:50], radius, args)  # imports, warm-up
+    call(
+        x[:2000] if not task.startswith("imagededup") else x[:50], radius, args
+    )  # imports, warm-up
     times = []
     for _ in range(1 if task.startswith("imagededup") else args.repeats):
         wall, cpu = time.perf_counter(), time.process_time()
@@ -189,14 +216,26 @@ def child(args):
     np.savez(out, **arrays)
     best = [min(column) for column in zip(*times, strict=True)]
     peak = peak_memory()
-    print(json.dumps({"wall": best[0], "cpu": best[1], "peak": peak} | {k: v for k, v in answer.items() if k not in arrays}))
+    print(
+        json.dumps(
+            {"wall": best[0], "cpu": best[1], "peak": peak}
+            | {k: v for k, v in answer.items() if k not in arrays}
+        )
+    )
 
 
 def peak_memory():
     """MiB; Linux keeps ru_maxrss of the parent across a fork, but not VmHWM."""
     status = Path("/proc/self/status")
     if status.exists():
-        return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")) / 2**10
+        return (
+            next(
+                int(line.split()[1])
+                for line in status.read_text().splitlines()
+                if line.startswith("VmHWM")
+            )
+            / 2**10
+        )
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 
@@ -236,7 +275,11 @@ def sklearn_nearest(x, radius, args):
 def sklearn_radius(x, radius, args):
     from sklearn.neighbors import NearestNeighbors
 
-    _, index = NearestNeighbors(radius=radius, algorithm="brute").fit(x).radius_neighbors(sort_results=False)
+    _, index = (
+        NearestNeighbors(radius=radius, algorithm="brute")
+        .fit(x)
+        .radius_neighbors(sort_results=False)
+    )
     return {"pairs": sum(map(len, index)) // 2}
 
 
@@ -254,14 +297,18 @@ def imagededup_python(x, radius, args):
     from imagededup.handlers.search.brute_force import BruteForce
 
     table = hashes(x)
-    return timed_queries(BruteForce(table, popcount).search, list(table.values()), max(2, args.queries // 10))
+    return timed_queries(
+        BruteForce(table, popcount).search, list(table.values()), max(2, args.queries // 10)
+    )
 
 
 def imagededup_compiled(x, radius, args):
     from imagededup.handlers.search.brute_force_cython import BruteForceCython
 
     table = hashes(x)
-    return timed_queries(BruteForceCython(table, popcount).search, list(table.values()), args.queries)
+    return timed_queries(
+        BruteForceCython(table, popcount).search, list(table.values()), args.queries
+    )
 
 
 def imagededup_kernel(x, radius, args):
@@ -271,7 +318,9 @@ def imagededup_kernel(x, radius, args):
     table = hashes(x)
     names, values = [name.encode() for name in table], [int(value, 16) for value in table.values()]
     return timed_queries(
-        lambda query, tol: brute_force_cython_ext.query(names, values, int(query, 16), tol), list(table.values()), args.queries
+        lambda query, tol: brute_force_cython_ext.query(names, values, int(query, 16), tol),
+        list(table.values()),
+        args.queries,
     )
 
 
@@ -281,7 +330,10 @@ def timed_queries(search, values, count):
     for value in chosen:
         search(query=value, tol=10)
     scale = len(values) / len(chosen)
-    return {"seconds": ((time.perf_counter() - wall) * scale, (time.process_time() - cpu) * scale), "timed": len(chosen)}
+    return {
+        "seconds": ((time.perf_counter() - wall) * scale, (time.process_time() - cpu) * scale),
+        "timed": len(chosen),
+    }
 
 
 TASKS = {
@@ -304,7 +356,10 @@ TASKS = {
 def run(args, folder, task, file, radius, threads):
     """The child's numbers, or None with a line saying why."""
     out = folder / "answer.npz"
-    limits = {name: str(threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    limits = {
+        name: str(threads)
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    }
     command = [
         sys.executable,
         __file__,
@@ -320,7 +375,9 @@ def run(args, folder, task, file, radius, threads):
     ]
     if args.imagededup:
         command += ["--imagededup", str(args.imagededup.resolve())]
-    done = subprocess.run(command, env=os.environ | limits, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env=os.environ | limits, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         reason = done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "killed"
         print(f"    {task:22s} skipped: {reason}", flush=True)
@@ -353,7 +410,9 @@ def compare(args, folder):
         for threads in args.threads:
             mine = run(args, folder, "palpate k=1", file, 0, threads)
             if radius is None:
-                radius = float(np.quantile(mine["distance"], 0.25)) * (1 + 1e-6)  # between distances: they are rounded to float32
+                radius = float(np.quantile(mine["distance"], 0.25)) * (
+                    1 + 1e-6
+                )  # between distances: they are rounded to float32
                 print(
                     f"{kind}: N = {len(x):,}, d = {x.shape[1]}, nearest other row at {np.median(mine['distance']):.3f} (median); radius {radius:.4f}",
                     flush=True,
@@ -378,7 +437,9 @@ def compare(args, folder):
                     f"{ratio(other, mine, threads)}; recall {(other['index'] == mine['index']).mean():.4f}; {other['backend']}",
                 )
             near = run(args, folder, "palpate k=1 <= radius", file, radius, threads)
-            same = np.array_equal(near["index"], np.where(mine["distance"] <= np.float32(radius), mine["index"], -1))
+            same = np.array_equal(
+                near["index"], np.where(mine["distance"] <= np.float32(radius), mine["index"], -1)
+            )
             note = f"; sklearn k=1 takes {ratio(rival, near, threads)}" if rival else ""
             line(
                 "palpate k=1 <= radius",
@@ -390,7 +451,12 @@ def compare(args, folder):
             line("palpate radius", threads, pairs, f"{pairs['pairs']:,} pairs")
             rival = run(args, folder, "sklearn radius", file, radius, threads)
             if rival:
-                line("sklearn radius", threads, rival, f"{ratio(rival, pairs, threads)}; {rival['pairs']:,} pairs")
+                line(
+                    "sklearn radius",
+                    threads,
+                    rival,
+                    f"{ratio(rival, pairs, threads)}; {rival['pairs']:,} pairs",
+                )
             joined = run(args, folder, "palpate clusters", file, radius, threads)
             line("palpate clusters", threads, joined, f"{joined['clusters']:,} clusters")
             if threads == 1 and kind == args.kinds[0]:
@@ -398,7 +464,12 @@ def compare(args, folder):
                     rival = run(args, folder, task, file, radius, 1)
                     if rival:
                         note = f"{rival['timed']} of {len(x):,} queries timed, scaled up"
-                        line(task, 1, rival, f"{ratio(rival, mine, 1)} (k=1), {rival['cpu'] / pairs['cpu']:.0f} x (radius); {note}")
+                        line(
+                            task,
+                            1,
+                            rival,
+                            f"{ratio(rival, mine, 1)} (k=1), {rival['cpu'] / pairs['cpu']:.0f} x (radius); {note}",
+                        )
 
 
 def scaling(args, folder):

@@ -10,9 +10,9 @@ the classifiers, the protocols of a seed differ in nothing but the split; every 
 the pools too: 100 samples of about 2,000 test frames of nearly all 500 videos by random frame, but of only 125 videos by video, so that pools by video
 hold more near-twins and are harder; part of the step is that. Features are patch words: small patches of contact minus background (touch; the background is the frame that the background rule
 names, and printed markers are filled in first in both, since their shift tells more about drag than about material) or of the photo (vision), projected
-on their leading principal components, words by k-means, the square root of each image's word frequencies; components and words are learnt on the train
-side alone. Classifiers: logistic regression on standardised features, whose penalty is chosen by leaving out whole videos of the train side in every
-protocol, and the nearest neighbour by cosine. Retrieval: a ridge regression from vision to touch words, cosine among 100 samples of the test side.
+on their leading principal components, words by k-means, the square root of each image's word frequencies; components and words are learned on the train
+side alone. Classifiers: logistic regression on standardized features, whose penalty is chosen by leaving out whole videos of the train side in every
+protocol, and the nearest neighbor by cosine. Retrieval: a ridge regression from vision to touch words, cosine among 100 samples of the test side.
 Intervals are robust to whole videos deviating together, Student's t (retrieval: folds combined as independent, which is too narrow where the
 same videos lie in all folds: by random frame and by random touch). Rows are not weighted (not balanced); chance is one in the number of materials, and
 the share of the largest class is printed. Frames are rendered into memory without JPEG; only the table is written.
@@ -40,7 +40,12 @@ from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.options import BACKGROUND_OFFSET
 from palpate.sim.plan import contact_frames, first_contact
 
-PROTOCOLS = {"frame": "random frame", "touch": "random whole touch", "video": "by video", "object": "by object"}
+PROTOCOLS = {
+    "frame": "random frame",
+    "contact": "random whole touch",
+    "video": "by video",
+    "object": "by object",
+}
 FOLDS = 4  # every unit is tested once
 PATCH, STRIDE, COMPONENTS, WORDS, SAMPLED = 8, 4, 32, 1024, 60_000
 PENALTIES, INNER_FOLDS = (1e-3, 3e-3, 1e-2), 3  # C of scikit-learn, strongest first
@@ -57,7 +62,9 @@ class Frames:
     material: np.ndarray
     video: np.ndarray
     contact: np.ndarray  # "video/touch"
-    thing: np.ndarray  # the main object of the video; the guests of a mixed video appear in no other
+    thing: (
+        np.ndarray
+    )  # the main object of the video; the guests of a mixed video appear in no other
     ids: np.ndarray
 
     def images(self, modality):
@@ -65,7 +72,10 @@ class Frames:
         if modality == "vision":
             return self.vision.astype(np.float32) / 255
         return np.concatenate(
-            [without_markers(a) - without_markers(b) for a, b in zip(*map(chunks, (self.touch, self.background)), strict=True)]
+            [
+                without_markers(a) - without_markers(b)
+                for a, b in zip(*map(chunks, (self.touch, self.background)), strict=True)
+            ]
         )
 
 
@@ -77,9 +87,11 @@ def chunks(images, size=500):
 def without_markers(images):
     """(n, s, s, 3) in [0, 1] with the printed dots, pixels darker than 0.8 of the brightest around, filled in from the pixels beside them."""
     x, width = images.astype(np.float32) / 255, round(images.shape[1] * 9 / 64) | 1
-    grey = x.mean(axis=3)
-    around = ndimage.uniform_filter(ndimage.maximum_filter(grey, (1, width, width)), (0, width, width))
-    clear = ~ndimage.binary_dilation(grey < 0.8 * around, np.ones((1, 3, 3)))
+    gray = x.mean(axis=3)
+    around = ndimage.uniform_filter(
+        ndimage.maximum_filter(gray, (1, width, width)), (0, width, width)
+    )
+    clear = ~ndimage.binary_dilation(gray < 0.8 * around, np.ones((1, 3, 3)))
     clear = clear[..., None].astype(np.float32)
     spread = lambda a: ndimage.gaussian_filter(a, (0, width / 4.5, width / 4.5, 0))  # noqa: E731
     return x * clear + (1 - clear) * spread(x * clear) / np.maximum(spread(clear), 1e-3)
@@ -92,7 +104,9 @@ def render_video(options, plan):
         background = video.tactile(first_contact(options, touch) - BACKGROUND_OFFSET)
         for frame in contact_frames(options, touch):
             images.append((video.vision(frame), video.tactile(frame), background))
-            names.append((plan.object_of(touch).material, plan.name, touch, plan.objects[0].name, frame))
+            names.append(
+                (plan.object_of(touch).material, plan.name, touch, plan.objects[0].name, frame)
+            )
     return [np.stack(column) for column in zip(*images, strict=True)], names
 
 
@@ -104,7 +118,9 @@ def render(options, processes=2):
             parts = pool.map(job, plans, chunksize=4)
     else:
         parts = list(map(job, plans))
-    vision, touch, background = (np.concatenate([images[k] for images, _ in parts]) for k in range(3))
+    vision, touch, background = (
+        np.concatenate([images[k] for images, _ in parts]) for k in range(3)
+    )
     rows = [row for _, names in parts for row in names]
     return Frames(
         vision,
@@ -120,7 +136,12 @@ def render(options, processes=2):
 
 def cut(frames, protocol, seed, fold, folds=FOLDS):
     """Rows of train and test: the units dealt into ``folds`` at random, material by material so that each has its part; one fold is tested."""
-    unit = {"frame": frames.ids, "touch": frames.contact, "video": frames.video, "object": frames.thing}[protocol]
+    unit = {
+        "frame": frames.ids,
+        "contact": frames.contact,
+        "video": frames.video,
+        "object": frames.thing,
+    }[protocol]
     names, first, inverse = np.unique(unit, return_index=True, return_inverse=True)
     order = rng_for(seed, "split protocols", protocol).permutation(len(names))
     order = order[np.argsort(frames.material[first][order], kind="stable")]
@@ -132,15 +153,24 @@ def cut(frames, protocol, seed, fold, folds=FOLDS):
 
 def equal_cuts(frames, seed):
     """(Protocol, fold) -> rows of train and test, the train sides thinned at random to one size."""
-    cuts = {(protocol, fold): cut(frames, protocol, seed, fold) for protocol in PROTOCOLS for fold in range(FOLDS)}
+    cuts = {
+        (protocol, fold): cut(frames, protocol, seed, fold)
+        for protocol in PROTOCOLS
+        for fold in range(FOLDS)
+    }
     size = min(len(train) for train, _ in cuts.values())
     thin = lambda rows, *where: np.sort(rng_for(seed, "thinning", *where).permutation(rows)[:size])  # noqa: E731
-    return {(protocol, fold): (thin(train, f"{protocol} {fold}"), test) for (protocol, fold), (train, test) in cuts.items()}
+    return {
+        (protocol, fold): (thin(train, f"{protocol} {fold}"), test)
+        for (protocol, fold), (train, test) in cuts.items()
+    }
 
 
 def patches_of(images):
     """All patches of (n, s, s, 3) as rows (n, k, PATCH * PATCH * 3)."""
-    windows = np.lib.stride_tricks.sliding_window_view(images, (PATCH, PATCH), axis=(1, 2))[:, ::STRIDE, ::STRIDE]
+    windows = np.lib.stride_tricks.sliding_window_view(images, (PATCH, PATCH), axis=(1, 2))[
+        :, ::STRIDE, ::STRIDE
+    ]
     return windows.reshape(len(images), windows.shape[1] * windows.shape[2], -1)
 
 
@@ -154,20 +184,35 @@ def patch_words(images, train, seed, words=WORDS):
     values, vectors = np.linalg.eigh(np.cov((pool - mean).T))
     basis = vectors[:, ::-1][:, :COMPONENTS] / np.sqrt(values[::-1][:COMPONENTS] + 1e-4)
     basis, offset = basis.astype(np.float32), (mean @ basis).astype(np.float32)
-    found = MiniBatchKMeans(words, batch_size=4096, n_init=1, max_iter=20, random_state=int(rng.integers(2**31))).fit(pool @ basis - offset)
-    centres = found.cluster_centers_.astype(np.float32)
-    half = (centres**2).sum(axis=1) / 2
+    found = MiniBatchKMeans(
+        words, batch_size=4096, n_init=1, max_iter=20, random_state=int(rng.integers(2**31))
+    ).fit(pool @ basis - offset)
+    centers = found.cluster_centers_.astype(np.float32)
+    half = (centers**2).sum(axis=1) / 2
     out = np.empty((len(images), words), np.float32)
     for k in range(0, len(images), 64):
         parts = patches_of(images[k : k + 64])
-        best = ((parts.reshape(-1, parts.shape[2]) @ basis - offset) @ centres.T - half).argmax(axis=1).reshape(len(parts), -1)
+        best = (
+            ((parts.reshape(-1, parts.shape[2]) @ basis - offset) @ centers.T - half)
+            .argmax(axis=1)
+            .reshape(len(parts), -1)
+        )
         flat = best + np.arange(len(parts))[:, None] * words
-        out[k : k + 64] = np.sqrt(np.bincount(flat.ravel(), minlength=len(parts) * words).reshape(-1, words) / parts.shape[1])
+        out[k : k + 64] = np.sqrt(
+            np.bincount(flat.ravel(), minlength=len(parts) * words).reshape(-1, words)
+            / parts.shape[1]
+        )
     return out
 
 
 def feature_set(features, frames, rows, encoder):
-    return FeatureSet(list(frames.ids[rows]), features[rows], list(frames.material[rows]), list(frames.video[rows]), encoder)
+    return FeatureSet(
+        list(frames.ids[rows]),
+        features[rows],
+        list(frames.material[rows]),
+        list(frames.video[rows]),
+        encoder,
+    )
 
 
 def nearest(train, test):
@@ -183,11 +228,21 @@ def logistic(train, test, seed):
     mean, sd = train.features.mean(axis=0), train.features.std(axis=0) + 1e-6
     x, y, groups = (train.features - mean) / sd, np.array(train.labels), np.array(train.groups)
     names = np.unique(groups)
-    fold = (rng_for(seed, "folds").permutation(len(names)) % INNER_FOLDS)[np.searchsorted(names, groups)]
+    fold = (rng_for(seed, "folds").permutation(len(names)) % INNER_FOLDS)[
+        np.searchsorted(names, groups)
+    ]
     fit = lambda rows, c: LogisticRegression(C=c, max_iter=200, tol=1e-3).fit(x[rows], y[rows])  # noqa: E731
-    right = {c: sum((fit(fold != f, c).predict(x[fold == f]) == y[fold == f]).sum() for f in range(INNER_FOLDS)) for c in PENALTIES}
+    right = {
+        c: sum(
+            (fit(fold != f, c).predict(x[fold == f]) == y[fold == f]).sum()
+            for f in range(INNER_FOLDS)
+        )
+        for c in PENALTIES
+    }
     chosen = max(PENALTIES, key=right.__getitem__)
-    return fit(slice(None), chosen).predict((test.features - mean) / sd) == np.array(test.labels), chosen
+    return fit(slice(None), chosen).predict((test.features - mean) / sd) == np.array(
+        test.labels
+    ), chosen
 
 
 def across(vision, touch):
@@ -198,23 +253,40 @@ def across(vision, touch):
     gram = x.T @ x
     gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / len(gram)
     weight = np.linalg.solve(gram, x.T @ (target.features - y_mean))
-    guess = FeatureSet(queries.ids, (queries.features - x_mean) @ weight, None, queries.groups, "ridge")
-    centred = FeatureSet(keys.ids, keys.features - y_mean, None, keys.groups, "ridge")
+    guess = FeatureSet(
+        queries.ids, (queries.features - x_mean) @ weight, None, queries.groups, "ridge"
+    )
+    centered = FeatureSet(keys.ids, keys.features - y_mean, None, keys.groups, "ridge")
     pool = min(POOL, len(keys.ids))
-    return [(s.value, s.interval, s.details["chance"]) for s in retrieval(guess, centred, pool=pool)]
+    return [
+        (s.value, s.interval, s.details["chance"]) for s in retrieval(guess, centered, pool=pool)
+    ]
 
 
 def measure(frames, images, protocol, fold, seed):
     """One fold of one protocol: hits (n,) by measure under "hits", their videos, retrieval as (value, interval, chance), sizes and penalties."""
     train, test = equal_cuts(frames, seed)[protocol, fold]
-    found, sides = {"hits": {}, "across": {}, "C": {}, "videos": frames.video[test], "frames": (len(train), len(test))}, {}
+    found, sides = (
+        {
+            "hits": {},
+            "across": {},
+            "C": {},
+            "videos": frames.video[test],
+            "frames": (len(train), len(test)),
+        },
+        {},
+    )
     for modality in images:
         features = patch_words(images[modality], train, seed)
-        sides[modality] = tuple(feature_set(features, frames, rows, "patch words") for rows in (train, test))
-        found["hits"][f"{modality}, logistic regression"], found["C"][modality] = logistic(*sides[modality], seed)
-        found["hits"][f"{modality}, nearest neighbour"] = nearest(*sides[modality])
+        sides[modality] = tuple(
+            feature_set(features, frames, rows, "patch words") for rows in (train, test)
+        )
+        found["hits"][f"{modality}, logistic regression"], found["C"][modality] = logistic(
+            *sides[modality], seed
+        )
+        found["hits"][f"{modality}, nearest neighbor"] = nearest(*sides[modality])
     if len(images) == 2:
-        for k, score in zip((1, 5), across(sides["vision"], sides["touch"]), strict=True):
+        for k, score in zip((1, 5), across(sides["vision"], sides["tactile"]), strict=True):
             found["across"][f"vision to touch, top {k} of {POOL}"] = score
     return found
 
@@ -222,7 +294,10 @@ def measure(frames, images, protocol, fold, seed):
 def combine(folds, chance):
     """Measure -> (value, interval, chance) over all folds of one protocol and seed; "frames" (train, tested) and the penalties "C" beside them."""
     videos = np.concatenate([f["videos"] for f in folds])
-    row = {"frames": (folds[0]["frames"][0], len(videos)), "C": {m: sorted({f["C"][m] for f in folds}) for m in folds[0]["C"]}}
+    row = {
+        "frames": (folds[0]["frames"][0], len(videos)),
+        "C": {m: sorted({f["C"][m] for f in folds}) for m in folds[0]["C"]},
+    }
     for name in folds[0]["hits"]:
         hit = np.concatenate([f["hits"][name] for f in folds]).astype(float)
         row[name] = (float(hit.mean()), mean_interval(hit, videos, 0.95)[0], chance)
@@ -242,7 +317,10 @@ _KEPT = {}
 def keep(frames, modalities):
     """Gives a worker process the frames, once."""
     threadpool_limits(1)
-    _KEPT["frames"], _KEPT["images"] = frames, {modality: frames.images(modality) for modality in modalities}
+    _KEPT["frames"], _KEPT["images"] = (
+        frames,
+        {modality: frames.images(modality) for modality in modalities},
+    )
 
 
 def job(task):
@@ -252,7 +330,9 @@ def job(task):
 
 def measure_all(frames, seeds, modalities, processes):
     """A list with one dictionary a seed: protocol -> measures."""
-    tasks = [(protocol, fold, seed) for seed in seeds for protocol in PROTOCOLS for fold in range(FOLDS)]
+    tasks = [
+        (protocol, fold, seed) for seed in seeds for protocol in PROTOCOLS for fold in range(FOLDS)
+    ]
     found, folds, chance = {seed: {} for seed in seeds}, [], 1 / len(set(frames.material))
     with multiprocessing.get_context("spawn").Pool(processes, keep, (frames, modalities)) as pool:
         for (protocol, fold, seed), one in pool.imap(job, tasks):
@@ -261,7 +341,9 @@ def measure_all(frames, seeds, modalities, processes):
                 continue
             row = found[seed][protocol] = combine(folds, chance)
             folds = []
-            values = ", ".join(f"{name} {100 * v[0]:.1f}" for name, v in row.items() if name not in ("frames", "C"))
+            values = ", ".join(
+                f"{name} {100 * v[0]:.1f}" for name, v in row.items() if name not in ("frames", "C")
+            )
             print(f"seed {seed} {PROTOCOLS[protocol]:18s} C {row['C']}: {values}", flush=True)
     return [found[seed] for seed in seeds]
 
@@ -269,7 +351,10 @@ def measure_all(frames, seeds, modalities, processes):
 def steps_of(results):
     """Differences in points, per seed: frame - touch and touch - video of the touch probe."""
     value = lambda r, p: 100 * r[p]["touch, logistic regression"][0]  # noqa: E731
-    return [(value(r, "frame") - value(r, "touch"), value(r, "touch") - value(r, "video")) for r in results]
+    return [
+        (value(r, "frame") - value(r, "contact"), value(r, "contact") - value(r, "video"))
+        for r in results
+    ]
 
 
 def table(results):
@@ -281,7 +366,10 @@ def table(results):
         for name in measures:
             found = [r[protocol][name] for r in results]
             values = [100 * value for value, *_ in found]
-            half = np.mean([50 * (interval[1] - interval[0]) for _, interval, _ in found if interval] or [np.nan])
+            half = np.mean(
+                [50 * (interval[1] - interval[0]) for _, interval, _ in found if interval]
+                or [np.nan]
+            )
             spread = f" ({min(values):.1f} to {max(values):.1f})" if len(results) > 1 else ""
             cells.append(f"{np.mean(values):.1f} ± {half:.1f} %{spread}")
         lines.append(f"| {title} | " + " | ".join(cells) + " |")
@@ -293,14 +381,18 @@ def table(results):
 def page(results, seeds, preset, options, frames, command):
     """The whole Markdown file."""
     steps = steps_of(results)
-    each = ", ".join(f"seed {s}: {a:+.1f} and {b:+.1f}" for s, (a, b) in zip(seeds, steps, strict=True))
+    each = ", ".join(
+        f"seed {s}: {a:+.1f} and {b:+.1f}" for s, (a, b) in zip(seeds, steps, strict=True)
+    )
     means = np.mean(steps, axis=0)
     met = (
         "In every seed each step is at least 5 points."
         if np.min(steps) >= 5
         else f"The smallest step is {np.min(steps):+.1f} points, below 5."
     )
-    chosen = sorted({c for r in results for p in PROTOCOLS for cs in r[p]["C"].values() for c in cs})
+    chosen = sorted(
+        {c for r in results for p in PROTOCOLS for cs in r[p]["C"].values() for c in cs}
+    )
     counts = np.unique(frames.material, return_counts=True)[1]
     return f"""# Ways to cut one world
 
@@ -327,8 +419,16 @@ Features, classifiers and intervals are described at the head of `benchmarks/spl
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--preset", default="small", choices=tuple(PRESETS))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="split seeds; the world stays the same")
-    parser.add_argument("--modalities", nargs="+", default=["touch", "vision"], choices=("touch", "vision"))
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        nargs="+",
+        default=[0, 1, 2],
+        help="split seeds; the world stays the same",
+    )
+    parser.add_argument(
+        "--modalities", nargs="+", default=["tactile", "vision"], choices=("tactile", "vision")
+    )
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--write", type=Path, help="Markdown file to write (needs touch)")
     chosen = parser.parse_args()
@@ -341,11 +441,16 @@ def main():
     )
     results = measure_all(frames, chosen.seeds, tuple(chosen.modalities), chosen.processes)
     print(table(results))
-    if "touch" in chosen.modalities:
-        print("steps of touch in points:", ", ".join(f"{a:+.1f} {b:+.1f}" for a, b in steps_of(results)))
+    if "tactile" in chosen.modalities:
+        print(
+            "steps of touch in points:",
+            ", ".join(f"{a:+.1f} {b:+.1f}" for a, b in steps_of(results)),
+        )
     if chosen.write:
         command = f"python benchmarks/split_protocols.py {' '.join(sys.argv[1:])}"
-        chosen.write.write_text(page(results, chosen.seeds, chosen.preset, options, frames, command))
+        chosen.write.write_text(
+            page(results, chosen.seeds, chosen.preset, options, frames, command)
+        )
     print(f"{time.perf_counter() - start:.0f} s in all")
 
 

@@ -4,9 +4,9 @@
     python benchmarks/world_background.py --preset demo                      # a first look, under a minute
 
 1. PSNR and SSIM against the true touch of: the empty background of the same video, another touch of the same material on the same sensor unit (another
-   video), one of another material on the same unit, and a neighbouring frame of the same touch. A generator that draws no touch at all is the first row.
+   video), one of another material on the same unit, and a neighboring frame of the same touch. A generator that draws no touch at all is the first row.
 2. Class-aware MMD (CI-TMMD) of real touches with random halves of a class, and with halves of whole videos, beside the mean distance between classes: the
-   same data, only the halving differs. Features: patch words of contact minus background, L2-normalised; Gaussian kernel of bandwidth 10, scale 1000.
+   same data, only the halving differs. Features: patch words of contact minus background, L2-normalized; Gaussian kernel of bandwidth 10, scale 1000.
 
 Intervals are robust to whole videos deviating together. Frames are rendered into memory, without JPEG.
 """
@@ -27,7 +27,7 @@ SUBJECTS = {
     "background": "the empty background",
     "same": "another touch, same material, same unit",
     "other": "a touch of another material, same unit",
-    "neighbour": "a neighbouring frame of the touch",
+    "neighbor": "a neighboring frame of the touch",
 }
 
 
@@ -44,10 +44,16 @@ def partners(frames, units, count, seed):
     for row in rng.permutation(len(frames.ids)):
         elsewhere = (units == units[row]) & (frames.video != frames.video[row])
         alike = frames.material == frames.material[row]
-        pools = {"same": elsewhere & alike, "other": elsewhere & ~alike, "neighbour": frames.contact == frames.contact[row]}
+        pools = {
+            "same": elsewhere & alike,
+            "other": elsewhere & ~alike,
+            "neighbor": frames.contact == frames.contact[row],
+        }
         pools = {name: np.flatnonzero(pool) for name, pool in pools.items()}
-        beside = pools["neighbour"]
-        pools["neighbour"] = beside[np.abs(beside - row) == 1]  # rows of a touch stand in the order of its frames
+        beside = pools["neighbor"]
+        pools["neighbor"] = beside[
+            np.abs(beside - row) == 1
+        ]  # rows of a touch stand in the order of its frames
         if not all(map(len, pools.values())):
             continue
         found["true"].append(row)
@@ -66,18 +72,27 @@ def pairwise(frames, units, count=2000, seed=0):
     groups = list(frames.video[rows["true"]])
     out = {}
     for name in SUBJECTS:
-        shown = frames.background[rows["true"]] if name == "background" else frames.touch[rows[name]]
-        out[name] = psnr(shown, true, groups=groups, subject=name), ssim(shown, true, groups=groups, subject=name)
+        shown = (
+            frames.background[rows["true"]] if name == "background" else frames.touch[rows[name]]
+        )
+        out[name] = (
+            psnr(shown, true, groups=groups, subject=name),
+            ssim(shown, true, groups=groups, subject=name),
+        )
     return out
 
 
 def halves(frames, seed=0, words=512):
     """The scores of real touches: CI-TMMD with random halves, the same with halves of whole videos, and D-TMMD by video for the distance between classes."""
-    features = patch_words(frames.images("touch"), np.arange(len(frames.ids)), seed, words)
+    features = patch_words(frames.images("tactile"), np.arange(len(frames.ids)), seed, words)
     real = feature_set(features, frames, np.arange(len(frames.ids)), "patch words")
     options = {"normalize": True, "subject": "real"}
     by_video = ci_tmmd(real, preset="paper", halves="group", **options)
-    return ci_tmmd(real, preset="paper", seed=seed, **options), by_video, d_tmmd(real, preset="paper", halves="group", **options)
+    return (
+        ci_tmmd(real, preset="paper", seed=seed, **options),
+        by_video,
+        d_tmmd(real, preset="paper", halves="group", **options),
+    )
 
 
 def shown(score, digits):
@@ -88,7 +103,10 @@ def shown(score, digits):
 def tables(pairs, found):
     """Both tables in Markdown."""
     lines = ["| against the true touch | PSNR dB | SSIM |", "|---|---|---|"]
-    lines += [f"| {title} | {shown(pairs[name][0], 1)} | {shown(pairs[name][1], 3)} |" for name, title in SUBJECTS.items()]
+    lines += [
+        f"| {title} | {shown(pairs[name][0], 1)} | {shown(pairs[name][1], 3)} |"
+        for name, title in SUBJECTS.items()
+    ]
     random, by_video, between = found
     matrix = np.array(between.details["matrix"])
     apart = matrix[~np.eye(len(matrix), dtype=bool)].mean()
@@ -104,7 +122,10 @@ def tables(pairs, found):
 
 def page(text, preset, options, frames, pairs, command):
     drawn_nothing, true_material = pairs["background"], pairs["same"]
-    better = drawn_nothing[0].value > true_material[0].value and drawn_nothing[1].value > true_material[1].value
+    better = (
+        drawn_nothing[0].value > true_material[0].value
+        and drawn_nothing[1].value > true_material[1].value
+    )
     return f"""# What pairwise metrics and random halves reward
 
 Drawn by a committed command; do not edit by hand. Synthetic: the tables show mechanisms, and their numbers are never compared with those of real data.
@@ -132,7 +153,9 @@ def main():
     frames: Frames = render(options, chosen.processes)
     pairs = pairwise(frames, unit_of(frames, options), chosen.pairs, chosen.seed)
     text = tables(pairs, halves(frames, chosen.seed))
-    print(f"preset {chosen.preset}, version {VERSION}, options {short(options.digest)}: {len(frames.ids)} contact frames\n{text}")
+    print(
+        f"preset {chosen.preset}, version {VERSION}, options {short(options.digest)}: {len(frames.ids)} contact frames\n{text}"
+    )
     if chosen.write:
         command = f"python benchmarks/world_background.py {' '.join(sys.argv[1:])}"
         chosen.write.write_text(page(text, chosen.preset, options, frames, pairs, command))

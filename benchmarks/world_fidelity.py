@@ -5,7 +5,7 @@
     python benchmarks/world_fidelity.py --sizes 64 --videos 20           # a quick look
 
 The real clips are found under ``PALPATE_SHARED_DATA`` or ``../shared/data`` (``touch_and_go/clips``, needs PyAV). Of each 480 x 640 frame the central
-square is taken and averaged down; the pad is taken to be 14 mm high, so that a pixel is 14 / n mm. A run is a stretch of labelled frames; its background
+square is taken and averaged down; the pad is taken to be 14 mm high, so that a pixel is 14 / n mm. A run is a stretch of labeled frames; its background
 is the frame 4 before its first. Of the world, one frame at random of two contacts a video, against the frame 4 before the contact.
 
 The statistics are those of :mod:`palpate.sim.fidelity`. A statistic is ``inside`` if the world's median lies between the smallest and the largest median
@@ -25,7 +25,7 @@ from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.fidelity import (
     BANDS,
     change,
-    colour_grid,
+    color_grid,
     contact_area,
     contrast,
     marker_statistics,
@@ -39,15 +39,42 @@ from palpate.sim.plan import contact_frames, first_contact
 
 EVERY = 4  # real frames of a run used
 NAMES = {
-    "mean R": "mean of R", "mean G": "mean of G", "mean B": "mean of B", "tint": "largest minus smallest channel, mean of 9 cells",
-    "rms_r": "rms of R", "rms_g": "rms of G", "rms_b": "rms of B", "p95_r": "95 % of R", "p95_g": "95 % of G", "p95_b": "95 % of B",
-    "chroma": "chroma share", "slope": "log-log slope, 0.15 .. 2 /mm", "count": "dark blobs a pad", "marker area": "their share of the pad, %",
-    "largest": "the largest, % of the pad", "area": "contact area, %", "noise": "image noise, grey levels",
-} | {f"band_{k}": f"{low:g} .. {high:g} cycles/mm, rms" for k, (low, high) in enumerate(itertools.pairwise(BANDS))}  # fmt: skip
+    "mean R": "mean of R",
+    "mean G": "mean of G",
+    "mean B": "mean of B",
+    "tint": "largest minus smallest channel, mean of 9 cells",
+    "rms_r": "rms of R",
+    "rms_g": "rms of G",
+    "rms_b": "rms of B",
+    "p95_r": "95 % of R",
+    "p95_g": "95 % of G",
+    "p95_b": "95 % of B",
+    "chroma": "chroma share",
+    "slope": "log-log slope, 0.15 .. 2 /mm",
+    "count": "dark blobs a pad",
+    "marker area": "their share of the pad, %",
+    "largest": "the largest, % of the pad",
+    "area": "contact area, %",
+    "noise": "image noise, gray levels",
+} | {
+    f"band_{k}": f"{low:g} .. {high:g} cycles/mm, rms"
+    for k, (low, high) in enumerate(itertools.pairwise(BANDS))
+}
 TABLES = {
-    "Colour of the empty gel (grey levels)": ["mean R", "mean G", "mean B", "tint"],
-    "Contrast: contact minus background (grey levels)": ["rms_r", "rms_g", "rms_b", "p95_r", "p95_g", "p95_b", "chroma"],
-    "Radial power spectrum of contact minus background": [*(f"band_{k}" for k in range(len(BANDS) - 1)), "slope"],
+    "Color of the empty gel (gray levels)": ["mean R", "mean G", "mean B", "tint"],
+    "Contrast: contact minus background (gray levels)": [
+        "rms_r",
+        "rms_g",
+        "rms_b",
+        "p95_r",
+        "p95_g",
+        "p95_b",
+        "chroma",
+    ],
+    "Radial power spectrum of contact minus background": [
+        *(f"band_{k}" for k in range(len(BANDS) - 1)),
+        "slope",
+    ],
     "Markers of the empty gel": ["count", "marker area", "largest"],
     "Contact area and noise": ["area", "noise"],
 }
@@ -55,7 +82,15 @@ TABLES = {
 
 def real_touches():
     """Clip, background, the frame before it, contact frame for the frames used, as the central squares (480, 480, 3); or None where data or PyAV are missing."""
-    root = Path(os.environ.get("PALPATE_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "touch_and_go" / "clips"
+    root = (
+        Path(
+            os.environ.get(
+                "PALPATE_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"
+            )
+        )
+        / "touch_and_go"
+        / "clips"
+    )
     try:
         import av
     except ImportError:
@@ -94,7 +129,14 @@ def world_touches(seeds, videos, size):
                 before = first_contact(options, int(touch)) - BACKGROUND_OFFSET
                 frame = int(rng.choice(contact_frames(options, int(touch))))
                 material = plans[index].object_of(int(touch)).material
-                touches.append((material, video.tactile(before), video.tactile(before - 1), video.tactile(frame)))
+                touches.append(
+                    (
+                        material,
+                        video.tactile(before),
+                        video.tactile(before - 1),
+                        video.tactile(frame),
+                    )
+                )
     return touches
 
 
@@ -107,13 +149,17 @@ def measure(touches, threshold):
     """Statistic -> values over the touches, and the cells of the empty gel, (touches, 3, 3, 3)."""
     rows, cells = [], []
     for _, background, _, contact in touches:
-        cell, markers = colour_grid(background), marker_statistics(background)
+        cell, markers = color_grid(background), marker_statistics(background)
         row = (
             {f"mean {c}": float(cell[..., k].mean()) for k, c in enumerate("RGB")}
             | contrast(contact, background)
             | spectrum(contact, background)
         )
-        row |= {"tint": float((cell.max(-1) - cell.min(-1)).mean()), "count": markers["count"], "noise": noise_level(background)}
+        row |= {
+            "tint": float((cell.max(-1) - cell.min(-1)).mean()),
+            "count": markers["count"],
+            "noise": noise_level(background),
+        }
         row |= {"marker area": 100 * markers["area"], "largest": 100 * markers["largest"]}
         rows.append(row | {"area": 100 * contact_area(contact, background, threshold)})
         cells.append(cell)
@@ -153,21 +199,36 @@ def compare(real, world, real_values, world_values):
 
 def grid_table(real, real_cells, world_cells):
     """The lines of the table of the nine cells: R, G, B each as real smallest .. largest clip, world's median."""
-    yield from ("**Empty gel on a grid of 3 x 3 (real clips, world median, verdict)**", "", "| cell | R | G | B |", "|---|---|---|---|")
+    yield from (
+        "**Empty gel on a grid of 3 x 3 (real clips, world median, verdict)**",
+        "",
+        "| cell | R | G | B |",
+        "|---|---|---|---|",
+    )
     for i, j in itertools.product(range(3), repeat=2):
         entries = []
         for c in range(3):
             medians = by_group(real, real_cells[:, i, j, c]).values()
             middle = float(np.median(world_cells[:, i, j, c]))
-            entries.append(f"{min(medians):.0f} .. {max(medians):.0f}, {middle:.0f} {verdict(middle, min(medians), max(medians))}")
-        place = f"{('top', 'middle', 'bottom')[i]} {('left', 'centre', 'right')[j]}"
+            entries.append(
+                f"{min(medians):.0f} .. {max(medians):.0f}, {middle:.0f} {verdict(middle, min(medians), max(medians))}"
+            )
+        place = f"{('top', 'middle', 'bottom')[i]} {('left', 'center', 'right')[j]}"
         yield f"| {place} | {' | '.join(entries)} |"
     yield ""
 
 
 def material_table(real_values, world, world_values):
     """The lines of the medians of each material, with a star where they leave 5 .. 95 % of the real frames."""
-    names = ["rms_r", "rms_g", "rms_b", "chroma", *(f"band_{k}" for k in range(len(BANDS) - 1)), "slope", "area"]
+    names = [
+        "rms_r",
+        "rms_g",
+        "rms_b",
+        "chroma",
+        *(f"band_{k}" for k in range(len(BANDS) - 1)),
+        "slope",
+        "area",
+    ]
     yield from (
         "**Medians of each material** (a star: outside 5 .. 95 % of the real frames)",
         "",
@@ -186,7 +247,7 @@ def material_table(real_values, world, world_values):
 
 
 def unit_table(seeds):
-    """The lines of the spread of gel units: mean colour of the empty gel without white balance, and markers."""
+    """The lines of the spread of gel units: mean color of the empty gel without white balance, and markers."""
     yield from (
         "**Units of the family** (64 px, without white balance)",
         "",
@@ -196,9 +257,11 @@ def unit_table(seeds):
     for seed in seeds:
         options = replace(PRESETS["small"], seed=seed)
         for unit in range(options.sensors):
-            image = 255 * shade(make_sensor(options, unit), np.zeros((64, 64), np.float32), np.ones(3, np.float32))
+            image = 255 * shade(
+                make_sensor(options, unit), np.zeros((64, 64), np.float32), np.ones(3, np.float32)
+            )
             markers = marker_statistics(image)
-            red, green, blue = colour_grid(image).mean((0, 1))
+            red, green, blue = color_grid(image).mean((0, 1))
             yield f"| {seed}, {unit} | {red:.0f} {green:.0f} {blue:.0f} | {markers['count']:.0f} | {100 * markers['area']:.1f} |"
     yield ""
 
@@ -213,7 +276,10 @@ def report(sizes, seeds, videos):
         world = world_touches(seeds, videos, size)
         noise = free_change(real), free_change(world)
         threshold = max(4.0, 2 * max(noise))
-        (real_values, real_cells), (world_values, world_cells) = measure(real, threshold), measure(world, threshold)
+        (real_values, real_cells), (world_values, world_cells) = (
+            measure(real, threshold),
+            measure(world, threshold),
+        )
         clips = len({touch[0] for touch in real})
         yield from (
             f"## {size} px ({1000 * 14 / size:.0f} µm a pixel): {len(real)} real frames of {clips} clips, {len(world)} of the world",
@@ -222,7 +288,7 @@ def report(sizes, seeds, videos):
         yield from grid_table(real, real_cells, world_cells)
         yield from compare(real, world, real_values, world_values)
         yield (
-            f"The change between two frames without contact reaches {noise[0]:.2f} (real) and {noise[1]:.2f} (world) grey levels at 99 % of the pad "
+            f"The change between two frames without contact reaches {noise[0]:.2f} (real) and {noise[1]:.2f} (world) gray levels at 99 % of the pad "
             f"(medians over the touches); the threshold of the contact area is {threshold:.1f}."
         )
         yield ""
@@ -238,36 +304,55 @@ def in_words(lines):
         if line.startswith("## "):
             size = line[3:].split(":")[0].split(" (")[0]
         elif "outside by" in line:
-            found = [f"{name} {cell.split()[-1]}" for name, cell in zip("RGB", cells[1:4], strict=False) if "outside by" in cell]
-            outside.append(f"{size}: {cells[0]} by {', '.join(found)}" if found else f"{size}: {cells[0]} by {cells[-1].split()[-1]}")
+            found = [
+                f"{name} {cell.split()[-1]}"
+                for name, cell in zip("RGB", cells[1:4], strict=False)
+                if "outside by" in cell
+            ]
+            outside.append(
+                f"{size}: {cells[0]} by {', '.join(found)}"
+                if found
+                else f"{size}: {cells[0]} by {cells[-1].split()[-1]}"
+            )
         if len(cells) == 7 and cells[5].endswith("%") and float(cells[5].rstrip(" %")) < 80:
             wide.append(f"{size}: {cells[0]} ({cells[5]})")
     yield from ("## What does not fit", "")
     yield from (
-        "Medians of the world outside the spread of the clips (grey levels, or the unit of the row):",
+        "Medians of the world outside the spread of the clips (gray levels, or the unit of the row):",
         "",
         *(f"- {text}" for text in outside or ["none"]),
     )
-    yield from ("", "Fewer than 80 % of the world's frames lie between the 5 and 95 % quantiles of the real frames in:", "")
+    yield from (
+        "",
+        "Fewer than 80 % of the world's frames lie between the 5 and 95 % quantiles of the real frames in:",
+        "",
+    )
     yield from (*(f"- {text}" for text in wide or ["none"]), "")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--videos", type=int, default=60, help="of each seed")
     parser.add_argument("--write", type=Path, help="Markdown file to write")
     asked = parser.parse_args()
-    command = "python benchmarks/world_fidelity.py" + (f" --write {asked.write}" if asked.write else "")
+    command = "python benchmarks/world_fidelity.py" + (
+        f" --write {asked.write}" if asked.write else ""
+    )
     options = f"--sizes {' '.join(map(str, asked.sizes))} --seeds {' '.join(map(str, asked.seeds))} --videos {asked.videos}"
     head = [
-        "# The simulated GelSight beside real touches", "",
+        "# The simulated GelSight beside real touches",
+        "",
         f"Written by `{command} {options}`, world VERSION {VERSION}, {datetime.datetime.now(tz=datetime.UTC).date()}. What is measured, and how, "
-        "stands in that script and in `palpate.sim.fidelity`.", "",
+        "stands in that script and in `palpate.sim.fidelity`.",
+        "",
         "Read it with care: the real side is five short clips, which look like one or two pads of one product, and their materials are five of the "
-        "world's twenty. `inside` means no more than that the world's median frame could have come from one of them.", "",
-    ]  # fmt: skip
+        "world's twenty. `inside` means no more than that the world's median frame could have come from one of them.",
+        "",
+    ]
     body = [*report(asked.sizes, asked.seeds, asked.videos)]
     lines = [*head, *in_words(body), *body]
     text = "\n".join(lines).rstrip() + "\n"

@@ -30,12 +30,26 @@ from pathlib import Path
 import numpy as np
 
 from palpate.core import rng_for
-from palpate.sim import PRESETS, VERSION, Video, World, WorldOptions, open_arrays, plan_world, write_world
+from palpate.sim import (
+    PRESETS,
+    VERSION,
+    Video,
+    World,
+    WorldOptions,
+    open_arrays,
+    plan_world,
+    write_world,
+)
 from palpate.sim.objects import make_object
 from palpate.sim.plan import contact_frames
 
 PARTS = ("frames", "processes", "memory", "equal")
-WANTED = {"frames a second and core at 64 px": 150, "object ms": 60, "times the prototype": 1.5, "two processes against one": 1.7}
+WANTED = {
+    "frames a second and core at 64 px": 150,
+    "object ms": 60,
+    "times the prototype": 1.5,
+    "two processes against one": 1.7,
+}
 PROTOTYPE_TILE = 512
 
 
@@ -57,7 +71,11 @@ class Cost:
         """Mean over objects, and the mean of the slowest material with its name."""
         means = {name: 1000 * float(np.mean(values)) for name, values in self.objects.items()}
         worst = max(means, key=means.get)
-        return 1000 * float(np.mean(np.concatenate(list(self.objects.values())))), means[worst], worst
+        return (
+            1000 * float(np.mean(np.concatenate(list(self.objects.values())))),
+            means[worst],
+            worst,
+        )
 
     def video_ms(self):
         return 1000 * float(np.mean(self.videos))
@@ -89,7 +107,11 @@ def world_for(size, objects, touches, frames, tile=None, seed=11):
 
 def ours(options, plan, cost):
     """One video of palpate: its object, its set-up (light and pose; the second call of the first photo is taken off the first), its frames."""
-    numbers = [frame for touch in range(options.touches_per_video) for frame in contact_frames(options, touch)]
+    numbers = [
+        frame
+        for touch in range(options.touches_per_video)
+        for frame in contact_frames(options, touch)
+    ]
     ref = plan.objects[0]
     _, spent = clocked(make_object, options, ref)
     cost.objects.setdefault(ref.material, []).append(spent)
@@ -105,7 +127,9 @@ def ours(options, plan, cost):
 def theirs(prototype, sensors, options, plan, tile, cost):
     """The same video of the prototype."""
     material = options.names.index(plan.objects[0].material)
-    thing, spent = clocked(prototype.make_object, options.seed, material, plan.objects[0].number, tile)
+    thing, spent = clocked(
+        prototype.make_object, options.seed, material, plan.objects[0].number, tile
+    )
     cost.objects.setdefault(plan.objects[0].material, []).append(spent)
     video, spent = clocked(
         prototype.make_video,
@@ -126,7 +150,11 @@ def theirs(prototype, sensors, options, plan, tile, cost):
 def find_prototype(given):
     """The prototype as a module, or None where there is none."""
     shared = os.environ.get("PALPATE_SHARED_DATA")
-    places = [given] if given else [*([Path(shared).parent / "prototype"] if shared else []), Path("../shared/prototype")]
+    places = (
+        [given]
+        if given
+        else [*([Path(shared).parent / "prototype"] if shared else []), Path("../shared/prototype")]
+    )
     for place in places:
         path = Path(place) if Path(place).suffix == ".py" else Path(place) / "world_prototype.py"
         if path.is_file():
@@ -141,9 +169,17 @@ def find_prototype(given):
 def measure_frames(size, objects, touches, frames, prototype=None, other_tiles=()):
     """Costs of palpate and, by tile, of the prototype on the same videos, in turn."""
     options = world_for(size, objects, touches, frames)
-    plans, mine, rivals = plan_world(options), empty_cost(), {tile: empty_cost() for tile in other_tiles}
+    plans, mine, rivals = (
+        plan_world(options),
+        empty_cost(),
+        {tile: empty_cost() for tile in other_tiles},
+    )
     ours(options, plans[0], empty_cost())  # imports, caches of FFT plans, sensors
-    sensors = [prototype.make_sensor(options.seed, unit, size) for unit in range(options.sensors)] if prototype else []
+    sensors = (
+        [prototype.make_sensor(options.seed, unit, size) for unit in range(options.sensors)]
+        if prototype
+        else []
+    )
     for plan in plans:
         for unit in range(options.sensors) if plan is plans[0] else ():
             Video(options, dataclasses.replace(plan, sensor=unit)).background()
@@ -158,10 +194,17 @@ def show_frames(size, options, mine, rivals):
     print(
         f"\n{size} px, tile {options.tile}: {videos} objects and videos, {len(mine.frames) // videos} contact frames each, CPU time of one core"
     )
-    print(f"{'':26s} {'frames/s':>9s} {'object ms':>10s} {'slowest material ms':>26s} {'video ms':>9s} {'whole s':>8s}")
-    for name, cost in [("palpate", mine), *((f"prototype, tile {tile}", cost) for tile, cost in rivals.items())]:
+    print(
+        f"{'':26s} {'frames/s':>9s} {'object ms':>10s} {'slowest material ms':>26s} {'video ms':>9s} {'whole s':>8s}"
+    )
+    for name, cost in [
+        ("palpate", mine),
+        *((f"prototype, tile {tile}", cost) for tile, cost in rivals.items()),
+    ]:
         mean, worst, who = cost.object_ms()
-        print(f"{name:26s} {cost.rate():9.1f} {mean:10.1f} {worst:9.1f} {who:>16s} {cost.video_ms():9.1f} {cost.total():8.2f}")
+        print(
+            f"{name:26s} {cost.rate():9.1f} {mean:10.1f} {worst:9.1f} {who:>16s} {cost.video_ms():9.1f} {cost.total():8.2f}"
+        )
     for tile, cost in rivals.items():
         print(
             f"times the prototype with tile {tile}: frames {mine.rate() / cost.rate():.2f}, objects {cost.object_ms()[0] / mine.object_ms()[0]:.2f}, "
@@ -209,7 +252,9 @@ def clock_write(options, workers):
 
 def processes_part(chosen):
     options = dataclasses.replace(PRESETS[chosen.preset], layout="raw")
-    print(f"\nload of the machine before (1, 5, 15 minutes): {', '.join(f'{v:.2f}' for v in os.getloadavg())}; {os.cpu_count()} processors")
+    print(
+        f"\nload of the machine before (1, 5, 15 minutes): {', '.join(f'{v:.2f}' for v in os.getloadavg())}; {os.cpu_count()} processors"
+    )
     ceilings, times = [machine_ceiling()], {1: [], 2: []}
     for _ in range(chosen.repeats):
         for workers in (1, 2):
@@ -219,23 +264,46 @@ def processes_part(chosen):
     frames = record.counts["written_frames"]
     for workers, values in times.items():
         listed = ", ".join(f"{v:.1f}" for v in values)
-        print(f"preset {chosen.preset} as {options.layout}, {workers} process(es): {listed} s, best {frames / min(values):.0f} frames/s")
+        print(
+            f"preset {chosen.preset} as {options.layout}, {workers} process(es): {listed} s, best {frames / min(values):.0f} frames/s"
+        )
     ratios = ", ".join(f"{a / b:.2f}" for a, b in zip(*times.values(), strict=True))
-    print(f"two processes against one: {ratios}; best against best {min(times[1]) / min(times[2]):.2f}")
-    print(f"a NumPy loop on this machine, before and after: {', '.join(f'{v:.2f}' for v in ceilings)}")
+    print(
+        f"two processes against one: {ratios}; best against best {min(times[1]) / min(times[2]):.2f}"
+    )
+    print(
+        f"a NumPy loop on this machine, before and after: {', '.join(f'{v:.2f}' for v in ceilings)}"
+    )
 
 
 def child(settings, folder):
     """Writes a world in this process and says its peak memory in MiB."""
     record = write_world(Path(folder) / "world", WorldOptions(**settings))
-    print(json.dumps({"mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "frames": record.counts["written_frames"]}))
+    print(
+        json.dumps(
+            {
+                "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                "frames": record.counts["written_frames"],
+            }
+        )
+    )
 
 
 def peak_of(options):
     """Peak memory in MiB of a fresh process that writes that world, and its written frames."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, str(Path(__file__).resolve()), "--child", json.dumps(dataclasses.asdict(options)), folder]
-        found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+        command = [
+            sys.executable,
+            str(Path(__file__).resolve()),
+            "--child",
+            json.dumps(dataclasses.asdict(options)),
+            folder,
+        ]
+        found = json.loads(
+            subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[
+                -1
+            ]
+        )
     return found["mib"], found["frames"]
 
 
@@ -260,10 +328,15 @@ def compare(options, count, workers=1, seed=0):
         for row in rows:
             sample = world[int(row)]
             if sample["id"] != arrays.manifest.ids[row]:
-                raise SystemExit(f"row {row} is {arrays.manifest.ids[row]} as written and {sample['id']} as rendered")
+                raise SystemExit(
+                    f"row {row} is {arrays.manifest.ids[row]} as written and {sample['id']} as rendered"
+                )
             for name in ("vision", "tactile", "background"):
                 difference = np.abs(sample[name].astype(int) - getattr(arrays, name)[row])
-                differ, largest = differ + int((difference > 0).sum()), max(largest, int(difference.max()))
+                differ, largest = (
+                    differ + int((difference > 0).sum()),
+                    max(largest, int(difference.max())),
+                )
     return len(rows), differ, largest
 
 
@@ -271,8 +344,19 @@ def equal_part(chosen):
     print(
         "\nsamples (vision, tactile, background) rendered alone by World[k], in random order, against the arrays that two processes wrote"
     )
-    for size, look, count in ((64, "gelsight", 1000), (64, "digit", 300), (128, "gelsight", 200), (256, "gelsight", 50)):
-        options = dataclasses.replace(world_for(size, 2, 4, 4), look=look, layout="raw", mixed=0.2, materials=20 if size == 64 else 6)
+    for size, look, count in (
+        (64, "gelsight", 1000),
+        (64, "digit", 300),
+        (128, "gelsight", 200),
+        (256, "gelsight", 50),
+    ):
+        options = dataclasses.replace(
+            world_for(size, 2, 4, 4),
+            look=look,
+            layout="raw",
+            mixed=0.2,
+            materials=20 if size == 64 else 6,
+        )
         compared, differ, largest = compare(options, count, workers=2)
         print(
             f"{size:4d} px {look:9s} {compared:5d} of {len(World(options))} samples: {differ} values differ, largest difference {largest}"
@@ -286,13 +370,24 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=PARTS)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256])
-    parser.add_argument("--objects", type=int, default=3, help="objects a material at 64 px; one at larger sizes")
+    parser.add_argument(
+        "--objects", type=int, default=3, help="objects a material at 64 px; one at larger sizes"
+    )
     parser.add_argument("--prototype", help="the prototype's file or folder")
-    parser.add_argument("--preset", default="small", choices=tuple(PRESETS), help="of the processes part")
+    parser.add_argument(
+        "--preset", default="small", choices=tuple(PRESETS), help="of the processes part"
+    )
     parser.add_argument("--repeats", type=int, default=2, help="of the processes part")
     chosen = parser.parse_args()
-    print(f"world version {VERSION}; wanted: {', '.join(f'{name} {value:g}' for name, value in WANTED.items())}")
-    run = {"frames": frames_part, "processes": processes_part, "memory": memory_part, "equal": equal_part}
+    print(
+        f"world version {VERSION}; wanted: {', '.join(f'{name} {value:g}' for name, value in WANTED.items())}"
+    )
+    run = {
+        "frames": frames_part,
+        "processes": processes_part,
+        "memory": memory_part,
+        "equal": equal_part,
+    }
     for part in chosen.parts:
         run[part](chosen)
 

@@ -1,6 +1,6 @@
 """Trains the models that ship with palpate (``palpate/mini``), scores them on worlds that they have not seen, and writes their cards.
 
-    python recipes/mini.py --work runs/mini                     # everything: worlds, towers, autoencoder, generator, scores
+    python recipes/mini.py --work runs/mini                     # everything: worlds, encoders, autoencoder, generator, scores
     python recipes/mini.py --work runs/mini --only autoencoder  # one part and what it needs; parts may run side by side after "worlds"
     python recipes/mini.py --work runs/mini --ship              # and put the result into src/palpate/mini
     python recipes/mini.py --work runs/mini --verify            # score what is shipped again and compare with its cards
@@ -41,14 +41,14 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.autoencoder_training import train_autoencoder
-from palpate.diffusion.pipeline import Pipeline
+from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
 from palpate.diffusion.recipe import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_touch
+from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.presets import preset
-from palpate.encoders.towers import Towers, load_clip
-from palpate.protocol.inputs import fresh
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
+from palpate.studies.inputs import fresh
 
 NAME = "palpate/mini"
 #: Its table of scores is written from the cards.
@@ -65,9 +65,13 @@ WORLDS: dict[str, WorldOptions] = {
 ENCODER = preset("mini")
 #: Passes over the touches. One core sees about 400 photos or touches a second in training.
 CLIP_EPOCHS, TOUCH_EPOCHS = 14.0, 8.0
-AUTOENCODER = replace(DIFFUSION.autoencoder, steps_free=12_000, steps_quantised=1_200) if DIFFUSION.autoencoder else None
+AUTOENCODER = (
+    replace(DIFFUSION.autoencoder, steps_free=12_000, steps_quantized=1_200)
+    if DIFFUSION.autoencoder
+    else None
+)
 GENERATOR_STEPS = 8_000
-PARTS = ("worlds", "clip", "towers", "autoencoder", "generator", "scores")
+PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
 LIMITS = (
     "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. Real photos and real touches are out of its range.",
     "Made to show mechanisms and to test code offline; never compare its numbers with those of real data sets.",
@@ -76,12 +80,28 @@ LIMITS = (
 
 def main() -> int:
     """Runs the asked parts; the exit status is 1 if ``--verify`` finds other scores than the cards say."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=Path("runs/mini"), help="folder for worlds, checkpoints and results")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--work",
+        type=Path,
+        default=Path("runs/mini"),
+        help="folder for worlds, checkpoints and results",
+    )
     parser.add_argument("--only", choices=PARTS, default="scores", help="the last part to make")
-    parser.add_argument("--ship", action="store_true", help="write src/palpate/mini of this checkout")
-    parser.add_argument("--verify", action="store_true", help="score the shipped models again instead of training")
-    parser.add_argument("--share", type=float, default=1.0, help="share of all training lengths, to try the recipe out (not for shipping)")
+    parser.add_argument(
+        "--ship", action="store_true", help="write src/palpate/mini of this checkout"
+    )
+    parser.add_argument(
+        "--verify", action="store_true", help="score the shipped models again instead of training"
+    )
+    parser.add_argument(
+        "--share",
+        type=float,
+        default=1.0,
+        help="share of all training lengths, to try the recipe out (not for shipping)",
+    )
     options = parser.parse_args()
     recipe = Recipe(options.work, options.share)
     try:
@@ -125,9 +145,13 @@ class Recipe:
         for name in WORLDS:
             self.world(name)
         wanted = {
-            "worlds": (), "clip": (self.clip,), "towers": (self.towers,), "autoencoder": (self.autoencoder,),
-            "generator": (self.generator,), "scores": (self.scores,),
-        }[last]  # fmt: skip
+            "worlds": (),
+            "clip": (self.clip,),
+            "encoders": (self.encoders,),
+            "autoencoder": (self.autoencoder,),
+            "generator": (self.generator,),
+            "scores": (self.scores,),
+        }[last]
         for part in wanted:
             part()
 
@@ -136,14 +160,27 @@ class Recipe:
         options = WORLDS[name]
 
         def build(folder: Path) -> Mapping[str, Any]:
-            record = write_world(folder / "tree", options, workers=len(os.sched_getaffinity(0)), progress=self.progress)
-            return {"digest": record.digest, "frames": record.counts["contact_frames"], "videos": record.counts["videos"]}
+            record = write_world(
+                folder / "tree",
+                options,
+                workers=len(os.sched_getaffinity(0)),
+                progress=self.progress,
+            )
+            return {
+                "digest": record.digest,
+                "frames": record.counts["contact_frames"],
+                "videos": record.counts["videos"],
+            }
 
         stage = self.run.stage(f"world {name}", {"options": options.digest}, build)
         return Manifest.load(stage.folder / "tree")
 
     def _everything(self, manifest: Manifest) -> Split:
-        return Split.from_ids(train=manifest.ids, rule={"name": "everything, for the shipped models"}, manifest=manifest.digest)
+        return Split.from_ids(
+            train=manifest.ids,
+            rule={"name": "everything, for the shipped models"},
+            manifest=manifest.digest,
+        )
 
     def clip(self) -> Path:
         """Vision and text, by contrast of photos and captions."""
@@ -164,37 +201,73 @@ class Recipe:
             clip.save(fresh(folder / "clip"))
             return {"vision": clip.digest("vision"), "text": clip.digest("text")}
 
-        stage = self.run.stage("clip", {"preset": ENCODER, "epochs": epochs, "seed": SEED, "train": train.digest}, build)
+        stage = self.run.stage(
+            "clip",
+            {"preset": ENCODER, "epochs": epochs, "seed": SEED, "train": train.digest},
+            build,
+        )
         return stage.folder / "clip"
 
-    def towers(self) -> Towers:
-        """The pair and a touch tower that learns from it, rounded to 16 bits."""
+    def encoders(self) -> EncoderSet:
+        """The pair and a tactile encoder that learns from it, rounded to 16 bits."""
         clip, train = self.clip(), self.world("touches")
         epochs = TOUCH_EPOCHS * self.share
 
         def build(folder: Path) -> Mapping[str, Any]:
-            towers = train_touch(
-                train, self._everything(train), load_clip(clip), ENCODER, folder / "training", epochs=epochs, seed=SEED, cache=self.cache,
+            encoders = train_touch(
+                train,
+                self._everything(train),
+                load_clip(clip),
+                ENCODER,
+                folder / "training",
+                epochs=epochs,
+                seed=SEED,
+                cache=self.cache,
                 progress=self.progress,
-            )  # fmt: skip
-            towers.save(fresh(folder / "towers"))
-            return {"touch": towers.digest("touch")}
+            )
+            encoders.save(fresh(folder / "encoders"))
+            return {"tactile": encoders.digest("tactile")}
 
-        stage = self.run.stage("towers", {"preset": ENCODER, "epochs": epochs, "seed": SEED, "clip": self.run.stages["clip"].digest}, build)
-        return Towers.load(stage.folder / "towers")
+        stage = self.run.stage(
+            "encoders",
+            {
+                "preset": ENCODER,
+                "epochs": epochs,
+                "seed": SEED,
+                "clip": self.run.stages["clip"].digest,
+            },
+            build,
+        )
+        return EncoderSet.load(stage.folder / "encoders")
 
     def autoencoder(self) -> Autoencoder:
         """The VQ autoencoder, of touches of both looks."""
         parts = [self.world(name) for name in ("touches", "digit")]
         if AUTOENCODER is None:
-            raise PalpateError("The preset mini must train an autoencoder", "none", "Give it AutoencoderOptions")
+            raise PalpateError(
+                "The preset mini must train an autoencoder", "none", "Give it AutoencoderOptions"
+            )
         length = lambda steps: max(1, round(steps * self.share))  # noqa: E731
-        options = replace(AUTOENCODER, steps_free=length(AUTOENCODER.steps_free), steps_quantised=length(AUTOENCODER.steps_quantised))
+        options = replace(
+            AUTOENCODER,
+            steps_free=length(AUTOENCODER.steps_free),
+            steps_quantized=length(AUTOENCODER.steps_quantized),
+        )
 
         def build(folder: Path) -> Mapping[str, Any]:
-            images = np.concatenate([cached_images(part, "tactile", DIFFUSION.size, self.cache, self.progress) for part in parts])
+            images = np.concatenate(
+                [
+                    cached_images(part, "tactile", DIFFUSION.size, self.cache, self.progress)
+                    for part in parts
+                ]
+            )
             model = train_autoencoder(
-                images, options, folder / "training", seed=SEED, key=digest_json([p.digest for p in parts]), progress=self.progress
+                images,
+                options,
+                folder / "training",
+                seed=SEED,
+                key=digest_json([p.digest for p in parts]),
+                progress=self.progress,
             )
             model.save(fresh(folder / "autoencoder"))
             return {"digest": model.digest}
@@ -202,60 +275,99 @@ class Recipe:
         inputs = {"options": options, "seed": SEED, "train": [p.digest for p in parts]}
         return Autoencoder.load(self.run.stage("autoencoder", inputs, build).folder / "autoencoder")
 
-    def generator(self) -> Pipeline:
-        """From a photo to a touch, in the space of the rounded towers and autoencoder."""
-        towers, autoencoder, train = self.towers(), self.autoencoder(), self.world("one unit")
-        towers.halve()
+    def generator(self) -> TactilePipeline:
+        """From a photo to a touch, in the space of the rounded encoders and autoencoder."""
+        encoders, autoencoder, train = self.encoders(), self.autoencoder(), self.world("one unit")
+        encoders.halve()
         autoencoder.halve()
         steps = max(1, math.ceil(GENERATOR_STEPS * self.share))
 
         def build(folder: Path) -> Mapping[str, Any]:
             pipeline = train_pipeline(
-                train, self._everything(train), towers, autoencoder, DIFFUSION, folder / "training", seed=SEED, steps=steps, cache=self.cache,
+                train,
+                self._everything(train),
+                encoders,
+                autoencoder,
+                DIFFUSION,
+                folder / "training",
+                seed=SEED,
+                steps=steps,
+                cache=self.cache,
                 progress=self.progress,
-            )  # fmt: skip
+            )
             pipeline.save(fresh(folder / "model"))
             return {"digest": pipeline.digest, "train": len(train)}
 
         inputs = {
-            "preset": DIFFUSION, "steps": steps, "seed": SEED, "vision": towers.digest("vision"), "text": towers.digest("text"),
-            "autoencoder": autoencoder.digest, "train": train.digest,
-        }  # fmt: skip
-        return Pipeline.load(self.run.stage("generator", inputs, build).folder / "model")
+            "preset": DIFFUSION,
+            "steps": steps,
+            "seed": SEED,
+            "vision": encoders.digest("vision"),
+            "text": encoders.digest("text"),
+            "autoencoder": autoencoder.digest,
+            "train": train.digest,
+        }
+        return TactilePipeline.load(self.run.stage("generator", inputs, build).folder / "model")
 
     def scores(self) -> dict[str, Any]:
         """Scores of the full and of the rounded models on the new worlds, as rows for the cards."""
-        full = self.towers(), self.autoencoder(), self.generator()
-        digests = [full[0].digest("touch"), full[0].digest("vision"), full[1].digest, full[2].digest]
+        full = self.encoders(), self.autoencoder(), self.generator()
+        digests = [
+            full[0].digest("tactile"),
+            full[0].digest("vision"),
+            full[1].digest,
+            full[2].digest,
+        ]
 
         def build(folder: Path) -> Mapping[str, Any]:
             exact = score_all(*full, self._samples(), self.cache, None, self.progress)
             rounding = self._halve(*full)
-            rounded = score_all(*full, self._samples(), self.cache, folder / "generated", self.progress)
-            write_json(folder / "scores.json", {"rounded": rounded, "exact": exact, "rounding": rounding})
+            rounded = score_all(
+                *full, self._samples(), self.cache, folder / "generated", self.progress
+            )
+            write_json(
+                folder / "scores.json", {"rounded": rounded, "exact": exact, "rounding": rounding}
+            )
             return {"rounding": rounding}
 
-        stage = self.run.stage("scores", {"models": digests, "worlds": [self.world(n).digest for n in WORLDS]}, build)
+        stage = self.run.stage(
+            "scores", {"models": digests, "worlds": [self.world(n).digest for n in WORLDS]}, build
+        )
         return read_json(stage.folder / "scores.json", "scores")
 
     def _samples(self) -> dict[str, Manifest]:
         return {name: self.world(name) for name in WORLDS}
 
     @staticmethod
-    def _halve(towers: Towers, autoencoder: Autoencoder, pipeline: Pipeline) -> dict[str, float]:
+    def _halve(
+        encoders: EncoderSet, autoencoder: Autoencoder, pipeline: TactilePipeline
+    ) -> dict[str, float]:
         """Rounds all weights to 16 bits, in place; the largest relative change of a tensor of each model."""
-        changes = {"towers": towers.halve(), "autoencoder": autoencoder.halve(), "generator": pipeline.denoiser.halve()}
+        changes = {
+            "encoders": encoders.halve(),
+            "autoencoder": autoencoder.halve(),
+            "generator": pipeline.denoiser.halve(),
+        }
         vars(pipeline).pop("digest", None)  # cached before the weights changed
         return {name: change.relative for name, change in changes.items()}
 
     def ship(self) -> None:
         """Writes ``src/palpate/mini``: weights in 16 bits, and cards."""
         if self.share != 1.0:
-            raise PalpateError("Shipped models must have been trained in full", f"--share {self.share:g}", "Leave out --share")
-        scores, towers, autoencoder, pipeline = self.scores(), self.towers(), self.autoencoder(), self.generator()
-        self._halve(towers, autoencoder, pipeline)
+            raise PalpateError(
+                "Shipped models must have been trained in full",
+                f"--share {self.share:g}",
+                "Leave out --share",
+            )
+        scores, encoders, autoencoder, pipeline = (
+            self.scores(),
+            self.encoders(),
+            self.autoencoder(),
+            self.generator(),
+        )
+        self._halve(encoders, autoencoder, pipeline)
         target = shipped_root() / SHIPPED[NAME]
-        ship(target, towers, autoencoder, pipeline, scores, self._worlds(), LIMITS)
+        ship(target, encoders, autoencoder, pipeline, scores, self._worlds(), LIMITS)
         if PAGE.is_file():
             write_page(PAGE, target)
         say(f"Shipped in {target}")
@@ -263,28 +375,49 @@ class Recipe:
     def _worlds(self) -> list[dict[str, Any]]:
         stages = {name: self.run.stages[f"world {name}"].facts for name in WORLDS}
         return [
-            {"world": name, "seed": o.seed, "look": o.look, "version": VERSION, "frames": stages[name]["frames"], "videos": stages[name]["videos"],
-             "digest": stages[name]["digest"]}
+            {
+                "world": name,
+                "seed": o.seed,
+                "look": o.look,
+                "version": VERSION,
+                "frames": stages[name]["frames"],
+                "videos": stages[name]["videos"],
+                "digest": stages[name]["digest"],
+            }
             for name, o in WORLDS.items()
-        ]  # fmt: skip
+        ]
 
     def verify(self) -> int:
         """Scores the shipped models again; every score must come out as its card says, within 0.002 of its scale."""
-        towers, autoencoder, pipeline = Towers.load(NAME), Autoencoder.load(NAME), Pipeline.load(NAME)
-        rows = score_all(towers, autoencoder, pipeline, self._samples(), self.cache, None, self.progress)
-        cards = {"towers": towers.card, "autoencoder": autoencoder.card, "generator": dict(pipeline.training)}
+        encoders, autoencoder, pipeline = (
+            EncoderSet.load(NAME),
+            Autoencoder.load(NAME),
+            TactilePipeline.load(NAME),
+        )
+        rows = score_all(
+            encoders, autoencoder, pipeline, self._samples(), self.cache, None, self.progress
+        )
+        cards = {
+            "encoders": encoders.card,
+            "autoencoder": autoencoder.card,
+            "generator": dict(pipeline.training),
+        }
         bad = 0
         for part, scored in rows.items():
             said = {row["score"]: row["value"] for row in cards[part]["scores"]}
             if missing := sorted(set(said) - {row["score"] for row in scored}):
                 bad += len(missing)
-                say(f"{part}: the card has scores that are no longer made: {', '.join(missing)}  DIFFERS")
+                say(
+                    f"{part}: the card has scores that are no longer made: {', '.join(missing)}  DIFFERS"
+                )
             for row in scored:
                 value, card = row["value"], said.get(row["score"])
                 same = card is not None and abs(value - card) <= 0.002 * max(1.0, abs(card))
                 bad += not same
                 told = "nothing" if card is None else f"{card:.4g}"
-                say(f"{part}: {row['score']}: {value:.4g}, the card says {told}{'' if same else '  DIFFERS'}")
+                say(
+                    f"{part}: {row['score']}: {value:.4g}, the card says {told}{'' if same else '  DIFFERS'}"
+                )
         return 1 if bad else 0
 
 

@@ -12,18 +12,18 @@ from typing import Any
 from palpate.core import read_json, write_text
 from palpate.core.cards import write_model_cards
 from palpate.diffusion.autoencoder import Autoencoder
-from palpate.diffusion.pipeline import Pipeline
-from palpate.encoders.towers import Towers
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.sim import VERSION
 
 NAME = "palpate/mini"
 RECIPE = "python recipes/mini.py --work runs/mini --ship"
 TAGS = ("synthetic",)
 SUMMARIES = {
-    "towers": (
-        "Vision, text and touch towers of palpate's world",
-        "Three small towers with one space of 128 dimensions: a CLIP (vision and text, own tokenizer) trained on photos and captions of the procedural "
-        "world, and a touch tower trained against it with the three-way InfoNCE. They take the part of the frozen CLIP of the paper where no hub is in reach.",
+    "encoders": (
+        "Vision, text and tactile encoders of palpate's world",
+        "Three small encoders with one space of 128 dimensions: a CLIP (vision and text, own tokenizer) trained on photos and captions of the procedural "
+        "world, and a tactile encoder trained against it with the three-way InfoNCE. They take the part of the frozen CLIP of the paper where no hub is in reach.",
     ),
     "autoencoder": (
         "VQ f4 autoencoder of touches of palpate's world",
@@ -32,30 +32,35 @@ SUMMARIES = {
     ),
     "generator": (
         "From a photo to a touch of palpate's world",
-        "A latent diffusion model, conditioned on captions and photos in turn and driven by photos, in the space of the towers and the autoencoder beside it. "
-        "It knows the world's twenty materials and nothing else, tells rough from smooth better than one rough material from another, and always answers for the one gel unit it has learnt.",
+        "A latent diffusion model, conditioned on captions and photos in turn and driven by photos, in the space of the encoders and the autoencoder beside it. "
+        "It knows the world's twenty materials and nothing else, tells rough from smooth better than one rough material from another, and always answers for the one gel unit it has learned.",
     ),
 }
 PAIR = (
-    "Vision and text towers of palpate's world",
-    "A small CLIP with its own tokenizer, trained on photos and captions of the procedural world; its space has 128 dimensions. The touch tower beside it was trained against it.",
+    "Vision and text encoders of palpate's world",
+    "A small CLIP with its own tokenizer, trained on photos and captions of the procedural world; its space has 128 dimensions. The tactile encoder beside it was trained against it.",
 )
 READ = {
-    "towers": ("touches", "new touches"),
+    "encoders": ("touches", "new touches"),
     "autoencoder": ("touches", "digit", "new touches", "new digit"),
     "generator": ("one unit", "touches", "new touches"),
 }
 
 
 def ship(
-    target: Path, towers: Towers, autoencoder: Autoencoder, pipeline: Pipeline, scores: Mapping[str, Any], worlds: Sequence[Mapping[str, Any]],
+    target: Path,
+    encoders: EncoderSet,
+    autoencoder: Autoencoder,
+    pipeline: TactilePipeline,
+    scores: Mapping[str, Any],
+    worlds: Sequence[Mapping[str, Any]],
     limits: Sequence[str],
-) -> None:  # fmt: skip
+) -> None:
     """Replaces what is shipped; the models must be rounded to 16 bits already, since the scores are theirs.
 
     Args:
         target: the folder of the package.
-        towers: vision, text and touch.
+        encoders: vision, text and touch.
         autoencoder: of touches.
         pipeline: the generator, in the space of the other two.
         scores: rows by model under ``rounded`` and ``exact``, and the change by ``rounding``.
@@ -69,22 +74,35 @@ def ship(
         before = {row["score"]: row["value"] for row in scores["exact"][part]}
         for row in rows:
             row["in 32 bits"] = before[row["score"]]
-        data = [{**world, "used for": _use(part, str(world["world"]))} for world in worlds if world["world"] in READ[part]]
+        data = [
+            {**world, "used for": _use(part, str(world["world"]))}
+            for world in worlds
+            if world["world"] in READ[part]
+        ]
         return {
-            "name": NAME, "title": title, "summary": summary, "tags": list(TAGS), "license": "apache-2.0", "data": data, "scores": rows,
-            "limits": list(limits), "recipe": RECIPE, "world version": VERSION, "synthetic": True,
+            "name": NAME,
+            "title": title,
+            "summary": summary,
+            "tags": list(TAGS),
+            "license": "apache-2.0",
+            "data": data,
+            "scores": rows,
+            "limits": list(limits),
+            "recipe": RECIPE,
+            "world version": VERSION,
+            "synthetic": True,
             "largest relative change by 16 bits": scores["rounding"][part],
-        }  # fmt: skip
+        }
 
-    towers.card = {**towers.card, **card("towers")}
-    pair = card("towers")
+    encoders.card = {**encoders.card, **card("encoders")}
+    pair = card("encoders")
     pair["title"], pair["summary"] = PAIR
     pair["scores"] = [row for row in pair["scores"] if "touch" not in row["score"]]
-    towers.clip.card = {**towers.clip.card, **pair}
+    encoders.clip.card = {**encoders.clip.card, **pair}
     autoencoder.card = {**autoencoder.card, **card("autoencoder")}
     pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
     with _replacing(target):
-        towers.save(target / "towers", half=True)
+        encoders.save(target / "encoders", half=True)
         autoencoder.save(target / "autoencoder", half=True)
         pipeline.save(target / "generator", half=True, shared=NAME)
         write_model_cards(target)
@@ -111,7 +129,11 @@ def _use(part: str, world: str) -> str:
     """What a world was used for by a part."""
     if world.startswith("new"):
         return "scores"
-    return "training of the towers and the autoencoder" if part == "generator" and world == "touches" else "training"
+    return (
+        "training of the encoders and the autoencoder"
+        if part == "generator" and world == "touches"
+        else "training"
+    )
 
 
 MARKS = ("<!-- scores of the cards -->", "<!-- end of the scores -->")
@@ -119,12 +141,17 @@ MARKS = ("<!-- scores of the cards -->", "<!-- end of the scores -->")
 
 def scores_table(target: Path) -> str:
     """The scores of all cards below ``target`` as one Markdown table."""
-    lines = ["| part | score | value | 95 % by video | chance | in 32 bits |", "|---|---|---|---|---|---|"]
-    for part, key in (("towers", "card"), ("autoencoder", "card"), ("generator", "training")):
+    lines = [
+        "| part | score | value | 95 % by video | chance | in 32 bits |",
+        "|---|---|---|---|---|---|",
+    ]
+    for part, key in (("encoders", "card"), ("autoencoder", "card"), ("generator", "training")):
         for row in read_json(target / part / "palpate.json", "card")[key]["scores"]:
             interval = " to ".join(f"{v:.3g}" for v in row.get("interval", ()))
             chance = f"{row['chance']:.3g}" if "chance" in row else ""
-            lines.append(f"| {part} | {row['score']} | {row['value']:.4g} | {interval} | {chance} | {row['in 32 bits']:.4g} |")
+            lines.append(
+                f"| {part} | {row['score']} | {row['value']:.4g} | {interval} | {chance} | {row['in 32 bits']:.4g} |"
+            )
     return "\n".join(lines)
 
 

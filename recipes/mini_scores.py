@@ -2,7 +2,7 @@
 
 Intervals are leave-one-video-out jackknives. Zero-shot prompts are the world's own sentences with a class name and no adjective; a class whose
 pieces have names of their own ("a leaf", "moss") is asked for by each of them. The probe's train side is every fourth sample of the world that the
-towers were trained on, its test side the new world.
+encoders were trained on, its test side the new world.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.pipeline import Pipeline
+from palpate.diffusion.generate import generate
+from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_texts, texts_of
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.probe import material_accuracy, retrieval, text_positives
-from palpate.encoders.towers import Towers
 from palpate.encoders.zero_shot import zero_shot_accuracy
-from palpate.generate import generate
-from palpate.protocol.scoring import score_generated
+from palpate.evaluation.scoring import score_generated
 from palpate.sim import MATERIALS, WorldOptions
 from palpate.sim.objects import make_object
 from palpate.sim.plan import ObjectRef
@@ -43,18 +43,18 @@ Rows = list[dict[str, Any]]
 
 
 def score_all(
-    towers: Towers,
+    encoders: EncoderSet,
     autoencoder: Autoencoder,
-    pipeline: Pipeline,
+    pipeline: TactilePipeline,
     worlds: Mapping[str, Manifest],
     cache: Path,
     folder: Path | None,
     progress: Progress,
 ) -> dict[str, Rows]:
-    """Rows of scores by model: ``towers``, ``autoencoder``, ``generator``.
+    """Rows of scores by model: ``encoders``, ``autoencoder``, ``generator``.
 
     Args:
-        towers: vision, text and touch.
+        encoders: vision, text and touch.
         autoencoder: of touches.
         pipeline: the generator.
         worlds: ``touches``, ``new touches``, ``digit`` and ``new digit``.
@@ -63,9 +63,19 @@ def score_all(
         progress: told what is being done.
     """
     return {
-        "towers": score_towers(towers, worlds["touches"], worlds["new touches"], cache, progress),
+        "encoders": score_encoders(
+            encoders, worlds["touches"], worlds["new touches"], cache, progress
+        ),
         "autoencoder": score_autoencoder(autoencoder, worlds, cache, progress),
-        "generator": score_generator(pipeline, towers, worlds["touches"], worlds["new touches"], folder or cache, cache, progress),
+        "generator": score_generator(
+            pipeline,
+            encoders,
+            worlds["touches"],
+            worlds["new touches"],
+            folder or cache,
+            cache,
+            progress,
+        ),
     }
 
 
@@ -73,65 +83,114 @@ def prompts(options: WorldOptions) -> dict[str, list[str]]:
     """Material -> the named sentences of the world, for each name that its pieces have."""
     found: dict[str, list[str]] = {}
     for material in MATERIALS:
-        nouns = {make_object(options, ObjectRef(material, k)).surface.noun for k in range(NAMED_OBJECTS)}
+        nouns = {
+            make_object(options, ObjectRef(material, k)).surface.noun for k in range(NAMED_OBJECTS)
+        }
         sentences = (t.format(phrase=noun) for noun in sorted(nouns) for t in NAMED)
         found[material] = [f"{s[0].upper()}{s[1:]}." for s in sentences]
     return found
 
 
-def score_towers(towers: Towers, old: Manifest, new: Manifest, cache: Path, progress: Progress) -> Rows:
+def score_encoders(
+    encoders: EncoderSet, old: Manifest, new: Manifest, cache: Path, progress: Progress
+) -> Rows:
     """Zero-shot and probe accuracy, and retrieval in the new world."""
     names = prompts(WorldOptions(seed=900_050))
     train = old.take(old.ids[::EVERY])
-    sides = {t: [embed(part, towers, t, cache=cache, progress=progress) for part in (train, new)] for t in ("vision", "touch")}
-    vision, touch = sides["vision"][1], sides["touch"][1]
-    text = embed(new, towers, "text", cache=cache, progress=progress)
-    same = text_positives(embed_texts(texts_of(new)[0], towers), 0.999)  # equal captions count as right
+    sides = {
+        t: [embed(part, encoders, t, cache=cache, progress=progress) for part in (train, new)]
+        for t in ("vision", "tactile")
+    }
+    vision, touch = sides["vision"][1], sides["tactile"][1]
+    text = embed(new, encoders, "text", cache=cache, progress=progress)
+    same = text_positives(
+        embed_texts(texts_of(new)[0], encoders), 0.999
+    )  # equal captions count as right
     scores = [
-        ("zero-shot material, vision", zero_shot_accuracy(vision, names, towers)),
-        ("zero-shot material, touch", zero_shot_accuracy(touch, names, towers)),
+        ("zero-shot material, vision", zero_shot_accuracy(vision, names, encoders)),
+        ("zero-shot material, touch", zero_shot_accuracy(touch, names, encoders)),
         ("linear probe of material, vision", material_accuracy(*sides["vision"])),
-        ("linear probe of material, touch", material_accuracy(*sides["touch"])),
+        ("linear probe of material, touch", material_accuracy(*sides["tactile"])),
     ]
-    pairs = (("photo to text", vision, text, same), ("text to photo", text, vision, same), ("photo to touch", vision, touch, None))
+    pairs = (
+        ("photo to text", vision, text, same),
+        ("text to photo", text, vision, same),
+        ("photo to touch", vision, touch, None),
+    )
     for name, queries, keys, positives in pairs:
         scores += [
-            (f"{name}, top-{k} of {POOL}", s) for k, s in zip((1, 5), retrieval(queries, keys, pool=POOL, positives=positives), strict=True)
+            (f"{name}, top-{k} of {POOL}", s)
+            for k, s in zip(
+                (1, 5), retrieval(queries, keys, pool=POOL, positives=positives), strict=True
+            )
         ]
     return [_row(name, score, len(new)) for name, score in scores]
 
 
-def score_autoencoder(autoencoder: Autoencoder, worlds: Mapping[str, Manifest], cache: Path, progress: Progress) -> Rows:
+def score_autoencoder(
+    autoencoder: Autoencoder, worlds: Mapping[str, Manifest], cache: Path, progress: Progress
+) -> Rows:
     """Reconstruction of touches of new videos, and use of the codebook."""
     rows: Rows = []
     for look, name in (("gelsight", "new touches"), ("digit", "new digit")):
         images = cached_images(worlds[name], "tactile", 64, cache, progress)
         found = measure_reconstruction(autoencoder, np.asarray(images))
         values = {
-            "PSNR [dB]": found.psnr, "PSNR without quantisation [dB]": found.psnr_free, "SSIM": found.ssim,
-            "codebook perplexity": found.perplexity, "codes never used": found.dead,
-        }  # fmt: skip
-        rows += [{"score": f"{what}, {look}", "value": float(value), "n": found.n} for what, value in values.items()]
+            "PSNR [dB]": found.psnr,
+            "PSNR without quantization [dB]": found.psnr_free,
+            "SSIM": found.ssim,
+            "codebook perplexity": found.perplexity,
+            "codes never used": found.dead,
+        }
+        rows += [
+            {"score": f"{what}, {look}", "value": float(value), "n": found.n}
+            for what, value in values.items()
+        ]
     rows.append({"score": "codes", "value": float(found.codes), "n": found.codes})
     return rows
 
 
 def score_generator(
-    pipeline: Pipeline, towers: Towers, old: Manifest, new: Manifest, folder: Path, cache: Path, progress: Progress
+    pipeline: TactilePipeline,
+    encoders: EncoderSet,
+    old: Manifest,
+    new: Manifest,
+    folder: Path,
+    cache: Path,
+    progress: Progress,
 ) -> Rows:
     """TMMD, material accuracy and the pairwise metrics of touches for photos of the new world, beside the controls."""
     step = max(1, len(new) // GENERATED)
     test, train = new.take(new.ids[::step]), old.take(old.ids[::EVERY])
     joined = Manifest.join(train.prefixed("train/"), test)
     split = Split.from_ids(
-        train=[f"train/{i}" for i in train.ids], test=test.ids, rule={"name": "old and new world"}, manifest=joined.digest
+        train=[f"train/{i}" for i in train.ids],
+        test=test.ids,
+        rule={"name": "old and new world"},
+        manifest=joined.digest,
     )
     made = generate(
-        pipeline, manifest=joined.part(split, "test"), out=folder / f"touches-{pipeline.digest[:12]}", seed=0, progress=progress
+        pipeline,
+        manifest=joined.part(split, "test"),
+        out=folder / f"touches-{pipeline.digest[:12]}",
+        seed=0,
+        progress=progress,
     )
-    scores = score_generated(joined, split, {"generated": made}, towers, presets=("grouped",), cache=cache, progress=progress)
+    scores = score_generated(
+        joined,
+        split,
+        {"generated": made},
+        encoders,
+        presets=("grouped",),
+        cache=cache,
+        progress=progress,
+    )
     kept = ("TMMD", "material accuracy", "SSIM", "PSNR")
-    return [_row(f"{s.metric}, {s.subject}", s, s.n) for s in scores if s.metric in kept and s.value is not None]
+    return [
+        _row(f"{s.metric}, {s.subject}", s, s.n)
+        for s in scores
+        if s.metric in kept and s.value is not None
+    ]
 
 
 def _row(name: str, score: Score, n: int) -> dict[str, Any]:

@@ -20,7 +20,9 @@ from palpate.leakage.splits.noleak import load_record, make_record, verify_recor
 
 def main() -> int:
     """Makes the record, says what was achieved, and writes or compares it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("lists", nargs=2, type=Path, metavar="LIST")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
@@ -34,11 +36,18 @@ def main() -> int:
             )
     sys.stdout.write(f"sha256 {record['sha256']}, {time.process_time() - start:.1f} CPU seconds\n")
     if options.output:
-        text = canonical_json(record).replace('"splits":', '\n"splits":').replace('{"bound"', '\n{"bound"') + "\n"
+        text = (
+            canonical_json(record)
+            .replace('"splits":', '\n"splits":')
+            .replace('{"bound"', '\n{"bound"')
+            + "\n"
+        )
         write_text(options.output, text)
         return 0
     same = load_record("touch-and-go") == record
-    sys.stdout.write("The shipped record is the same.\n" if same else "The shipped record differs.\n")
+    sys.stdout.write(
+        "The shipped record is the same.\n" if same else "The shipped record differs.\n"
+    )
     return 0 if same else 1
 
 

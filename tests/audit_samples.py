@@ -10,10 +10,12 @@ from palpate.core import Audit, Impact, ImpactRow, LeakPair, SampleRef, Signal
 
 #: Gaps of Touch and Go's own split, as `palpate audit` finds them.
 GAPS = {
-    "gap_min": 31, "gap_median": 304, "gap_max": 2485,
+    "gap_min": 31,
+    "gap_median": 304,
+    "gap_max": 2485,
     "gap_edges": [0, 1, 3, 10, 30, 60, 90, 150, 300, 600, 900, 1800, 2486],
     "gap_counts": [0, 0, 0, 0, 2400, 2210, 3500, 6590, 9012, 3001, 2115, 769],
-}  # fmt: skip
+}
 
 
 def relief(rng, side):
@@ -22,7 +24,11 @@ def relief(rng, side):
     a, b, phase = rng.uniform(5, 45), rng.uniform(5, 45), rng.uniform(0, 6)
     wave = np.sin(a * x + b * y + phase) * np.sin(b * x - a * y)
     light = np.stack([0.6 - 0.3 * y, 0.5 + 0.1 * x, 0.45 + 0.3 * y], axis=-1)
-    return (255 * (light + 0.1 * wave[..., None] * np.array([1, -0.4, -1]))).clip(0, 255).astype(np.uint8)
+    return (
+        (255 * (light + 0.1 * wave[..., None] * np.array([1, -0.4, -1])))
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
 
 
 def pictures(folder, n, side=128):
@@ -41,8 +47,18 @@ def pairs(names, n, *, start=0, gap=True, score=0.97, causes=("",), prefix="2022
         video = f"{prefix}{k % 7:02}_1137"
         other = video if gap else f"{prefix}{k % 7 + 8:02}_0842"
         test = SampleRef(f"{video}/{30 * k}", video, 30 * k, "wood", pick(0), pick(1))
-        train = SampleRef(f"{other}/{30 * k + 31 + k}", other, 31 * k + 31, "wood", pick(2), pick(3))
-        out.append(LeakPair(test, train, 31 + k if gap else None, round(score - 0.002 * k, 4), causes[k % len(causes)]))
+        train = SampleRef(
+            f"{other}/{30 * k + 31 + k}", other, 31 * k + 31, "wood", pick(2), pick(3)
+        )
+        out.append(
+            LeakPair(
+                test,
+                train,
+                31 + k if gap else None,
+                round(score - 0.002 * k, 4),
+                causes[k % len(causes)],
+            )
+        )
     return out
 
 
@@ -51,7 +67,13 @@ def histograms(rng, low, high, n=29879, bins=80):
     edges = np.linspace(0, 1, bins + 1)
     unrelated = np.histogram(rng.beta(low * 40, (1 - low) * 40, 12000), edges)[0]
     found = np.histogram(
-        np.concatenate([rng.beta(low * 30, (1 - low) * 30, int(0.8 * n)), rng.beta(high * 60, (1 - high) * 60, n - int(0.8 * n))]), edges
+        np.concatenate(
+            [
+                rng.beta(low * 30, (1 - low) * 30, int(0.8 * n)),
+                rng.beta(high * 60, (1 - high) * 60, n - int(0.8 * n)),
+            ]
+        ),
+        edges,
     )[0]
     return edges.round(6).tolist(), unrelated.tolist(), found.tolist()
 
@@ -63,26 +85,89 @@ def signals(names=(), worst=8):
     n = 29879
     return [
         Signal("identical sample", n, 12, 1.0, worst=pairs(names, min(worst, 3), score=1.0)),
-        Signal("identical bytes", n - 4, 40, 1.0, worst=pairs(names, min(worst, 4), start=400, gap=False, score=1.0), notes=["4 pictures could not be read."]),
-        Signal("shared video", n, 29597, 1.0),
-        Signal("time gap", 29597, 4610, 0.5, worst=pairs(names, worst, start=100, score=0.49), notes=["Flagged within 30 frames of a train frame."]),
-        Signal("near-duplicate vision", n, 5210, 0.8125, 0.001, *vision, {"content": 5210}, pairs(names, worst, start=200, gap=False, causes=("content",))),
         Signal(
-            "near-duplicate touch", n, 3601, 0.872, 0.001, *touch, {"content": 3601, "nothing touched": 1204, "sensor drift": 88},
-            pairs(names, worst, start=300, gap=False, causes=("content", "content", "nothing touched", "sensor drift")), ["Calibrated on 12,000 pairs of different videos."],
+            "identical bytes",
+            n - 4,
+            40,
+            1.0,
+            worst=pairs(names, min(worst, 4), start=400, gap=False, score=1.0),
+            notes=["4 pictures could not be read."],
         ),
-    ]  # fmt: skip
+        Signal("shared video", n, 29597, 1.0),
+        Signal(
+            "time gap",
+            29597,
+            4610,
+            0.5,
+            worst=pairs(names, worst, start=100, score=0.49),
+            notes=["Flagged within 30 frames of a train frame."],
+        ),
+        Signal(
+            "near-duplicate vision",
+            n,
+            5210,
+            0.8125,
+            0.001,
+            *vision,
+            {"content": 5210},
+            pairs(names, worst, start=200, gap=False, causes=("content",)),
+        ),
+        Signal(
+            "near-duplicate touch",
+            n,
+            3601,
+            0.872,
+            0.001,
+            *touch,
+            {"content": 3601, "nothing touched": 1204, "sensor drift": 88},
+            pairs(
+                names,
+                worst,
+                start=300,
+                gap=False,
+                causes=("content", "content", "nothing touched", "sensor drift"),
+            ),
+            ["Calibrated on 12,000 pairs of different videos."],
+        ),
+    ]
 
 
 def impact():
     """Two kinds of features, two classifiers; the last row has no intervals."""
     rows = [
-        ImpactRow("touch pixels", "1-NN", 0.714, 0.382, 0.332, (0.66, 0.765), (0.31, 0.455), (0.262, 0.401), 0.0526),
-        ImpactRow("touch pixels", "linear probe", 0.522, 0.347, 0.175, (0.47, 0.574), (0.283, 0.41), (0.102, 0.25), 0.0526),
+        ImpactRow(
+            "touch pixels",
+            "1-NN",
+            0.714,
+            0.382,
+            0.332,
+            (0.66, 0.765),
+            (0.31, 0.455),
+            (0.262, 0.401),
+            0.0526,
+        ),
+        ImpactRow(
+            "touch pixels",
+            "linear probe",
+            0.522,
+            0.347,
+            0.175,
+            (0.47, 0.574),
+            (0.283, 0.41),
+            (0.102, 0.25),
+            0.0526,
+        ),
         ImpactRow("touch minus background", "1-NN", 0.61, 0.401, 0.209, None, None, None, 0.0526),
     ]
     headline = "A 1-NN on touch pixels reaches 71.4 % under this split and 38.2 % without the leak: it costs 33.2 points [26.2, 40.1]."
-    return Impact(rows, headline, "video", ["c0" * 32, "c1" * 32], {"size": 32, "seeds": [0, 1]}, ["Nothing is whitened."])
+    return Impact(
+        rows,
+        headline,
+        "video",
+        ["c0" * 32, "c1" * 32],
+        {"size": 32, "seeds": [0, 1]},
+        ["Nothing is whitened."],
+    )
 
 
 def matrix(n=60):
@@ -91,18 +176,49 @@ def matrix(n=60):
     for k in range(n):
         shared = k < 0.8 * n
         test = 610 - 9 * k if shared else 0
-        rows.append({"group": f"20220607_13{k:04}", "train": 1800 - 20 * k if k % 10 else 90, "val": 0, "test": test, "leaking": test})
+        rows.append(
+            {
+                "group": f"20220607_13{k:04}",
+                "train": 1800 - 20 * k if k % 10 else 90,
+                "val": 0,
+                "test": test,
+                "leaking": test,
+            }
+        )
     return rows
 
 
 def full_audit(names=(), **changes):
     """Touch and Go's own split with every signal, an impact and a matrix."""
     audit = Audit(
-        "Orig", "video", 91982, 29879, 120, 106, 100, 29597, 0.99056, 12, **GAPS, worst=pairs(names, 8),
-        materials=[{"material": m, "train": 4600, "test": 1500, "groups_train": 9, "groups_test": 7} for m in ("brick", "grass", "wood")],
-        notes=["2 test samples have no video."], split="9f" * 32, signals=signals(names), leaking_samples=29611, matrix=matrix(), groups_in_all=126,
-        impact=impact(), commands=["palpate split data/manifest.parquet --by video --near both -o noleak.json", "palpate audit data/manifest.parquet --split noleak.json"],
-    )  # fmt: skip
+        "Orig",
+        "video",
+        91982,
+        29879,
+        120,
+        106,
+        100,
+        29597,
+        0.99056,
+        12,
+        **GAPS,
+        worst=pairs(names, 8),
+        materials=[
+            {"material": m, "train": 4600, "test": 1500, "groups_train": 9, "groups_test": 7}
+            for m in ("brick", "grass", "wood")
+        ],
+        notes=["2 test samples have no video."],
+        split="9f" * 32,
+        signals=signals(names),
+        leaking_samples=29611,
+        matrix=matrix(),
+        groups_in_all=126,
+        impact=impact(),
+        commands=[
+            "palpate split data/manifest.parquet --by video --near both -o noleak.json",
+            "palpate audit data/manifest.parquet --split noleak.json",
+        ],
+    )
     return dataclasses.replace(audit, **changes)
 
 
@@ -110,7 +226,20 @@ def clean_audit(**changes):
     """A split in which nothing was found."""
     found = [Signal("identical sample", 24000, 0, 1.0), Signal("shared video", 24000, 0, 1.0)]
     audit = Audit(
-        "NoLeak", "video", 97000, 24000, 101, 25, 0, 0, 0.0, 0, split="5b" * 32, signals=found, groups_in_all=126, matrix=matrix(4)[:1]
+        "NoLeak",
+        "video",
+        97000,
+        24000,
+        101,
+        25,
+        0,
+        0,
+        0.0,
+        0,
+        split="5b" * 32,
+        signals=found,
+        groups_in_all=126,
+        matrix=matrix(4)[:1],
     )
     return dataclasses.replace(audit, **changes)
 
@@ -118,10 +247,30 @@ def clean_audit(**changes):
 def pretraining_audit(names=()):
     """The test part against data that an encoder has seen."""
     found = [
-        Signal("identical bytes", 24000, 310, 1.0, worst=pairs(names, 3, gap=False, score=1.0, prefix="ssvtp_")),
+        Signal(
+            "identical bytes",
+            24000,
+            310,
+            1.0,
+            worst=pairs(names, 3, gap=False, score=1.0, prefix="ssvtp_"),
+        ),
         Signal("shared video", 0, 0, 1.0),
     ]
-    return Audit("pretrain.csv / test", "none", 4500, 24000, 0, 0, 0, 0, 0.0, 0, against="pretraining", signals=found, leaking_samples=310)
+    return Audit(
+        "pretrain.csv / test",
+        "none",
+        4500,
+        24000,
+        0,
+        0,
+        0,
+        0,
+        0.0,
+        0,
+        against="pretraining",
+        signals=found,
+        leaking_samples=310,
+    )
 
 
 def many_names(folder, sources, n):

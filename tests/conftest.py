@@ -14,8 +14,13 @@ from palpate.data.manifest import Manifest
 TOP = Path(__file__).resolve().parents[1]
 CHROMIUM = Path(os.environ.get("PALPATE_CHROMIUM", "/usr/bin/chromium"))
 ARGS = [
-    "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
-]  # fmt: skip
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+]
 
 
 def shared_data() -> Path | None:
@@ -47,10 +52,19 @@ def small_manifest(tmp_path: Path) -> Manifest:
                     path = tmp_path / "root" / f"v{v}" / kind / f"{frame}.png"
                     path.parent.mkdir(parents=True, exist_ok=True)
                     base = 40 * (v % 3) + 20 if kind != "background" else 100
-                    Image.fromarray((base + rng.integers(0, 30, (32, 32, 3))).astype(np.uint8)).save(path)
+                    Image.fromarray(
+                        (base + rng.integers(0, 30, (32, 32, 3))).astype(np.uint8)
+                    ).save(path)
                     paths[kind] = path.relative_to(tmp_path / "root").as_posix()
                 rows.append(
-                    {"id": f"v{v}/{frame}", "video": f"v{v}", "frame": frame, "touch": f"v{v}#{touch}", "material": material, **paths}
+                    {
+                        "id": f"v{v}/{frame}",
+                        "video": f"v{v}",
+                        "frame": frame,
+                        "contact": f"v{v}#{touch}",
+                        "material": material,
+                        **paths,
+                    }
                 )
     return Manifest.from_rows(rows, tmp_path / "root")
 

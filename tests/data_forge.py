@@ -22,14 +22,29 @@ def picture(k: int, size: int = SIZE) -> np.ndarray:
 def number(array: np.ndarray) -> int:
     """The number drawn by :func:`picture`."""
     size = array.shape[1]
-    return sum(1 << bit for bit in range(8) if array[:, bit * size // 8 + 2 : (bit + 1) * size // 8 - 2].mean() > 115)
+    return sum(
+        1 << bit
+        for bit in range(8)
+        if array[:, bit * size // 8 + 2 : (bit + 1) * size // 8 - 2].mean() > 115
+    )
 
 
-def write_video(path: Path, count: int, *, start: int = 0, codec: str = "libx264", gop: int = 12, b_frames: int = 3, options=None) -> Path:
+def write_video(
+    path: Path,
+    count: int,
+    *,
+    start: int = 0,
+    codec: str = "libx264",
+    gop: int = 12,
+    b_frames: int = 3,
+    options=None,
+) -> Path:
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w", options={"movflags": "faststart"} if path.suffix == ".mp4" else {}) as out:
+    with av.open(
+        str(path), "w", options={"movflags": "faststart"} if path.suffix == ".mp4" else {}
+    ) as out:
         stream = out.add_stream(codec, rate=30)
         stream.width = stream.height = SIZE
         stream.pix_fmt = "yuv420p"
@@ -57,7 +72,9 @@ def write_frames(folder: Path, count: int) -> None:
 
 def tree(folder: Path) -> set[str]:
     """All files and folders below ``folder``."""
-    return {p.relative_to(folder).as_posix() for p in folder.rglob("*")} if folder.exists() else set()
+    return (
+        {p.relative_to(folder).as_posix() for p in folder.rglob("*")} if folder.exists() else set()
+    )
 
 
 @dataclass(frozen=True)
@@ -68,7 +85,7 @@ class Forged:
         source: what a user would name: a folder or a table.
         samples: how many samples an import must find in it.
         options: options of the import that it needs; paths below the folder follow a copied tree.
-        auto: whether the format must be recognised by look; False only where nothing on disk tells it (a remote name).
+        auto: whether the format must be recognized by look; False only where nothing on disk tells it (a remote name).
         remove: takes away what one sample needs, given the source; default: deletes the touch image of the last sample.
         cut: spoils it instead; default: cuts that file in half.
     """

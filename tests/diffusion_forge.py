@@ -1,4 +1,4 @@
-"""A small untrained pipeline whose vision tower is a few lines of arithmetic."""
+"""A small untrained pipeline whose vision encoder is a few lines of arithmetic."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import torch
 from palpate.diffusion.autoencoder_training import build_autoencoder
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, build_unet
 from palpate.diffusion.latents import LatentStats
-from palpate.diffusion.pipeline import Pipeline
+from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import TINY
 
 
-class StandInTowers:
-    """A vision tower that embeds a photo's mean colour and contrast: 6 numbers, normalised."""
+class StandInEncoders:
+    """A vision encoder that embeds a photo's mean color and contrast: 6 numbers, normalized."""
 
     dim, device = 6, torch.device("cpu")
 
@@ -25,22 +25,24 @@ class StandInTowers:
         def crop(self, x):
             return x
 
-        def normalise(self, x):
+        def normalize(self, x):
             return x - 0.5
 
-    def preprocess(self, tower):
-        assert tower == "vision"
+    def preprocess(self, encoder):
+        assert encoder == "vision"
         return self._Transform()
 
-    def encode(self, tower, pixels):
+    def encode(self, encoder, pixels):
         values = torch.cat([pixels.mean((2, 3)), pixels.std((2, 3))], dim=1)
         return torch.nn.functional.normalize(values, dim=1)
 
-    def digest(self, tower):
-        return f"stand-in {tower}"
+    def digest(self, encoder):
+        return f"stand-in {encoder}"
 
 
-def make_pipeline(*, background: bool = False, policy: ConditionPolicy | None = None, width: int = 6) -> Pipeline:
+def make_pipeline(
+    *, background: bool = False, policy: ConditionPolicy | None = None, width: int = 6
+) -> TactilePipeline:
     """An untrained pipeline of 32 px touches."""
     torch.manual_seed(0)
     assert TINY.autoencoder is not None
@@ -51,7 +53,14 @@ def make_pipeline(*, background: bool = False, policy: ConditionPolicy | None = 
         if "attn2" in name:
             p.data.mul_(4)
     stats = LatentStats((0.1, 0.0, -0.1), (0.5, 0.6, 0.7))
-    return Pipeline(
-        build_autoencoder(TINY.autoencoder).eval(), Denoiser(unet, policy).eval(), stats, TINY.schedule, TINY.sampler, 32,
-        towers=StandInTowers(), preset="tiny", training={"steps": 0, "split": None},
-    )  # fmt: skip
+    return TactilePipeline(
+        build_autoencoder(TINY.autoencoder).eval(),
+        Denoiser(unet, policy).eval(),
+        stats,
+        TINY.schedule,
+        TINY.sampler,
+        32,
+        encoders=StandInEncoders(),
+        preset="tiny",
+        training={"steps": 0, "split": None},
+    )

@@ -10,7 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from data_forge import Forged, write_image
-from formats_forge import forge_objectfolder, forge_objectfolder_generation, forge_tarf, forge_visgel, forge_ycb_slide
+from formats_forge import (
+    forge_objectfolder,
+    forge_objectfolder_generation,
+    forge_tarf,
+    forge_visgel,
+    forge_ycb_slide,
+)
 from generic_forge import forge_hf, forge_intervals
 from palpate.data.listing import write_list
 from tvl_forge import forge_hct, forge_ssvtp

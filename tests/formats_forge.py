@@ -32,17 +32,23 @@ def forge_tarf(folder: Path) -> Forged:
         names = [f"{side}/{scene}_40_30/{k}.jpg" for scene, k in pairs]
         write_pictures(root, names, 1 if side == "touch" else 33)
     write_pictures(root, [f"vision/{scene}_80_60/{k}.jpg" for scene, k in pairs], 65)
-    write_pictures(root, ["touch_bg/bench_outdoor_1_colmap_40_50/bg.jpg", "touch_bg/office_1_40_30/bg.jpg"], 97)
+    write_pictures(
+        root, ["touch_bg/bench_outdoor_1_colmap_40_50/bg.jpg", "touch_bg/office_1_40_30/bg.jpg"], 97
+    )
     (root / "depth" / "bench_40_30").mkdir(parents=True)
     (root / "depth" / "bench_40_30" / "0.npy").write_bytes(b"never read")
-    lists = {"train": [["bench_40_30", str(k)] for k in range(4)], "val": [["bench_40_30", "4"]], "test": []}
+    lists = {
+        "train": [["bench_40_30", str(k)] for k in range(4)],
+        "val": [["bench_40_30", "4"]],
+        "test": [],
+    }
     lists["test"] = [["office_1_40_30", str(k)] for k in frames["office_1"]]
     (root / "split_interval.json").write_text(json.dumps(lists))
     return Forged(root, 10)
 
 
 def visgel_line(place: str, recording: str, k: int, way: str) -> str:
-    """One line of a list; a neighbour before the first frame is the first."""
+    """One line of a list; a neighbor before the first frame is the first."""
 
     def path(side, number):
         return f"{place}/{side}/{recording}/frame{number:04d}.jpg"
@@ -55,13 +61,19 @@ def visgel_line(place: str, recording: str, k: int, way: str) -> str:
 def forge_visgel(folder: Path) -> Forged:
     """Two recordings of seen and one of unseen objects, six frames after the reference, three of them listed, and the four lists."""
     root = folder / "visgel"
-    recordings = [("data/data_seen", "1/rec_a"), ("data/data_seen", "10/rec_a"), ("data/data_unseen", "2/rec_b")]
+    recordings = [
+        ("data/data_seen", "1/rec_a"),
+        ("data/data_seen", "10/rec_a"),
+        ("data/data_unseen", "2/rec_b"),
+    ]
     numbers = count(1)
     for (place, recording), side in product(recordings, ("touch", "vision")):
         for k in range(7):
             write_image(root / place / side / recording / f"frame{k:04d}.jpg", next(numbers))
     (root / "data_lst").mkdir()
-    for way, (part, those) in product(("vision2touch", "touch2vision"), (("train", recordings[:2]), ("eval", recordings[2:]))):
+    for way, (part, those) in product(
+        ("vision2touch", "touch2vision"), (("train", recordings[:2]), ("eval", recordings[2:]))
+    ):
         lines = [visgel_line(*recording, k, way) for recording in those for k in (2, 3, 4)]
         (root / "data_lst" / f"{part}_{way}.txt").write_text("\n".join(lines))
     return Forged(root, 9)
@@ -70,15 +82,24 @@ def forge_visgel(folder: Path) -> Forged:
 def forge_visgel_recordings(folder: Path) -> Forged:
     """The tree that T3 reads: touch alone, two recordings of four frames, the first of which is the reference."""
     root = folder / "data_seen"
-    write_pictures(root, [f"{rec}/frame{k:04d}.jpg" for rec in ("2/rec", "10/rec") for k in range(4)])
+    write_pictures(
+        root, [f"{rec}/frame{k:04d}.jpg" for rec in ("2/rec", "10/rec") for k in range(4)]
+    )
     return Forged(root, 6)
 
 
 def forge_objectfolder(folder: Path) -> Forged:
     """Objects 2, 10 and 17 with trials of five, three and two pictures, and the table of materials."""
     root = folder / "objectfolder"
-    trials = {"2/tactile_data/1": range(5), "2/tactile_data/2": range(9, 12), "10/tactile_data/1": range(3), "17/tactile_data/3": range(2)}
-    write_pictures(root, [f"{trial}/0/gelsight/{k}.png" for trial, frames in trials.items() for k in frames])
+    trials = {
+        "2/tactile_data/1": range(5),
+        "2/tactile_data/2": range(9, 12),
+        "10/tactile_data/1": range(3),
+        "17/tactile_data/3": range(2),
+    }
+    write_pictures(
+        root, [f"{trial}/0/gelsight/{k}.png" for trial, frames in trials.items() for k in frames]
+    )
     write_image(root / "2/tactile_data/1/0/gelsight/3.jpg", 99)  # T3's copy
     (root / "objectfolder_real_metadata.csv").write_text(METADATA)
     last = "17/tactile_data/3/0/gelsight"  # a lone missing picture leaves no trace; a missing trial does
@@ -97,7 +118,10 @@ def forge_objectfolder_generation(folder: Path) -> Forged:
         "val": [[o, 12] for o in objects],
         "test": [[o, 100] for o in objects],
     }
-    thing = {part: [[o, c] for c in contacts] for part, o in zip(("train", "val", "test"), objects, strict=True)}
+    thing = {
+        part: [[o, c] for c in contacts]
+        for part, o in zip(("train", "val", "test"), objects, strict=True)
+    }
     (root / "cross_contact.json").write_text(json.dumps(contact))
     (root / "cross_object.json").write_text(json.dumps(thing))
     return Forged(root, 12)
@@ -108,7 +132,9 @@ def forge_ycb_slide(folder: Path) -> Forged:
     root = folder / "ycb"
     logs = [f"real/{o}/dataset_{k}" for o, k in product(("004_sugar_box", "055_baseball"), (0, 4))]
     for side, start in (("frames", 1), ("webcam_frames", 33)):
-        write_pictures(root, [f"{log}/{side}/frame_{k:07d}.jpg" for log in logs for k in (0, 1, 2)], start)
+        write_pictures(
+            root, [f"{log}/{side}/frame_{k:07d}.jpg" for log in logs for k in (0, 1, 2)], start
+        )
     for log in logs:
         (root / log / "digit_data.npy").write_bytes(b"a pickle, never opened")
     write_pictures(root, [f"sim/025_mug/03/tactile_images/{k}.jpg" for k in (0, 1)], 65)
@@ -122,7 +148,9 @@ def imported(forge, tmp_path, **options):
 
 
 def row(found, i):
-    return {k: v for k, v in found.manifest.take([i]).table.row(0, named=True).items() if v is not None}
+    return {
+        k: v for k, v in found.manifest.take([i]).table.row(0, named=True).items() if v is not None
+    }
 
 
 def drawn(found, column):

@@ -31,10 +31,15 @@ def save_hf(folder: Path, rows: list[dict], **kinds) -> Path:
 
     features = datasets.Features({n: kinds.get(n, datasets.Value("string")) for n in rows[0]})
     datasets.disable_progress_bars()
-    by_part = {part: [r for r in rows if r["part"] == part] for part in sorted({r["part"] for r in rows})}
+    by_part = {
+        part: [r for r in rows if r["part"] == part] for part in sorted({r["part"] for r in rows})
+    }
     datasets.DatasetDict(
-        {part: datasets.Dataset.from_list(some, features=features) for part, some in by_part.items()}
-    ).save_to_disk(str(folder))  # fmt: skip
+        {
+            part: datasets.Dataset.from_list(some, features=features)
+            for part, some in by_part.items()
+        }
+    ).save_to_disk(str(folder))
     return folder
 
 
@@ -42,7 +47,11 @@ def hf_rows(folder: Path) -> list[dict]:
     """Eight rows of two parts, with images, a class label and a path."""
     rows = []
     for k in range(8):
-        row = {"part": "train" if k < 5 else "validation", "path": f"data1/0-17.{k // 4}/{k:04d}.jpg", "kind": k % 2}
+        row = {
+            "part": "train" if k < 5 else "validation",
+            "path": f"data1/0-17.{k // 4}/{k:04d}.jpg",
+            "kind": k % 2,
+        }
         for side, suffix in (("rgb", ".png"), ("gel", ".jpg")):
             path = folder / f"{side}{k}{suffix}"
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,9 +66,19 @@ def forge_hf(folder: Path) -> Forged:
     """A folder of ``save_to_disk`` with two images a row, class labels and parts."""
     import datasets
 
-    kinds = {"rgb": datasets.Image(), "gel": datasets.Image(), "kind": datasets.ClassLabel(names=["Wood", "Rock"])}
+    kinds = {
+        "rgb": datasets.Image(),
+        "gel": datasets.Image(),
+        "kind": datasets.ClassLabel(names=["Wood", "Rock"]),
+    }
     rows = hf_rows(folder)
-    maps = {"vision": "rgb", "tactile": "gel", "video": "parent(path)", "frame": "stem(gel)", "material": "kind"}
+    maps = {
+        "vision": "rgb",
+        "tactile": "gel",
+        "video": "parent(path)",
+        "frame": "stem(gel)",
+        "material": "kind",
+    }
 
     def again(change):
         def spoil(source: Path) -> None:

@@ -37,7 +37,9 @@ class Leaky:
 
 def changed(picture: np.ndarray, how: str, rng: np.random.Generator) -> np.ndarray:
     """A crop of a picture with margin: brightness times 0.95 to 1.05, moved by up to 4 pixels along each axis."""
-    moves = [(y, x) for y in range(-MARGIN, MARGIN + 1) for x in range(-MARGIN, MARGIN + 1) if y or x]
+    moves = [
+        (y, x) for y in range(-MARGIN, MARGIN + 1) for x in range(-MARGIN, MARGIN + 1) if y or x
+    ]
     down, right = moves[int(rng.integers(len(moves)))] if "shift" in how else (0, 0)
     out = crop(picture, down, right).astype(np.float32)
     if "brightness" in how:
@@ -52,26 +54,30 @@ def crop(picture: np.ndarray, down: int = 0, right: int = 0) -> np.ndarray:
 
 def save(path: Path, picture: np.ndarray, quality: int = 95) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture).save(path, "JPEG", quality=quality, subsampling=0 if quality == 95 else 2)
+    Image.fromarray(picture).save(
+        path, "JPEG", quality=quality, subsampling=0 if quality == 95 else 2
+    )
 
 
 class NoiseVideo:
-    """Smooth random fields: a photo of them, and their relief lit from three sides on a gel of smooth colours."""
+    """Smooth random fields: a photo of them, and their relief lit from three sides on a gel of smooth colors."""
 
     def __init__(self, rng: np.random.Generator, size: int):
         self.rng, self.size = rng, size
         self.gel = 110 + 20 * np.tanh(np.stack([self._field(size / 3) for _ in range(3)], -1))
-        self.scale, self.colour = rng.uniform(2, 8) * size / 128, rng.uniform(40, 200, 3)
+        self.scale, self.color = rng.uniform(2, 8) * size / 128, rng.uniform(40, 200, 3)
         self.frames: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def _field(self, sigma: float) -> np.ndarray:
-        x = ndimage.gaussian_filter(self.rng.standard_normal((self.size, self.size)), sigma, mode="wrap")
+        x = ndimage.gaussian_filter(
+            self.rng.standard_normal((self.size, self.size)), sigma, mode="wrap"
+        )
         return x / x.std()
 
     def render(self, touch: int) -> tuple[np.ndarray, np.ndarray]:
         if touch not in self.frames:
             coarse, fine = self._field(3 * self.scale), self._field(self.scale)
-            photo = self.colour * (1 + 0.25 * coarse + 0.15 * fine)[..., None]
+            photo = self.color * (1 + 0.25 * coarse + 0.15 * fine)[..., None]
             y, x = np.mgrid[-1 : 1 : self.size * 1j, -1 : 1 : self.size * 1j]
             middle = self.rng.uniform(-0.3, 0.3, 2)
             pad = np.clip(3 - 4 * np.hypot(y - middle[0], x - middle[1]), 0, 1)
@@ -95,22 +101,54 @@ class NoiseVideo:
 
 
 def forge(
-    root: Path, seed: int, *, size: int = 128, objects: int = 6, materials: tuple[str, ...] = MATERIALS, look: str = "gelsight", planted: float = 0.25,
+    root: Path,
+    seed: int,
+    *,
+    size: int = 128,
+    objects: int = 6,
+    materials: tuple[str, ...] = MATERIALS,
+    look: str = "gelsight",
+    planted: float = 0.25,
     kinds: tuple[str, ...] = KINDS,
-) -> Leaky:  # fmt: skip
+) -> Leaky:
     """Writes pictures below ``root``: ``objects`` videos of each material of the world and a quarter as many of noise, 4 touches each, 40 % of the videos in test."""
     rng = np.random.default_rng([seed, 7])
     options = WorldOptions(
-        seed=seed, size=size + 2 * MARGIN, materials=materials, objects_per_material=objects, touches_per_video=4, frames_per_touch=4,
-        free_written="background", look=look, mixed=0.0,
-    )  # fmt: skip
+        seed=seed,
+        size=size + 2 * MARGIN,
+        materials=materials,
+        objects_per_material=objects,
+        touches_per_video=4,
+        frames_per_touch=4,
+        free_written="background",
+        look=look,
+        mixed=0.0,
+    )
     samples: list[dict] = []
     pictures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     worlds = [Video(options, plan) for plan in plan_world(options)]
-    noises = [NoiseVideo(np.random.default_rng([seed, k]), size + 2 * MARGIN) for k in range(len(worlds) // 4)]
+    noises = [
+        NoiseVideo(np.random.default_rng([seed, k]), size + 2 * MARGIN)
+        for k in range(len(worlds) // 4)
+    ]
 
-    def add(name: str, touch: int, frame: int, photo: np.ndarray, tactile: np.ndarray, background: np.ndarray, material: str) -> dict:
-        row = {"id": f"{name}/{frame}", "video": name, "frame": frame, "touch": f"{name}#{touch}", "material": material, "sensor": "gel"}
+    def add(
+        name: str,
+        touch: int,
+        frame: int,
+        photo: np.ndarray,
+        tactile: np.ndarray,
+        background: np.ndarray,
+        material: str,
+    ) -> dict:
+        row = {
+            "id": f"{name}/{frame}",
+            "video": name,
+            "frame": frame,
+            "contact": f"{name}#{touch}",
+            "material": material,
+            "sensor": "gel",
+        }
         for kind, picture in (("vision", photo), ("tactile", tactile), ("background", background)):
             row[kind] = f"{name}/{kind}/{frame}.jpg"
             save(root / row[kind], crop(picture))
@@ -121,16 +159,36 @@ def forge(
         for t in range(4):
             first = t * (options.free_frames + 4) + options.free_frames
             background = world.tactile(first - 4)
-            row = add(world.plan.name, t, first, world.vision(first), world.tactile(first), background, world.plan.objects[0].material)
+            row = add(
+                world.plan.name,
+                t,
+                first,
+                world.vision(first),
+                world.tactile(first),
+                background,
+                world.plan.objects[0].material,
+            )
             samples.append({**row, "later": (world, first + 3, background)})
     for k, noise in enumerate(noises):
         for t in range(4):
-            samples.append(add(f"noise{k:03d}", t, 10 * t, noise.photo(t), noise.touch(t), noise.background(), "noise"))
+            samples.append(
+                add(
+                    f"noise{k:03d}",
+                    t,
+                    10 * t,
+                    noise.photo(t),
+                    noise.touch(t),
+                    noise.background(),
+                    "noise",
+                )
+            )
     videos = sorted({s["video"] for s in samples})
     in_test = {videos[k] for k in rng.permutation(len(videos))[: round(0.4 * len(videos))]}
     train = [s for s in samples if s["video"] not in in_test]
     test = [s for s in samples if s["video"] in in_test]
-    out = Leaky(Manifest.from_rows([], root), Manifest.from_rows([], root), {kind: {} for kind in KINDS})
+    out = Leaky(
+        Manifest.from_rows([], root), Manifest.from_rows([], root), {kind: {} for kind in KINDS}
+    )
     count = round(planted * len(test))
     free = [int(k) for k in rng.permutation(len(test))]
     sources = [train[int(k)] for k in rng.permutation(len(train))]
@@ -143,7 +201,11 @@ def forge(
         out.planted["near-duplicate"][row["id"]], out.change[row["id"]] = source["id"], how
     for kind in [k for k in KINDS[1:] if k in kinds]:
         for _ in range(max(2, count // 6)):
-            source = sources.pop() if kind != "time gap" else sources.pop(next(k for k, s in enumerate(sources) if "later" in s))
+            source = (
+                sources.pop()
+                if kind != "time gap"
+                else sources.pop(next(k for k, s in enumerate(sources) if "later" in s))
+            )
             if kind == "identical sample":
                 row = dict(source)
             elif kind == "identical bytes":
@@ -153,17 +215,36 @@ def forge(
                     (root / row[column]).write_bytes((root / source[column]).read_bytes())
                 row["background"] = source["background"]
             elif kind == "shared video":
-                row = {**test[free.pop()], "video": source["video"], "frame": source["frame"] + 5000}
+                row = {
+                    **test[free.pop()],
+                    "video": source["video"],
+                    "frame": source["frame"] + 5000,
+                }
                 test.remove(next(s for s in test if s["id"] == row["id"]))
-                free = [k for k in range(len(test)) if test[k]["id"] not in {i for p in out.planted.values() for i in p}]
+                free = [
+                    k
+                    for k in range(len(test))
+                    if test[k]["id"] not in {i for p in out.planted.values() for i in p}
+                ]
                 free = [int(k) for k in rng.permutation(free)]
             else:
                 world, frame, background = source["later"]
-                row = add(source["video"], 0, frame, world.vision(frame), world.tactile(frame), background, source["material"])
+                row = add(
+                    source["video"],
+                    0,
+                    frame,
+                    world.vision(frame),
+                    world.tactile(frame),
+                    background,
+                    source["material"],
+                )
             if kind != "identical bytes":
                 test.append(row)
                 free = [k for k in free if k != len(test) - 1]
             out.planted[kind][row["id"]] = source["id"]
     clean = lambda rows: [{k: v for k, v in r.items() if k != "later"} for r in rows]  # noqa: E731
-    out.train, out.test = Manifest.from_rows(clean(train), root), Manifest.from_rows(clean(test), root)
+    out.train, out.test = (
+        Manifest.from_rows(clean(train), root),
+        Manifest.from_rows(clean(test), root),
+    )
     return out

@@ -4,7 +4,13 @@ from pathlib import Path
 
 import torch
 
-SHAPES = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+SHAPES = {
+    0: (64, 3, 11, 11),
+    3: (192, 64, 5, 5),
+    6: (384, 192, 3, 3),
+    8: (256, 384, 3, 3),
+    10: (256, 256, 3, 3),
+}
 
 
 def random_states() -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
@@ -20,9 +26,13 @@ def random_states() -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
     return backbone, heads
 
 
-def save_states(states: tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]], folder: Path) -> tuple[Path, Path]:
+def save_states(
+    states: tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]], folder: Path
+) -> tuple[Path, Path]:
     """Backbone and heads as files."""
     places = folder / "alexnet-owt-7be5be79.pth", folder / "alex.pth"
     torch.save(states[0], places[0])
-    torch.save(states[1], places[1], _use_new_zipfile_serialization=False)  # the published file is of the old format
+    torch.save(
+        states[1], places[1], _use_new_zipfile_serialization=False
+    )  # the published file is of the old format
     return places

@@ -15,4 +15,6 @@ def score(capsys, *args):
     status, out, err = call(capsys, *args, "--json")
     assert status == 0, err
     data = json.loads(out)
-    return {(s["metric"], s["subject"], s["settings"].get("preset")): s for s in data["scores"]}, data
+    return {
+        (s["metric"], s["subject"], s["settings"].get("preset")): s for s in data["scores"]
+    }, data

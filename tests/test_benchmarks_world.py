@@ -17,9 +17,18 @@ from palpate.sim import Video, WorldOptions, plan_world
 from palpate.sim.plan import contact_frames
 
 OPTIONS = WorldOptions(
-    seed=5, size=32, tile=128, materials=("Wood", "Brick", "Leather", "Grass"), objects_per_material=3, two_videos=0.5, mixed=0.3, sensors=2,
-    touches_per_video=3, frames_per_touch=3, free_written="background",
-)  # fmt: skip
+    seed=5,
+    size=32,
+    tile=128,
+    materials=("Wood", "Brick", "Leather", "Grass"),
+    objects_per_material=3,
+    two_videos=0.5,
+    mixed=0.3,
+    sensors=2,
+    touches_per_video=3,
+    frames_per_touch=3,
+    free_written="background",
+)
 
 
 @pytest.fixture(scope="module")
@@ -36,18 +45,28 @@ def test_rendered_frames_are_the_worlds_in_order(frames):
     np.testing.assert_array_equal(frames.vision[row], video.vision(first))
     np.testing.assert_array_equal(frames.touch[row], video.tactile(first))
     np.testing.assert_array_equal(frames.background[row], video.tactile(first - 4))
-    assert (frames.material[row], frames.video[row]) == (plans[4].object_of(1).material, plans[4].name)
+    assert (frames.material[row], frames.video[row]) == (
+        plans[4].object_of(1).material,
+        plans[4].name,
+    )
     assert frames.thing[row] == plans[4].objects[0].name
 
 
 @pytest.mark.parametrize("protocol", protocols.PROTOCOLS)
 def test_a_cut_keeps_its_units_whole_and_only_its_units(frames, protocol):
     folds = [protocols.cut(frames, protocol, 3, fold) for fold in range(protocols.FOLDS)]
-    assert sorted(row for _, test in folds for row in test) == list(range(len(frames.ids)))  # every frame is tested once
+    assert sorted(row for _, test in folds for row in test) == list(
+        range(len(frames.ids))
+    )  # every frame is tested once
     train, test = folds[1]
     assert sorted([*train, *test]) == list(range(len(frames.ids)))
     assert 0.1 < len(test) / len(frames.ids) < 0.45
-    units = {"frame": frames.ids, "touch": frames.contact, "video": frames.video, "object": frames.thing}
+    units = {
+        "frame": frames.ids,
+        "touch": frames.contact,
+        "video": frames.video,
+        "object": frames.thing,
+    }
     order = list(units)
     shared = {name: set(column[train]) & set(column[test]) for name, column in units.items()}
     for name in order:
@@ -93,7 +112,9 @@ def test_classifiers_find_a_planted_class_and_not_noise():
     labels, groups = np.repeat(["a", "b"], 60), np.repeat([f"v{k}" for k in range(24)], 5)
     planted = rng.standard_normal((120, 6)).astype(np.float32)
     planted[:, 0] += 6 * (labels == "a")
-    side = lambda x, rows: protocols.FeatureSet([str(k) for k in rows], x[rows], list(labels[rows]), list(groups[rows]), "e")  # noqa: E731
+    side = lambda x, rows: protocols.FeatureSet(
+        [str(k) for k in rows], x[rows], list(labels[rows]), list(groups[rows]), "e"
+    )
     train, test = np.arange(0, 120, 2), np.arange(1, 120, 2)
     hit, penalty = protocols.logistic(side(planted, train), side(planted, test), seed=0)
     assert hit.mean() > 0.95
@@ -102,23 +123,43 @@ def test_classifiers_find_a_planted_class_and_not_noise():
     assert protocols.logistic(side(noise, train), side(noise, test), seed=0)[0].mean() < 0.75
     unit = noise / np.linalg.norm(noise, axis=1, keepdims=True)  # as patch words are
     best = [int(np.argmin(((unit[train] - row) ** 2).sum(axis=1))) for row in unit[test]]
-    np.testing.assert_array_equal(protocols.nearest(side(unit, train), side(unit, test)), labels[train][best] == labels[test])
+    np.testing.assert_array_equal(
+        protocols.nearest(side(unit, train), side(unit, test)), labels[train][best] == labels[test]
+    )
 
 
 def test_folds_are_combined_over_their_frames_and_videos():
     fold = lambda hits, videos, top: {  # noqa: E731
-        "hits": {"touch": np.array(hits)}, "videos": np.array(videos), "frames": (9, len(hits)), "C": {"touch": 0.01}, "across": {"top": top},
-    }  # fmt: skip
-    row = protocols.combine([fold([1, 1, 0], ["a", "a", "b"], (0.2, (0.1, 0.3), 0.01)), fold([0], ["c"], (0.4, (0.3, 0.5), 0.01))], 0.25)
+        "hits": {"touch": np.array(hits)},
+        "videos": np.array(videos),
+        "frames": (9, len(hits)),
+        "C": {"touch": 0.01},
+        "across": {"top": top},
+    }
+    row = protocols.combine(
+        [
+            fold([1, 1, 0], ["a", "a", "b"], (0.2, (0.1, 0.3), 0.01)),
+            fold([0], ["c"], (0.4, (0.3, 0.5), 0.01)),
+        ],
+        0.25,
+    )
     value, interval, chance = row["touch"]
     assert (value, chance, row["frames"], row["C"]) == (0.5, 0.25, (9, 4), {"touch": [0.01]})
-    assert interval == protocols.mean_interval(np.array([1.0, 1, 0, 0]), ["a", "a", "b", "c"], 0.95)[0]
+    assert (
+        interval == protocols.mean_interval(np.array([1.0, 1, 0, 0]), ["a", "a", "b", "c"], 0.95)[0]
+    )
     np.testing.assert_allclose(row["top"][0], 0.3)
-    np.testing.assert_allclose(row["top"][1], (0.3 - 0.1 / np.sqrt(2), 0.3 + 0.1 / np.sqrt(2)))  # two equal errors
+    np.testing.assert_allclose(
+        row["top"][1], (0.3 - 0.1 / np.sqrt(2), 0.3 + 0.1 / np.sqrt(2))
+    )  # two equal errors
 
 
 def test_the_table_holds_means_ranges_and_steps():
-    row = lambda v: {"frames": (6, 2), "C": {"touch": [0.01]}, "touch, logistic regression": (v, (v - 0.1, v + 0.1), 0.25)}  # noqa: E731
+    row = lambda v: {
+        "frames": (6, 2),
+        "C": {"touch": [0.01]},
+        "touch, logistic regression": (v, (v - 0.1, v + 0.1), 0.25),
+    }
     first = dict(zip(protocols.PROTOCOLS, map(row, (0.8, 0.6, 0.5, 0.4)), strict=True))
     second = dict(zip(protocols.PROTOCOLS, map(row, (0.9, 0.7, 0.68, 0.4)), strict=True))
     np.testing.assert_allclose(protocols.steps_of([first, second]), [(20, 10), (20, 2)])
@@ -130,7 +171,7 @@ def test_the_table_holds_means_ranges_and_steps():
 def test_partners_are_of_the_right_kind(frames):
     units = background.unit_of(frames, OPTIONS)
     rows = background.partners(frames, units, 40, seed=1)
-    true, same, other, beside = rows["true"], rows["same"], rows["other"], rows["neighbour"]
+    true, same, other, beside = rows["true"], rows["same"], rows["other"], rows["neighbor"]
     assert len(true) == 40 == len(set(true))
     for picked in (same, other):
         assert (units[picked] == units[true]).all()
@@ -148,18 +189,27 @@ def test_background_table_says_which_is_better(frames):
     text = background.tables(pairs, found)
     assert all(title in text for title in background.SUBJECTS.values())
     whole = background.page(text, "tiny", OPTIONS, frames, pairs, "command")
-    better = pairs["background"][0].value > pairs["same"][0].value and pairs["background"][1].value > pairs["same"][1].value
+    better = (
+        pairs["background"][0].value > pairs["same"][0].value
+        and pairs["background"][1].value > pairs["same"][1].value
+    )
     assert ("NOT better" in whole) == (not better)
     assert found[1].value > found[0].value  # halves of videos differ more than random ones
 
 
 def test_costs_count_every_object_video_and_frame_once():
     options, mine, rivals = speed.measure_frames(16, 1, 2, 2)
-    assert (sum(map(len, mine.objects.values())), len(mine.videos), len(mine.frames)) == (20, 20, 80)
+    assert (sum(map(len, mine.objects.values())), len(mine.videos), len(mine.frames)) == (
+        20,
+        20,
+        80,
+    )
     assert rivals == {}
     cost = speed.Cost({"a": [0.1, 0.3], "b": [0.4]}, [0.5], [0.1, 0.1])
     mean, worst, who = cost.object_ms()
-    np.testing.assert_allclose((mean, worst, cost.rate(), cost.video_ms(), cost.total()), (800 / 3, 400, 10, 500, 1.5))
+    np.testing.assert_allclose(
+        (mean, worst, cost.rate(), cost.video_ms(), cost.total()), (800 / 3, 400, 10, 500, 1.5)
+    )
     assert who == "b"
     assert options.size == 16
 

@@ -24,12 +24,22 @@ def call(capsys, *args):
 
 def test_official_lists_give_the_published_facts(capsys, real_data):
     place = real_data / "touch_and_go" / "lists"
-    status, out, _ = call(capsys, "audit", place / "train.txt", place / "test.txt", "--json", "--fail-over", "0.01")
+    status, out, _ = call(
+        capsys, "audit", place / "train.txt", place / "test.txt", "--json", "--fail-over", "0.01"
+    )
     facts = json.loads(out)
     wanted = {
-        "test_samples": 29879, "groups_train": 120, "groups_test": 106, "groups_shared": 100, "test_samples_in_shared_groups": 29597,
-        "leaked_fraction": 0.99056, "gap_min": 31, "gap_median": 304, "gap_max": 2485, "identical_samples": 0,
-    }  # fmt: skip
+        "test_samples": 29879,
+        "groups_train": 120,
+        "groups_test": 106,
+        "groups_shared": 100,
+        "test_samples_in_shared_groups": 29597,
+        "leaked_fraction": 0.99056,
+        "gap_min": 31,
+        "gap_median": 304,
+        "gap_max": 2485,
+        "identical_samples": 0,
+    }
     assert {name: facts[name] for name in wanted} == wanted
     assert (status, facts["failed"]) == (1, True)
 
@@ -43,24 +53,31 @@ def test_fail_over_is_a_limit_not_a_switch(capsys, lists):
 
 def test_text_output_has_every_count(capsys, lists):
     _, out, _ = call(capsys, "audit", *lists)
-    for line in ("leaked_fraction                0.5", "gap_min                        4", "groups_shared                  1"):
+    for line in (
+        "leaked_fraction                0.5",
+        "gap_min                        4",
+        "groups_shared                  1",
+    ):
         assert line in out
 
 
-@pytest.mark.parametrize(("args", "word"), [
-    (["audti"], "Did you mean: palpate audit"),
-    (["audit", "one.txt"], "TRAIN and TEST"),
-    (["audit", "no.txt", "such.txt"], "nothing at no.txt"),
-    (["audit", "--colour", "red"], "Unrecognized"),
-    (["split", "nowhere", "-o", "s.json"], "nothing at nowhere"),
-    (["split", "nowhere", "-o", "s.json", "--train", "most"], "most"),
-    (["import", "nowhere", "-o", "out"], "nothing at nowhere"),
-    (["import", ".", "-o", "out", "--map", "vision"], "--map takes"),
-    (["demo", "--data", "nowhere"], "nowhere"),
-    (["report", "-o", "page.html"], "needs results"),
-    (["generate", "-o", "out"], "photos or --manifest"),
-    (["world", "-o", "w", "--size", "7"], "size"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (["audti"], "Did you mean: palpate audit"),
+        (["audit", "one.txt"], "TRAIN and TEST"),
+        (["audit", "no.txt", "such.txt"], "nothing at no.txt"),
+        (["audit", "--color", "red"], "Unrecognized"),
+        (["split", "nowhere", "-o", "s.json"], "nothing at nowhere"),
+        (["split", "nowhere", "-o", "s.json", "--train", "most"], "most"),
+        (["import", "nowhere", "-o", "out"], "nothing at nowhere"),
+        (["import", ".", "-o", "out", "--map", "vision"], "--map takes"),
+        (["demo", "--data", "nowhere"], "nowhere"),
+        (["report", "-o", "page.html"], "needs results"),
+        (["generate", "-o", "out"], "photos or --manifest"),
+        (["world", "-o", "w", "--size", "7"], "size"),
+    ],
+)
 def test_a_users_mistake_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, args, word):
     monkeypatch.chdir(tmp_path)
     status, out, err = call(capsys, *args)
@@ -72,10 +89,14 @@ def test_a_users_mistake_is_one_line_and_status_2(capsys, tmp_path, monkeypatch,
     assert out == ""
 
 
-def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(capsys, lists, small_manifest, tmp_path):
+def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(
+    capsys, lists, small_manifest, tmp_path
+):
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
     (tmp_path / "half.json").write_text('{"format": "palpate-split/1", "rule": {}, "digest": "x"}')
-    (tmp_path / "odd.json").write_text('{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}')
+    (tmp_path / "odd.json").write_text(
+        '{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}'
+    )
     (tmp_path / "scores.json").write_text(
         '{"format": "palpate-results/1", "title": "t", "scores": [{"metric": "m", "subject": "s", "value": "high"}]}'
     )
@@ -85,9 +106,24 @@ def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(capsys, l
         (["split", tmp_path / "m", "-o", tmp_path / "m"], "must not replace an input"),
         (["audit", tmp_path / "m", "--split", tmp_path / "half.json"], "an incomplete split file"),
         (["audit", tmp_path / "m", "--split", tmp_path / "odd.json"], "an incomplete split file"),
-        (["report", tmp_path / "scores.json", "-o", tmp_path / "p.html"], "must hold complete results"),
+        (
+            ["report", tmp_path / "scores.json", "-o", tmp_path / "p.html"],
+            "must hold complete results",
+        ),
         (["audit", *lists, "--worst", "-1"], "--worst must be at least 0"),
-        (["encoder", tmp_path / "m", "--split", tmp_path / "half.json", "-o", tmp_path / "t", "--epochs", "nan"], "--epochs must be"),
+        (
+            [
+                "encoder",
+                tmp_path / "m",
+                "--split",
+                tmp_path / "half.json",
+                "-o",
+                tmp_path / "t",
+                "--epochs",
+                "nan",
+            ],
+            "--epochs must be",
+        ),
     ):
         status, _, err = call(capsys, *args)
         assert (status, word in err, "Traceback" in err) == (2, True, False), (args, err)
@@ -98,7 +134,13 @@ def test_no_output_replaces_an_input_or_a_foreign_file(capsys, lists, small_mani
     assert call(capsys, "audit", *lists, "-o", tmp_path / "a.json")[0] == 0
     (tmp_path / "notes.html").write_text("my notes")
     kept = {
-        p: p.read_bytes() for p in (*map(Path, lists), tmp_path / "m" / "manifest.parquet", tmp_path / "a.json", tmp_path / "notes.html")
+        p: p.read_bytes()
+        for p in (
+            *map(Path, lists),
+            tmp_path / "m" / "manifest.parquet",
+            tmp_path / "a.json",
+            tmp_path / "notes.html",
+        )
     }
     for args in (
         ["audit", *lists, "-o", lists[0]],
@@ -110,16 +152,31 @@ def test_no_output_replaces_an_input_or_a_foreign_file(capsys, lists, small_mani
         assert call(capsys, *args)[0] == 2, args
     assert {p: p.read_bytes() for p in kept} == kept
     for _ in range(2):  # its own earlier output may be replaced
-        assert call(capsys, "report", tmp_path / "a.json", "-o", tmp_path / "page.html", "-q")[0] == 0
+        assert (
+            call(capsys, "report", tmp_path / "a.json", "-o", tmp_path / "page.html", "-q")[0] == 0
+        )
         assert call(capsys, "audit", *lists, "-o", tmp_path / "a.json")[0] == 0
         assert call(capsys, "split", tmp_path / "m", "-o", tmp_path / "s.json")[0] == 0
 
 
 def test_a_page_whose_audit_is_of_another_split_says_so(capsys, lists, tmp_path):
     score = {"metric": "TMMD", "subject": "x", "value": 1.0, "split": "b" * 64}
-    (tmp_path / "r.json").write_text(json.dumps({"format": "palpate-results/1", "title": "t", "scores": [score]}))
+    (tmp_path / "r.json").write_text(
+        json.dumps({"format": "palpate-results/1", "title": "t", "scores": [score]})
+    )
     assert call(capsys, "audit", *lists, "-o", tmp_path / "a.json")[0] == 0
-    assert call(capsys, "report", tmp_path / "a.json", tmp_path / "r.json", "-o", tmp_path / "p.html", "-q")[0] == 0
+    assert (
+        call(
+            capsys,
+            "report",
+            tmp_path / "a.json",
+            tmp_path / "r.json",
+            "-o",
+            tmp_path / "p.html",
+            "-q",
+        )[0]
+        == 0
+    )
     assert "No audit on this page is of the split" in (tmp_path / "p.html").read_text()
 
 
@@ -150,7 +207,9 @@ def test_a_mistake_as_json(capsys, tmp_path):
 def test_bad_lines_of_both_lists_are_told_at_once_or_skipped(capsys, lists):
     for path in lists:
         with open(path, "a") as file:
-            file.write("\nno comma here\n../../etc/passwd.jpg,3\nv/0000000007.jpg,stone\na/x.jpg,1\n")
+            file.write(
+                "\nno comma here\n../../etc/passwd.jpg,3\nv/0000000007.jpg,stone\na/x.jpg,1\n"
+            )
     status, out, err = call(capsys, "audit", *lists, "--json")
     assert status == 2
     problems = json.loads(out)["problems"]
@@ -170,9 +229,22 @@ def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_
     facts = json.loads(out)
     assert (status, facts["group"], facts["audit"]["leaked_fraction"]) == (0, "video", 0.0)
     assert facts["largest_material_deviation"] == 0.0
-    status, out, _ = call(capsys, "audit", tmp_path / "m", "--split", split, "--json", "--fail-over", "0", "-o", tmp_path / "audit.json")
+    status, out, _ = call(
+        capsys,
+        "audit",
+        tmp_path / "m",
+        "--split",
+        split,
+        "--json",
+        "--fail-over",
+        "0",
+        "-o",
+        tmp_path / "audit.json",
+    )
     assert (status, json.loads(out)["groups_shared"]) == (0, 0)
-    status, out, _ = call(capsys, "report", tmp_path / "audit.json", "-o", tmp_path / "page.html", "--json", "-q")
+    status, out, _ = call(
+        capsys, "report", tmp_path / "audit.json", "-o", tmp_path / "page.html", "--json", "-q"
+    )
     assert status == 0
     assert "NoLeak" in (tmp_path / "page.html").read_text()
     again = call(capsys, "report", tmp_path / "page.json", "-o", tmp_path / "again.html", "-q")
@@ -181,7 +253,13 @@ def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_
 
 def test_report_refuses_foreign_json(capsys, tmp_path):
     (tmp_path / "x.json").write_text('{"format": "other"}')
-    assert "must hold results of palpate" in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
+    assert (
+        "must hold results of palpate"
+        in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
+    )
     (tmp_path / "x.json").write_text('{"format": "palpate-audit/1", "name": "x"}')
-    assert "missing or unknown field" in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
+    assert (
+        "missing or unknown field"
+        in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
+    )
     assert not (tmp_path / "p.html").exists()

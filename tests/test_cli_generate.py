@@ -40,7 +40,13 @@ def test_a_photo_becomes_a_picture_and_the_user_is_told_what_it_is(place, capsys
         notice = image.info["palpate.notice"]
     status, out, _ = call(capsys, "photo.jpg", "-o", "touch.png", "--json")
     facts = json.loads(out)
-    assert (status, facts["image"], facts["images"], facts["made_now"], facts["model"]) == (0, "touch.png", 1, 0, "palpate/mini")
+    assert (status, facts["image"], facts["images"], facts["made_now"], facts["model"]) == (
+        0,
+        "touch.png",
+        1,
+        0,
+        "palpate/mini",
+    )
     assert facts["notice"] == notice
     status, out, _ = call(capsys, "photo.jpg", "-o", "new/deep/TOUCH.PNG", "--seed", "1", "--json")
     assert (status, json.loads(out)["made_now"]) == (0, 1)
@@ -107,11 +113,11 @@ def test_what_cannot_be_done_is_one_line_and_writes_nothing(place, capsys):
 
 def test_a_broken_photo_is_refused_before_the_model_is_loaded(place, capsys, monkeypatch):
     """And whatever else needs no model: settings, device, output and the model's name."""
-    from palpate.diffusion.pipeline import Pipeline
+    from palpate.diffusion.pipeline import TactilePipeline
 
     loads = []
-    load = Pipeline.load
-    monkeypatch.setattr(Pipeline, "load", lambda *args: loads.append(args) or load(*args))
+    load = TactilePipeline.load
+    monkeypatch.setattr(TactilePipeline, "load", lambda *args: loads.append(args) or load(*args))
     (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
     (place / "full").mkdir()
     (place / "full" / "notes.txt").write_text("mine")
@@ -154,16 +160,32 @@ def test_what_is_refused_first_needs_no_torch(place):
         "sys.exit(9 if {'torch', 'transformers', 'diffusers'} & set(sys.modules) else status)"
     )
     (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
-    for args in (["cut.jpg"], ["photo.jpg", "--steps", "0"], ["photo.jpg", "--device", "gpu"], ["photo.jpg", "--model", "palpate/maxi"]):
-        done = subprocess.run([sys.executable, "-c", code, "generate", *args, "-o", "t.png"], capture_output=True, text=True, check=False)
+    for args in (
+        ["cut.jpg"],
+        ["photo.jpg", "--steps", "0"],
+        ["photo.jpg", "--device", "gpu"],
+        ["photo.jpg", "--model", "palpate/maxi"],
+    ):
+        done = subprocess.run(
+            [sys.executable, "-c", code, "generate", *args, "-o", "t.png"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         assert done.returncode == 2, (args, done.stderr)
 
 
 def test_bad_photos_may_be_left_out(place, capsys):
     (place / "cut.jpg").write_bytes((place / "photo.jpg").read_bytes()[:300])
-    status, out, err = call(capsys, "photo.jpg", "cut.jpg", "gone.jpg", "-o", "t", "--skip-bad", "--json")
+    status, out, err = call(
+        capsys, "photo.jpg", "cut.jpg", "gone.jpg", "-o", "t", "--skip-bad", "--json"
+    )
     facts = json.loads(out)
-    assert (status, facts["images"], {p["kind"] for p in facts["skipped"]}) == (0, 1, {"bad-image", "missing-file"})
+    assert (status, facts["images"], {p["kind"] for p in facts["skipped"]}) == (
+        0,
+        1,
+        {"bad-image", "missing-file"},
+    )
     assert "Skipped 2" in err
 
 

@@ -35,12 +35,21 @@ def table(tmp_path):
         write_image(tmp_path / "data" / "v" / f"{k}_rgb.jpg", k)
         write_image(tmp_path / "data" / "t" / f"{k}_tac.jpg", k)
     path = tmp_path / "data" / "t.csv"
-    path.write_text("url,kind,clip\n" + "".join(f"v/{k}_rgb.jpg,{k % 2},{'a' if k else ''}\n" for k in range(4)))
+    path.write_text(
+        "url,kind,clip\n" + "".join(f"v/{k}_rgb.jpg,{k % 2},{'a' if k else ''}\n" for k in range(4))
+    )
     (tmp_path / "data" / "classes.txt").write_text("Wood: 0\nRock: 1\n")
     return path
 
 
-MAPS = ["--map", "vision=url", "tactile=replace(replace(url, 'v/', 't/'), '_rgb', '_tac')", "--map", "material=kind", "video=clip"]
+MAPS = [
+    "--map",
+    "vision=url",
+    "tactile=replace(replace(url, 'v/', 't/'), '_rgb', '_tac')",
+    "--map",
+    "material=kind",
+    "video=clip",
+]
 
 
 def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path):
@@ -75,19 +84,36 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
     status, out, _ = call(capsys, *args, "--set", f"labels={tag / 'test.txt'}")
     assert (status, json.loads(out)["samples"]) == (0, 4)
     assert call(capsys, "validate", tag, *args[4:8])[0] == 0  # the same line serves to look first
-    status, out, _ = call(capsys, "validate", tag, "--set", f"labels={tag / 'train.txt'}", "seed=3", "--json")
+    status, out, _ = call(
+        capsys, "validate", tag, "--set", f"labels={tag / 'train.txt'}", "seed=3", "--json"
+    )
     assert (status, json.loads(out)["samples"]) == (0, 6)
 
 
-@pytest.mark.parametrize(("args", "word"), [
-    (["--set", "colour=red"], "--set of the format touch-and-go takes labels, image_format, seed"), (["--set", "seed=three"], "--set seed must be a whole number"),
-    (["--set", "image_format=gif"], "jpg|png"), (["--set", "seed"], "--set takes OPTION=VALUE"), (["--set", "seed=1", "seed=2"], "must stand once"), (["--set", "size=3"], "Write --size"),
-    (["--map", "video=a", "--map", "video=b"], "each column once"), (["--map", "video="], "--map takes"), (["--format", "zip"], "auto or one of"), (["--format", "zip", "--set", "a=b"], "must be known"),
-    (["--as", "vision"], "side"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (
+            ["--set", "color=red"],
+            "--set of the format touch-and-go takes labels, image_format, seed",
+        ),
+        (["--set", "seed=three"], "--set seed must be a whole number"),
+        (["--set", "image_format=gif"], "jpg|png"),
+        (["--set", "seed"], "--set takes OPTION=VALUE"),
+        (["--set", "seed=1", "seed=2"], "must stand once"),
+        (["--set", "size=3"], "Write --size"),
+        (["--map", "video=a", "--map", "video=b"], "each column once"),
+        (["--map", "video="], "--map takes"),
+        (["--format", "zip"], "auto or one of"),
+        (["--format", "zip", "--set", "a=b"], "must be known"),
+        (["--as", "vision"], "side"),
+    ],
+)
 @pytest.mark.parametrize("verb", ["import", "validate"])
 def test_mistakes_in_options_are_one_line_and_status_2(capsys, tag, tmp_path, verb, args, word):
-    status, out, err = call(capsys, verb, tag, *(["-o", tmp_path / "m"] if verb == "import" else []), *args)
+    status, out, err = call(
+        capsys, verb, tag, *(["-o", tmp_path / "m"] if verb == "import" else []), *args
+    )
     assert (status, out, word in err, "Traceback" in err) == (2, "", True, False), err
     assert not (tmp_path / "m").exists()
 
@@ -111,16 +137,16 @@ def test_validation_tells_facts_and_fails_on_what_is_asked(capsys, tag, table, t
     assert call(capsys, "validate", tag, "--fail-on", "invalid")[0] == 0
     status, out, _ = call(capsys, "validate", tag, "--json")
     data = json.loads(out)
-    assert (status, data["ok"], data["failed"], data["samples"], len(data["missing"]), data["invalid"]) == (
-        1,
-        False,
-        ["missing"],
-        11,
-        1,
-        [],
-    )
+    assert (
+        status,
+        data["ok"],
+        data["failed"],
+        data["samples"],
+        len(data["missing"]),
+        data["invalid"],
+    ) == (1, False, ["missing"], 11, 1, [])
     assert data["missing"][0]["kind"] == "missing-file"
-    assert data["facts"]["licence"] == "CC BY 4.0"
+    assert data["facts"]["license"] == "CC BY 4.0"
     assert call(capsys, "validate", table, *MAPS)[0] == 0
     status, out, _ = call(capsys, "validate", table, *MAPS, "--fail-on", "suspicious")
     assert (status, "Suspicious: 1" in out) == (1, True)
@@ -148,7 +174,9 @@ def test_the_list_of_formats_names_every_option(capsys):
 
 
 def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
-    status, out, _ = call(capsys, "import", table.parent / "v", "--as", "vision", "-o", tmp_path / "m", "--json")
+    status, out, _ = call(
+        capsys, "import", table.parent / "v", "--as", "vision", "-o", tmp_path / "m", "--json"
+    )
     assert (status, json.loads(out)["samples"]) == (0, 4)
     status, _, err = call(capsys, "import", table.parent / "v", "-o", tmp_path / "n")
     assert (status, "--as vision or --as tactile" in err) == (2, True)
@@ -158,21 +186,40 @@ def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
 
 def test_export_says_how_to_read_it_again_and_that_works(capsys, small_manifest, tmp_path):
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
-    Split({i: "train" if k % 2 else "test" for k, i in enumerate(small_manifest.ids)}).save(tmp_path / "s.json")
-    status, out, _ = call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "my e's", "--split", tmp_path / "s.json")
+    Split({i: "train" if k % 2 else "test" for k, i in enumerate(small_manifest.ids)}).save(
+        tmp_path / "s.json"
+    )
+    status, out, _ = call(
+        capsys,
+        "export",
+        tmp_path / "m",
+        "--to",
+        "jsonl",
+        "-o",
+        tmp_path / "my e's",
+        "--split",
+        tmp_path / "s.json",
+    )
     assert status == 0
     command = shlex.split(out.split("again with: palpate ")[1])
     assert call(capsys, *command[:-1], tmp_path / "again", "--json")[0] == 0
     assert Manifest.load(tmp_path / "again").digest == small_manifest.digest
-    assert Split.load(tmp_path / "again" / "splits" / "Orig.json").digest == Split.load(tmp_path / "s.json").digest
-    assert call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "my e's")[0] == 2
+    assert (
+        Split.load(tmp_path / "again" / "splits" / "Orig.json").digest
+        == Split.load(tmp_path / "s.json").digest
+    )
+    assert (
+        call(capsys, "export", tmp_path / "m", "--to", "jsonl", "-o", tmp_path / "my e's")[0] == 2
+    )
     assert call(capsys, "export", tmp_path / "m", "-o", tmp_path / "f")[0] == 2
 
 
 def test_export_to_hugging_face_and_back(capsys, small_manifest, tmp_path):
     pytest.importorskip("datasets", reason="the extra hf is not installed")
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
-    status, out, _ = call(capsys, "export", tmp_path / "m", "--to", "hf", "-o", tmp_path / "e", "--json")
+    status, out, _ = call(
+        capsys, "export", tmp_path / "m", "--to", "hf", "-o", tmp_path / "e", "--json"
+    )
     assert (status, json.loads(out)["samples"]) == (0, 48)
     assert call(capsys, "import", tmp_path / "e", "-o", tmp_path / "again")[0] == 0
     assert Manifest.load(tmp_path / "again").digest == small_manifest.digest
@@ -199,13 +246,21 @@ def test_a_full_disk_is_told_in_a_line_and_leaves_nothing(capsys, tag, tmp_path,
         assert err.startswith(f"palpate {args[0]}: The disk must have room for ")
         assert "Got No space left on device. Free some space" in err
         assert "Traceback" not in err
-        assert not [p for p in tmp_path.rglob("*.parquet") if "full" in p.parts or p.name.startswith(".")]
+        assert not [
+            p for p in tmp_path.rglob("*.parquet") if "full" in p.parts or p.name.startswith(".")
+        ]
 
 
-def test_a_place_without_room_for_a_new_file_is_told_by_its_own_name(tmp_path, monkeypatch, capsys, tag):
+def test_a_place_without_room_for_a_new_file_is_told_by_its_own_name(
+    tmp_path, monkeypatch, capsys, tag
+):
     def full(*args, **kwargs):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "somewhere")
 
     monkeypatch.setattr("tempfile.mkstemp", full)
     status, _, err = call(capsys, "import", tag, "-o", tmp_path / "m", "-q")
-    assert (status, f"must have room for {tmp_path / 'm'}" in err, "somewhere" in err) == (2, True, False)
+    assert (status, f"must have room for {tmp_path / 'm'}" in err, "somewhere" in err) == (
+        2,
+        True,
+        False,
+    )

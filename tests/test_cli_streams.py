@@ -14,7 +14,17 @@ from palpate.core import FeatureSet, Results
 
 NOPE = ("score", "--generated", "nope.npy", "--reference", "nope.npy")
 AUDIT = ("audit", "train.txt", "test.txt", "--fail-over", "0.01")
-SCORE = ("score", "--generated", "g.npz", "--reference", "r.npz", "--companions", "none", "--permutations", "0")
+SCORE = (
+    "score",
+    "--generated",
+    "g.npz",
+    "--reference",
+    "r.npz",
+    "--companions",
+    "none",
+    "--permutations",
+    "0",
+)
 
 
 @pytest.fixture
@@ -24,7 +34,9 @@ def here(tmp_path, monkeypatch):
     for seed, name in enumerate("gr"):
         x = np.random.default_rng(seed).normal(size=(12, 4)) + 2
         unit = (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
-        FeatureSet([f"{k}" for k in range(12)], unit, groups=[f"v{k // 3}" for k in range(12)]).save(Path(f"{name}.npz"))
+        FeatureSet(
+            [f"{k}" for k in range(12)], unit, groups=[f"v{k // 3}" for k in range(12)]
+        ).save(Path(f"{name}.npz"))
     for name in ("train", "test"):
         Path(f"{name}.txt").write_text("a/0000000001.jpg,3\n")
     return tmp_path
@@ -41,14 +53,19 @@ def unread():
 
 def palpate(*args, closed=None, **how):
     """The finished process; ``closed`` is a stream that the shell closes before the start. Streams are buffered, as they are for a user."""
-    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"} | how.pop("env", {})
+    env = {
+        name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"
+    } | how.pop("env", {})
     command = [sys.executable, "-m", "palpate", *args]
     if closed is not None:
         command = ["sh", "-c", f'exec "$@" {closed}>&-', "sh", *command]
     return subprocess.run(command, check=False, env=env, **how)
 
 
-@pytest.mark.parametrize(("args", "status"), [((*AUDIT, "--json"), 1), (NOPE, 2), ((*NOPE, "--json"), 2), (("--help",), 0)])
+@pytest.mark.parametrize(
+    ("args", "status"),
+    [((*AUDIT, "--json"), 1), (NOPE, 2), ((*NOPE, "--json"), 2), (("--help",), 0)],
+)
 def test_readers_that_go_away_leave_the_status(here, unread, args, status):
     assert palpate(*args, stdout=unread, stderr=unread).returncode == status
 
@@ -61,7 +78,11 @@ def test_a_reader_that_goes_away_loses_no_file_and_no_status(here, unread):
     assert Path("o.tex").is_file()
     assert not Path(".o.json.work").exists()
     done = palpate(*AUDIT, **how)
-    assert (done.returncode, "Traceback" in done.stderr, "FAIL: leaked fraction" in done.stderr) == (1, False, True)
+    assert (
+        done.returncode,
+        "Traceback" in done.stderr,
+        "FAIL: leaked fraction" in done.stderr,
+    ) == (1, False, True)
 
 
 def test_streams_that_are_closed_leave_status_and_files(here):
@@ -72,22 +93,36 @@ def test_streams_that_are_closed_leave_status_and_files(here):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
-@pytest.mark.parametrize("args", [(*SCORE, "-o", "o.json"), (*SCORE, "-o", "o.json", "--json"), (*NOPE, "--json"), ("--help",)])
+@pytest.mark.parametrize(
+    "args",
+    [(*SCORE, "-o", "o.json"), (*SCORE, "-o", "o.json", "--json"), (*NOPE, "--json"), ("--help",)],
+)
 def test_a_full_disk_behind_standard_output_is_told_and_the_file_is_written(here, args):
     with open("/dev/full", "w") as full:
         done = palpate(*args, stdout=full, stderr=subprocess.PIPE, text=True)
-    assert (done.returncode, "No space left on device" in done.stderr, "Traceback" in done.stderr) == (2, True, False), done.stderr
+    assert (
+        done.returncode,
+        "No space left on device" in done.stderr,
+        "Traceback" in done.stderr,
+    ) == (2, True, False), done.stderr
     assert Path("o.json").is_file() == ("-o" in args)
 
 
 def test_letters_that_a_stream_lacks_are_question_marks_and_json_stays_whole(here):
-    ascii_only = {"env": {"PYTHONIOENCODING": "ascii"}, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    ascii_only = {
+        "env": {"PYTHONIOENCODING": "ascii"},
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+    }
     done = palpate(*SCORE, "--names", "grün", **ascii_only)
     assert done.returncode == 0, done.stderr
     row = next(line for line in done.stdout.decode("ascii").splitlines() if line.startswith("TMMD"))
     assert row.split()[:4] == ["TMMD", "?", "grouped", "gr?n"]
     done = palpate(*SCORE, "--names", "grün", "--json", **ascii_only)
-    assert (done.returncode, {s["subject"] for s in json.loads(done.stdout.decode("ascii"))["scores"]}) == (0, {"grün"})
+    assert (
+        done.returncode,
+        {s["subject"] for s in json.loads(done.stdout.decode("ascii"))["scores"]},
+    ) == (0, {"grün"})
 
 
 class Plain:

@@ -30,13 +30,15 @@ from palpate.core import (
     require_comparable,
     rng_for,
     seed_for,
-)  # fmt: skip
+)
 
 
 def test_an_error_is_one_line_of_must_got_fix():
     error = PalpateError("--ratio must lie in (0, 1)", "1.5", "Pass 0.8")
     assert str(error) == "--ratio must lie in (0, 1). Got 1.5. Pass 0.8."
-    many = ProblemsError([Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")], "Mend them")
+    many = ProblemsError(
+        [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")], "Mend them"
+    )
     assert "2 problems: 2 bad-line" in str(many)
     assert many.to_json()["problems"] == [
         {"where": "a:1", "kind": "bad-line", "text": "x"},
@@ -45,15 +47,25 @@ def test_an_error_is_one_line_of_must_got_fix():
 
 
 def test_errors_survive_pickling_as_worker_processes_need():
-    for error in (PalpateError("m", "g", "f"), ProblemsError([Problem("a:1", "k", "t")], "f"), MissingExtraError("av", "video", "x")):
+    for error in (
+        PalpateError("m", "g", "f"),
+        ProblemsError([Problem("a:1", "k", "t")], "f"),
+        MissingExtraError("av", "video", "x"),
+    ):
         again = pickle.loads(pickle.dumps(error))
-        assert (type(again), str(again), again.to_json()) == (type(error), str(error), error.to_json())
+        assert (type(again), str(again), again.to_json()) == (
+            type(error),
+            str(error),
+            error.to_json(),
+        )
 
 
 def test_seeds_depend_on_names_alone_and_are_stable_across_versions():
     assert seed_for(0, "noise", "a/1") == seed_for(0, "noise", "a/1") != seed_for(0, "noise", "a/2")
     assert seed_for(0, "ab", "c") != seed_for(0, "a", "bc")
-    assert seed_for(0, "noise", "a/1") == 7037779842902421232  # a change here would change every generated image
+    assert (
+        seed_for(0, "noise", "a/1") == 7037779842902421232
+    )  # a change here would change every generated image
     assert rng_for(1, "x").random() == rng_for(1, "x").random()
 
 
@@ -109,7 +121,9 @@ def test_split_round_trip_and_tampering(tmp_path):
 
 def test_incomparable_scores_refuse_one_column():
     a = Score("TMMD", "ours", 1.0, bandwidth=10.0, encoder="e1")
-    assert columns([a, Score("TMMD", "theirs", 2.0, bandwidth=10.0, encoder="e1"), Score("SSIM", "ours", 0.5)]).keys() == {"TMMD", "SSIM"}
+    assert columns(
+        [a, Score("TMMD", "theirs", 2.0, bandwidth=10.0, encoder="e1"), Score("SSIM", "ours", 0.5)]
+    ).keys() == {"TMMD", "SSIM"}
     with pytest.raises(PalpateError, match="bandwidth"):
         columns([a, Score("TMMD", "theirs", 2.0, bandwidth=5.0, encoder="e1")])
     with pytest.raises(PalpateError, match="encoder"):
@@ -130,30 +144,46 @@ def test_scores_against_other_references_refuse_one_column_wherever_they_stand()
     ):
         require_comparable(fine)
     for places in itertools.permutations([unknown, unknown, one, two]):
-        with pytest.raises(PalpateError, match=r"agree in reference. Got '(r1' for 'g' and 'r2|r2' for 'g' and 'r1)' for 'g'"):
+        with pytest.raises(
+            PalpateError,
+            match=r"agree in reference. Got '(r1' for 'g' and 'r2|r2' for 'g' and 'r1)' for 'g'",
+        ):
             require_comparable(places)
     with pytest.raises(PalpateError, match="reference"):
         require_comparable([one, one, two])
-    with pytest.raises(PalpateError, match="encoder"):  # for what is not a reference, unknown is a value of its own
+    with pytest.raises(
+        PalpateError, match="encoder"
+    ):  # for what is not a reference, unknown is a value of its own
         require_comparable([Score("TMMD", "g", 1.0, encoder="e"), unknown])
 
 
 def test_the_digest_of_features_is_of_ids_and_values_in_any_order():
-    ids, x = [f"v/{k}" for k in range(9)], np.random.default_rng(0).normal(size=(9, 4)).astype(np.float32)
+    ids, x = (
+        [f"v/{k}" for k in range(9)],
+        np.random.default_rng(0).normal(size=(9, 4)).astype(np.float32),
+    )
     digest = FeatureSet(ids, x).digest
     assert len(digest) == 64
     assert int(digest, 16) >= 0
     for seed in range(3):
         order = np.random.default_rng(seed).permutation(9)
         assert FeatureSet([ids[k] for k in order], x[order]).digest == digest
-    assert FeatureSet(ids, np.asfortranarray(x)).digest == FeatureSet(ids, np.repeat(x, 2, axis=0)[::2]).digest == digest
+    assert (
+        FeatureSet(ids, np.asfortranarray(x)).digest
+        == FeatureSet(ids, np.repeat(x, 2, axis=0)[::2]).digest
+        == digest
+    )
     assert FeatureSet(ids, x, labels=["a"] * 9, groups=["b"] * 9, encoder="e").digest == digest
     bit, renamed, swapped = x.copy(), [*ids[:8], "v/9"], [ids[1], ids[0], *ids[2:]]
     bit[8, 3] = np.nextafter(bit[8, 3], np.float32(9))
     others = [
-        FeatureSet(ids, bit), FeatureSet(renamed, x), FeatureSet(swapped, x), FeatureSet(ids[:8], x[:8]), FeatureSet(ids, x[:, :3]),
+        FeatureSet(ids, bit),
+        FeatureSet(renamed, x),
+        FeatureSet(swapped, x),
+        FeatureSet(ids[:8], x[:8]),
+        FeatureSet(ids, x[:, :3]),
         FeatureSet(["v/0v/1", "", *ids[2:]], x),
-    ]  # fmt: skip
+    ]
     assert len({digest, *(s.digest for s in others)}) == 7
     assert FeatureSet(ids, x.astype(np.float64)).digest == digest  # the same numbers
 
@@ -181,7 +211,9 @@ def test_numbers_that_are_equal_have_one_digest():
 def test_tensors_of_half_precision_are_widened_and_it_is_said():
     torch = pytest.importorskip("torch")
     rows = torch.eye(2)
-    with pytest.warns(UserWarning, match="bfloat16 features were widened to float32; their rounding stays"):
+    with pytest.warns(
+        UserWarning, match="bfloat16 features were widened to float32; their rounding stays"
+    ):
         assert FeatureSet(["a", "b"], rows.bfloat16()).features.dtype == np.float32
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -190,7 +222,9 @@ def test_tensors_of_half_precision_are_widened_and_it_is_said():
 
 def test_features_name_the_bad_row_and_round_trip(tmp_path):
     x = np.eye(3, dtype=np.float32)
-    features = FeatureSet(["a", "b", "c"], x, labels=["w", "w", "g"], groups=["v", "v", "u"], encoder="e")
+    features = FeatureSet(
+        ["a", "b", "c"], x, labels=["w", "w", "g"], groups=["v", "v", "u"], encoder="e"
+    )
     features.save(tmp_path / "f.npz")
     again = FeatureSet.load(tmp_path / "f.npz").take(["c", "a"])
     assert again.labels == ["g", "w"]
@@ -207,8 +241,16 @@ def test_features_name_the_bad_row_and_round_trip(tmp_path):
 
 def test_results_round_trip(tmp_path):
     ref = SampleRef("v/1", "v", 1, "Wood", "a.png", "b.png")
-    audit = Audit("Orig", "video", 1, 1, 1, 1, 1, 1, 1.0, 0, 2, 2, 2, [0, 3], [1], [LeakPair(ref, ref, 2)])
-    results = Results("t", ["f"], [audit], [Score("TMMD", "g", float("inf"), interval=(0.0, 1.0))], [GalleryItem(ref, "g.png")])
+    audit = Audit(
+        "Orig", "video", 1, 1, 1, 1, 1, 1, 1.0, 0, 2, 2, 2, [0, 3], [1], [LeakPair(ref, ref, 2)]
+    )
+    results = Results(
+        "t",
+        ["f"],
+        [audit],
+        [Score("TMMD", "g", float("inf"), interval=(0.0, 1.0))],
+        [GalleryItem(ref, "g.png")],
+    )
     results.save(tmp_path / "r.json")
     again = Results.load(tmp_path / "r.json")
     assert again.audits[0].worst[0].test == ref
@@ -243,7 +285,9 @@ def test_a_killed_stage_keeps_its_partial_folder_for_the_same_inputs_only(tmp_pa
             Run(tmp_path).stage("a", {"k": 1}, killed)
         assert not (tmp_path / "a").exists()
         seen = []
-        Run(tmp_path).stage("a", inputs, lambda folder, seen=seen: seen.append((folder / "checkpoint").exists()))
+        Run(tmp_path).stage(
+            "a", inputs, lambda folder, seen=seen: seen.append((folder / "checkpoint").exists())
+        )
         assert seen == [found]
         for path in (tmp_path / "a").iterdir():
             path.unlink()
@@ -270,7 +314,9 @@ def test_the_digest_of_features_on_disk_is_that_of_the_same_numbers_in_memory(tm
     assert FeatureSet(ids, x).digest != wanted
 
 
-@pytest.mark.parametrize("features", [[["1", "2"]], [[None, 2.0]], np.array([[1, "a"]], dtype=object)])
+@pytest.mark.parametrize(
+    "features", [[["1", "2"]], [[None, 2.0]], np.array([[1, "a"]], dtype=object)]
+)
 def test_features_that_are_no_numbers_are_refused(features):
     with pytest.raises(PalpateError, match="Features must"):
         FeatureSet(["a"], features)

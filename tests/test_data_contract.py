@@ -14,7 +14,7 @@ from palpate.data.formats import FORMATS
 from palpate.data.importing import import_dataset, validate_dataset, write_lists
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
-#: Takes what no other format recognised, so it may recognise trees of others too; it must stand last.
+#: Takes what no other format recognized, so it may recognize trees of others too; it must stand last.
 CATCH_ALL = "pairs"
 
 
@@ -33,7 +33,9 @@ def folder(name, tmp_path_factory) -> Path:
 def forged(name, folder) -> Forged:
     """The format's forged tree, shared by all tests: not to be changed."""
     if name not in FORGES:
-        pytest.fail(f"the format {name!r} has no forge: write one and add it to FORGES in tests/forges.py")
+        pytest.fail(
+            f"the format {name!r} has no forge: write one and add it to FORGES in tests/forges.py"
+        )
     folder.mkdir()
     return FORGES[name](folder)
 
@@ -41,7 +43,9 @@ def forged(name, folder) -> Forged:
 @pytest.fixture(scope="session")
 def whole(name, forged, tmp_path_factory):
     """The forged tree, imported."""
-    return import_dataset(forged.source, tmp_path_factory.mktemp("whole") / "out", format=name, **forged.options)
+    return import_dataset(
+        forged.source, tmp_path_factory.mktemp("whole") / "out", format=name, **forged.options
+    )
 
 
 def copied(forged: Forged, folder: Path, copy: Path) -> Forged:
@@ -51,7 +55,11 @@ def copied(forged: Forged, folder: Path, copy: Path) -> Forged:
     def there(value):
         return copy / value.relative_to(folder) if isinstance(value, Path) else value
 
-    return replace(forged, source=there(forged.source), options={k: there(v) for k, v in forged.options.items()})
+    return replace(
+        forged,
+        source=there(forged.source),
+        options={k: there(v) for k, v in forged.options.items()},
+    )
 
 
 def told(problems) -> set[tuple[str, str, str]]:
@@ -65,11 +73,13 @@ def test_every_format_has_a_forge_and_every_forge_a_format():
 
 def test_facts_are_complete(name):
     facts = FORMATS[name].facts
-    for word in ("name", "citation", "licence", "url", "sensor", "samples", "group"):
+    for word in ("name", "citation", "license", "url", "sensor", "samples", "group"):
         assert getattr(facts, word).strip() == getattr(facts, word) != "", word
     assert facts.url == "unknown" or facts.url.startswith(("https://", "http://"))
-    assert facts.image_size is None or (len(facts.image_size) == 2 and all(isinstance(n, int) and n > 0 for n in facts.image_size))
-    for purpose, (mean, std) in facts.normalisation.items():
+    assert facts.image_size is None or (
+        len(facts.image_size) == 2 and all(isinstance(n, int) and n > 0 for n in facts.image_size)
+    )
+    for purpose, (mean, std) in facts.normalization.items():
         assert len(mean) == len(std) == 3, purpose
         assert all(-1 < m < 1 for m in mean), purpose
         assert all(0 < s < 1 for s in std), purpose
@@ -77,7 +87,7 @@ def test_facts_are_complete(name):
     assert {"skip_bad", "check", "progress"} <= set(FORMATS[name].options)
 
 
-def test_a_tree_is_recognised_by_its_own_format_and_by_no_other(name, forged, tmp_path):
+def test_a_tree_is_recognized_by_its_own_format_and_by_no_other(name, forged, tmp_path):
     knowing = [n for n, f in FORMATS.items() if f.detect(forged.source)]
     assert (name in knowing) == forged.auto
     assert set(knowing) <= {name, CATCH_ALL}
@@ -91,7 +101,13 @@ def test_detect_looks_at_anything_without_raising(name, tmp_path):
     (tmp_path / "note.txt").write_bytes(b"\xff\x00")
     (tmp_path / "empty.csv").write_bytes(b"")
     (tmp_path / "broken.json").write_text("{")
-    for source in (tmp_path / "empty", tmp_path / "note.txt", tmp_path / "broken.json", tmp_path / "absent", tmp_path / "empty.csv"):
+    for source in (
+        tmp_path / "empty",
+        tmp_path / "note.txt",
+        tmp_path / "broken.json",
+        tmp_path / "absent",
+        tmp_path / "empty.csv",
+    ):
         if name == CATCH_ALL and source.suffix == ".csv":
             continue
         assert FORMATS[name].detect(source) is False, source
@@ -108,7 +124,9 @@ def test_import_gives_a_sound_manifest(name, forged, whole):
     if "vision" not in whole.facts:  # a layout without photos says so in a fact
         assert None not in manifest.column("vision"), "every sample needs a photo"
     for column in manifest.table.columns:
-        assert not any(isinstance(v, str) and v.strip() != v for v in manifest.column(column)), column
+        assert not any(isinstance(v, str) and v.strip() != v for v in manifest.column(column)), (
+            column
+        )
         assert "" not in manifest.column(column), f"{column}: null, not an empty string"
     facts = whole.facts
     assert facts["format"] == name
@@ -139,7 +157,9 @@ def test_import_is_the_same_again_and_on_a_copied_tree(name, folder, forged, who
     assert again.manifest.digest == moved.manifest.digest == whole.manifest.digest
     assert dict(again.facts) == dict(moved.facts) == dict(whole.facts)
     for other in (again, moved):
-        assert {n: s.digest for n, s in other.splits.items()} == {n: s.digest for n, s in whole.splits.items()}
+        assert {n: s.digest for n, s in other.splits.items()} == {
+            n: s.digest for n, s in whole.splits.items()
+        }
 
 
 def test_validation_of_a_whole_tree_finds_all_samples(name, forged, whole):
@@ -174,11 +194,16 @@ def test_a_bad_image_is_told_by_both_and_skipped_alone(name, folder, forged, who
         import_dataset(copy.source, tmp_path / "out", format=name, **copy.options)
     assert told(caught.value.problems) == told([*looked.missing, *looked.invalid])
     assert not (tmp_path / "out").exists(), "a failed import must leave nothing behind"
-    found = import_dataset(copy.source, tmp_path / "out", format=name, skip_bad=True, **copy.options)
+    found = import_dataset(
+        copy.source, tmp_path / "out", format=name, skip_bad=True, **copy.options
+    )
     assert told(found.skipped) == told(caught.value.problems)
     assert found.manifest.ids == [i for i in whole.manifest.ids if i != row["id"]]
     assert looked.samples == len(found.manifest)
-    kept = {c: dict(zip(whole.manifest.ids, whole.manifest.column(c), strict=True)) for c in ("video", "frame", *IMAGE_COLUMNS[:2])}
+    kept = {
+        c: dict(zip(whole.manifest.ids, whole.manifest.column(c), strict=True))
+        for c in ("video", "frame", *IMAGE_COLUMNS[:2])
+    }
     for column, values in kept.items():
         assert found.manifest.column(column) == [values[i] for i in found.manifest.ids], column
 

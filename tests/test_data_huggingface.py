@@ -14,11 +14,21 @@ from palpate.data.importing import import_dataset, validate_dataset
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 datasets = pytest.importorskip("datasets", reason="the extra hf is not installed")
-MAPS = {"vision": "rgb", "tactile": "gel", "video": "parent(path)", "frame": "stem(gel)", "material": "kind"}
+MAPS = {
+    "vision": "rgb",
+    "tactile": "gel",
+    "video": "parent(path)",
+    "frame": "stem(gel)",
+    "material": "kind",
+}
 
 
 def kinds():
-    return {"rgb": datasets.Image(), "gel": datasets.Image(), "kind": datasets.ClassLabel(names=["Wood", "Rock"])}
+    return {
+        "rgb": datasets.Image(),
+        "gel": datasets.Image(),
+        "kind": datasets.ClassLabel(names=["Wood", "Rock"]),
+    }
 
 
 @pytest.fixture
@@ -57,17 +67,26 @@ def test_a_foreign_set_keeps_its_bytes_parts_and_labels(source, tmp_path, form):
 
 @pytest.mark.parametrize("parted", [False, True])
 def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
-    table = small_manifest.table.sample(fraction=1, shuffle=True, seed=3)  # an order of its own, which the parts tear apart
+    table = small_manifest.table.sample(
+        fraction=1, shuffle=True, seed=3
+    )  # an order of its own, which the parts tear apart
     facts = {
         "dataset": "ours",
-        "licence": "CC0",
+        "license": "CC0",
         "citation": "nobody, 2024",
         "url": "https://example.org",
         "format": "touch-and-go",
         "text_source": "none",
     }
     manifest = Manifest(table, small_manifest.root, facts)
-    split = Split({i: ("train", "val", "test")[k % 3] for k, i in enumerate(manifest.ids) if k % 7}, {"method": "mine"}) if parted else None
+    split = (
+        Split(
+            {i: ("train", "val", "test")[k % 3] for k, i in enumerate(manifest.ids) if k % 7},
+            {"method": "mine"},
+        )
+        if parted
+        else None
+    )
     files = export_dataset(manifest, tmp_path / "hf", to="hf", split=split)
     assert all(f.is_file() for f in files)
     loaded = datasets.load_from_disk(str(tmp_path / "hf"))
@@ -88,13 +107,22 @@ def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
         assert again.splits["Orig"].rule == {"method": "mine"}
 
 
-@pytest.mark.parametrize(("to", "name"), [("csv", "manifest.csv"), ("jsonl", "manifest.jsonl"), ("parquet", "samples.parquet")])
+@pytest.mark.parametrize(
+    ("to", "name"),
+    [("csv", "manifest.csv"), ("jsonl", "manifest.jsonl"), ("parquet", "samples.parquet")],
+)
 def test_tables_come_back_with_their_split(small_manifest, tmp_path, to, name):
-    table = small_manifest.table.with_columns(text=small_manifest.table["id"] + ', "so\n called" 5"')
+    table = small_manifest.table.with_columns(
+        text=small_manifest.table["id"] + ', "so\n called" 5"'
+    )
     manifest = Manifest(table, small_manifest.root, {})
     split = Split({i: ("train", "test")[k % 2] for k, i in enumerate(manifest.ids) if k % 5})
     files = export_dataset(manifest, tmp_path / "o", to=to, split=split)
-    assert {f.relative_to(tmp_path / "o").as_posix() for f in files} == {name, "lists/train.csv", "lists/test.csv"}
+    assert {f.relative_to(tmp_path / "o").as_posix() for f in files} == {
+        name,
+        "lists/train.csv",
+        "lists/test.csv",
+    }
     again = import_dataset(tmp_path / "o" / name, tmp_path / "out", root=manifest.root)
     assert again.manifest.digest == manifest.digest
     assert again.splits["Orig"].digest == split.digest
@@ -117,12 +145,20 @@ def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_ma
     rows = hf_rows(tmp_path / "made")
     for row in rows:
         row["gel"] = rows[0]["gel"]
-    found = import_dataset(save_hf(tmp_path / "mine", rows, **kinds()), tmp_path / "out", columns=MAPS | {"frame": "stem(path)"})
+    found = import_dataset(
+        save_hf(tmp_path / "mine", rows, **kinds()),
+        tmp_path / "out",
+        columns=MAPS | {"frame": "stem(path)"},
+    )
     assert set(found.manifest.column("tactile")) == {"train/tactile/00000000.jpg"}
     export_dataset(small_manifest, tmp_path / "hf", to="hf")
     loaded = datasets.load_from_disk(str(tmp_path / "hf"))
     outside = {"tactile_path": [f"../../{k}.png" for k in range(len(small_manifest))]}
-    evil = loaded["all"].remove_columns("tactile_path").add_column("tactile_path", outside["tactile_path"])
+    evil = (
+        loaded["all"]
+        .remove_columns("tactile_path")
+        .add_column("tactile_path", outside["tactile_path"])
+    )
     evil.save_to_disk(str(tmp_path / "evil"))
     again = import_dataset(tmp_path / "evil", tmp_path / "out2")
     assert all(p.startswith("all/tactile/") for p in again.manifest.column("tactile"))
@@ -138,7 +174,14 @@ def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_p
     rows[3]["rgb"] = {"bytes": rows[3]["rgb"]["bytes"][:-200], "path": "x.png"}
     rows[4]["path"] = "a/b"
     source = tmp_path / "mine"
-    table = [{**{k: v for k, v in row.items() if k not in ("rgb", "gel")}, "rgb": row["rgb"], "gel": row["gel"]} for row in rows]
+    table = [
+        {
+            **{k: v for k, v in row.items() if k not in ("rgb", "gel")},
+            "rgb": row["rgb"],
+            "gel": row["gel"],
+        }
+        for row in rows
+    ]
     save_hf(source, table, **kinds())
     maps = MAPS | {"frame": "stem(path)"}
     with pytest.raises(ProblemsError) as caught:
@@ -161,13 +204,20 @@ def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_p
     ]
     save_hf(tmp_path / "texts", texts)
     (tmp_path / "texts" / "in.jpg").write_bytes(secret.read_bytes())
-    found = import_dataset(tmp_path / "texts", tmp_path / "out2", columns={"tactile": "image"}, skip_bad=True)
-    assert [(p.where, p.kind) for p in found.skipped] == [("texts/all:0", "outside-root"), ("texts/all:2", "missing-file")]
+    found = import_dataset(
+        tmp_path / "texts", tmp_path / "out2", columns={"tactile": "image"}, skip_bad=True
+    )
+    assert [(p.where, p.kind) for p in found.skipped] == [
+        ("texts/all:0", "outside-root"),
+        ("texts/all:2", "missing-file"),
+    ]
     assert found.manifest.ids == ["all/00000001"]
 
 
 def test_what_cannot_be_opened_is_told(source, tmp_path, monkeypatch):
-    with pytest.raises(PalpateError, match="no vision and no tactile among part, path, kind, rgb, gel"):
+    with pytest.raises(
+        PalpateError, match="no vision and no tactile among part, path, kind, rgb, gel"
+    ):
         import_dataset(source, tmp_path / "out")
     next(source.glob("train/*.arrow")).write_bytes(b"x")
     with pytest.raises(PalpateError, match="mine must be whole and readable"):
@@ -184,9 +234,12 @@ def test_what_cannot_be_opened_is_told(source, tmp_path, monkeypatch):
         import_dataset(tmp_path / "none" / "such" / "place", tmp_path / "out", format="hf")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr(
-        "palpate.data.formats.huggingface_source._streamed", lambda *_: (_ for _ in ()).throw(ConnectionError("offline\nmode"))
+        "palpate.data.formats.huggingface_source._streamed",
+        lambda *_: (_ for _ in ()).throw(ConnectionError("offline\nmode")),
     )
-    with pytest.raises(PalpateError, match=r"user/name must be whole and readable. Got offline\. Check the name"):
+    with pytest.raises(
+        PalpateError, match=r"user/name must be whole and readable. Got offline\. Check the name"
+    ):
         import_dataset("user/name", tmp_path / "out", format="hf")
     assert not (tmp_path / "out").exists()
 
@@ -197,7 +250,10 @@ def test_a_hub_out_of_reach_is_told_at_once_with_what_to_do(tmp_path, monkeypatc
 
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     monkeypatch.setattr("huggingface_hub.HfApi.dataset_info", unreachable)
-    with pytest.raises(PalpateError, match=r"hub must be within reach.*hf download --repo-type dataset user/name --local-dir DIR"):
+    with pytest.raises(
+        PalpateError,
+        match=r"hub must be within reach.*hf download --repo-type dataset user/name --local-dir DIR",
+    ):
         import_dataset("user/name", tmp_path / "out", format="hf")
 
 
@@ -206,9 +262,15 @@ def test_an_id_of_two_parts_is_in_neither_and_parts_follow_the_kept_row(tmp_path
     rows[5]["path"] = rows[1]["path"]  # of validation: the id of a row of train
     rows[2]["path"] = rows[1]["path"]  # twice in train
     found = import_dataset(
-        save_hf(tmp_path / "mine", rows, **kinds()), tmp_path / "out", columns=MAPS | {"frame": "stem(path)"}, skip_bad=True
+        save_hf(tmp_path / "mine", rows, **kinds()),
+        tmp_path / "out",
+        columns=MAPS | {"frame": "stem(path)"},
+        skip_bad=True,
     )
-    assert [(p.where, p.kind) for p in found.skipped] == [("mine/train:2", "duplicate-id"), ("mine/validation:0", "two-parts")]
+    assert [(p.where, p.kind) for p in found.skipped] == [
+        ("mine/train:2", "duplicate-id"),
+        ("mine/validation:0", "two-parts"),
+    ]
     assert found.splits["Orig"].counts() == {"train": 3, "val": 2}
     assert "data1/0-17.0/1" in found.manifest.ids
 
@@ -217,7 +279,9 @@ def test_numbers_that_are_no_class_are_told_and_minus_one_is_inconclusive(tmp_pa
     rows = hf_rows(tmp_path / "made")
     rows[1]["kind"], rows[2]["kind"], rows[6]["kind"] = 7, -1, -2
     source = save_hf(tmp_path / "mine", rows, **kinds() | {"kind": datasets.Value("int64")})
-    for path in source.glob("*/dataset_info.json"):  # a number that the library refuses to write, though not to read
+    for path in source.glob(
+        "*/dataset_info.json"
+    ):  # a number that the library refuses to write, though not to read
         info = json.loads(path.read_text())
         info["features"]["kind"] = {"names": ["Wood", "Rock"], "_type": "ClassLabel"}
         path.write_text(json.dumps(info))
@@ -232,7 +296,9 @@ def test_numbers_that_are_no_class_are_told_and_minus_one_is_inconclusive(tmp_pa
     assert None not in found.manifest.column("material")
 
 
-def test_without_the_extra_the_error_says_what_to_install(small_manifest, source, tmp_path, monkeypatch):
+def test_without_the_extra_the_error_says_what_to_install(
+    small_manifest, source, tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, "datasets", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'palpate\[hf\]'"):
         import_dataset(source, tmp_path / "out", columns=MAPS)

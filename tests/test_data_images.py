@@ -9,18 +9,30 @@ from PIL import Image
 
 from data_forge import number, picture, tree, write_image
 from palpate.core import PalpateError, ProblemsError
-from palpate.data.images import cached_images, check_image, in_threads, load_images, read_image, square, write_png
+from palpate.data.images import (
+    cached_images,
+    check_image,
+    in_threads,
+    load_images,
+    read_image,
+    square,
+    write_png,
+)
 from palpate.data.manifest import Manifest
 
 RNG = np.random.default_rng(0)
 
 
 def test_every_mode_becomes_rgb_by_the_stated_rules(tmp_path):
-    grey16 = np.array([[0, 257, 65535, 128, 129]], np.uint16)
-    Image.fromarray(grey16).save(tmp_path / "i16.png")
+    gray16 = np.array([[0, 257, 65535, 128, 129]], np.uint16)
+    Image.fromarray(gray16).save(tmp_path / "i16.png")
     assert np.asarray(read_image(tmp_path / "i16.png"))[0, :, 0].tolist() == [0, 1, 255, 0, 1]
-    Image.fromarray(np.array([[[10, 20, 30, 255], [10, 20, 30, 0], [0, 0, 0, 51]]], np.uint8)).save(tmp_path / "a.png")
-    assert np.asarray(read_image(tmp_path / "a.png")).tolist() == [[[10, 20, 30], [255, 255, 255], [204, 204, 204]]]
+    Image.fromarray(np.array([[[10, 20, 30, 255], [10, 20, 30, 0], [0, 0, 0, 51]]], np.uint8)).save(
+        tmp_path / "a.png"
+    )
+    assert np.asarray(read_image(tmp_path / "a.png")).tolist() == [
+        [[10, 20, 30], [255, 255, 255], [204, 204, 204]]
+    ]
     Image.fromarray(np.array([[7, 200]], np.uint8)).save(tmp_path / "l.png")
     assert np.asarray(read_image(tmp_path / "l.png")).tolist() == [[[7] * 3, [200] * 3]]
     palette = Image.new("P", (2, 1))
@@ -51,7 +63,12 @@ def test_cut_empty_foreign_and_missing_files_are_refused_by_name(tmp_path, suffi
     good.write_bytes(data)
     assert check_image(good) is None
     assert check_image(good, "header") is None
-    for name, content in {"half": data[: len(data) // 2], "most": data[:-200], "empty": b"", "text": b"no image at all"}.items():
+    for name, content in {
+        "half": data[: len(data) // 2],
+        "most": data[:-200],
+        "empty": b"",
+        "text": b"no image at all",
+    }.items():
         bad = tmp_path / f"{name}.{suffix}"
         bad.write_bytes(content)
         assert check_image(bad), name
@@ -63,13 +80,15 @@ def test_cut_empty_foreign_and_missing_files_are_refused_by_name(tmp_path, suffi
     assert "0 bytes" in (check_image(tmp_path / f"empty.{suffix}", "header") or "")
 
 
-def test_centre_square_is_antialiased():
+def test_center_square_is_antialiased():
     wide = np.zeros((40, 100, 3), np.uint8)
-    wide[:, 30:70] = 200  # exactly the centre square
+    wide[:, 30:70] = 200  # exactly the center square
     assert (square(Image.fromarray(wide), 8) == 200).all()
     checks = (np.indices((64, 64)).sum(0) % 2 * 255).astype(np.uint8)
     small = square(Image.fromarray(checks).convert("RGB"), 8)
-    assert abs(small.astype(int) - 127).max() <= 3  # a filter without antialiasing would give 0 or 255
+    assert (
+        abs(small.astype(int) - 127).max() <= 3
+    )  # a filter without antialiasing would give 0 or 255
 
 
 def test_load_keeps_order_decodes_doubles_once_and_names_all_bad_files(tmp_path, monkeypatch):
@@ -110,11 +129,15 @@ def test_cache_is_mapped_reused_and_renewed_when_a_file_changes(tmp_path):
     cached_images(manifest, "tactile", 16, cache)
     assert file.stat().st_mtime_ns == stamp
     file.write_bytes(file.read_bytes()[:200])  # a cut cache is not trusted
-    assert np.array_equal(cached_images(manifest, "tactile", 16, cache), cached_images(manifest, "tactile", 16))
+    assert np.array_equal(
+        cached_images(manifest, "tactile", 16, cache), cached_images(manifest, "tactile", 16)
+    )
     for damage in (b"{(((", b"0000"):  # nor one whose header, which is parsed as Python, is none
         whole = file.read_bytes()
         file.write_bytes(whole[:10] + damage + whole[10 + len(damage) :])
-        assert np.array_equal(cached_images(manifest, "tactile", 16, cache), cached_images(manifest, "tactile", 16))
+        assert np.array_equal(
+            cached_images(manifest, "tactile", 16, cache), cached_images(manifest, "tactile", 16)
+        )
     write_image(tmp_path / "d" / "1.png", 9)
     os.utime(tmp_path / "d" / "1.png", ns=(1, 1))
     assert number(cached_images(manifest, "tactile", 64, cache)[1]) == 9
@@ -126,7 +149,11 @@ def test_cache_is_mapped_reused_and_renewed_when_a_file_changes(tmp_path):
 
 
 def test_write_png_is_exact_whole_and_strict(tmp_path):
-    for array in (RNG.integers(100, 110, (5, 7, 3), np.uint8), RNG.integers(0, 255, (5, 7), np.uint8), picture(77)[:, ::-1]):
+    for array in (
+        RNG.integers(100, 110, (5, 7, 3), np.uint8),
+        RNG.integers(0, 255, (5, 7), np.uint8),
+        picture(77)[:, ::-1],
+    ):
         write_png(tmp_path / "sub" / "x.png", array)
         assert np.array_equal(np.asarray(Image.open(tmp_path / "sub" / "x.png")), array)
     for bad in (np.zeros((4, 4, 3)), np.zeros((3, 4, 4), np.uint8), np.zeros(4, np.uint8)):

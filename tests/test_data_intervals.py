@@ -34,45 +34,72 @@ def shown(manifest, column):
 def test_intervals_give_what_a_frame_list_of_the_same_touches_gives(tmp_path, raw):
     root = recording(tmp_path / "tag", "a", raw=raw)
     (root / "list.csv").write_text(LIST)
-    frames = [(k, 3) for k in range(10, 16)] + [(k, 15) for k in range(17, 20)] + [(k, -1) for k in range(30, 34)]
+    frames = (
+        [(k, 3) for k in range(10, 16)]
+        + [(k, 15) for k in range(17, 20)]
+        + [(k, -1) for k in range(30, 34)]
+    )
     (root / "label.txt").write_text("\n".join(f"a/{k:010d}.jpg,{c}" for k, c in frames))
     (root / "classes.txt").write_text("Wood: 3\nRock: 15\n")
-    found = import_dataset(root / "list.csv", tmp_path / "out", classes=root / "classes.txt", sensor="GelSight'17")
+    found = import_dataset(
+        root / "list.csv", tmp_path / "out", classes=root / "classes.txt", sensor="GelSight'17"
+    )
     wanted = import_touch_and_go(root, tmp_path / "tag_out")
     assert found.manifest.require_valid().digest == wanted.manifest.digest
     assert found.inconclusive == 1  # intervals here, frames there
-    assert shown(found.manifest, "tactile") == shown(found.manifest, "vision") == [*range(10, 16), *range(17, 20)]
+    assert (
+        shown(found.manifest, "tactile")
+        == shown(found.manifest, "vision")
+        == [*range(10, 16), *range(17, 20)]
+    )
     assert shown(found.manifest, "background") == [6] * 6 + [9] * 3
     assert found.facts["format"] == "intervals"
     looked = validate_dataset(root / "list.csv", classes=root / "classes.txt")
     assert (looked.ok, looked.samples, looked.format) == (True, 9, "intervals")
 
 
-@pytest.mark.parametrize(("text", "options"), [
-    ("a,10,12,Wood\na,20,20,Rock", {}),  # no header
-    ("Clip;First;Last;Class\na;10;12;Wood\na;20;20;Rock", {}),
-    ("video,start,end,label\na,10,13,Wood\na,20,21,Rock", {"half_open": True}),
-    ("file,from,to,what\nx/a.mp4,10,12,Wood\nx/a.mp4,20,20,Rock", {"columns": {"video": "stem(file)", "material": "what"}}),
-    ("label,end,start,video\nRock,20,20,a\nWood,12.0,10,a", {}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        ("a,10,12,Wood\na,20,20,Rock", {}),  # no header
+        ("Clip;First;Last;Class\na;10;12;Wood\na;20;20;Rock", {}),
+        ("video,start,end,label\na,10,13,Wood\na,20,21,Rock", {"half_open": True}),
+        (
+            "file,from,to,what\nx/a.mp4,10,12,Wood\nx/a.mp4,20,20,Rock",
+            {"columns": {"video": "stem(file)", "material": "what"}},
+        ),
+        ("label,end,start,video\nRock,20,20,a\nWood,12.0,10,a", {}),
+    ],
+)
 def test_forms_of_the_same_list(tmp_path, text, options):
     root = recording(tmp_path / "d", "a")
     (root / "l.csv").write_text(text)
-    manifest = import_dataset(root / "l.csv", tmp_path / "out", format="intervals", **options).manifest
+    manifest = import_dataset(
+        root / "l.csv", tmp_path / "out", format="intervals", **options
+    ).manifest
     assert manifest.ids == [f"a/{k:010d}" for k in (10, 11, 12, 20)]
-    assert manifest.column("touch") == ["a#0001"] * 3 + ["a#0002"]
+    assert manifest.column("contact") == ["a#0001"] * 3 + ["a#0002"]
     assert manifest.column("material") == ["Wood"] * 3 + ["Rock"]
     assert manifest.column("sensor") == [None] * 4
 
 
 def test_words_backgrounds_root_and_thinning(tmp_path):
     recording(tmp_path / "d", "a")
-    (tmp_path / "l.csv").write_text('video,start,end,object,text,background\na,10,16,chair,"soft, warm",2\na,20,22,,,\n')
-    manifest = import_dataset(tmp_path / "l.csv", tmp_path / "out", root=tmp_path / "d", every=3).manifest
+    (tmp_path / "l.csv").write_text(
+        'video,start,end,object,text,background\na,10,16,chair,"soft, warm",2\na,20,22,,,\n'
+    )
+    manifest = import_dataset(
+        tmp_path / "l.csv", tmp_path / "out", root=tmp_path / "d", every=3
+    ).manifest
     assert manifest.column("frame") == [10, 13, 16, 20]
     assert manifest.column("object") == ["chair"] * 3 + [None]
     assert manifest.column("text") == ["soft, warm"] * 3 + [None]
-    assert shown(manifest, "background") == [2, 2, 2, 9]  # 4 before 20 is in the first touch, whole though thinned
+    assert shown(manifest, "background") == [
+        2,
+        2,
+        2,
+        9,
+    ]  # 4 before 20 is in the first touch, whole though thinned
     assert manifest.column("material") == [None] * 4
 
 
@@ -82,7 +109,10 @@ def test_what_looks_wrong_is_told_by_import_and_validation(tmp_path):
     (tmp_path / "l.csv").write_text("video,start,end,background\na,10,16,2\na,20,22,15\n")
     found = import_dataset(tmp_path / "l.csv", tmp_path / "out")
     told = [(p.where, p.kind) for p in found.suspicious]
-    assert told == [(f"{tmp_path / 'l.csv'}:3", "background-in-touch"), (str(tmp_path), "unlisted-video")]
+    assert told == [
+        (f"{tmp_path / 'l.csv'}:3", "background-in-touch"),
+        (str(tmp_path), "unlisted-video"),
+    ]
     assert "frame 15 of 'a'" in found.suspicious[0].text
     assert list(validate_dataset(tmp_path / "l.csv").suspicious) == found.suspicious
 
@@ -110,23 +140,41 @@ def test_every_bad_interval_is_told_by_its_line(tmp_path):
     (root / "b" / "gelsight_frame" / "0000000031.jpg").unlink()
     (root / "b" / "video_frame" / "0000000035.jpg").write_bytes(b"")
     lines = [
-        ("a,1,3,x", None), ("a,5,9,x", "overlap"), ("a,8,12,y", "overlap"), ("a,12,14,y", "overlap"), ("a,1,3,x", "duplicate-row"), ("a,20,19,x", "bad-interval"),
-        ("none,1,2,x", "missing-video"), ("a,38,40,x", "beyond-end"), ("a,one,2,x", "bad-frame"), (",1,2,x", "empty-cell"), ("b,30,32,x", "missing-file"),
-        ("b,34,36,x", "bad-image"), ("a,1,2", "bad-row"), ("a,16,,x", "empty-cell"), ("a,15,15,z", None), ("a,999999999999,9999999999999,x", "beyond-end"),
-    ]  # fmt: skip
+        ("a,1,3,x", None),
+        ("a,5,9,x", "overlap"),
+        ("a,8,12,y", "overlap"),
+        ("a,12,14,y", "overlap"),
+        ("a,1,3,x", "duplicate-row"),
+        ("a,20,19,x", "bad-interval"),
+        ("none,1,2,x", "missing-video"),
+        ("a,38,40,x", "beyond-end"),
+        ("a,one,2,x", "bad-frame"),
+        (",1,2,x", "empty-cell"),
+        ("b,30,32,x", "missing-file"),
+        ("b,34,36,x", "bad-image"),
+        ("a,1,2", "bad-row"),
+        ("a,16,,x", "empty-cell"),
+        ("a,15,15,z", None),
+        ("a,999999999999,9999999999999,x", "beyond-end"),
+    ]
     (root / "l.csv").write_text("video,start,end,label\n" + "\n".join(line for line, _ in lines))
     with pytest.raises(ProblemsError) as caught:
         import_dataset(root / "l.csv", tmp_path / "out")
     told = [(p.where, p.kind) for p in caught.value.problems]
-    assert sorted(told) == sorted((f"{root / 'l.csv'}:{n}", kind) for n, (_, kind) in enumerate(lines, 2) if kind)
-    assert f"overlap with 8 to 12 at {root / 'l.csv'}:4" in next(p.text for p in caught.value.problems if p.where.endswith(":3"))
+    assert sorted(told) == sorted(
+        (f"{root / 'l.csv'}:{n}", kind) for n, (_, kind) in enumerate(lines, 2) if kind
+    )
+    assert f"overlap with 8 to 12 at {root / 'l.csv'}:4" in next(
+        p.text for p in caught.value.problems if p.where.endswith(":3")
+    )
     assert not (tmp_path / "out").exists()
     looked = validate_dataset(root / "l.csv")
     assert sorted((p.where, p.kind) for p in [*looked.missing, *looked.invalid]) == sorted(told)
     found = import_dataset(root / "l.csv", tmp_path / "out", skip_bad=True)
-    assert [(v, f) for v, f in zip(found.manifest.column("video"), found.manifest.column("frame"), strict=True)] == [
-        *(("a", k) for k in (1, 2, 3, 15)), ("b", 30), ("b", 32), ("b", 34), ("b", 36),
-    ]  # fmt: skip
+    assert [
+        (v, f)
+        for v, f in zip(found.manifest.column("video"), found.manifest.column("frame"), strict=True)
+    ] == [*(("a", k) for k in (1, 2, 3, 15)), ("b", 30), ("b", 32), ("b", 34), ("b", 36)]
     assert looked.samples == len(found.manifest)
 
 
@@ -134,9 +182,20 @@ def test_overlaps_are_those_of_a_slow_search(tmp_path):
     rng = np.random.default_rng(0)
     root = recording(tmp_path / "d", "a", 90)
     for _ in range(12):
-        spans = [(int(a), int(a + n)) for a, n in zip(rng.integers(0, 80, 9), rng.integers(0, 8, 9), strict=True)]
-        (root / "l.csv").write_text("video,start,end,label\n" + "".join(f"a,{a},{b},{k}\n" for k, (a, b) in enumerate(spans)))
-        slow = {k for k, (a, b) in enumerate(spans) for j, (c, d) in enumerate(spans) if j != k and a <= d and c <= b}
+        spans = [
+            (int(a), int(a + n))
+            for a, n in zip(rng.integers(0, 80, 9), rng.integers(0, 8, 9), strict=True)
+        ]
+        (root / "l.csv").write_text(
+            "video,start,end,label\n"
+            + "".join(f"a,{a},{b},{k}\n" for k, (a, b) in enumerate(spans))
+        )
+        slow = {
+            k
+            for k, (a, b) in enumerate(spans)
+            for j, (c, d) in enumerate(spans)
+            if j != k and a <= d and c <= b
+        }
         looked = validate_dataset(root / "l.csv", check="none")
         assert {int(p.where.rpartition(":")[2]) - 2 for p in looked.invalid} == slow
 
@@ -177,11 +236,23 @@ def test_the_real_clips_by_intervals_are_those_by_frames(real_data, tmp_path):
     pytest.importorskip("av", reason="PyAV is not installed")
     root = real_data / "touch_and_go" / "clips"
     frame = pl.col("frame")
-    touches = read_list(root / "label.txt").manifest.table.group_by("touch", maintain_order=True).agg(
-        pl.col("video").first(), start=frame.min(), end=frame.max(), label=pl.col("material").first()
-    )  # fmt: skip
+    touches = (
+        read_list(root / "label.txt")
+        .manifest.table.group_by("contact", maintain_order=True)
+        .agg(
+            pl.col("video").first(),
+            start=frame.min(),
+            end=frame.max(),
+            label=pl.col("material").first(),
+        )
+    )
     assert touches.height == 17
-    touches.drop("touch").write_csv(tmp_path / "touches.csv")
-    found = import_dataset(tmp_path / "touches.csv", tmp_path / "out", root=root, sensor="GelSight'17", size=64)
+    touches.drop("contact").write_csv(tmp_path / "touches.csv")
+    found = import_dataset(
+        tmp_path / "touches.csv", tmp_path / "out", root=root, sensor="GelSight'17", size=64
+    )
     assert len(found.manifest) == 436
-    assert found.manifest.digest == import_touch_and_go(root, tmp_path / "tag", size=64).manifest.digest
+    assert (
+        found.manifest.digest
+        == import_touch_and_go(root, tmp_path / "tag", size=64).manifest.digest
+    )

@@ -7,7 +7,14 @@ import time
 import pytest
 
 from palpate.core import PalpateError, ProblemsError
-from palpate.data.listing import read_categories, read_frame_table, read_list, read_lists, touches, write_list
+from palpate.data.listing import (
+    read_categories,
+    read_frame_table,
+    read_list,
+    read_lists,
+    touches,
+    write_list,
+)
 from palpate.data.reading import is_list
 
 
@@ -64,27 +71,45 @@ BAD = {
 
 
 def test_every_bad_line_is_told_at_once_with_its_place(tmp_path):
-    path = write(tmp_path / "bad.txt", "\n".join(["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]))
+    path = write(
+        tmp_path / "bad.txt",
+        "\n".join(
+            ["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]
+        ),
+    )
     with pytest.raises(ProblemsError) as caught:
         read_list(path)
-    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{path}:{n}", kind) for n, (_, kind) in BAD.items()]
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        (f"{path}:{n}", kind) for n, (_, kind) in BAD.items()
+    ]
 
 
 def test_skip_bad_leaves_them_out_and_lists_them_and_trusts_neither_of_two_labels(tmp_path):
-    path = write(tmp_path / "bad.txt", "\n".join(["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]))
+    path = write(
+        tmp_path / "bad.txt",
+        "\n".join(
+            ["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]
+        ),
+    )
     found = read_list(path, skip_bad=True)
     assert found.manifest.ids == ["v/0000000001", "v/0000000019"]
-    assert [(p.where, p.kind) for p in found.skipped] == [(f"{path}:{n}", kind) for n, (_, kind) in BAD.items()]
+    assert [(p.where, p.kind) for p in found.skipped] == [
+        (f"{path}:{n}", kind) for n, (_, kind) in BAD.items()
+    ]
     assert f"4 at {path}:12" in found.skipped[9].text
 
 
 def test_empty_missing_folder_and_foreign_bytes(tmp_path):
     with pytest.raises(ProblemsError) as caught:
         read_list(write(tmp_path / "empty.txt", "\n \n"))
-    assert [(p.where, p.kind) for p in caught.value.problems] == [(str(tmp_path / "empty.txt"), "empty-list")]
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        (str(tmp_path / "empty.txt"), "empty-list")
+    ]
     with pytest.raises(ProblemsError) as caught:
         read_list(write(tmp_path / "latin.txt", b"v/1.jpg,3\nv\xe9/2.jpg,3\n"))
-    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{tmp_path / 'latin.txt'}:2", "bad-encoding")]
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        (f"{tmp_path / 'latin.txt'}:2", "bad-encoding")
+    ]
     with pytest.raises(PalpateError, match="no file"):
         read_list(tmp_path / "none.txt")
     with pytest.raises(PalpateError, match="folder"):
@@ -100,19 +125,39 @@ def test_categories_beside_the_list_name_the_material_and_refuse_other_labels(tm
         read_list(path)
     assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{path}:3", "unknown-label")]
     assert read_list(path, skip_bad=True).manifest.column("material") == ["Wood", "Rubber"]
-    assert read_list(path, categories={3: "x", 10: "y", 11: "z"}).manifest.column("material") == ["x", "y", "z"]
+    assert read_list(path, categories={3: "x", 10: "y", 11: "z"}).manifest.column("material") == [
+        "x",
+        "y",
+        "z",
+    ]
 
 
 def test_joined_lists_find_a_frame_that_stands_in_both(tmp_path):
-    a, b = write(tmp_path / "a.txt", "v/1.jpg,3\nv/2.jpg,3"), write(tmp_path / "b.txt", "v/0002.jpg,3\nv/1.jpg,4\nv/3.jpg,3")
+    a, b = (
+        write(tmp_path / "a.txt", "v/1.jpg,3\nv/2.jpg,3"),
+        write(tmp_path / "b.txt", "v/0002.jpg,3\nv/1.jpg,4\nv/3.jpg,3"),
+    )
     found = read_lists([a, b], root=tmp_path, skip_bad=True)
-    assert [(p.where, p.kind) for p in found.skipped] == [(f"{a}:1", "two-labels"), (f"{b}:1", "duplicate-row"), (f"{b}:2", "two-labels")]
+    assert [(p.where, p.kind) for p in found.skipped] == [
+        (f"{a}:1", "two-labels"),
+        (f"{b}:1", "duplicate-row"),
+        (f"{b}:2", "two-labels"),
+    ]
     assert found.manifest.column("touch") == ["v#0001", "v#0001"]
 
 
 def test_touches_by_hand_and_against_a_slow_count():
     videos, frames, labels = list("bbbaabba"), [5, 4, 9, 1, 2, 6, 7, 4], [0, 0, 0, 1, 1, 2, 2, 1]
-    assert touches(videos, frames, labels) == ["b#0001", "b#0001", "b#0003", "a#0001", "a#0001", "b#0002", "b#0002", "a#0002"]
+    assert touches(videos, frames, labels) == [
+        "b#0001",
+        "b#0001",
+        "b#0003",
+        "a#0001",
+        "a#0001",
+        "b#0002",
+        "b#0002",
+        "a#0002",
+    ]
     assert touches(videos, frames, None)[5] == "b#0001"
     import numpy as np
 
@@ -137,7 +182,14 @@ def test_write_list_can_be_read_back_and_refuses_what_could_not(tmp_path):
 def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
     text = "Inconclusive: -1 (Do not use)\nWood: 3 \nMetal:4\n'Synthetic  Fabric' : 8\n\"Ruber\": 10,\nOthers: 19"
     found = read_categories(write(tmp_path / "c.txt", text))
-    assert found == {-1: "Inconclusive", 3: "Wood", 4: "Metal", 8: "Synthetic Fabric", 10: "Rubber", 19: "Others"}
+    assert found == {
+        -1: "Inconclusive",
+        3: "Wood",
+        4: "Metal",
+        8: "Synthetic Fabric",
+        10: "Rubber",
+        19: "Others",
+    }
     with pytest.raises(ProblemsError) as caught:
         read_categories(write(tmp_path / "d.txt", "Wood: 3\nStone\nIron: 3\n"))
     assert [(p.where, p.kind) for p in caught.value.problems] == [
@@ -153,7 +205,11 @@ def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
 def test_lists_of_other_tools(tmp_path, code, end):
     name = "gr\u00f6\u00dfe\u2028 a"  # a line separator that is not the end of a line
     path = tmp_path / "l.txt"
-    path.write_bytes(end.join([f"{name}/0001.jpg,3", "", f"{name}/2.jpg,4", "nonsense", "v/3.jpg,5", ""]).encode(code))
+    path.write_bytes(
+        end.join([f"{name}/0001.jpg,3", "", f"{name}/2.jpg,4", "nonsense", "v/3.jpg,5", ""]).encode(
+            code
+        )
+    )
     found = read_list(path, skip_bad=True)
     assert found.manifest.ids == [f"{name}/0001", f"{name}/2", "v/3"]
     assert found.rows["line"].to_list() == [1, 3, 5]
@@ -164,10 +220,17 @@ def test_lists_of_other_tools(tmp_path, code, end):
 
 
 def test_words_for_frames(tmp_path):
-    path = write(tmp_path / "captions.csv", 'frame,text\nv/0001.jpg,"hard, cold"\nv/2.jpg,soft, warm\nx,hard\nv/3.jpg,\nv/1.jpg,soft\n')
+    path = write(
+        tmp_path / "captions.csv",
+        'frame,text\nv/0001.jpg,"hard, cold"\nv/2.jpg,soft, warm\nx,hard\nv/3.jpg,\nv/1.jpg,soft\n',
+    )
     found = read_frame_table(path)
     assert found.values == {("v", 1): "hard, cold", ("v", 2): "soft, warm"}
-    assert [(p.where, p.kind) for p in found.skipped] == [(f"{path}:4", "bad-path"), (f"{path}:5", "bad-line"), (f"{path}:6", "two-labels")]
+    assert [(p.where, p.kind) for p in found.skipped] == [
+        (f"{path}:4", "bad-path"),
+        (f"{path}:5", "bad-line"),
+        (f"{path}:6", "two-labels"),
+    ]
 
 
 def test_listing_loads_neither_pillow_nor_av():
@@ -184,7 +247,9 @@ def test_facts_of_the_official_lists(real_data):
     runs = [f.manifest.table["touch"].n_unique() for f in (train, test, both)]
     assert [len(f.manifest) for f in (train, test, both)] == [91_982, 29_879, 121_861]
     assert runs == [3_378, 1_113, 4_491]
-    by_touch = both.manifest.table.with_columns(source=both.rows["source"]).group_by("touch").n_unique()
+    by_touch = (
+        both.manifest.table.with_columns(source=both.rows["source"]).group_by("touch").n_unique()
+    )
     assert by_touch["source"].max() == 1
     assert by_touch["material"].max() == 1
     assert train.manifest.table["video"].n_unique() == 120

@@ -20,7 +20,10 @@ def test_digest_sees_every_cell_and_the_order(small_manifest):
     digests = {small_manifest.digest, small_manifest.take(small_manifest.ids[::-1]).digest}
     for column in ("text", "material", "vision"):
         changed = small_manifest.table.with_columns(
-            pl.when(pl.col("id") == "v0/0").then(pl.lit("x")).otherwise(pl.col(column)).alias(column)
+            pl.when(pl.col("id") == "v0/0")
+            .then(pl.lit("x"))
+            .otherwise(pl.col(column))
+            .alias(column)
         )
         digests.add(Manifest(changed, small_manifest.root).digest)
     assert len(digests) == 5
@@ -29,13 +32,20 @@ def test_digest_sees_every_cell_and_the_order(small_manifest):
 def test_every_problem_is_listed_at_once(tmp_path):
     (tmp_path / "a.png").touch()
     rows = [
-        {"id": "1", "vision": "a.png"}, {"id": "1", "vision": "a.png"}, {"id": None}, {"id": "4", "tactile": "../b.png"}, {"id": "5", "background": "gone.png"},
-    ]  # fmt: skip
+        {"id": "1", "vision": "a.png"},
+        {"id": "1", "vision": "a.png"},
+        {"id": None},
+        {"id": "4", "tactile": "../b.png"},
+        {"id": "5", "background": "gone.png"},
+    ]
     with pytest.raises(ProblemsError) as caught:
         Manifest.from_rows(rows, tmp_path).require_valid()
     assert {(p.where, p.kind) for p in caught.value.problems} == {
-        ("row 2", "duplicate-id"), ("row 3", "null-id"), ("row 4", "outside-root"), ("row 5", "missing-file"),
-    }  # fmt: skip
+        ("row 2", "duplicate-id"),
+        ("row 3", "null-id"),
+        ("row 4", "outside-root"),
+        ("row 5", "missing-file"),
+    }
     with pytest.raises(ProblemsError, match="1 empty"):
         Manifest.from_rows([], tmp_path).require_valid()
 
@@ -51,18 +61,25 @@ def test_foreign_and_changed_files_are_refused(small_manifest, tmp_path):
     with pytest.raises(PalpateError, match="foreign"):
         Manifest.load(path)
     small_manifest.table.head(3).write_parquet(
-        path, metadata={"palpate.format": "palpate-manifest/2", "palpate.digest": small_manifest.digest, "palpate.root": "."}
+        path,
+        metadata={
+            "palpate.format": "palpate-manifest/2",
+            "palpate.digest": small_manifest.digest,
+            "palpate.root": ".",
+        },
     )
     with pytest.raises(PalpateError, match="another program"):
         Manifest.load(path)
-    with pytest.raises(PalpateError, match="'colour'"):
-        Manifest.from_rows([{"colour": "red"}], tmp_path)
+    with pytest.raises(PalpateError, match="'color'"):
+        Manifest.from_rows([{"color": "red"}], tmp_path)
 
 
 def test_a_manifest_whose_paths_climb_out_is_not_loaded(tmp_path):
     (tmp_path / "secret.png").touch()
     for path in ("../secret.png", "a/../../secret.png", str(tmp_path / "secret.png"), "C:/x.png"):
-        Manifest.from_rows([{"id": "1", "vision": path}], tmp_path / "root").save(tmp_path / "root" / "manifest.parquet")
+        Manifest.from_rows([{"id": "1", "vision": path}], tmp_path / "root").save(
+            tmp_path / "root" / "manifest.parquet"
+        )
         with pytest.raises(PalpateError, match="inside the root"):
             Manifest.load(tmp_path / "root")
 

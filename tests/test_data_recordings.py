@@ -32,14 +32,20 @@ def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(root, tmp_path / "out")
     assert list(caught.value.problems) == list(looked.invalid)
-    assert looked.samples == len(import_touch_and_go(root, tmp_path / "out", skip_bad=True).manifest) < 18
+    assert (
+        looked.samples
+        == len(import_touch_and_go(root, tmp_path / "out", skip_bad=True).manifest)
+        < 18
+    )
     assert validate_dataset(root, check="header").ok
     assert len(read_samples(root)[0]) == 18  # who only wants the samples waits for no decoding
     assert tree(root) == before
 
 
 def test_a_stray_number_costs_nothing_and_what_looks_wrong_reaches_the_user(tmp_path):
-    root = forge(tmp_path / "tag", extracted=("a", "spare"), lines=[f"a/{k:010d}.jpg,3" for k in range(3)])
+    root = forge(
+        tmp_path / "tag", extracted=("a", "spare"), lines=[f"a/{k:010d}.jpg,3" for k in range(3)]
+    )
     place = root / "dataset" / "a"
     wanted = import_touch_and_go(root, tmp_path / "wanted").manifest
     for side in ("gelsight_frame", "video_frame"):
@@ -53,8 +59,10 @@ def test_a_stray_number_costs_nothing_and_what_looks_wrong_reaches_the_user(tmp_
     looked = validate_dataset(root)
     assert looked.ok
     assert sorted((p.kind, p.where.removeprefix(str(root))) for p in looked.suspicious) == [
-        ("duplicate-frame", "/dataset/a/video_frame/000001.jpg"), ("duplicate-frame", "/dataset/a/video_frame/1.png"), ("unlisted-video", ""),
-    ]  # fmt: skip
+        ("duplicate-frame", "/dataset/a/video_frame/000001.jpg"),
+        ("duplicate-frame", "/dataset/a/video_frame/1.png"),
+        ("unlisted-video", ""),
+    ]
     assert found.suspicious == list(looked.suspicious)
 
 
@@ -69,7 +77,9 @@ def test_untouched_frames_are_those_of_a_slow_search(tmp_path):
             (root / "t" / f"{k}.jpg").write_bytes(b"")
         work = recordings.Recordings(root, root, {}, {"a": contact}, "jpg", None, [])
         work.sides["a"] = {"tactile": recordings.FolderFrames(root / "t", root)}
-        far = [k for k in there if not any(abs(k - c) <= 4 for c in contact)] or [k for k in there if k not in contact]
+        far = [k for k in there if not any(abs(k - c) <= 4 for c in contact)] or [
+            k for k in there if k not in contact
+        ]
         found = work._untouched("a")
         assert set(found) <= set(far)
         assert len(found) == min(len(far), 15)

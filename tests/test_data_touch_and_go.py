@@ -17,7 +17,9 @@ from palpate.data.manifest import Manifest
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
 #: Touches of every forged recording of 40 frames: label 3 from 10 to 15, label 15 from 17 to 19.
-LINES = [f"{{}}/{k:010d}.jpg,3" for k in range(10, 16)] + [f"{{}}/{k:010d}.jpg,15" for k in range(17, 20)]
+LINES = [f"{{}}/{k:010d}.jpg,3" for k in range(10, 16)] + [
+    f"{{}}/{k:010d}.jpg,15" for k in range(17, 20)
+]
 
 
 def forge(root, *, raw=(), extracted=(), place="dataset", lines=None):
@@ -28,7 +30,11 @@ def forge(root, *, raw=(), extracted=(), place="dataset", lines=None):
     for name in extracted:
         write_frames(root / place / name / "video_frame", 40)
         write_frames(root / place / name / "gelsight_frame", 40)
-    text = lines if lines is not None else [line.format(name) for name in (*raw, *extracted) for line in LINES]
+    text = (
+        lines
+        if lines is not None
+        else [line.format(name) for name in (*raw, *extracted) for line in LINES]
+    )
     (root / "label.txt").write_text("\n".join(text))
     return root
 
@@ -40,7 +46,11 @@ def shown(manifest, column):
 @pytest.mark.parametrize("place", ["dataset", "final_dataset", "."])
 @pytest.mark.parametrize("layout", ["raw", "extracted", "mixed"])
 def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
-    names = {"raw": {"raw": ("a", "b")}, "extracted": {"extracted": ("a", "b")}, "mixed": {"raw": ("a",), "extracted": ("b",)}}
+    names = {
+        "raw": {"raw": ("a", "b")},
+        "extracted": {"extracted": ("a", "b")},
+        "mixed": {"raw": ("a",), "extracted": ("b",)},
+    }
     root = forge(tmp_path / "tag", place=place, **names[layout])
     found = import_touch_and_go(root, tmp_path / "out")
     manifest = found.manifest.require_valid()
@@ -48,13 +58,13 @@ def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
     assert manifest.ids == [f"{v}/{k:010d}" for v, k in zip("a" * 9 + "b" * 9, frames, strict=True)]
     assert manifest.column("frame") == frames
     assert manifest.column("material") == (["Wood"] * 6 + ["Rock"] * 3) * 2
-    assert manifest.column("touch") == [f"{v}#000{t}" for v in "ab" for t in [1] * 6 + [2] * 3]
+    assert manifest.column("contact") == [f"{v}#000{t}" for v in "ab" for t in [1] * 6 + [2] * 3]
     assert shown(manifest, "vision") == frames
     assert shown(manifest, "tactile") == frames
     # 4 before 10 is 6; 4 before 17 is 13, in a touch, so back to 9
     assert shown(manifest, "background") == ([6] * 6 + [9] * 3) * 2
     assert found.facts["layout"] == layout
-    assert found.facts["licence"] == "CC BY 4.0"
+    assert found.facts["license"] == "CC BY 4.0"
     assert found.facts["text_source"] == "none"
     assert manifest.column("text") == [None] * 18
     roots = {"raw": tmp_path / "out", "extracted": root, "mixed": tmp_path / "out"}
@@ -131,7 +141,9 @@ def test_everything_bad_is_told_at_once_and_nothing_is_left(tmp_path):
     wanted = spoil(tmp_path / "tag")
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(tmp_path / "tag", tmp_path / "out")
-    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{f}:{n}", kind) for f, n, kind, _ in wanted]
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        (f"{f}:{n}", kind) for f, n, kind, _ in wanted
+    ]
     for problem, (_, _, _, word) in zip(caught.value.problems, wanted, strict=True):
         assert word in problem.text
     assert not (tmp_path / "out").exists()
@@ -140,7 +152,9 @@ def test_everything_bad_is_told_at_once_and_nothing_is_left(tmp_path):
 def test_skip_bad_imports_the_rest_and_lists_the_same(tmp_path):
     wanted = spoil(tmp_path / "tag")
     found = import_touch_and_go(tmp_path / "tag", tmp_path / "out", skip_bad=True)
-    assert [(p.where, p.kind) for p in found.skipped] == [(f"{f}:{n}", kind) for f, n, kind, _ in wanted]
+    assert [(p.where, p.kind) for p in found.skipped] == [
+        (f"{f}:{n}", kind) for f, n, kind, _ in wanted
+    ]
     assert found.manifest.ids == ["ext/0000000014", "good/0000000010", "good/0000000039"]
     assert found.manifest.column("text") == [None, "hard", None]
     assert found.inconclusive == 1
@@ -154,13 +168,17 @@ def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatc
     def fail(self, wanted, created, stop):
         original(self, {10, 11} if "b" in self.source.parts else wanted, created, stop)
         if "b" in self.source.parts:
-            raise PalpateError("the video must be whole", "frame 12 of 40 cannot be decoded", "fetch it")
+            raise PalpateError(
+                "the video must be whole", "frame 12 of 40 cannot be decoded", "fetch it"
+            )
 
     monkeypatch.setattr(recordings.VideoFrames, "extract", fail)
     (tmp_path / "out").mkdir()
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(root, tmp_path / "out")
-    assert {(p.where, p.kind) for p in caught.value.problems} == {(f"{root / 'label.txt'}:10", "bad-video")}
+    assert {(p.where, p.kind) for p in caught.value.problems} == {
+        (f"{root / 'label.txt'}:10", "bad-video")
+    }
     assert tree(tmp_path / "out") == set()
     found = import_touch_and_go(root, tmp_path / "out", skip_bad=True)
     assert found.manifest.column("video") == ["a"] * 9 + ["b"] * 2
@@ -184,7 +202,10 @@ def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
     assert all(p.stat().st_mtime_ns == t for p, t in kept.items())
     assert resumed.manifest.digest == whole.manifest.digest
     for path in (tmp_path / "whole").rglob("*.jpg"):
-        assert path.read_bytes() == (tmp_path / "out" / path.relative_to(tmp_path / "whole")).read_bytes()
+        assert (
+            path.read_bytes()
+            == (tmp_path / "out" / path.relative_to(tmp_path / "whole")).read_bytes()
+        )
 
 
 def test_cached_frames_of_other_settings_are_refused(tmp_path):
@@ -202,14 +223,18 @@ def test_cached_frames_of_other_settings_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["raw", "extracted"])
-def test_background_is_a_typical_frame_where_the_recording_begins_with_a_touch_else_null(tmp_path, layout):
+def test_background_is_a_typical_frame_where_the_recording_begins_with_a_touch_else_null(
+    tmp_path, layout
+):
     lines = [f"a/{k:010d}.jpg,3" for k in range(0, 8)] + [f"b/{k:010d}.jpg,3" for k in range(40)]
     root = forge(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
     found = import_touch_and_go(root, tmp_path / "out")
     manifest = found.manifest.require_valid()
     assert found.facts["backgrounds"] == "none 1, typical 1"
     assert manifest.column("background")[8:] == [None] * 40
-    frames = [round(x) for x in np.linspace(12, 39, 15)]  # from 5 behind the touch's last frame to the end
+    frames = [
+        round(x) for x in np.linspace(12, 39, 15)
+    ]  # from 5 behind the touch's last frame to the end
     median = np.median([[k >> b & 1 for b in range(8)] for k in frames], axis=0)
     distance = [sum(abs((k >> b & 1) - median[b]) for b in range(8)) for k in frames]
     nearest = {k for k, d in zip(frames, distance, strict=True) if d == min(distance)}
@@ -240,7 +265,9 @@ def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):
 
 def test_official_split_captions_and_objects(tmp_path):
     root = forge(tmp_path / "tag", extracted=("a", "b"))
-    (root / "train.txt").write_text("\n".join(f"a/{k:010d}.jpg,3" for k in range(10, 16)) + "\nelsewhere/0000000001.jpg,3")
+    (root / "train.txt").write_text(
+        "\n".join(f"a/{k:010d}.jpg,3" for k in range(10, 16)) + "\nelsewhere/0000000001.jpg,3"
+    )
     (root / "test.txt").write_text("b/17.jpg,15\nb/0000000018.jpg,15")
     (root / "captions.csv").write_text("a/0000000010.jpg,hard, cold\n")
     (root / "objects.csv").write_text("frame,object\nb/0000000019.jpg,wall\n")
@@ -257,7 +284,9 @@ def test_official_split_captions_and_objects(tmp_path):
     assert found.facts["text_source"] == "captions.csv"
     (root / "label.txt").unlink()
     (root / "train.txt").write_text("a/0000000010.jpg,3\nx,3\na/0000000011.jpg,-2")
-    with pytest.raises(ProblemsError) as caught:  # each once, although the lists are labels and split in one
+    with pytest.raises(
+        ProblemsError
+    ) as caught:  # each once, although the lists are labels and split in one
         import_touch_and_go(root, tmp_path / "out2")
     assert [(p.where, p.kind) for p in caught.value.problems] == [
         (f"{root / 'train.txt'}:2", "bad-path"),
@@ -328,15 +357,15 @@ def test_one_frame_that_links_out_of_the_data_set_is_told_or_skipped(tmp_path):
 def test_the_five_real_clips(real_data, tmp_path):
     found = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path / "out")
     table = found.manifest.require_valid().table
-    assert (table.height, table["touch"].n_unique(), table["video"].n_unique()) == (436, 17, 5)
+    assert (table.height, table["contact"].n_unique(), table["video"].n_unique()) == (436, 17, 5)
     counts = dict(table["material"].value_counts().iter_rows())
     assert counts == {"Rock": 124, "Wood": 111, "Concrete": 88, "Brick": 58, "Grass": 55}
     assert table["background"].null_count() == 0
     assert found.facts["backgrounds"] == "frame 17"
     # At the height of each touch the gel differs from its background more than at the touch's first frame.
-    for (_,), group in table.sort("frame").group_by("touch"):
+    for (_,), group in table.sort("frame").group_by("contact"):
         gel = lambda p: np.asarray(Image.open(found.manifest.path(p)), np.float32)  # noqa: E731
         rest = gel(group["background"][0])
         change = [np.abs(gel(p) - rest).mean() for p in group["tactile"]]
-        assert max(change) > change[0], group["touch"][0]
+        assert max(change) > change[0], group["contact"][0]
         assert (pl.Series(change) > 0).all()

@@ -42,7 +42,10 @@ def official(real_data, tmp_path_factory):
     items = json.loads((real_data / "tvl" / "test_items.json").read_text())
     root = tmp_path_factory.mktemp("tvl")
     sample = tmp_path_factory.mktemp("bytes")
-    content = {"image_fp": put(sample / "v.jpg", photo(1)).read_bytes(), "tactile_fp": put(sample / "t.jpg", gel(1)).read_bytes()}
+    content = {
+        "image_fp": put(sample / "v.jpg", photo(1)).read_bytes(),
+        "tactile_fp": put(sample / "t.jpg", gel(1)).read_bytes(),
+    }
     lists: dict[Path, list[list[str]]] = {}
     for item in items:
         for side, data in content.items():
@@ -51,9 +54,15 @@ def official(real_data, tmp_path_factory):
         depth = 2 if item["image_fp"].startswith("hct/") else 1
         base = PurePosixPath(*PurePosixPath(item["image_fp"]).parts[:depth])
         paths = [str(PurePosixPath(item[side]).relative_to(base)) for side in content]
-        lists.setdefault(root / base, []).append([*paths, *([""] if depth == 2 else []), item["label"]])
+        lists.setdefault(root / base, []).append(
+            [*paths, *([""] if depth == 2 else []), item["label"]]
+        )
     for base, rows in lists.items():
-        write_csv(base / "test.csv", COLUMNS if base.parent.name == "hct" else ("url", "tactile", "caption"), rows)
+        write_csv(
+            base / "test.csv",
+            COLUMNS if base.parent.name == "hct" else ("url", "tactile", "caption"),
+            rows,
+        )
     return root, items
 
 
@@ -78,18 +87,33 @@ def test_the_official_hct_rows_have_their_measured_facts(official, tmp_path):
     gaps = [b - a for v in frames.values() for a, b in pairwise(v)]
     assert (min(gaps), np.median(gaps)) == (1, 19)
     prefixes = Counter(video.split("-")[0] for video in frames)
-    assert (len(prefixes), sum(n > 1 for n in prefixes.values()), max(prefixes.values())) == (71, 43, 63)
+    assert (len(prefixes), sum(n > 1 for n in prefixes.values()), max(prefixes.values())) == (
+        71,
+        43,
+        63,
+    )
     texts = table["text"].to_list()
     assert len(set(texts)) == 336
-    assert Counter(text.count(",") + 1 for text in texts) == {1: 3, 2: 55, 3: 145, 4: 135, 5: 17, 6: 1}
-    words = {video: set(table.filter(table["video"] == video)["text"]) for video, own in frames.items() if len(own) > 1}
+    assert Counter(text.count(",") + 1 for text in texts) == {
+        1: 3,
+        2: 55,
+        3: 145,
+        4: 135,
+        5: 17,
+        6: 1,
+    }
+    words = {
+        video: set(table.filter(table["video"] == video)["text"])
+        for video, own in frames.items()
+        if len(own) > 1
+    }
     assert (sum(len(w) > 1 for w in words.values()), len(words)) == (63, 65)
     assert found.splits["Orig"].counts() == {"test": 356}
     assert {p.kind for p in found.suspicious} == {"no-background", "other-half"}
 
 
 def test_the_official_folders_join_into_sessions(official, tmp_path):
-    """Of neighbouring folders 82 % start less than a minute apart in data2, 34 % in data3: so many joints have the sessions."""
+    """Of neighboring folders 82 % start less than a minute apart in data2, 34 % in data3: so many joints have the sessions."""
     table = read(official[0], tmp_path / "out", check="none").manifest.table
     joined = {}
     for rig in ("data2", "data3"):
@@ -110,9 +134,13 @@ def test_the_official_ssvtp_rows_and_all_adjectives(official, tmp_path):
     assert len(found.manifest) == 46
     assert set(found.manifest.column("video")) == {None}
     assert found.facts["text_source"] == "column caption"
-    both = found.manifest.column("text") + read(root, tmp_path / "hct", check="none").manifest.column("text")
+    both = found.manifest.column("text") + read(
+        root, tmp_path / "hct", check="none"
+    ).manifest.column("text")
     words = {word for text in both for word in text.split(", ")}
-    assert len(words) == 70  # 71 with the empty one after the comma that ends 'textured, stiff, rigid,'
+    assert (
+        len(words) == 70
+    )  # 71 with the empty one after the comma that ends 'textured, stiff, rigid,'
     assert all(word == word.strip().lower() and "." not in word and word for word in words)
 
 
@@ -139,9 +167,15 @@ def rewrite(root: Path, dialect: str) -> None:
         elif dialect == "url is the index":
             header = ["", *COLUMNS[1:]]
         elif dialect in ("from hct", "one list", "from above"):
-            rows = [[f"{'hct/' * (dialect == 'from above')}{rig}/{cell}" for cell in row[:3]] + row[3:] for row in rows]
+            rows = [
+                [f"{'hct/' * (dialect == 'from above')}{rig}/{cell}" for cell in row[:3]] + row[3:]
+                for row in rows
+            ]
         elif dialect == "dots":
-            rows = [[f"./{cell}".replace("/vision/", "//vision/") for cell in row[:3]] + row[3:] for row in rows]
+            rows = [
+                [f"./{cell}".replace("/vision/", "//vision/") for cell in row[:3]] + row[3:]
+                for row in rows
+            ]
         if dialect == "one list":
             path.unlink()
             above.setdefault(part, []).extend(rows)
@@ -162,9 +196,21 @@ def rewrite(root: Path, dialect: str) -> None:
 
 
 DIALECTS = [
-    "no header", "foreign header", "index", "index without header", "other order", "url is the index", "from hct", "one list", "from above",
-    "dots", "windows", "mark without header", "no last newline", "capitals and blank lines",
-]  # fmt: skip
+    "no header",
+    "foreign header",
+    "index",
+    "index without header",
+    "other order",
+    "url is the index",
+    "from hct",
+    "one list",
+    "from above",
+    "dots",
+    "windows",
+    "mark without header",
+    "no last newline",
+    "capitals and blank lines",
+]
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
@@ -237,31 +283,49 @@ def test_lists_of_hct_need_rows_of_its_rigs(presses, tmp_path):
 def test_ssvtp_finds_touch_and_text_by_the_id_and_tells_what_disagrees(presses, tmp_path):
     whole = read(presses, tmp_path / "whole").manifest
     write_csv(
-        presses / "train.csv", ("url", "tactile", "caption"),
+        presses / "train.csv",
+        ("url", "tactile", "caption"),
         [
-            ["images_rgb/image_3_rgb.jpg", "images_tac/image_12_tac.jpg", "x"],  # 2: another's touch, other words
-            ["ssvtp/images_rgb/image_12_rgb.jpg", "ssvtp/images_tac/image_12_tac.jpg", "Fabric, coarse, deformable."],
+            [
+                "images_rgb/image_3_rgb.jpg",
+                "images_tac/image_12_tac.jpg",
+                "x",
+            ],  # 2: another's touch, other words
+            [
+                "ssvtp/images_rgb/image_12_rgb.jpg",
+                "ssvtp/images_tac/image_12_tac.jpg",
+                "Fabric, coarse, deformable.",
+            ],
             ["images_tac/image_21_tac.jpg", "", ""],  # 4: the touch for the photo
             ["images_rgb/image_437.jpg", "images_tac/image_437_rgb.jpg", ""],  # 5: suffixes wrong
-            ["images_rgb/image_438_rgb.png", "images_tac/image_438_tac.png", ""],  # 6: another suffix
+            [
+                "images_rgb/image_438_rgb.png",
+                "images_tac/image_438_tac.png",
+                "",
+            ],  # 6: another suffix
             ["./images_rgb/image_1000_rgb.jpg", "images_tac//image_1000_tac.jpg", ""],
             ["images_rgb/image_1001_rgb.jpg", "", ""],
         ],
-    )  # fmt: skip
+    )
     found = read(presses, tmp_path / "found")
     assert found.manifest.digest == whole.digest
     assert [(p.where, p.kind, p.text.split(" row")[0]) for p in found.suspicious] == [
-        (f"{presses / 'train.csv'}:2", "misnamed-path", "4"), (f"{presses / 'train.csv'}:2", "two-captions", "1"),
-    ]  # fmt: skip
+        (f"{presses / 'train.csv'}:2", "misnamed-path", "4"),
+        (f"{presses / 'train.csv'}:2", "two-captions", "1"),
+    ]
     assert "text/labels_<id>.txt" in found.facts["text_source"]
 
 
-@pytest.mark.parametrize("rows", [None, ("url", "caption"), ("", "tactile", "caption"), ("url",), ()])
+@pytest.mark.parametrize(
+    "rows", [None, ("url", "caption"), ("", "tactile", "caption"), ("url",), ()]
+)
 def test_ssvtp_lists_of_every_width(presses, tmp_path, rows):
     whole = read(presses, tmp_path / "whole").manifest
     cells = [
         dict(zip(("url", "tactile", "caption"), r, strict=False))
-        for r in [[v, t, ""] for v, t in zip(whole.column("vision"), whole.column("tactile"), strict=True)]
+        for r in [
+            [v, t, ""] for v, t in zip(whole.column("vision"), whole.column("tactile"), strict=True)
+        ]
     ]
     (presses / "test.csv").unlink()
     if rows is None:  # no list at all
@@ -280,17 +344,32 @@ def test_ssvtp_counts_its_losses(presses, tmp_path):
     (presses / "images_rgb" / "image_21_rgb.jpg").unlink()
     (presses / "images_rgb" / "image_437_rgb.jpg").write_bytes(b"")
     (presses / "text" / "labels_4210.txt").unlink()
-    for line in ("images_rgb/photo.jpg,x,y", "../image_1_rgb.jpg,x,y", "images_rgb/image_3_rgb.jpg,,again", ",x,y"):
+    for line in (
+        "images_rgb/photo.jpg,x,y",
+        "../image_1_rgb.jpg,x,y",
+        "images_rgb/image_3_rgb.jpg,,again",
+        ",x,y",
+    ):
         with (presses / "train.csv").open("a") as file:
             file.write(f"{line}\n")
     with pytest.raises(ProblemsError) as caught:
         read(presses, tmp_path / "out")
-    wanted = {"missing-file": 2, "bad-image": 1, "bad-path": 1, "outside-root": 1, "duplicate-id": 1, "empty-cell": 1}
+    wanted = {
+        "missing-file": 2,
+        "bad-image": 1,
+        "bad-path": 1,
+        "outside-root": 1,
+        "duplicate-id": 1,
+        "empty-cell": 1,
+    }
     assert kinds(caught.value.problems) == wanted
     found = read(presses, tmp_path / "out", skip_bad=True)
     assert len(found.manifest) == 6
     assert kinds(found.suspicious) == {"two-captions": 1}
-    assert dict(zip(found.manifest.ids, found.manifest.column("text"), strict=True))["ssvtp/4210"] == "fabric, coarse, deformable"
+    assert (
+        dict(zip(found.manifest.ids, found.manifest.column("text"), strict=True))["ssvtp/4210"]
+        == "fabric, coarse, deformable"
+    )
     for name in ("train", "test"):
         (presses / f"{name}.csv").unlink()
     with pytest.raises(ProblemsError) as caught:
@@ -309,24 +388,29 @@ def test_an_ssvtp_sample_of_two_lists_is_told_and_is_in_no_part(presses, tmp_pat
     found = read(presses, tmp_path / "out", skip_bad=True)
     assert kinds(found.skipped) == {"two-parts": 1}
     assert found.manifest.ids == whole.manifest.ids
-    assert found.splits["Orig"].parts == {i: part for i, part in whole.splits["Orig"].parts.items() if i != both}
+    assert found.splits["Orig"].parts == {
+        i: part for i, part in whole.splits["Orig"].parts.items() if i != both
+    }
 
 
 def test_a_listed_path_stands_in_only_for_a_file_that_is_absent(presses, tmp_path):
     place = presses / "images_tac"
     (place / "image_3_tac.jpg").rename(place / "three.jpg")
     write_csv(
-        presses / "train.csv", ("url", "tactile"),
+        presses / "train.csv",
+        ("url", "tactile"),
         [
             ["images_rgb/image_3_rgb.jpg", "images_tac/three.jpg"],  # the derived file is absent
             ["images_rgb/image_12_rgb.jpg", "images_tac/three.jpg"],  # it is there, and counts
             ["images_rgb/image_21_rgb.jpg", "images_tac/none.jpg"],  # the listed one is not there
         ],
-    )  # fmt: skip
+    )
     table = read(presses, tmp_path / "out").manifest.table
     assert dict(table.select("id", "tactile").head(3).rows()) == {
-        "ssvtp/3": "images_tac/three.jpg", "ssvtp/12": "images_tac/image_12_tac.jpg", "ssvtp/21": "images_tac/image_21_tac.jpg",
-    }  # fmt: skip
+        "ssvtp/3": "images_tac/three.jpg",
+        "ssvtp/12": "images_tac/image_12_tac.jpg",
+        "ssvtp/21": "images_tac/image_21_tac.jpg",
+    }
 
 
 def test_ssvtp_tells_unlisted_photos_absent_words_and_the_background(presses, tmp_path):
@@ -335,16 +419,24 @@ def test_ssvtp_tells_unlisted_photos_absent_words_and_the_background(presses, tm
     put(presses / "tac_background.png", gel(0, pressed=False))
     found = read(presses, tmp_path / "out")
     assert set(found.manifest.column("background")) == {"tac_background.png"}
-    assert {(p.kind, p.text.split()[0]) for p in found.suspicious} == {("unlisted", "6"), ("no-text", "1")}
+    assert {(p.kind, p.text.split()[0]) for p in found.suspicious} == {
+        ("unlisted", "6"),
+        ("no-text", "1"),
+    }
     assert found.manifest.column("text")[0] is None
 
 
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [
-        (" Soft ,  FUZZY.", "soft, fuzzy"), ("textured, stiff, rigid,", "textured, stiff, rigid"), ("a.b", "ab"), (" . , ", None), ("", None),
-        (None, None), ("two  words\n, x", "two words, x"),
+        (" Soft ,  FUZZY.", "soft, fuzzy"),
+        ("textured, stiff, rigid,", "textured, stiff, rigid"),
+        ("a.b", "ab"),
+        (" . , ", None),
+        ("", None),
+        (None, None),
+        ("two  words\n, x", "two words, x"),
     ],
-)  # fmt: skip
+)
 def test_captions_are_cleaned(given, wanted):
     assert tvl.clean_caption(given) == wanted

@@ -12,7 +12,18 @@ from palpate.core import PalpateError, ProblemsError, Split, quiet
 from palpate.data.formats import hct, tvl
 from palpate.data.formats.hct_lists import TRAJECTORY
 from palpate.data.importing import import_dataset, validate_dataset, write_lists
-from tvl_forge import COLUMNS, PHOTO, TOUCH, forge_hct, gel, name_of, photo, put, trajectory, write_csv
+from tvl_forge import (
+    COLUMNS,
+    PHOTO,
+    TOUCH,
+    forge_hct,
+    gel,
+    name_of,
+    photo,
+    put,
+    trajectory,
+    write_csv,
+)
 
 
 @pytest.fixture
@@ -36,16 +47,22 @@ def test_without_lists_contact_json_gives_the_samples_and_finetune_json_the_word
     talk = []
     for path in sorted(tree.glob("data1/*.csv")):
         for _, cells in tvl.read_csv(path, []):
-            turns = [{"from": "human", "value": "What?"}, {"from": "gpt", "value": cells["caption"]}]
-            talk.append({"image": cells["url"], "tactile": cells["tactile"], "conversations": turns})
+            turns = [
+                {"from": "human", "value": "What?"},
+                {"from": "gpt", "value": cells["caption"]},
+            ]
+            talk.append(
+                {"image": cells["url"], "tactile": cells["tactile"], "conversations": turns}
+            )
     (tree / "data1" / "finetune.json").write_text(json.dumps(talk))
     for path in tree.glob("data*/*.csv"):
         path.unlink()
     found = read(tree, tmp_path / "found")
     assert found.manifest.ids == listed.ids
-    assert found.manifest.column("touch") == listed.column("touch")
+    assert found.manifest.column("contact") == listed.column("contact")
     assert found.manifest.column("text") == [
-        t if i.startswith("data1/") else None for i, t in zip(listed.ids, listed.column("text"), strict=True)
+        t if i.startswith("data1/") else None
+        for i, t in zip(listed.ids, listed.column("text"), strict=True)
     ]
     assert found.facts["text_source"] == "captions of finetune.json"
     assert not found.splits
@@ -61,9 +78,15 @@ def test_frames_that_only_contact_json_names_are_counted_or_taken(tree, tmp_path
     taken = read(tree, tmp_path / "b", contact=True)
     assert taken.manifest.ids == read(whole, tmp_path / "c").manifest.ids
     (new,) = set(taken.manifest.ids) - set(left.manifest.ids)
-    assert taken.manifest.table.filter(taken.manifest.table["id"] == new)["text"].to_list() == [None]
+    assert taken.manifest.table.filter(taken.manifest.table["id"] == new)["text"].to_list() == [
+        None
+    ]
     assert new not in taken.splits["Orig"].parts
-    assert left.manifest.column("touch") == [t for i, t in zip(taken.manifest.ids, taken.manifest.column("touch"), strict=True) if i != new]
+    assert left.manifest.column("contact") == [
+        t
+        for i, t in zip(taken.manifest.ids, taken.manifest.column("contact"), strict=True)
+        if i != new
+    ]
 
 
 def test_frames_of_not_contact_json_are_no_samples(tree, tmp_path):
@@ -84,15 +107,22 @@ def test_frames_of_not_contact_json_are_no_samples(tree, tmp_path):
 @pytest.mark.parametrize(
     ("text", "kind"),
     [
-        ('{"vision": ["a"], "tactile": []}', "unequal-lists"), ('{"vision": []}', "bad-json"), ("{", "bad-json"), ("", "bad-json"),
-        ('{"vision": [1], "tactile": [2]}', "bad-json"), ("[]", "bad-json"), ('{"vision": [], "tactile": [], "background": ["x"]}', "unequal-lists"),
+        ('{"vision": ["a"], "tactile": []}', "unequal-lists"),
+        ('{"vision": []}', "bad-json"),
+        ("{", "bad-json"),
+        ("", "bad-json"),
+        ('{"vision": [1], "tactile": [2]}', "bad-json"),
+        ("[]", "bad-json"),
+        ('{"vision": [], "tactile": [], "background": ["x"]}', "unequal-lists"),
     ],
-)  # fmt: skip
+)
 def test_broken_json_is_told_once_and_its_rows_stay_out(tree, tmp_path, text, kind):
     (tree / "data1" / "contact.json").write_text(text)
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")
-    assert [(p.where, p.kind) for p in caught.value.problems] == [(str(tree / "data1" / "contact.json"), kind)]
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        (str(tree / "data1" / "contact.json"), kind)
+    ]
     assert len(read(tree, tmp_path / "out", skip_bad=True).manifest) == 24
 
 
@@ -103,9 +133,15 @@ def test_a_touch_runs_on_through_frames_that_only_contact_json_names(tmp_path):
     runs = {}
     for name, pairs in (("lists alone", []), ("contact", rows), ("untouched", rows[1:2])):
         lists = {"vision": [row[0] for row in pairs], "tactile": [row[1] for row in pairs]}
-        (rig / ("not_contact.json" if name == "untouched" else "contact.json")).write_text(json.dumps(lists))
-        runs[name] = [t[-4:] for t in read(tmp_path, tmp_path / "out").manifest.column("touch")]
-    assert runs == {"lists alone": ["0001", "0002", "0003"], "contact": ["0001", "0001", "0002"], "untouched": ["0001", "0002", "0003"]}
+        (rig / ("not_contact.json" if name == "untouched" else "contact.json")).write_text(
+            json.dumps(lists)
+        )
+        runs[name] = [t[-4:] for t in read(tmp_path, tmp_path / "out").manifest.column("contact")]
+    assert runs == {
+        "lists alone": ["0001", "0002", "0003"],
+        "contact": ["0001", "0001", "0002"],
+        "untouched": ["0001", "0002", "0003"],
+    }
 
 
 def test_a_row_in_both_lists_is_told_and_is_in_no_part(tree, tmp_path):
@@ -122,12 +158,16 @@ def test_touches_are_runs_and_sessions_chains(tree, tmp_path):
     table = read(tree, tmp_path / "a").manifest.table
     first = table.filter(table["video"] == table["video"][0])
     assert first["frame"].to_list() == [10, 11, 30, 31]
-    assert [t.split("#")[1] for t in first["touch"]] == ["0001", "0001", "0002", "0002"]
+    assert [t.split("#")[1] for t in first["contact"]] == ["0001", "0001", "0002", "0002"]
     starts = [1702596200.5, 1702596265.5, 1702596380.5]  # gaps of 65 and 115 seconds
     for gap, sessions in ((64.9, 3), (65.0, 2), (115.0, 1)):
         found = hct.sessions_of({("data1", f"{k}-{t}") for k, t in enumerate(starts)}, gap)
         assert len(set(found.values())) == sessions
-    chained = hct.sessions_of([("data1", f"9-{100 + 50 * k}") for k in range(4)] + [("data2", "9-120"), ("data2", "odd name")], 60.0)
+    chained = hct.sessions_of(
+        [("data1", f"9-{100 + 50 * k}") for k in range(4)]
+        + [("data2", "9-120"), ("data2", "odd name")],
+        60.0,
+    )
     assert set(chained.values()) == {"data1/9-100", "data2/9-120", "data2/odd name"}
     wide = read(tree, tmp_path / "b", session_gap=120.0).manifest
     assert sorted(set(wide.column("session"))) == ["data1/7-1702596200.5", "data2/7-1702599800.5"]
@@ -142,14 +182,20 @@ def test_each_source_of_a_background_is_tried_in_turn_and_counted(tree, tmp_path
     videos = sorted({p.parent for p in tree.glob("data*/*/vision")})
     for video in videos[1:]:
         (video / "background.png").unlink()
-    (tree / "data2" / "digit_background.png").write_bytes((videos[0] / "background.png").read_bytes())
+    (tree / "data2" / "digit_background.png").write_bytes(
+        (videos[0] / "background.png").read_bytes()
+    )
     rest = videos[2]  # of data1: its untouched frames are gone too
     for frame in (8, 9):
         (rest / "tactile" / name_of(frame)).unlink()
     found = read(tree, tmp_path / "out")
-    assert found.facts["backgrounds"] == "as listed 4, digit_background.png 12, none 4, untouched frame 4"
+    assert (
+        found.facts["backgrounds"]
+        == "as listed 4, digit_background.png 12, none 4, untouched frame 4"
+    )
     own = {
-        v: set(found.manifest.table.filter(found.manifest.table["video"] == v)["background"]) for v in set(found.manifest.column("video"))
+        v: set(found.manifest.table.filter(found.manifest.table["video"] == v)["background"])
+        for v in set(found.manifest.column("video"))
     }
     names = [v.relative_to(tree).as_posix() for v in videos]
     assert own[names[0]] == {f"{names[0]}/background.png"}
@@ -166,13 +212,23 @@ def test_the_untouched_frame_nearest_to_the_median_is_taken(tmp_path):
     rig = tmp_path / "hct" / "data1"
     light = [90, 92, 91, 200, 10]
     rows = trajectory(rig, "4-100.5", range(20, 26), background=False)
-    rest = trajectory(rig, "4-100.5", range(5), background=False, touch=lambda k: Image.new("RGB", TOUCH, (light[k % 100],) * 3))
+    rest = trajectory(
+        rig,
+        "4-100.5",
+        range(5),
+        background=False,
+        touch=lambda k: Image.new("RGB", TOUCH, (light[k % 100],) * 3),
+    )
     write_csv(rig / "train.csv", COLUMNS, [[*row, "soft"] for row in rows])
-    (rig / "not_contact.json").write_text(json.dumps({"vision": [r[0] for r in rest], "tactile": [r[1] for r in rest]}))
+    (rig / "not_contact.json").write_text(
+        json.dumps({"vision": [r[0] for r in rest], "tactile": [r[1] for r in rest]})
+    )
     found = read(tmp_path, tmp_path / "out")
     assert set(found.manifest.column("background")) == {f"data1/4-100.5/tactile/{name_of(2)}"}
     (rig / "4-100.5" / "tactile" / name_of(3)).write_bytes(b"")  # a broken one does not count
-    assert set(read(tmp_path, tmp_path / "again").manifest.column("background")) == {f"data1/4-100.5/tactile/{name_of(0)}"}
+    assert set(read(tmp_path, tmp_path / "again").manifest.column("background")) == {
+        f"data1/4-100.5/tactile/{name_of(0)}"
+    }
     put(rig / "4-100.5" / "tactile" / name_of(2), gel(1, size=(32, 32)))  # sizes differ: no median
     assert read(tmp_path, tmp_path / "out").facts["backgrounds"] == "none 6"
 
@@ -186,9 +242,13 @@ def rig_of(tmp_path, *, swapped, sizes, count=12, **sides):
     rows = []
     for k in range(count):
         own = trajectory(
-            rig, f"3-{1000 + 100 * k}.5", [5, 6], swapped=k in swapped, view=sides.get("view", lambda n: photo(n, sizes[0])),
+            rig,
+            f"3-{1000 + 100 * k}.5",
+            [5, 6],
+            swapped=k in swapped,
+            view=sides.get("view", lambda n: photo(n, sizes[0])),
             touch=sides.get("touch", lambda n: gel(n, sizes[1])),
-        )  # fmt: skip
+        )
         rows += [[*row, "soft"] for row in own]
     write_csv(rig / "train.csv", COLUMNS, rows)
     return rig
@@ -196,12 +256,16 @@ def rig_of(tmp_path, *, swapped, sizes, count=12, **sides):
 
 def named(problems):
     return {
-        int((TRAJECTORY.fullmatch(p.where.split("/")[1])[1]).split(".")[0]) // 100 - 10 for p in problems if p.kind == "swapped-folders"
+        int((TRAJECTORY.fullmatch(p.where.split("/")[1])[1]).split(".")[0]) // 100 - 10
+        for p in problems
+        if p.kind == "swapped-folders"
     }
 
 
 @pytest.mark.parametrize(
-    "sizes", [(PHOTO, TOUCH), (TOUCH, TOUCH), ((640, 480), (240, 320))], ids=["foreign sizes", "equal sizes", "true sizes"]
+    "sizes",
+    [(PHOTO, TOUCH), (TOUCH, TOUCH), ((640, 480), (240, 320))],
+    ids=["foreign sizes", "equal sizes", "true sizes"],
 )
 @pytest.mark.parametrize("swapped", [set(), {0}, {2, 5, 11}])
 def test_exchanged_folders_are_told_and_mended(tmp_path, sizes, swapped):
@@ -209,9 +273,13 @@ def test_exchanged_folders_are_told_and_mended(tmp_path, sizes, swapped):
     found = read(tmp_path, tmp_path / "a")
     assert named(found.suspicious) == swapped
     assert all("vision/" in p for p in found.manifest.column("vision"))
-    (tmp_path / "hct" / "digit_background.png").write_bytes(put(tmp_path / "b.png", gel(0, pressed=False)).read_bytes())
+    (tmp_path / "hct" / "digit_background.png").write_bytes(
+        put(tmp_path / "b.png", gel(0, pressed=False)).read_bytes()
+    )
     mended = read(tmp_path, tmp_path / "b", swap="mend").manifest
-    for video, vision, tactile, background in mended.table.select("video", "vision", "tactile", "background").iter_rows():
+    for video, vision, tactile, background in mended.table.select(
+        "video", "vision", "tactile", "background"
+    ).iter_rows():
         right = int(float(video.split("-")[1])) // 100 - 10 not in swapped
         assert ("/vision/" in vision, "/tactile/" in tactile) == (right, right)
         assert background == (f"{video}/background.png" if right else "digit_background.png")
@@ -231,11 +299,13 @@ def test_sides_that_look_alike_are_not_called_exchanged(tmp_path):
     rig_of(tmp_path, swapped={1}, sizes=(TOUCH, TOUCH), touch=lambda n: photo(n + 7, TOUCH))
     assert read(tmp_path, tmp_path / "a").suspicious == []
     shutil.rmtree(tmp_path / "hct")
-    rig_of(tmp_path, swapped={1}, sizes=(TOUCH, TOUCH), count=2)  # two recordings tell no typical gel
+    rig_of(
+        tmp_path, swapped={1}, sizes=(TOUCH, TOUCH), count=2
+    )  # two recordings tell no typical gel
     assert read(tmp_path, tmp_path / "b").suspicious == []
 
 
-def test_exchange_by_colour_over_many_rigs():
+def test_exchange_by_color_over_many_rigs():
     """Precision and recall on 60 rigs whose gel drifts and whose photos share a tint; a look is made of thumbnails directly."""
     hits = wrong = planted = 0
     for seed in range(60):
@@ -244,11 +314,19 @@ def test_exchange_by_colour_over_many_rigs():
         truth = {str(k) for k in rng.permutation(30)[: rng.integers(0, 7)]}
         sides = {}
         for k in range(30):
-            touch = tvl.Look((240, 320), (base + rng.normal(0, 0.01) + rng.normal(0, 0.02, (8, 8, 3))).clip(0, 1))
-            view = tvl.Look((240, 320), (0.5 * tint + 0.5 * rng.uniform(0, 1, (8, 8, 3))).clip(0, 1))
+            touch = tvl.Look(
+                (240, 320), (base + rng.normal(0, 0.01) + rng.normal(0, 0.02, (8, 8, 3))).clip(0, 1)
+            )
+            view = tvl.Look(
+                (240, 320), (0.5 * tint + 0.5 * rng.uniform(0, 1, (8, 8, 3))).clip(0, 1)
+            )
             sides[str(k)] = (touch, view) if str(k) in truth else (view, touch)
         found = set(tvl.exchanged(sides, (240, 320)))
-        hits, wrong, planted = hits + len(found & truth), wrong + len(found - truth), planted + len(truth)
+        hits, wrong, planted = (
+            hits + len(found & truth),
+            wrong + len(found - truth),
+            planted + len(truth),
+        )
     assert planted > 100
     assert (hits, wrong) == (planted, 0)
 
@@ -264,10 +342,16 @@ def constant(*levels):
     return [tvl.Look((240, 320), np.full((8, 8, 3), level)) for level in levels]
 
 
-def test_colours_that_prove_nothing_are_not_used():
+def test_colors_that_prove_nothing_are_not_used():
     gels, views = constant(*np.linspace(0.30, 0.34, 9)), constant(*np.linspace(0.1, 0.9, 9))
     (far, further) = constant(0.6, 0.95)  # one side is nearer to the gel, but neither is one
-    assert tvl.exchanged({str(k): p for k, p in enumerate([*zip(views, gels, strict=True), (far, further)])}, (240, 320)) == {}
+    assert (
+        tvl.exchanged(
+            {str(k): p for k, p in enumerate([*zip(views, gels, strict=True), (far, further)])},
+            (240, 320),
+        )
+        == {}
+    )
     for seed in range(20):  # both sides vary alike: nobody knows the gel
         levels = np.random.default_rng(seed).uniform(0, 1, (2, 25))
         pairs = zip(constant(*levels[0]), constant(*levels[1]), strict=True)
@@ -282,7 +366,10 @@ def test_looks_pass_over_what_cannot_be_read(tmp_path):
     seen = tvl.look([tmp_path / "cut.jpg", tmp_path / "a.jpg", tmp_path / "b.jpg"])
     assert seen is not None
     assert seen.size == TOUCH
-    assert np.abs(seen.thumbnail - np.asarray(gel(1).resize((8, 8), Image.Resampling.BOX)) / 255).max() < 0.06
+    assert (
+        np.abs(seen.thumbnail - np.asarray(gel(1).resize((8, 8), Image.Resampling.BOX)) / 255).max()
+        < 0.06
+    )
     assert tvl.looks({"x": ([tmp_path / "cut.jpg"], [tmp_path / "a.jpg"])}, quiet) == {}
 
 
@@ -308,16 +395,32 @@ def test_every_bad_row_of_hct_is_told_at_once(tree, tmp_path):
         f"{video}/vision/99-0.1.jpg,{video}/tactile/99-0.1.jpg,,a\n"  # 10: neither file
         "data7/1-2.5/vision/1-0.1.jpg,data7/1-2.5/tactile/1-0.1.jpg,,a\n"  # 11: no such rig
         f"{good},{good},,\xff".encode("latin-1")  # 12: not UTF-8
-    )  # fmt: skip
+    )
     wanted = [
-        (2, "outside-root"), (3, "outside-root"), (4, "bad-row"), (5, "bad-row"), (6, "bad-path"), (7, "bad-frame"), (8, "empty-cell"),
-        (9, "two-parts"), (10, "missing-file"), (10, "missing-file"), (11, "missing-folder"), (12, "bad-encoding"),
-    ]  # fmt: skip
+        (2, "outside-root"),
+        (3, "outside-root"),
+        (4, "bad-row"),
+        (5, "bad-row"),
+        (6, "bad-path"),
+        (7, "bad-frame"),
+        (8, "empty-cell"),
+        (9, "two-parts"),
+        (10, "missing-file"),
+        (10, "missing-file"),
+        (11, "missing-folder"),
+        (12, "bad-encoding"),
+    ]
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")
     told = caught.value.problems
-    assert [(int(p.where.rpartition(":")[2]), p.kind) for p in told if p.where.startswith(str(tree / "data1" / "val.csv"))] == wanted
-    assert [p.text for p in told if p.where.endswith("val.csv:11")] == [f"1 row: no folder 'data7' in {tree}"]
+    assert [
+        (int(p.where.rpartition(":")[2]), p.kind)
+        for p in told
+        if p.where.startswith(str(tree / "data1" / "val.csv"))
+    ] == wanted
+    assert [p.text for p in told if p.where.endswith("val.csv:11")] == [
+        f"1 row: no folder 'data7' in {tree}"
+    ]
     others = [p for p in told if not p.where.startswith(str(tree / "data1" / "val.csv"))]
     assert [p.kind for p in others] == ["bad-image", "missing-folder"]
     assert others[1].text == f"4 rows: no folder 'data2/{gone}' in {tree}"
@@ -337,8 +440,14 @@ def test_a_rig_that_is_missing_is_one_problem(tree, tmp_path):
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")
     assert [p.text.split(":")[0] for p in caught.value.problems] == ["3 rows"] * 3
-    for path in (tree / "data1" / "train.csv", tree / "data2" / "train.csv"):  # one list for all, in hct/
-        rows = [[f"{path.parent.name}/{cell}" for cell in (c["url"], c["tactile"])] for _, c in tvl.read_csv(path, [])]
+    for path in (
+        tree / "data1" / "train.csv",
+        tree / "data2" / "train.csv",
+    ):  # one list for all, in hct/
+        rows = [
+            [f"{path.parent.name}/{cell}" for cell in (c["url"], c["tactile"])]
+            for _, c in tvl.read_csv(path, [])
+        ]
         with (tree / "train.csv").open("a") as file:
             file.writelines(",".join([*row, "", "soft"]) + "\n" for row in rows)
         path.unlink()
@@ -367,7 +476,10 @@ def test_names_with_spaces_commas_and_other_scripts(tmp_path):
     shutil.rmtree(rig / "tisch, groß {n}")
     with pytest.raises(ProblemsError) as caught:
         read(tmp_path, tmp_path / "out2")
-    assert caught.value.problems[0].text == f"2 rows: no folder 'data1/tisch, groß {{n}}' in {tmp_path / 'hct'}"
+    assert (
+        caught.value.problems[0].text
+        == f"2 rows: no folder 'data1/tisch, groß {{n}}' in {tmp_path / 'hct'}"
+    )
 
 
 @pytest.mark.parametrize("text", ["", "\n\n", "a,b,c\nx,y,z\n"])
@@ -375,7 +487,9 @@ def test_lists_without_anything_usable(tree, tmp_path, text):
     (tree / "data1" / "train.csv").write_text(text)
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")
-    assert [p.kind for p in caught.value.problems] == ["missing-column" if text.strip() else "empty-list"]
+    assert [p.kind for p in caught.value.problems] == [
+        "missing-column" if text.strip() else "empty-list"
+    ]
 
 
 def test_pairs_across_trajectories_are_suspicious(tree, tmp_path):
@@ -384,4 +498,6 @@ def test_pairs_across_trajectories_are_suspicious(tree, tmp_path):
     row = lines[1].split(",")
     row[1] = lines[-1].split(",")[1]
     path.write_text("\n".join([lines[0], ",".join(row), *lines[2:]]))
-    assert [(p.where, p.kind) for p in read(tree, tmp_path / "out").suspicious] == [(f"{path}:2", "unequal-names")]
+    assert [(p.where, p.kind) for p in read(tree, tmp_path / "out").suspicious] == [
+        (f"{path}:2", "unequal-names")
+    ]

@@ -59,7 +59,12 @@ def test_numbers_outside_are_refused(tmp_path):
 def test_cut_files_are_refused_with_counts(tmp_path):
     data = write_video(tmp_path / "v.mp4", 60).read_bytes()
     cut = tmp_path / "cut.mp4"
-    for length, said in [(0, "0 bytes"), (40, "cut short"), (len(data) // 2, "of 60 declared"), (len(data) - 1, "59 readable of 60")]:
+    for length, said in [
+        (0, "0 bytes"),
+        (40, "cut short"),
+        (len(data) // 2, "of 60 declared"),
+        (len(data) - 1, "59 readable of 60"),
+    ]:
         cut.write_bytes(data[:length])
         with pytest.raises(PalpateError, match=said):
             VideoReader(cut)

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from data_forge import write_image
-from formats_forge import drawn, forge_visgel, forge_visgel_recordings, imported, kinds, of_kind, row, visgel_line
+from formats_forge import (
+    drawn,
+    forge_visgel,
+    forge_visgel_recordings,
+    imported,
+    kinds,
+    of_kind,
+    row,
+    visgel_line,
+)
 from palpate.core import PalpateError, Split
 from palpate.data.formats import visgel
 from palpate.data.importing import import_dataset, validate_dataset, write_lists
@@ -16,26 +25,39 @@ def test_visgel_lists_name_vision_touch_and_reference(tmp_path):
     found = imported(forge_visgel, tmp_path)
     assert found.facts["format"] == "visgel"
     assert found.facts["layout"] == "lists"
-    videos = [("data/data_seen/1/rec_a", "seen"), ("data/data_seen/10/rec_a", "seen"), ("data/data_unseen/2/rec_b", "unseen")]
+    videos = [
+        ("data/data_seen/1/rec_a", "seen"),
+        ("data/data_seen/10/rec_a", "seen"),
+        ("data/data_unseen/2/rec_b", "unseen"),
+    ]
     assert found.manifest.ids == [f"{video}/{k}" for video, _ in videos for k in (2, 3, 4)]
     assert found.manifest.column("domain") == [domain for _, domain in videos for _ in range(3)]
     assert row(found, "data/data_unseen/2/rec_b/4") == {
-        "id": "data/data_unseen/2/rec_b/4", "video": "data/data_unseen/2/rec_b", "frame": 4, "sensor": "GelSight", "domain": "unseen",
-        "vision": "data/data_unseen/vision/2/rec_b/frame0004.jpg", "tactile": "data/data_unseen/touch/2/rec_b/frame0004.jpg",
+        "id": "data/data_unseen/2/rec_b/4",
+        "video": "data/data_unseen/2/rec_b",
+        "frame": 4,
+        "sensor": "GelSight",
+        "domain": "unseen",
+        "vision": "data/data_unseen/vision/2/rec_b/frame0004.jpg",
+        "tactile": "data/data_unseen/touch/2/rec_b/frame0004.jpg",
         "background": "data/data_unseen/touch/2/rec_b/frame0000.jpg",
-    }  # fmt: skip
+    }
     # six folders of seven pictures each: touch, then vision, of the three recordings
     assert drawn(found, "tactile") == [first + k for first in (1, 15, 29) for k in (2, 3, 4)]
     assert drawn(found, "vision") == [first + k for first in (8, 22, 36) for k in (2, 3, 4)]
     assert drawn(found, "background") == [first for first in (1, 15, 29) for _ in range(3)]
-    assert {name: split.counts() for name, split in found.splits.items()} == {"Orig": {"train": 6, "test": 3}}
+    assert {name: split.counts() for name, split in found.splits.items()} == {
+        "Orig": {"train": 6, "test": 3}
+    }
 
 
 def test_visgel_lists_are_written_with_the_lines_of_the_set(tmp_path):
     found = imported(forge_visgel, tmp_path)
     lists = tmp_path / "data" / "visgel" / "data_lst"
     written = write_lists(found.manifest, found.splits["Orig"], tmp_path / "lists")
-    assert {p.name: p.read_text() for p in written} == {p.name: p.read_text() + "\n" for p in lists.iterdir()}
+    assert {p.name: p.read_text() for p in written} == {
+        p.name: p.read_text() + "\n" for p in lists.iterdir()
+    }
     ids = found.manifest.ids
     other = write_lists(found.manifest, Split({ids[0]: "test", ids[-1]: "val"}), tmp_path / "other")
     assert sorted(p.name for p in other) == [
@@ -44,7 +66,9 @@ def test_visgel_lists_are_written_with_the_lines_of_the_set(tmp_path):
         "val_touch2vision.txt",
         "val_vision2touch.txt",
     ]
-    assert (tmp_path / "other" / "eval_touch2vision.txt").read_text() == visgel_line("data/data_seen", "1/rec_a", 2, "touch2vision") + "\n"
+    assert (tmp_path / "other" / "eval_touch2vision.txt").read_text() == visgel_line(
+        "data/data_seen", "1/rec_a", 2, "touch2vision"
+    ) + "\n"
     (lists / "train_touch2vision.txt").unlink()
     (lists / "train_vision2touch.txt").unlink()
     with pytest.raises(PalpateError, match="Every sample must stand in one of the lists"):
@@ -61,9 +85,13 @@ def test_visgel_bad_lines(tmp_path):
         good[1].rpartition(" ")[0],  # 5: seven paths
         good[1].replace("frame0003", "last"),  # 6
         good[1].replace("data/", "../data/"),  # 7
-        visgel_line("data/data_seen", "77/gone", 1, "vision2touch"),  # 8 and 9: a recording that is not there
+        visgel_line(
+            "data/data_seen", "77/gone", 1, "vision2touch"
+        ),  # 8 and 9: a recording that is not there
         visgel_line("data/data_seen", "77/gone", 2, "vision2touch"),
-        visgel_line("data/data_seen", "10/rec_a", 66, "vision2touch"),  # 10: no touch and no vision of that number
+        visgel_line(
+            "data/data_seen", "10/rec_a", 66, "vision2touch"
+        ),  # 10: no touch and no vision of that number
         visgel_line("data/data_unseen", "2/rec_b", 2, "vision2touch"),  # 11: stands in eval
         "",
         "caf\xe9",
@@ -72,12 +100,20 @@ def test_visgel_bad_lines(tmp_path):
     looked = validate_dataset(root)
     told = {(p.where.removeprefix(f"{path}:"), p.kind) for p in [*looked.missing, *looked.invalid]}
     assert told == {
-        ("4", "duplicate-row"), ("5", "bad-line"), ("6", "bad-frame"), ("7", "outside-root"), ("10", "missing-file"), ("13", "bad-encoding"),
-        ("data/data_seen/touch/77/gone", "missing-folder"), (f"{root / 'data_lst' / 'eval_vision2touch.txt'}:1", "two-parts"),
-    }  # fmt: skip
+        ("4", "duplicate-row"),
+        ("5", "bad-line"),
+        ("6", "bad-frame"),
+        ("7", "outside-root"),
+        ("10", "missing-file"),
+        ("13", "bad-encoding"),
+        ("data/data_seen/touch/77/gone", "missing-folder"),
+        (f"{root / 'data_lst' / 'eval_vision2touch.txt'}:1", "two-parts"),
+    }
     assert "2 listed samples" in of_kind(looked.missing, "missing-folder").text
     found = import_dataset(root, tmp_path / "out", skip_bad=True)
-    assert len(found.manifest) == 10  # the nine of the other direction, and frame 5 of the first recording
+    assert (
+        len(found.manifest) == 10
+    )  # the nine of the other direction, and frame 5 of the first recording
     assert {name: split.counts() for name, split in found.splits.items()} == {
         "Orig-vision2touch": {"train": 3, "test": 2},
         "Orig-touch2vision": {"train": 6, "test": 3},
@@ -87,10 +123,21 @@ def test_visgel_bad_lines(tmp_path):
 def test_visgel_lists_of_another_disk(tmp_path):
     root = forge_visgel(tmp_path / "data").source
     for path in (root / "data_lst").iterdir():
-        path.write_text("\n".join(" ".join(f"/mit/{p}" for p in line.split()) for line in path.read_text().splitlines()))
+        path.write_text(
+            "\n".join(
+                " ".join(f"/mit/{p}" for p in line.split())
+                for line in path.read_text().splitlines()
+            )
+        )
     assert kinds(validate_dataset(root).invalid) == {"outside-root": 18}
     (root / "data_lst").rename(tmp_path / "elsewhere")
-    found = import_dataset(tmp_path / "elsewhere", tmp_path / "out", format="visgel", root=root / "data", prefix="/mit/data/")
+    found = import_dataset(
+        tmp_path / "elsewhere",
+        tmp_path / "out",
+        format="visgel",
+        root=root / "data",
+        prefix="/mit/data/",
+    )
     assert found.manifest.ids[0] == "data_seen/1/rec_a/2"
     assert found.manifest.require_valid().root == (root / "data").resolve()
     assert len(write_lists(found.manifest, found.splits["Orig"], tmp_path / "lists")) == 4
@@ -105,7 +152,9 @@ def test_visgel_recordings_without_lists(tmp_path):
     assert drawn(found, "tactile") == [2, 3, 4, 6, 7, 8]
     assert drawn(found, "background") == [1] * 3 + [5] * 3
     assert found.splits == {}
-    written = write_lists(found.manifest, Split(dict.fromkeys(found.manifest.ids, "train")), tmp_path / "lists")
+    written = write_lists(
+        found.manifest, Split(dict.fromkeys(found.manifest.ids, "train")), tmp_path / "lists"
+    )
     assert [p.name for p in written] == ["train.csv"]
     root = tmp_path / "data" / "data_seen"
     (root / "2" / "rec" / "frame0000.jpg").unlink()
@@ -138,11 +187,13 @@ def test_visgel_contact_is_the_variance_of_the_laplacian(tmp_path):
     frame, reference = np.full((9, 9), 100.0), np.full((9, 9), 90.0)
     assert visgel.contact(frame, reference) == 0  # a brighter gel is no contact
     frame[4, 4] += 9
-    # one pixel of 9: -36 there and 9 at each of 4 neighbours; mean 0, so the variance is (36² + 4·9²) / 81
+    # one pixel of 9: -36 there and 9 at each of 4 neighbors; mean 0, so the variance is (36² + 4·9²) / 81
     assert visgel.contact(frame, reference) == pytest.approx((36**2 + 4 * 9**2) / 81)
     root = forge_visgel_recordings(tmp_path / "data").source
     for k in (1, 2):
-        write_image(root / "2" / "rec" / f"frame{k:04d}.jpg", 1)  # like the reference, which carries 1
+        write_image(
+            root / "2" / "rec" / f"frame{k:04d}.jpg", 1
+        )  # like the reference, which carries 1
     found = import_dataset(root, tmp_path / "out", format="visgel", min_contact=18.0)
     assert found.manifest.ids == ["2/rec/3", "10/rec/1", "10/rec/2", "10/rec/3"]
     assert found.facts["min_contact"] == "18; 2 of 6 frames left out"
@@ -158,4 +209,10 @@ def test_visgel_contact_of_18_or_less_is_flat(tmp_path, monkeypatch, values, fla
     root = forge_visgel_recordings(tmp_path / "data").source
     monkeypatch.setattr(visgel, "_contacts", lambda *_: dict(enumerate(values)))
     told = [p.text for p in validate_dataset(root, format="visgel").suspicious]
-    assert told == ([f"{flat} of 3 frames looked at touch nothing (contact of 18 or less); min_contact=18 leaves such out"] if flat else [])
+    assert told == (
+        [
+            f"{flat} of 3 frames looked at touch nothing (contact of 18 or less); min_contact=18 leaves such out"
+        ]
+        if flat
+        else []
+    )

@@ -21,11 +21,21 @@ from palpate.diffusion.autoencoder_training import (
 from palpate.diffusion.latents import LatentStats, encode_latents
 from palpate.diffusion.pixels import digest_tensors, to_bytes, to_unit
 
-SMALL = AutoencoderOptions(patch=4, widths=(16,), groups=4, codes=32, steps_free=60, steps_quantised=20, batch=8, crop=8, lr=5e-3)
+SMALL = AutoencoderOptions(
+    patch=4,
+    widths=(16,),
+    groups=4,
+    codes=32,
+    steps_free=60,
+    steps_quantized=20,
+    batch=8,
+    crop=8,
+    lr=5e-3,
+)
 
 
 def pictures(n: int, size: int = 16, seed: int = 0) -> np.ndarray:
-    """Smooth colour ramps: easy to compress, all different."""
+    """Smooth color ramps: easy to compress, all different."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:size, :size] / size
     waves = np.stack([x, y, x * y, np.ones_like(x)], -1)
@@ -51,11 +61,16 @@ def test_pixels_go_there_and_back():
 def test_digest_sees_names_shapes_and_values():
     one = {"a": torch.arange(6.0)}
     assert digest_tensors(one) == digest_tensors({"a": torch.arange(6.0)})
-    others = [{"b": one["a"]}, {"a": one["a"].reshape(2, 3)}, {"a": one["a"].double()}, {"a": one["a"] + 1e-6}]
+    others = [
+        {"b": one["a"]},
+        {"a": one["a"].reshape(2, 3)},
+        {"a": one["a"].double()},
+        {"a": one["a"] + 1e-6},
+    ]
     assert len({digest_tensors(v) for v in [one, *others]}) == 5
 
 
-def test_encode_is_before_quantisation_and_decode_quantises():
+def test_encode_is_before_quantization_and_decode_quantizes():
     model = random_model()
     images = pictures(3)
     z = model.encode(images)
@@ -66,7 +81,7 @@ def test_encode_is_before_quantisation_and_decode_quantises():
     with torch.no_grad():
         by_hand = model.vq.quant_conv(model.vq.encoder(patches))
     assert torch.allclose(z, by_hand, atol=1e-6)
-    # Quantise by brute force: decoding latents equals decoding their nearest codes.
+    # Quantize by brute force: decoding latents equals decoding their nearest codes.
     codes = model.vq.quantize.embedding.weight.detach()
     flat = z.permute(0, 2, 3, 1).reshape(-1, 3)
     nearest = ((flat[:, None] - codes[None]) ** 2).sum(-1).argmin(1)
@@ -75,7 +90,7 @@ def test_encode_is_before_quantisation_and_decode_quantises():
     # z + (q - z) of the straight-through form is q up to rounding.
     assert np.abs(model.decode(z).astype(int) - model.decode(snapped)).max() <= 1
     with torch.no_grad():
-        free = to_bytes(model.image(z, quantise=False)[0])
+        free = to_bytes(model.image(z, quantize=False)[0])
     assert not np.array_equal(model.decode(z), free)
 
 
@@ -110,8 +125,17 @@ def test_saved_model_is_the_same_and_tampering_is_noticed(tmp_path):
 
 def test_a_plain_vqmodel_folder_loads_with_patch_1(tmp_path):
     torch.manual_seed(0)
-    blocks = {"down_block_types": ("DownEncoderBlock2D",) * 3, "up_block_types": ("UpDecoderBlock2D",) * 3}
-    vq = VQModel(block_out_channels=(8, 8, 16), norm_num_groups=4, num_vq_embeddings=16, latent_channels=3, **blocks)
+    blocks = {
+        "down_block_types": ("DownEncoderBlock2D",) * 3,
+        "up_block_types": ("UpDecoderBlock2D",) * 3,
+    }
+    vq = VQModel(
+        block_out_channels=(8, 8, 16),
+        norm_num_groups=4,
+        num_vq_embeddings=16,
+        latent_channels=3,
+        **blocks,
+    )
     vq.save_pretrained(tmp_path / "vq")
     model = Autoencoder.load(tmp_path / "vq")
     assert (model.patch, model.factor, model.channels) == (1, 4, 3)
@@ -146,7 +170,7 @@ class Evil:
 
 def test_other_options_in_the_same_folder_train_anew(tmp_path):
     train = pictures(32)
-    short = replace(SMALL, steps_free=5, steps_quantised=5)
+    short = replace(SMALL, steps_free=5, steps_quantized=5)
     train_autoencoder(train, replace(short, lr=1e-3), tmp_path / "a")
     second = train_autoencoder(train, short, tmp_path / "a")
     assert second.digest == train_autoencoder(train, short, tmp_path / "b").digest
@@ -157,12 +181,12 @@ def test_folders_that_are_none_are_refused(tmp_path):
         Autoencoder.load(tmp_path)
 
 
-def test_k_means_finds_separate_heaps_and_leaves_no_centre_unused():
+def test_k_means_finds_separate_heaps_and_leaves_no_center_unused():
     rng = np.random.default_rng(0)
     middles = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]])
     points = np.concatenate([m + 0.1 * rng.standard_normal((50, 3)) for m in middles])
-    centres = k_means(points, 4, np.random.default_rng(1))
-    distance = np.linalg.norm(middles[:, None] - centres[None], axis=2)
+    centers = k_means(points, 4, np.random.default_rng(1))
+    distance = np.linalg.norm(middles[:, None] - centers[None], axis=2)
     assert distance.min(axis=1).max() < 0.2
     many = k_means(points, 60, np.random.default_rng(1))
     used = np.linalg.norm(points[:, None] - many[None], axis=2).argmin(1)
@@ -197,7 +221,14 @@ def test_scores_of_a_perfect_copy_and_by_scikit_image():
     ours = _ssim(*(torch.from_numpy(v).permute(0, 3, 1, 2) for v in (a, mixed)))
     for k in range(2):
         _, full = structural_similarity(
-            a[k], mixed[k], data_range=1, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
+            a[k],
+            mixed[k],
+            data_range=1,
+            channel_axis=2,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            full=True,
         )
         assert float(ours[k]) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
 
@@ -207,12 +238,12 @@ def test_latent_statistics_by_hand():
     stats = LatentStats.of(z)
     assert stats.mean == pytest.approx(z.double().mean((0, 2, 3)).tolist(), abs=1e-9)
     assert stats.std == pytest.approx(z.double().std((0, 2, 3), correction=0).tolist(), abs=1e-9)
-    normal = stats.normalise(z)
+    normal = stats.normalize(z)
     assert torch.allclose(normal.std((0, 2, 3)), torch.ones(2), atol=1e-3)
     assert torch.allclose(stats.restore(normal), z, atol=1e-5)
     paper = LatentStats.of(z, "one")
     assert paper.std == stats.std
-    assert torch.equal(paper.normalise(z), z)
+    assert torch.equal(paper.normalize(z), z)
 
 
 def test_latents_are_encoded_once(tmp_path):
@@ -247,8 +278,14 @@ def test_a_card_that_cannot_be_used_is_told(tmp_path):
         ([], "must be a JSON object"),
         ({}, "must have the format palpate-autoencoder/1"),
         (about | {"format": "x"}, "must have the format palpate-autoencoder/1"),
-        *(({k: v for k, v in about.items() if k != key}, f"Got no {key}") for key in ("patch", "digest", "card")),
-        *((about | {"patch": patch}, "patch must be a whole number") for patch in ("x", "4", 4.0, None, 0, -4, True)),
+        *(
+            ({k: v for k, v in about.items() if k != key}, f"Got no {key}")
+            for key in ("patch", "digest", "card")
+        ),
+        *(
+            (about | {"patch": patch}, "patch must be a whole number")
+            for patch in ("x", "4", 4.0, None, 0, -4, True)
+        ),
         (about | {"card": []}, "card an object"),
         (about | {"patch": 2}, "must have 12 input and output channels"),
     ]

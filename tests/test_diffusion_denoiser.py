@@ -12,7 +12,7 @@ from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, UNetOptions, b
 from palpate.diffusion.latents import LatentStats
 from palpate.diffusion.presets import MINI, PAPER, PRESETS, preset_named
 from palpate.diffusion.training import DiffusionLoss, Schedule, train_denoiser
-from palpate.encoders.loop import LoopOptions
+from palpate.training.loop import LoopOptions
 
 UNET = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
 POLICY = ConditionPolicy(width=12)
@@ -22,7 +22,11 @@ LOOP = LoopOptions(steps=12, batch=4, lr=1e-3, warmup=2, ema=0.9)
 
 def denoiser(policy: ConditionPolicy = POLICY, *, background: bool = False, means=None) -> Denoiser:
     torch.manual_seed(0)
-    return Denoiser(build_unet(UNET, channels=3, size=8, width=policy.width, background=background), policy, means).eval()
+    return Denoiser(
+        build_unet(UNET, channels=3, size=8, width=policy.width, background=background),
+        policy,
+        means,
+    ).eval()
 
 
 def test_the_papers_unet_has_the_parameters_of_latent_diffusion():
@@ -34,18 +38,28 @@ def test_the_papers_unet_has_the_parameters_of_latent_diffusion():
     # w/ BG adds three input channels to the first 3 x 3 convolution and nothing else.
     assert sum(p.numel() for p in wide.parameters()) - count == 3 * 192 * 9
     # Attention at 1/2, 1/4 and 1/8 with heads of 32 channels.
-    heads = [b.attentions[0].transformer_blocks[0].attn1.heads for b in net.down_blocks if hasattr(b, "attentions")]
+    heads = [
+        b.attentions[0].transformer_blocks[0].attn1.heads
+        for b in net.down_blocks
+        if hasattr(b, "attentions")
+    ]
     assert heads == [384 // 32, 576 // 32, 960 // 32]
 
 
 def test_the_papers_preset_says_what_the_paper_says():
-    assert (PAPER.schedule.steps, PAPER.schedule.beta_start, PAPER.schedule.beta_end) == (1000, 0.0015, 0.0195)
+    assert (PAPER.schedule.steps, PAPER.schedule.beta_start, PAPER.schedule.beta_end) == (
+        1000,
+        0.0015,
+        0.0195,
+    )
     assert PAPER.schedule.prediction == "epsilon"
     assert PAPER.schedule.min_snr is None
     assert (PAPER.sampler.method, PAPER.sampler.steps, PAPER.sampler.guidance) == ("ddim", 200, 7.5)
     assert PAPER.loop.lr == pytest.approx(6.4e-5)
     assert PAPER.loop_for(13_900).steps == -(-30 * 13_900 // 32)
-    assert PAPER.condition == ConditionPolicy(width=768, dropout=0.1, gap="none", noise=0.0, null="zeros", source="text")
+    assert PAPER.condition == ConditionPolicy(
+        width=768, dropout=0.1, gap="none", noise=0.0, null="zeros", source="text"
+    )
     assert PAPER.latent_scale == "one"
     assert preset_named("mini") is MINI
     with pytest.raises(PalpateError, match="tiny, mini, paper"):
@@ -56,21 +70,33 @@ def test_the_papers_preset_says_what_the_paper_says():
 def test_every_preset_builds(name):
     preset = PRESETS[name]
     with torch.device("meta"):
-        net = build_unet(preset.unet, channels=3, size=preset.size // 4, width=preset.condition.width, background=False)
+        net = build_unet(
+            preset.unet,
+            channels=3,
+            size=preset.size // 4,
+            width=preset.condition.width,
+            background=False,
+        )
         model = Denoiser(net, replace(preset.condition, gap="none"))
-        out = model(torch.zeros(1, 3, 16, 16), torch.zeros(1, dtype=torch.long), torch.zeros(1, 1, preset.condition.width))
+        out = model(
+            torch.zeros(1, 3, 16, 16),
+            torch.zeros(1, dtype=torch.long),
+            torch.zeros(1, 1, preset.condition.width),
+        )
     assert out.shape == (1, 3, 16, 16)
 
 
 def test_schedule_is_diffusers_scaled_linear():
     from diffusers import DDIMScheduler
 
-    theirs = DDIMScheduler(beta_start=0.0015, beta_end=0.0195, beta_schedule="scaled_linear").alphas_cumprod
+    theirs = DDIMScheduler(
+        beta_start=0.0015, beta_end=0.0195, beta_schedule="scaled_linear"
+    ).alphas_cumprod
     assert torch.allclose(Schedule().alphas().float(), theirs, rtol=2e-5)
     assert Schedule().alphas()[0].item() == pytest.approx(1 - 0.0015)
 
 
-def test_tokens_are_normalised_scaled_repeated_and_shifted():
+def test_tokens_are_normalized_scaled_repeated_and_shifted():
     c = torch.randn(5, 12)
     plain = denoiser(replace(POLICY, tokens=3)).tokens(c, "text")
     wanted = c / c.norm(dim=1, keepdim=True) * 12**0.5
@@ -79,7 +105,11 @@ def test_tokens_are_normalised_scaled_repeated_and_shifted():
     m = torch.randn(12)
     shifted = denoiser(replace(POLICY, gap="mean-shift"), means={"text": m})
     moved = c - m
-    assert torch.allclose(shifted.tokens(c, "text")[:, 0], moved / moved.norm(dim=1, keepdim=True) * 12**0.5, atol=1e-5)
+    assert torch.allclose(
+        shifted.tokens(c, "text")[:, 0],
+        moved / moved.norm(dim=1, keepdim=True) * 12**0.5,
+        atol=1e-5,
+    )
     with pytest.raises(PalpateError, match="mean of vision"):
         shifted.tokens(c, "vision")
     with pytest.raises(PalpateError, match=r"\(n, 12\)"):
@@ -115,7 +145,9 @@ class Recorder(Denoiser):
 
 def recorder(policy: ConditionPolicy) -> Recorder:
     torch.manual_seed(0)
-    return Recorder(build_unet(UNET, channels=3, size=8, width=policy.width, background=False), policy)
+    return Recorder(
+        build_unet(UNET, channels=3, size=8, width=policy.width, background=False), policy
+    )
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
@@ -130,7 +162,9 @@ def test_loss_is_equation_1(prediction):
     x, t, seen, _ = model.seen
     assert torch.equal(seen, tokens)
     # The network sees sqrt(a) z + sqrt(1 - a) eps: recover eps, and with answer 0 the loss is the mean square of the target.
-    a = torch.tensor(np.cumprod(1 - np.linspace(0.0015**0.5, 0.0195**0.5, 1000) ** 2))[t].reshape(-1, 1, 1, 1)
+    a = torch.tensor(np.cumprod(1 - np.linspace(0.0015**0.5, 0.0195**0.5, 1000) ** 2))[t].reshape(
+        -1, 1, 1, 1
+    )
     eps = (x - a.sqrt() * z) / (1 - a).sqrt()
     assert abs(float(eps.mean())) < 0.05
     assert float(eps.std()) == pytest.approx(1, abs=0.05)
@@ -140,7 +174,13 @@ def test_loss_is_equation_1(prediction):
 
 
 def test_time_is_uniform_over_all_steps():
-    loss = DiffusionLoss(torch.zeros(4000, 3, 2, 2), {"text": torch.zeros(4000, 1, 12)}, None, PLAIN, Schedule(steps=10))
+    loss = DiffusionLoss(
+        torch.zeros(4000, 3, 2, 2),
+        {"text": torch.zeros(4000, 1, 12)},
+        None,
+        PLAIN,
+        Schedule(steps=10),
+    )
     model = recorder(POLICY)
     loss(model, torch.arange(4000), torch.Generator().manual_seed(0), 0)
     counts = torch.bincount(model.seen[1], minlength=10)
@@ -154,8 +194,12 @@ def test_min_snr_weight():
     t = torch.tensor([0, 200, 999])
     snr = (alphas / (1 - alphas))[t]
     for prediction, extra in (("epsilon", 0), ("v_prediction", 1)):
-        loss = DiffusionLoss(torch.zeros(1, 3, 2, 2), {}, None, PLAIN, Schedule(prediction=prediction, min_snr=5.0))
-        assert loss._weight(t).tolist() == pytest.approx((snr.clamp(max=5) / (snr + extra)).tolist(), rel=1e-5)
+        loss = DiffusionLoss(
+            torch.zeros(1, 3, 2, 2), {}, None, PLAIN, Schedule(prediction=prediction, min_snr=5.0)
+        )
+        assert loss._weight(t).tolist() == pytest.approx(
+            (snr.clamp(max=5) / (snr + extra)).tolist(), rel=1e-5
+        )
 
 
 def test_dropout_replaces_a_tenth_of_the_conditions_by_null():
@@ -195,7 +239,14 @@ def data(n: int = 24):
 
 def train(folder, **changes):
     z, conditions = data()
-    settings = {"stats": LatentStats.of(z), "unet": UNET, "policy": POLICY, "schedule": Schedule(), "loop": LOOP, "folder": folder}
+    settings = {
+        "stats": LatentStats.of(z),
+        "unet": UNET,
+        "policy": POLICY,
+        "schedule": Schedule(),
+        "loop": LOOP,
+        "folder": folder,
+    }
     return train_denoiser(z, conditions, **settings | changes)
 
 
@@ -213,14 +264,26 @@ def test_training_resumes_to_the_same_weights(tmp_path):
         assert torch.equal(a, b), name
     # Another schedule is another run: the old checkpoint is not used.
     other = train(tmp_path / "b", schedule=Schedule(prediction="v_prediction"))
-    assert not all(torch.equal(a, b) for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True))
+    assert not all(
+        torch.equal(a, b)
+        for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True)
+    )
 
 
 def test_training_does_not_touch_global_randomness(tmp_path):
     z, conditions = data()
     torch.manual_seed(3)
     before = torch.get_rng_state()
-    train_denoiser(z, conditions, stats=PLAIN, unet=UNET, policy=POLICY, schedule=Schedule(), loop=LOOP, folder=tmp_path)
+    train_denoiser(
+        z,
+        conditions,
+        stats=PLAIN,
+        unet=UNET,
+        policy=POLICY,
+        schedule=Schedule(),
+        loop=LOOP,
+        folder=tmp_path,
+    )
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -239,13 +302,26 @@ def test_mistakes_are_told(tmp_path):
     z, conditions = data()
     with pytest.raises(PalpateError, match="needs embeddings of text, vision"):
         train_denoiser(
-            z, {"text": conditions["text"]}, stats=PLAIN, unet=UNET, policy=replace(POLICY, source="mixed"), schedule=Schedule(), loop=LOOP,
+            z,
+            {"text": conditions["text"]},
+            stats=PLAIN,
+            unet=UNET,
+            policy=replace(POLICY, source="mixed"),
+            schedule=Schedule(),
+            loop=LOOP,
             folder=tmp_path,
-        )  # fmt: skip
+        )
     with pytest.raises(PalpateError, match="one row a sample"):
         train_denoiser(
-            z[:-1], conditions, stats=PLAIN, unet=UNET, policy=POLICY, schedule=Schedule(), loop=LOOP, folder=tmp_path
-        )  # fmt: skip
+            z[:-1],
+            conditions,
+            stats=PLAIN,
+            unet=UNET,
+            policy=POLICY,
+            schedule=Schedule(),
+            loop=LOOP,
+            folder=tmp_path,
+        )
     with pytest.raises(PalpateError, match=r"\[0, 1\)"):
         ConditionPolicy(width=3, dropout=1.0)
 
@@ -256,7 +332,9 @@ def test_the_token_reaches_the_output_and_a_saved_denoiser_is_the_same(tmp_path,
 
     policy = ConditionPolicy(width=8)
     torch.manual_seed(0)
-    net = build_unet(replace(UNET, modulate=modulate), channels=3, size=8, width=8, background=False)
+    net = build_unet(
+        replace(UNET, modulate=modulate), channels=3, size=8, width=8, background=False
+    )
     model = Denoiser(net, policy).eval()
     assert (net.class_embedding is not None) == modulate
     x, t, c = torch.randn(2, 3, 8, 8), torch.tensor([3, 700]), torch.randn(2, 8)
@@ -271,7 +349,9 @@ def test_the_token_reaches_the_output_and_a_saved_denoiser_is_the_same(tmp_path,
 def test_the_token_reaches_the_output_through_the_time_embedding_alone():
     torch.manual_seed(0)
     for modulate in (True, False):
-        net = build_unet(replace(UNET, modulate=modulate), channels=3, size=8, width=8, background=False)
+        net = build_unet(
+            replace(UNET, modulate=modulate), channels=3, size=8, width=8, background=False
+        )
         model = Denoiser(net, ConditionPolicy(width=8)).eval()
         values = [p for name, p in net.named_parameters() if "attn2.to_v" in name]
         assert values

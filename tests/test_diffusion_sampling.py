@@ -8,7 +8,13 @@ import torch
 
 from palpate.core import PalpateError
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, UNetOptions, build_unet
-from palpate.diffusion.sampling import SamplerOptions, build_scheduler, sample, sample_latents, starting_noise
+from palpate.diffusion.sampling import (
+    SamplerOptions,
+    build_scheduler,
+    sample,
+    sample_latents,
+    starting_noise,
+)
 from palpate.diffusion.training import Schedule
 
 SHAPE = (3, 4, 4)
@@ -32,14 +38,22 @@ def exact(schedule: Schedule, mean, spread: float):
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
-@pytest.mark.parametrize(("method", "steps", "tolerance"), [("ddim", 200, 0.02), ("ddim", 1000, 0.01), ("dpm", 20, 0.02)])
+@pytest.mark.parametrize(
+    ("method", "steps", "tolerance"), [("ddim", 200, 0.02), ("ddim", 1000, 0.01), ("dpm", 20, 0.02)]
+)
 def test_gaussian_data_come_out_with_their_mean_and_spread(method, steps, tolerance, prediction):
     schedule = Schedule(prediction=prediction)
     ids = [f"s{k}" for k in range(128)]
     z = sample(
-        exact(schedule, MEAN, SPREAD), TOKENS.expand(128, 1, 1), TOKENS, ids,
-        shape=SHAPE, schedule=schedule, options=SamplerOptions(method, steps, guidance=1.0, batch=64), seed=0,
-    )  # fmt: skip
+        exact(schedule, MEAN, SPREAD),
+        TOKENS.expand(128, 1, 1),
+        TOKENS,
+        ids,
+        shape=SHAPE,
+        schedule=schedule,
+        options=SamplerOptions(method, steps, guidance=1.0, batch=64),
+        seed=0,
+    )
     noise = starting_noise(ids, SHAPE, 0)
     # The probability flow of a Gaussian is z^0 = mean + spread * z^T (up to the signal left at T), sample by sample.
     assert float(z.mean()) == pytest.approx(MEAN + SPREAD * float(noise.mean()), abs=tolerance)
@@ -54,9 +68,15 @@ def test_guidance_extrapolates_from_the_unconditional_prediction():
     ids = [f"s{k}" for k in range(32)]
     for s in (0.0, 1.0, 3.0):
         z = sample(
-            predict, torch.full((32, 1, 1), 0.8), TOKENS, ids,
-            shape=SHAPE, schedule=schedule, options=SamplerOptions("ddim", 200, guidance=s, batch=16), seed=1,
-        )  # fmt: skip
+            predict,
+            torch.full((32, 1, 1), 0.8),
+            TOKENS,
+            ids,
+            shape=SHAPE,
+            schedule=schedule,
+            options=SamplerOptions("ddim", 200, guidance=s, batch=16),
+            seed=1,
+        )
         expected = s * 0.8 + 0.5 * float(starting_noise(ids, SHAPE, 1).mean())
         assert float(z.mean()) == pytest.approx(expected, abs=0.03)
 
@@ -73,7 +93,9 @@ def test_ddim_step_by_hand():
     x0 = (z - (1 - a[999]).sqrt() * eps) / a[999].sqrt()
     wanted = a[899].sqrt() * x0 + (1 - a[899]).sqrt() * eps
     assert times[1] == 899
-    assert torch.allclose(scheduler.step(eps, 999, z).prev_sample.double(), wanted.double(), rtol=1e-3, atol=1e-3)
+    assert torch.allclose(
+        scheduler.step(eps, 999, z).prev_sample.double(), wanted.double(), rtol=1e-3, atol=1e-3
+    )
 
 
 def test_noise_belongs_to_seed_and_id():
@@ -90,27 +112,39 @@ def network(policy: ConditionPolicy | None = None) -> Denoiser:
     torch.manual_seed(0)
     policy = policy or ConditionPolicy(width=12)
     options = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
-    return Denoiser(build_unet(options, channels=3, size=8, width=12, background=False), policy).eval()
+    return Denoiser(
+        build_unet(options, channels=3, size=8, width=12, background=False), policy
+    ).eval()
 
 
 def draw(model: Denoiser, conditions, ids, **changes) -> torch.Tensor:
     options = replace(SamplerOptions("dpm", 4, guidance=3.0, batch=4), **changes)
-    return sample_latents(model, model.tokens(conditions, "vision"), ids, size=8, schedule=Schedule(), options=options, seed=0)
+    return sample_latents(
+        model,
+        model.tokens(conditions, "vision"),
+        ids,
+        size=8,
+        schedule=Schedule(),
+        options=options,
+        seed=0,
+    )
 
 
-def test_a_sample_does_not_depend_on_its_neighbours():
+def test_a_sample_does_not_depend_on_its_neighbors():
     model = network()
     torch.manual_seed(1)
     c = torch.randn(7, 12)
     ids = [f"id {k}" for k in range(7)]
     whole = draw(model, c, ids)
     order = [4, 1, 6, 0]
-    # At one batch size, other neighbours and places change no bit.
+    # At one batch size, other neighbors and places change no bit.
     assert torch.equal(draw(model, c[order], [ids[k] for k in order]), whole[order])
     assert torch.equal(draw(model, c[3:4], ids[3:4])[0], whole[3])
     # Another batch size may pick other kernels: equal up to rounding.
     for batch in (1, 3, 7, 16):
-        assert torch.allclose(draw(model, c, ids, batch=batch), whole, rtol=1e-4, atol=1e-5 * float(whole.abs().max()))
+        assert torch.allclose(
+            draw(model, c, ids, batch=batch), whole, rtol=1e-4, atol=1e-5 * float(whole.abs().max())
+        )
 
 
 def test_guidance_changes_the_output():
@@ -143,7 +177,15 @@ def test_rescaling_keeps_the_spread_of_the_conditional_prediction():
     from palpate.diffusion.sampling import _guided
 
     z, t = torch.randn(2, 3, 4, 4), torch.tensor([5, 5])
-    out = _guided(predict, z, t, torch.ones(2, 1, 1), torch.zeros(2, 1, 1), None, SamplerOptions(guidance=4.0, rescale=1.0))
+    out = _guided(
+        predict,
+        z,
+        t,
+        torch.ones(2, 1, 1),
+        torch.zeros(2, 1, 1),
+        None,
+        SamplerOptions(guidance=4.0, rescale=1.0),
+    )
     assert torch.allclose(out.std((1, 2, 3)), z.std((1, 2, 3)), rtol=1e-5)
     assert torch.allclose(out / out.std(), z / z.std(), atol=1e-5)
 
@@ -156,8 +198,14 @@ def test_mistakes_are_told():
         draw(model, torch.randn(1, 12), ["a"], steps=0)
     with pytest.raises(PalpateError, match="w/ BG"):
         sample_latents(
-            model, model.tokens(torch.randn(1, 12), "text"), ["a"], size=8, schedule=Schedule(), options=SamplerOptions(), seed=0,
+            model,
+            model.tokens(torch.randn(1, 12), "text"),
+            ["a"],
+            size=8,
+            schedule=Schedule(),
+            options=SamplerOptions(),
+            seed=0,
             background=torch.zeros(1, 3, 8, 8),
-        )  # fmt: skip
+        )
     assert draw(model, torch.randn(0, 12), []).shape == (0, 3, 8, 8)
     assert np.isfinite(draw(model, torch.randn(1, 12), ["a"]).numpy()).all()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from diffusion_forge import make_pipeline
-from mini_forge import make_towers
+from mini_forge import make_encoders
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.denoiser import ConditionPolicy, UNetOptions
@@ -15,21 +15,32 @@ from palpate.diffusion.latents import LatentStats
 from palpate.diffusion.presets import TINY
 from palpate.diffusion.recipe import train_pipeline
 from palpate.diffusion.training import Schedule, train_denoiser
-from palpate.encoders.loop import LoopOptions
-from palpate.encoders.towers import Towers
+from palpate.encoders.encoder_set import EncoderSet
+from palpate.training.loop import LoopOptions
 
 
 def train(folder: Path, steps: int, start=None, **changes):
     torch.manual_seed(3)
     how = {
-        "stats": LatentStats((0.0,) * 3, (1.0,) * 3), "unet": TINY.unet, "policy": TINY.condition_for(6), "schedule": TINY.schedule,
+        "stats": LatentStats((0.0,) * 3, (1.0,) * 3),
+        "unet": TINY.unet,
+        "policy": TINY.condition_for(6),
+        "schedule": TINY.schedule,
         "loop": LoopOptions(steps=steps, batch=2, lr=1e-2, warmup=0),
-    }  # fmt: skip
-    return train_denoiser(torch.randn(4, 3, 8, 8), {"text": torch.randn(4, 6)}, folder=folder, start=start, **(how | changes))
+    }
+    return train_denoiser(
+        torch.randn(4, 3, 8, 8),
+        {"text": torch.randn(4, 6)},
+        folder=folder,
+        start=start,
+        **(how | changes),
+    )
 
 
 def same(a, b) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(a.unet.parameters(), b.unet.parameters(), strict=True))
+    return all(
+        torch.equal(x, y) for x, y in zip(a.unet.parameters(), b.unet.parameters(), strict=True)
+    )
 
 
 def test_it_begins_with_the_weights_of_the_other_and_leaves_those_alone(tmp_path):
@@ -48,7 +59,14 @@ def test_it_begins_with_the_weights_of_the_other_and_leaves_those_alone(tmp_path
 def test_another_geometry_is_refused(tmp_path):
     start = make_pipeline().denoiser
     with pytest.raises(PalpateError, match="geometry of the preset"):
-        train(tmp_path, 1, start, unet=UNetOptions(widths=(16, 16), attention=(False, True), layers=1, head_width=16, groups=8))
+        train(
+            tmp_path,
+            1,
+            start,
+            unet=UNetOptions(
+                widths=(16, 16), attention=(False, True), layers=1, head_width=16, groups=8
+            ),
+        )
 
 
 def test_a_learned_unconditional_token_goes_along(tmp_path):
@@ -58,22 +76,36 @@ def test_a_learned_unconditional_token_goes_along(tmp_path):
     assert torch.equal(made.null, start.null)
 
 
-def test_other_towers_autoencoders_and_schedules_are_refused(small_manifest, tmp_path):
-    towers = make_towers()
-    start = replace(make_pipeline(width=towers.dim), towers=Towers(towers.clip))
+def test_other_encoders_autoencoders_and_schedules_are_refused(small_manifest, tmp_path):
+    encoders = make_encoders()
+    start = replace(make_pipeline(width=encoders.dim), encoders=EncoderSet(encoders.clip))
     manifest = Manifest(small_manifest.table, small_manifest.root, {"synthetic": "yes"})
-    split = Split.from_ids(train=manifest.ids[:8], test=manifest.ids[8:], rule={"name": "t"}, manifest=manifest.digest)
+    split = Split.from_ids(
+        train=manifest.ids[:8], test=manifest.ids[8:], rule={"name": "t"}, manifest=manifest.digest
+    )
     preset = replace(TINY, loop=replace(TINY.loop, steps=1))
 
-    def run(towers=towers, autoencoder=start.autoencoder, preset=preset):
-        return train_pipeline(manifest, split, towers, autoencoder, preset, tmp_path / "work", start=start, device="cpu")
+    def run(encoders=encoders, autoencoder=start.autoencoder, preset=preset):
+        return train_pipeline(
+            manifest,
+            split,
+            encoders,
+            autoencoder,
+            preset,
+            tmp_path / "work",
+            start=start,
+            device="cpu",
+        )
 
     other = make_pipeline().autoencoder
     other.vq.quantize.embedding.weight.data.add_(1)
     for change, word in (
-        ({"towers": make_towers(seed=4)}, "another vision tower"),
+        ({"encoders": make_encoders(seed=4)}, "another vision encoder"),
         ({"autoencoder": other}, "another autoencoder"),
-        ({"preset": replace(preset, schedule=Schedule(prediction="v_prediction"))}, "another schedule"),
+        (
+            {"preset": replace(preset, schedule=Schedule(prediction="v_prediction"))},
+            "another schedule",
+        ),
     ):
         with pytest.raises(PalpateError, match=word):
             run(**change)
@@ -82,5 +114,7 @@ def test_other_towers_autoencoders_and_schedules_are_refused(small_manifest, tmp
     assert made.training["start"] == start.digest
     assert made.training["start_record"] == dict(start.training)
     assert made.training["synthetic"] is True
-    assert made.training["materials"] == sorted(set(manifest.part(split, "train").column("material")))
+    assert made.training["materials"] == sorted(
+        set(manifest.part(split, "train").column("material"))
+    )
     assert all(name in made.notice for name in made.training["materials"])

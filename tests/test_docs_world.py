@@ -22,7 +22,11 @@ from palpate.sim.plan import written_frames
 TOP = Path(__file__).resolve().parents[1]
 DOCS = TOP / "docs"
 PAGE = (DOCS / "world.md").read_text(encoding="utf-8")
-COMMANDS = [shlex.split(line, comments=True) for line in "\n".join(re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)).splitlines() if line]
+COMMANDS = [
+    shlex.split(line, comments=True)
+    for line in "\n".join(re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)).splitlines()
+    if line
+]
 SMALL = [
     "--materials",
     "2",
@@ -52,7 +56,9 @@ def number(value):
 
 @pytest.fixture(scope="module")
 def recipe():
-    spec = importlib.util.spec_from_file_location("world_pictures", TOP / "recipes" / "world_pictures.py")
+    spec = importlib.util.spec_from_file_location(
+        "world_pictures", TOP / "recipes" / "world_pictures.py"
+    )
     module = importlib.util.module_from_spec(spec)
     sys.modules["world_pictures"] = module
     spec.loader.exec_module(module)
@@ -66,7 +72,9 @@ def test_the_commands_run(tmp_path, monkeypatch, capsys):
         assert words[0] == "palpate"
         if "videos" in words and importlib.util.find_spec("av") is None:
             continue
-        small = [*SMALL, "-q"] if words[1] == "world" else []  # the last of two equal options counts
+        small = (
+            [*SMALL, "-q"] if words[1] == "world" else []
+        )  # the last of two equal options counts
         assert main([*words[1:], *small]) == 0, (words, capsys.readouterr().err)
 
 
@@ -101,23 +109,35 @@ def test_other_commands_name_scripts_and_flags_that_exist():
 
 
 def test_the_tables_of_options_are_those_of_the_code():
-    rows = {name: rest for name, *rest in re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \| (.+) \|$", section("Options"), re.MULTILINE)}
+    rows = {
+        name: rest
+        for name, *rest in re.findall(
+            r"^\| `(\w+)` \| (.*?) \| (.*?) \| (.+) \|$", section("Options"), re.MULTILINE
+        )
+    }
     assert set(rows) == {field.name for field in dataclasses.fields(WorldOptions)}
     for name, (default, allowed, _) in rows.items():
         value = getattr(WorldOptions(), name)
         if name == "materials":
             assert (default, allowed) == (str(len(value)), f"1 .. {len(MATERIALS)}, or names")
         elif name in CHOICES:
-            assert (default, allowed) == (f"`{value}`", ", ".join(f"`{choice}`" for choice in CHOICES[name]))
+            assert (default, allowed) == (
+                f"`{value}`",
+                ", ".join(f"`{choice}`" for choice in CHOICES[name]),
+            )
         else:
             low, high = (RANGES.get(name) or PAIRS.get(name) or SERIES[name])[:2]
             assert allowed == f"{number(low)} .. {number(high)}", name
-            assert default == ", ".join(map(number, value if isinstance(value, tuple) else (value,))), name
+            assert default == ", ".join(
+                map(number, value if isinstance(value, tuple) else (value,))
+            ), name
 
 
 def test_the_table_of_materials_is_that_of_the_code():
     rows = re.findall(r"^\| (\d+) \| (.+?) \| (.+) \|$", section("Materials"), re.MULTILINE)
-    assert [(int(label), name) for label, name, _ in rows] == [(material.label, name) for name, material in MATERIALS.items()]
+    assert [(int(label), name) for label, name, _ in rows] == [
+        (material.label, name) for name, material in MATERIALS.items()
+    ]
     words = set()
     for _, name, kinds in rows:
         told = dict(re.findall(r"([^;(]+?) \(([^)]*)\)(?:; )?", kinds))
@@ -130,9 +150,13 @@ def test_the_table_of_materials_is_that_of_the_code():
 
 
 def test_the_table_of_costs_is_that_of_the_presets():
-    noted = re.findall(r"#\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+)\n", Path(presets.__file__).read_text(encoding="utf-8"))
+    noted = re.findall(
+        r"#\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+)\n", Path(presets.__file__).read_text(encoding="utf-8")
+    )
     rows = []
-    for (name, options), (contact, written, seconds, megabytes) in zip(PRESETS.items(), noted, strict=True):
+    for (name, options), (contact, written, seconds, megabytes) in zip(
+        PRESETS.items(), noted, strict=True
+    ):
         plans = plan_world(options)
         assert len(plans) * len(written_frames(options)) == int(written)
         assert len(plans) * options.touches_per_video * options.frames_per_touch == int(contact)
@@ -145,16 +169,25 @@ def test_the_table_of_costs_is_that_of_the_presets():
 @pytest.mark.parametrize("title", ["Fidelity", "What it shows"])
 def test_figures_are_those_of_the_written_tables(title):
     text = section(title)
-    tables = "".join((DOCS / name).read_text(encoding="utf-8") for name in re.findall(r"\]\((world_\w+\.md)\)", text))
+    tables = "".join(
+        (DOCS / name).read_text(encoding="utf-8")
+        for name in re.findall(r"\]\((world_\w+\.md)\)", text)
+    )
     figures = re.findall(r"\d+\.\d+(?: ± \d+\.\d+)?(?! cycles)", re.sub(r"`[^`]*`", "", text))
     assert len(figures) > 5
-    assert [figure for figure in figures if not re.search(rf"(?<![\d.]){re.escape(figure)}(?!\d)", tables)] == []
+    assert [
+        figure
+        for figure in figures
+        if not re.search(rf"(?<![\d.]){re.escape(figure)}(?!\d)", tables)
+    ] == []
 
 
 def test_links_resolve_and_the_version_is_told():
     links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", PAGE)
     assert len(links) > 10
-    assert [link for link in links if not link.startswith("http") and not (DOCS / link).is_file()] == []
+    assert [
+        link for link in links if not link.startswith("http") and not (DOCS / link).is_file()
+    ] == []
     assert f"(now {VERSION})" in PAGE
 
 
@@ -165,17 +198,26 @@ def test_every_picture_is_small_and_shown_and_drawn_by_the_recipe(recipe):
         assert (DOCS / "images" / name).stat().st_size < 250_000, name
 
 
-@pytest.mark.parametrize("name", [
-    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
-    for name in sorted(path.name for path in (DOCS / "images").glob("world_*.png"))
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in sorted(path.name for path in (DOCS / "images").glob("world_*.png"))
+    ],
+)
 def test_pictures_are_redrawn_alike(recipe, name):
     board = recipe.PICTURES[name]()
     with Image.open(DOCS / "images" / name) as image:
         assert image.size == board.image().size
         stored = np.asarray(image.convert("RGB")).astype(int)
     assert board.panels
-    for left, top, pixels in board.panels:  # not the letters, which depend on the version of FreeType
-        difference = np.abs(stored[top : top + pixels.shape[0], left : left + pixels.shape[1]] - pixels)
-        coloured = (pixels != pixels[..., :1]).any()
-        assert difference.max() <= 2 + (recipe.STEP // 2 if coloured else 0)
+    for (
+        left,
+        top,
+        pixels,
+    ) in board.panels:  # not the letters, which depend on the version of FreeType
+        difference = np.abs(
+            stored[top : top + pixels.shape[0], left : left + pixels.shape[1]] - pixels
+        )
+        colored = (pixels != pixels[..., :1]).any()
+        assert difference.max() <= 2 + (recipe.STEP // 2 if colored else 0)

@@ -1,4 +1,4 @@
-"""The loss against a slow loop; training of a touch tower and of a fresh CLIP: what moves, what does not, what it refuses."""
+"""The loss against a slow loop; training of a tactile encoder and of a fresh CLIP: what moves, what does not, what it refuses."""
 
 import math
 from dataclasses import replace
@@ -11,12 +11,26 @@ from PIL import Image
 from palpate.core import PalpateError, Split, rng_for
 from palpate.data.manifest import Manifest
 from palpate.encoders import contrastive
-from palpate.encoders.contrastive import TouchModel, info_nce, new_clip, soft_targets, three_way, touch_loss, train_clip, train_touch
+from palpate.encoders.contrastive import (
+    TouchModel,
+    info_nce,
+    new_clip,
+    soft_targets,
+    three_way,
+    touch_loss,
+    train_clip,
+    train_touch,
+)
+from palpate.encoders.encoder_set import EncoderSet, new_touch
 from palpate.encoders.presets import preset
-from palpate.encoders.towers import Towers, new_touch
 
 TINY = preset("tiny")
-FEELS = {"Wood": "grained, firm wood", "Metal": "cold, smooth metal", "Grass": "soft grass", "Brick": "coarse, gritty brick"}
+FEELS = {
+    "Wood": "grained, firm wood",
+    "Metal": "cold, smooth metal",
+    "Grass": "soft grass",
+    "Brick": "coarse, gritty brick",
+}
 
 
 def make_world(root, videos=8, frames=3, size=16):
@@ -28,20 +42,29 @@ def make_world(root, videos=8, frames=3, size=16):
             rng = rng_for(0, material, v, k)
             wave = np.sin(np.arange(size) * (1 + v % 4))[:, None, None] * 60 + 128
             for suffix in ("v", "t"):
-                picture = np.clip(wave + rng.normal(0, 20, (size, size, 3)), 0, 255).astype(np.uint8)
+                picture = np.clip(wave + rng.normal(0, 20, (size, size, 3)), 0, 255).astype(
+                    np.uint8
+                )
                 Image.fromarray(picture).save(root / f"{v}_{k}_{suffix}.png")
             rows.append(
                 {
-                    "id": f"v{v}/{k}", "video": f"v{v}", "frame": k, "material": material, "text": FEELS[material],
-                    "vision": f"{v}_{k}_v.png", "tactile": f"{v}_{k}_t.png",
+                    "id": f"v{v}/{k}",
+                    "video": f"v{v}",
+                    "frame": k,
+                    "material": material,
+                    "text": FEELS[material],
+                    "vision": f"{v}_{k}_v.png",
+                    "tactile": f"{v}_{k}_t.png",
                 }
-            )  # fmt: skip
+            )
     return Manifest.from_rows(rows, root)
 
 
 def by_video(manifest, train=6):
     side = {i: int(i[1:].split("/")[0]) < train for i in manifest.ids}
-    return Split.from_ids(train=[i for i in manifest.ids if side[i]], test=[i for i in manifest.ids if not side[i]])
+    return Split.from_ids(
+        train=[i for i in manifest.ids if side[i]], test=[i for i in manifest.ids if not side[i]]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +73,9 @@ def world(tmp_path_factory):
 
 
 def unit(*shape, seed=0):
-    return torch.nn.functional.normalize(torch.randn(*shape, generator=torch.Generator().manual_seed(seed)), dim=-1)
+    return torch.nn.functional.normalize(
+        torch.randn(*shape, generator=torch.Generator().manual_seed(seed)), dim=-1
+    )
 
 
 def slow_nce(a, b, scale, target):
@@ -58,7 +83,10 @@ def slow_nce(a, b, scale, target):
     n, total = len(a), 0.0
     for x, y, t in ((a, b, target), (b, a, target.T)):
         for i in range(n):
-            logits = [scale * sum(float(p) * float(q) for p, q in zip(x[i], y[j], strict=True)) for j in range(n)]
+            logits = [
+                scale * sum(float(p) * float(q) for p, q in zip(x[i], y[j], strict=True))
+                for j in range(n)
+            ]
             log_sum = math.log(sum(math.exp(v) for v in logits))
             total -= sum(float(t[i][j]) * (logits[j] - log_sum) for j in range(n))
     return total / (2 * n)
@@ -67,24 +95,37 @@ def slow_nce(a, b, scale, target):
 def test_loss_equals_the_slow_loop():
     a, b, c = unit(6, 4, seed=1), unit(6, 4, seed=2), unit(6, 4, seed=3)
     words = torch.tensor([0, 1, 0, 2, 1, 0])
-    soft = np.array([[(words[i] == words[j]).item() / (words == words[i]).sum().item() for j in range(6)] for i in range(6)])
+    soft = np.array(
+        [
+            [(words[i] == words[j]).item() / (words == words[i]).sum().item() for j in range(6)]
+            for i in range(6)
+        ]
+    )
     assert torch.allclose(soft_targets(words).double(), torch.tensor(soft), atol=1e-7)
     assert float(info_nce(a, b, 7.0)) == pytest.approx(slow_nce(a, b, 7.0, np.eye(6)), abs=1e-5)
-    assert float(info_nce(a, b, 7.0, soft_targets(words))) == pytest.approx(slow_nce(a, b, 7.0, soft), abs=1e-5)
+    assert float(info_nce(a, b, 7.0, soft_targets(words))) == pytest.approx(
+        slow_nce(a, b, 7.0, soft), abs=1e-5
+    )
     # arguments in the order touch, text, vision
     parts = {
-        "touch_text": slow_nce(a, b, 7.0, soft), "vision_text": slow_nce(c, b, 7.0, soft), "touch_vision": slow_nce(a, c, 7.0, np.eye(6)),
-    }  # fmt: skip
+        "touch_text": slow_nce(a, b, 7.0, soft),
+        "vision_text": slow_nce(c, b, 7.0, soft),
+        "touch_vision": slow_nce(a, c, 7.0, np.eye(6)),
+    }
     total, logs = three_way(a, b, c, 7.0, text_targets=soft_targets(words))
     assert logs == pytest.approx(parts, abs=1e-5)
     assert float(total) == pytest.approx(sum(parts.values()) / 3, abs=1e-5)
     weighted, _ = three_way(a, b, c, 7.0, weights=(1, 0, 3), text_targets=soft_targets(words))
-    assert float(weighted) == pytest.approx((parts["touch_text"] + 3 * parts["touch_vision"]) / 4, abs=1e-5)
+    assert float(weighted) == pytest.approx(
+        (parts["touch_text"] + 3 * parts["touch_vision"]) / 4, abs=1e-5
+    )
 
 
 def test_soft_targets_of_distinct_texts_are_the_diagonal():
     a, b = unit(5, 3, seed=1), unit(5, 3, seed=2)
-    assert float(info_nce(a, b, 3.0, soft_targets(torch.arange(5)))) == pytest.approx(float(info_nce(a, b, 3.0)), abs=1e-6)
+    assert float(info_nce(a, b, 3.0, soft_targets(torch.arange(5)))) == pytest.approx(
+        float(info_nce(a, b, 3.0)), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("weights", [(1, 1), (0, 0, 0), (1, -1, 1), (math.nan,) * 3])
@@ -94,20 +135,30 @@ def test_bad_weights(weights):
         three_way(a, a, a, 1.0, weights=weights)
 
 
-def test_gradient_goes_to_the_touch_tower_and_the_temperature_only(world):
+def test_gradient_goes_to_the_touch_encoder_and_the_temperature_only(world):
     clip = new_clip(TINY, world.column("text"), seed=0)
     model = TouchModel(new_touch(TINY.touch_config(clip.dim), seed=1))
     text = clip.encode_text(world.column("text")[:6])
-    vision = clip.encode_vision(torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(0)))
+    vision = clip.encode_vision(
+        torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    )
     assert not text.requires_grad
     assert not vision.requires_grad
-    total, logs = touch_loss(model, torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(1)), text, vision)
+    total, logs = touch_loss(
+        model, torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(1)), text, vision
+    )
     total.backward()
-    moved = {name for name, p in model.named_parameters() if p.grad is not None and p.grad.abs().max() > 0}
+    moved = {
+        name
+        for name, p in model.named_parameters()
+        if p.grad is not None and p.grad.abs().max() > 0
+    }
     silent = {name for name, _ in model.named_parameters()} - moved
     assert "log_scale" in moved
     assert "touch.visual_projection.weight" in moved
-    assert all("post_layernorm" in name or "k_proj.bias" in name for name in silent)  # a key bias cancels in the softmax
+    assert all(
+        "post_layernorm" in name or "k_proj.bias" in name for name in silent
+    )  # a key bias cancels in the softmax
     assert all(p.grad is None for p in clip.model.parameters())
     assert logs["scale"] == pytest.approx(1 / 0.07, rel=1e-5)
 
@@ -115,7 +166,9 @@ def test_gradient_goes_to_the_touch_tower_and_the_temperature_only(world):
 def test_vision_text_term_moves_only_the_temperature(world):
     clip = new_clip(TINY, world.column("text"), seed=0)
     model = TouchModel(new_touch(TINY.touch_config(clip.dim), seed=1))
-    total, _ = touch_loss(model, torch.zeros(6, 3, 16, 16), unit(6, 8, seed=1), unit(6, 8, seed=2), weights=(0, 1, 0))
+    total, _ = touch_loss(
+        model, torch.zeros(6, 3, 16, 16), unit(6, 8, seed=1), unit(6, 8, seed=2), weights=(0, 1, 0)
+    )
     total.backward()
     assert model.log_scale.grad.abs() > 0
     assert all(p.grad is None or p.grad.abs().max() == 0 for p in model.touch.parameters())
@@ -131,7 +184,9 @@ def test_temperature_is_clamped_and_can_come_back():
 
 
 def quick(**change):
-    return replace(TINY, **{"touch_course": replace(TINY.touch_course, epochs=4.0, batch=6), **change})
+    return replace(
+        TINY, **{"touch_course": replace(TINY.touch_course, epochs=4.0, batch=6), **change}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -142,80 +197,126 @@ def clip(world, tmp_path_factory):
 def test_training_moves_touch_alone_and_says_what_it_used(world, clip, tmp_path):
     split = by_video(world)
     before = clip.digest("vision"), clip.digest("text")
-    towers = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu")
-    assert (clip.digest("vision"), clip.digest("text")) == before == (towers.digest("vision"), towers.digest("text"))
+    encoders = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu")
+    assert (
+        (clip.digest("vision"), clip.digest("text"))
+        == before
+        == (encoders.digest("vision"), encoders.digest("text"))
+    )
     start = new_touch(TINY.touch_config(clip.dim), seed=0)
-    assert not torch.equal(start.visual_projection.weight, towers.touch.visual_projection.weight)
-    card = towers.card
+    assert not torch.equal(start.visual_projection.weight, encoders.touch.visual_projection.weight)
+    card = encoders.card
     assert card["split"] == split.digest
     assert card["train_manifest"] == world.part(split, "train").digest
     assert (card["train_samples"], card["steps"], card["text_source"]) == (18, 12, "manifest")
-    assert set(card["loss"][0]) == {"step", "loss", "touch_text", "vision_text", "touch_vision", "scale"}
+    assert set(card["loss"][0]) == {
+        "step",
+        "loss",
+        "touch_text",
+        "vision_text",
+        "touch_vision",
+        "scale",
+    }
     assert card["targets"] == "identical-text"
     assert card["clip_card"]["split"] == split.digest
-    towers.save(tmp_path / "out")
-    again = Towers.load(tmp_path / "out")
+    encoders.save(tmp_path / "out")
+    again = EncoderSet.load(tmp_path / "out")
     assert again.card == card
-    assert again.digest("touch") == towers.digest("touch")
+    assert again.digest("tactile") == encoders.digest("tactile")
 
 
 def test_training_depends_on_the_seed_alone_and_resumes(world, clip, tmp_path):
     split = by_video(world)
-    digest = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu").digest("touch")
+    digest = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
+        "tactile"
+    )
     torch.manual_seed(99)
 
     def stop(what, done, total, remark=""):
-        if what == "training the touch tower" and done == 5:
+        if what == "training the tactile encoder" and done == 5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_touch(world, split, clip, quick(), tmp_path / "b", device="cpu", progress=stop, cache=tmp_path / "cache")
-    assert train_touch(world, split, clip, quick(), tmp_path / "b", device="cpu", cache=tmp_path / "cache").digest("touch") == digest
-    assert train_touch(world, split, clip, quick(), tmp_path / "b", device="cpu", seed=1).digest("touch") != digest
-    assert train_touch(world, split, clip, quick(), tmp_path / "c", device="cpu", targets="diagonal").digest("touch") != digest
+        train_touch(
+            world,
+            split,
+            clip,
+            quick(),
+            tmp_path / "b",
+            device="cpu",
+            progress=stop,
+            cache=tmp_path / "cache",
+        )
+    assert (
+        train_touch(
+            world, split, clip, quick(), tmp_path / "b", device="cpu", cache=tmp_path / "cache"
+        ).digest("tactile")
+        == digest
+    )
+    assert (
+        train_touch(world, split, clip, quick(), tmp_path / "b", device="cpu", seed=1).digest(
+            "tactile"
+        )
+        != digest
+    )
+    assert (
+        train_touch(
+            world, split, clip, quick(), tmp_path / "c", device="cpu", targets="diagonal"
+        ).digest("tactile")
+        != digest
+    )
 
 
-def test_training_can_go_on_from_another_tower(world, clip, tmp_path):
+def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
     split = by_video(world)
     first = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu", seed=3)
-    digest = first.digest("touch")
+    digest = first.digest("tactile")
     frozen = quick(touch_course=replace(TINY.touch_course, lr=1e-30, weight_decay=0.0))
     again = train_touch(world, split, clip, frozen, tmp_path / "b", device="cpu", start=first)
     fresh = train_touch(world, split, clip, frozen, tmp_path / "c", device="cpu")
-    assert again.digest("touch") == first.digest("touch") == digest != fresh.digest("touch")
+    assert again.digest("tactile") == first.digest("tactile") == digest != fresh.digest("tactile")
     assert again.touch is not first.touch
     assert again.card["start"] == digest
     assert again.card["start_card"]["seed"] == 3
     assert fresh.card["start"] is None
     with pytest.raises(PalpateError, match="size of the preset"):
-        train_touch(world, split, clip, replace(TINY, patch=4), tmp_path / "d", device="cpu", start=first)
-    with pytest.raises(PalpateError, match="touch tower"):
-        train_touch(world, split, clip, TINY, tmp_path / "e", device="cpu", start=Towers(clip))
+        train_touch(
+            world, split, clip, replace(TINY, patch=4), tmp_path / "d", device="cpu", start=first
+        )
+    with pytest.raises(PalpateError, match="tactile encoder"):
+        train_touch(world, split, clip, TINY, tmp_path / "e", device="cpu", start=EncoderSet(clip))
 
 
 def test_test_side_is_never_read(world, clip, tmp_path):
-    """The same train side with other test samples, whose files are even missing, trains the same tower."""
+    """The same train side with other test samples, whose files are even missing, trains the same encoder."""
     split = by_video(world)
-    digest = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu").digest("touch")
+    digest = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
+        "tactile"
+    )
     rows = world.table.to_dicts()
     for row in rows:
         if split.parts[row["id"]] == "test":
             row.update(tactile="absent.png", vision="absent.png", text="other words")
     other = Manifest.from_rows(rows, world.root)
-    assert train_touch(other, split, clip, quick(), tmp_path / "b", device="cpu").digest("touch") == digest
+    assert (
+        train_touch(other, split, clip, quick(), tmp_path / "b", device="cpu").digest("tactile")
+        == digest
+    )
 
 
 def test_global_random_state_is_left_alone(world, tmp_path):
     torch.manual_seed(7)
     state = torch.get_rng_state()
     clip = train_clip(world, by_video(world), TINY, tmp_path / "clip", device="cpu")
-    train_touch(world, by_video(world), clip, quick(), tmp_path / "touch", device="cpu")
+    train_touch(world, by_video(world), clip, quick(), tmp_path / "tactile", device="cpu")
     assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_fresh_clip_learns(world, tmp_path):
     course = replace(TINY.clip_course, epochs=40.0, batch=18, lr=1e-2)
-    clip = train_clip(world, by_video(world), replace(TINY, clip_course=course), tmp_path, device="cpu")
+    clip = train_clip(
+        world, by_video(world), replace(TINY, clip_course=course), tmp_path, device="cpu"
+    )
     curve = clip.card["loss"]
     assert curve[-1]["loss"] < curve[0]["loss"] - 0.5
     assert not any(p.requires_grad for p in clip.model.parameters())
@@ -230,13 +331,34 @@ def test_refusals(world, clip, tmp_path):
     rows = world.table.to_dicts()
     rows[2]["tactile"] = None
     with pytest.raises(PalpateError, match=r"tactile image.*v0/2"):
-        train_touch(Manifest.from_rows(rows, world.root), by_video(world), clip, TINY, tmp_path, device="cpu")
+        train_touch(
+            Manifest.from_rows(rows, world.root),
+            by_video(world),
+            clip,
+            TINY,
+            tmp_path,
+            device="cpu",
+        )
     rows[2].update(tactile="gone.png")
     with pytest.raises(PalpateError, match="1 bad-image"):
-        train_touch(Manifest.from_rows(rows, world.root), by_video(world), clip, TINY, tmp_path, device="cpu")
+        train_touch(
+            Manifest.from_rows(rows, world.root),
+            by_video(world),
+            clip,
+            TINY,
+            tmp_path,
+            device="cpu",
+        )
     rows[2].update(tactile=rows[1]["tactile"], text=None, material=None)
     with pytest.raises(PalpateError, match=r"text or a material.*v0/2"):
-        train_touch(Manifest.from_rows(rows, world.root), by_video(world), clip, TINY, tmp_path, device="cpu")
+        train_touch(
+            Manifest.from_rows(rows, world.root),
+            by_video(world),
+            clip,
+            TINY,
+            tmp_path,
+            device="cpu",
+        )
     with pytest.raises(PalpateError, match=r"1 that are not, first .nobody"):
         train_touch(world, Split.from_ids(train=["nobody"]), clip, TINY, tmp_path, device="cpu")
     with pytest.raises(PalpateError, match="fresh CLIP"):
@@ -247,11 +369,22 @@ def test_refusals(world, clip, tmp_path):
 
 def test_paper_preset_is_the_paper():
     paper = preset("paper")
-    assert (paper.touch_course.epochs, paper.touch_course.batch, paper.targets) == (200, 256, "diagonal")
+    assert (paper.touch_course.epochs, paper.touch_course.batch, paper.targets) == (
+        200,
+        256,
+        "diagonal",
+    )
     options = paper.touch_course.options(13_900, seed=0)
-    assert (options.steps, options.warmup, options.betas, options.lr) == (10860, 543, (0.9, 0.95), 1.5e-4)
+    assert (options.steps, options.warmup, options.betas, options.lr) == (
+        10860,
+        543,
+        (0.9, 0.95),
+        1.5e-4,
+    )
     with torch.device("meta"):
         touch = contrastive.CLIPVisionModelWithProjection(paper.touch_config(768))
-    assert sum(p.numel() for p in touch.parameters()) == 303_966_208  # ViT-L/14 at 224 px with a 768-wide projection
+    assert (
+        sum(p.numel() for p in touch.parameters()) == 303_966_208
+    )  # ViT-L/14 at 224 px with a 768-wide projection
     with pytest.raises(PalpateError, match="tiny, mini, paper"):
         preset("huge")

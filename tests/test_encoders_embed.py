@@ -12,9 +12,9 @@ from palpate.data.manifest import Manifest
 from palpate.encoders import embed as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
+from palpate.encoders.encoder_set import EncoderSet, new_touch
 from palpate.encoders.preprocess import Preprocess
 from palpate.encoders.presets import preset
-from palpate.encoders.towers import Towers, new_touch
 from test_encoders_contrastive import make_world
 
 TINY = preset("tiny")
@@ -27,138 +27,176 @@ def world(tmp_path):
 
 
 @pytest.fixture
-def towers(world):
-    return Towers(new_clip(TINY, world.column("text"), 0), new_touch(TINY.touch_config(8), 1).eval(), Preprocess.of_size(16))
+def encoders(world):
+    return EncoderSet(
+        new_clip(TINY, world.column("text"), 0),
+        new_touch(TINY.touch_config(8), 1).eval(),
+        Preprocess.of_size(16),
+    )
 
 
 @pytest.fixture
-def count(towers, monkeypatch):
-    """How many rows go through a tower."""
+def count(encoders, monkeypatch):
+    """How many rows go through a encoder."""
     rows = []
-    real = Towers.encode
-    monkeypatch.setattr(Towers, "encode", lambda self, tower, batch: (rows.append(len(batch)), real(self, tower, batch))[1])
+    real = EncoderSet.encode
+    monkeypatch.setattr(
+        EncoderSet,
+        "encode",
+        lambda self, encoder, batch: (rows.append(len(batch)), real(self, encoder, batch))[1],
+    )
     return rows
 
 
-@pytest.mark.parametrize("tower", ["touch", "vision", "text"])
+@pytest.mark.parametrize("encoder", ["tactile", "vision", "text"])
 @pytest.mark.parametrize("cached", [True, False])
-def test_embedding_equals_the_tower_picture_by_picture(world, towers, tower, cached, tmp_path):
-    found = embed(world, towers, tower, cache=tmp_path / "cache" if cached else None, batch=5)
-    column = {"touch": "tactile", "vision": "vision"}.get(tower)
+def test_embedding_equals_the_encoder_picture_by_picture(
+    world, encoders, encoder, cached, tmp_path
+):
+    found = embed(world, encoders, encoder, cache=tmp_path / "cache" if cached else None, batch=5)
+    column = {"tactile": "tactile", "vision": "vision"}.get(encoder)
     with torch.no_grad():
         for k in range(len(world)):
-            if tower == "text":
-                expect = towers.clip.encode_text([world.column("text")[k]])[0]
+            if encoder == "text":
+                expect = encoders.clip.encode_text([world.column("text")[k]])[0]
             else:
                 picture = np.asarray(Image.open(world.paths(column)[k]))
-                pre = towers.preprocess(tower)
-                pixels = (torch.tensor(picture).permute(2, 0, 1)[None] / 255 - torch.tensor(pre.mean).view(3, 1, 1)) / torch.tensor(
-                    pre.std
-                ).view(3, 1, 1)
-                model = towers.clip.model if tower == "vision" else towers.touch
+                pre = encoders.preprocess(encoder)
+                pixels = (
+                    torch.tensor(picture).permute(2, 0, 1)[None] / 255
+                    - torch.tensor(pre.mean).view(3, 1, 1)
+                ) / torch.tensor(pre.std).view(3, 1, 1)
+                model = encoders.clip.model if encoder == "vision" else encoders.touch
                 states = model.vision_model(pixel_values=pixels).pooler_output
                 expect = torch.nn.functional.normalize(model.visual_projection(states), dim=-1)[0]
             assert np.allclose(found.features[k], expect, atol=1e-5)
     assert found.features.dtype == np.float32
     assert np.allclose(np.linalg.norm(found.features, axis=1), 1, atol=1e-5)
-    assert (list(found.ids), list(found.labels), list(found.groups)) == (world.ids, world.column("material"), world.column("video"))
-    assert found.encoder == towers.digest(tower)
+    assert (list(found.ids), list(found.labels), list(found.groups)) == (
+        world.ids,
+        world.column("material"),
+        world.column("video"),
+    )
+    assert found.encoder == encoders.digest(encoder)
 
 
-@pytest.mark.parametrize("tower", ["touch", "vision", "text"])
-def test_batch_size_does_not_matter(world, towers, tower):
-    whole = embed(world, towers, tower, batch=100).features
+@pytest.mark.parametrize("encoder", ["tactile", "vision", "text"])
+def test_batch_size_does_not_matter(world, encoders, encoder):
+    whole = embed(world, encoders, encoder, batch=100).features
     for batch in (1, 5):
-        assert np.abs(embed(world, towers, tower, batch=batch).features - whole).max() < 1e-5
+        assert np.abs(embed(world, encoders, encoder, batch=batch).features - whole).max() < 1e-5
 
 
-@pytest.mark.parametrize("tower", ["touch", "vision", "text"])
-def test_second_call_computes_nothing(world, towers, tower, tmp_path, count, monkeypatch):
-    first = embed(world, towers, tower, cache=tmp_path / "cache")
-    assert sum(count) == (4 if tower == "text" else 12)  # equal texts are computed once
+@pytest.mark.parametrize("encoder", ["tactile", "vision", "text"])
+def test_second_call_computes_nothing(world, encoders, encoder, tmp_path, count, monkeypatch):
+    first = embed(world, encoders, encoder, cache=tmp_path / "cache")
+    assert sum(count) == (4 if encoder == "text" else 12)  # equal texts are computed once
     count.clear()
     monkeypatch.setattr(module, "cached_images", None)  # nor is an image decoded
-    again = embed(world, towers, tower, cache=tmp_path / "cache")
+    again = embed(world, encoders, encoder, cache=tmp_path / "cache")
     assert count == []
     assert np.array_equal(again.features, first.features)
-    assert (list(again.ids), list(again.labels), again.encoder) == (list(first.ids), list(first.labels), first.encoder)
+    assert (list(again.ids), list(again.labels), again.encoder) == (
+        list(first.ids),
+        list(first.labels),
+        first.encoder,
+    )
 
 
-def test_changed_image_weight_row_or_text_is_computed_again(world, towers, tmp_path, count):
+def test_changed_image_weight_row_or_text_is_computed_again(world, encoders, tmp_path, count):
     cache = tmp_path / "cache"
-    first = embed(world, towers, "touch", cache=cache)
+    first = embed(world, encoders, "tactile", cache=cache)
     path = world.paths("tactile")[4]
     stat = path.stat()
     Image.fromarray(np.full((16, 16, 3), 200, np.uint8)).save(path)
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns + 1))
     count.clear()
-    second = embed(world, towers, "touch", cache=cache)
+    second = embed(world, encoders, "tactile", cache=cache)
     assert sum(count) == 12
     assert [k for k in range(12) if not np.allclose(first.features[k], second.features[k])] == [4]
     with torch.no_grad():
-        towers.touch.visual_projection.weight[0, 0] += 1
+        encoders.touch.visual_projection.weight[0, 0] += 1
     count.clear()
-    assert not np.allclose(embed(world, towers, "touch", cache=cache).features, second.features)
+    assert not np.allclose(embed(world, encoders, "tactile", cache=cache).features, second.features)
     assert sum(count) == 12
     count.clear()
-    assert embed(world.take(world.ids[::-1]), towers, "touch", cache=cache).ids == world.ids[::-1]
+    assert (
+        embed(world.take(world.ids[::-1]), encoders, "tactile", cache=cache).ids == world.ids[::-1]
+    )
     assert sum(count) == 12
-    embed(world, towers, "text", cache=cache)
+    embed(world, encoders, "text", cache=cache)
     rows = world.table.to_dicts()
     rows[0]["text"] = "quite other words"
     count.clear()
-    embed(Manifest.from_rows(rows, world.root), towers, "text", cache=cache)
+    embed(Manifest.from_rows(rows, world.root), encoders, "text", cache=cache)
     assert sum(count) == 5
 
 
-def test_same_data_elsewhere_and_broken_cache(world, towers, tmp_path, count):
+def test_same_data_elsewhere_and_broken_cache(world, encoders, tmp_path, count):
     cache = tmp_path / "cache"
-    first = embed(world, towers, "vision", cache=cache)
+    first = embed(world, encoders, "vision", cache=cache)
     moved = tmp_path / "moved"
     world.root.rename(moved)
     count.clear()
-    assert np.array_equal(embed(Manifest(world.table, moved), towers, "vision", cache=cache).features, first.features)
+    assert np.array_equal(
+        embed(Manifest(world.table, moved), encoders, "vision", cache=cache).features,
+        first.features,
+    )
     assert count == []
     for file in cache.glob("vision-*.npz"):
         file.write_bytes(file.read_bytes()[:40])
-    assert np.array_equal(embed(Manifest(world.table, moved), towers, "vision", cache=cache).features, first.features)
+    assert np.array_equal(
+        embed(Manifest(world.table, moved), encoders, "vision", cache=cache).features,
+        first.features,
+    )
     assert sum(count) == 12
 
 
-def test_arrays_and_files_agree_also_when_resized(world, towers):
+def test_arrays_and_files_agree_also_when_resized(world, encoders):
     pictures = np.random.default_rng(0).integers(0, 256, (3, 24, 40, 3), dtype=np.uint8)
     rows = []
     for k, picture in enumerate(pictures):
         Image.fromarray(picture).save(world.root / f"wide{k}.png")
         rows.append({"id": str(k), "tactile": f"wide{k}.png"})
-    found = embed(Manifest.from_rows(rows, world.root), towers, "touch")
-    assert np.allclose(found.features, embed_images(pictures, towers, "touch"), atol=1e-6)
+    found = embed(Manifest.from_rows(rows, world.root), encoders, "tactile")
+    assert np.allclose(found.features, embed_images(pictures, encoders, "tactile"), atol=1e-6)
     assert found.labels is None
     assert found.groups is None
 
 
-def test_other_columns(world, towers):
-    background = Manifest.from_rows([{**r, "background": r["tactile"], "tactile": None} for r in world.table.to_dicts()], world.root)
-    assert np.allclose(embed(background, towers, "touch", column="background").features, embed(world, towers, "touch").features, atol=1e-6)
-    assert list(embed(world, towers, "touch", labels="video", groups="id").labels) == world.column("video")
+def test_other_columns(world, encoders):
+    background = Manifest.from_rows(
+        [{**r, "background": r["tactile"], "tactile": None} for r in world.table.to_dicts()],
+        world.root,
+    )
+    assert np.allclose(
+        embed(background, encoders, "tactile", column="background").features,
+        embed(world, encoders, "tactile").features,
+        atol=1e-6,
+    )
+    assert list(
+        embed(world, encoders, "tactile", labels="video", groups="id").labels
+    ) == world.column("video")
 
 
 @pytest.mark.parametrize("cached", [True, False])
-def test_refusals(world, towers, tmp_path, cached):
+def test_refusals(world, encoders, tmp_path, cached):
     cache = tmp_path / "cache" if cached else None
     with pytest.raises(PalpateError, match="vision, text, touch"):
-        embed(world, towers, "smell", cache=cache)
+        embed(world, encoders, "smell", cache=cache)
     with pytest.raises(PalpateError, match="must be samples"):
-        embed(world.take([]), towers, "touch", cache=cache)
+        embed(world.take([]), encoders, "tactile", cache=cache)
     with pytest.raises(PalpateError, match="--batch"):
-        embed(world, towers, "touch", batch=0, cache=cache)
-    with pytest.raises(PalpateError, match="touch tower"):
-        embed(world, Towers(towers.clip), "touch", cache=cache)
+        embed(world, encoders, "tactile", batch=0, cache=cache)
+    with pytest.raises(PalpateError, match="tactile encoder"):
+        embed(world, EncoderSet(encoders.clip), "tactile", cache=cache)
     for k in (1, 8):  # in two batches: both are named
         world.paths("tactile")[k].write_bytes(b"no picture")
     with pytest.raises(ProblemsError) as caught:
-        embed(world, towers, "touch", batch=3, cache=cache)
-    assert [p.where for p in caught.value.problems] == [str(world.paths("tactile")[k]) for k in (1, 8)]
+        embed(world, encoders, "tactile", batch=3, cache=cache)
+    assert [p.where for p in caught.value.problems] == [
+        str(world.paths("tactile")[k]) for k in (1, 8)
+    ]
 
 
 def test_texts_come_from_the_manifest_or_from_the_material(world):
@@ -177,8 +215,8 @@ def test_texts_come_from_the_manifest_or_from_the_material(world):
         texts_of(Manifest.from_rows(rows, world.root))
 
 
-def test_embed_texts_in_any_order(towers):
+def test_embed_texts_in_any_order(encoders):
     texts = ["soft", "rough and hard", "soft", "a"]
-    found = embed_texts(texts, towers, batch=2)
+    found = embed_texts(texts, encoders, batch=2)
     assert np.array_equal(found[0], found[2])
-    assert np.abs(found[[1]] - embed_texts(["rough and hard"], towers)).max() < 1e-5
+    assert np.abs(found[[1]] - embed_texts(["rough and hard"], encoders)).max() < 1e-5

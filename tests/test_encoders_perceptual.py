@@ -39,11 +39,19 @@ def written_out(state, image):
     x, found = (image - shift[:, None, None]) / scale[:, None, None], []
     for place, (stride, pad) in STEPS.items():
         if place in (3, 6):
-            x = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(1, 2))[:, ::2, ::2].max(axis=(3, 4))
-        weight, bias = (state[f"features.{place}.{part}"].double().numpy() for part in ("weight", "bias"))
+            x = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(1, 2))[:, ::2, ::2].max(
+                axis=(3, 4)
+            )
+        weight, bias = (
+            state[f"features.{place}.{part}"].double().numpy() for part in ("weight", "bias")
+        )
         x = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
-        windows = np.lib.stride_tricks.sliding_window_view(x, weight.shape[2:], axis=(1, 2))[:, ::stride, ::stride]
-        x = np.maximum(np.einsum("chwij,ocij->ohw", windows, weight, optimize=True) + bias[:, None, None], 0)
+        windows = np.lib.stride_tricks.sliding_window_view(x, weight.shape[2:], axis=(1, 2))[
+            :, ::stride, ::stride
+        ]
+        x = np.maximum(
+            np.einsum("chwij,ocij->ohw", windows, weight, optimize=True) + bias[:, None, None], 0
+        )
         found.append(x / (np.sqrt((x**2).sum(axis=0)) + 1e-10))
     return found
 
@@ -54,9 +62,13 @@ def test_the_distance_is_the_published_formula(states, network, size):
     found = lpips_per_image(first, second, network)
     assert found.dtype == np.float64
     for k in range(2):
-        stages = [written_out(states[0], v[k].transpose(2, 0, 1) / 127.5 - 1) for v in (first, second)]
+        stages = [
+            written_out(states[0], v[k].transpose(2, 0, 1) / 127.5 - 1) for v in (first, second)
+        ]
         weights = [states[1][f"lin{i}.model.1.weight"].double().numpy()[0] for i in range(5)]
-        expect = sum((w * (a - b) ** 2).sum(axis=0).mean() for a, b, w in zip(*stages, weights, strict=True))
+        expect = sum(
+            (w * (a - b) ** 2).sum(axis=0).mean() for a, b, w in zip(*stages, weights, strict=True)
+        )
         assert found[k] == pytest.approx(expect, rel=1e-5)
 
 
@@ -76,13 +88,19 @@ def test_a_mask_weighs_the_places_of_every_stage(states, network, size):
         weight = np.array(
             [
                 [
-                    mask[0, r * h // rows : -(-(r + 1) * h // rows), c * w // columns : -(-(c + 1) * w // columns)].mean()
+                    mask[
+                        0,
+                        r * h // rows : -(-(r + 1) * h // rows),
+                        c * w // columns : -(-(c + 1) * w // columns),
+                    ].mean()
                     for c in range(columns)
                 ]
                 for r in range(rows)
             ]
         )
-        places = (states[1][f"lin{i}.model.1.weight"].double().numpy()[0] * (a - b) ** 2).sum(axis=0)
+        places = (states[1][f"lin{i}.model.1.weight"].double().numpy()[0] * (a - b) ** 2).sum(
+            axis=0
+        )
         expect += (weight * places).sum() / weight.sum()
     assert found[0] == pytest.approx(expect, rel=1e-5)
     for bad in (mask[:2], mask[:, :-1], mask.astype(float)):
@@ -105,10 +123,16 @@ def test_values_do_not_depend_on_batches_or_on_how_pixels_are_written(network):
     found = lpips_per_image(first, second, network)
     np.testing.assert_allclose(lpips_per_image(first, second, network, batch=2), found, rtol=1e-5)
     np.testing.assert_allclose(lpips_per_image(first / 255, second, network), found, rtol=1e-5)
-    grey = [v[..., :1] for v in (first, second)]
-    np.testing.assert_allclose(lpips_per_image(*grey, network), lpips_per_image(*(v.repeat(3, axis=3) for v in grey), network), rtol=1e-6)
+    gray = [v[..., :1] for v in (first, second)]
+    np.testing.assert_allclose(
+        lpips_per_image(*gray, network),
+        lpips_per_image(*(v.repeat(3, axis=3) for v in gray), network),
+        rtol=1e-6,
+    )
     told = []
-    lpips_per_image(first[::-1], second[::-1], network, batch=2, progress=lambda *a, **_: told.append(a[1:3]))
+    lpips_per_image(
+        first[::-1], second[::-1], network, batch=2, progress=lambda *a, **_: told.append(a[1:3])
+    )
     assert told == [(2, 5), (4, 5), (5, 5)]
 
 
@@ -123,8 +147,14 @@ def test_the_digest_is_that_of_the_weights_used(files, states, network, tmp_path
     backbone = {name: value for name, value in states[0].items() if "classifier" not in name}
     save_file(backbone, tmp_path / "backbone.safetensors")
     save_file(states[1], tmp_path / "heads.safetensors")
-    assert load_lpips(tmp_path / "backbone.safetensors", tmp_path / "heads.safetensors").digest == network.digest
-    torch.save(states[1] | {"lin4.model.1.weight": states[1]["lin4.model.1.weight"] * 2}, tmp_path / "other.pth")
+    assert (
+        load_lpips(tmp_path / "backbone.safetensors", tmp_path / "heads.safetensors").digest
+        == network.digest
+    )
+    torch.save(
+        states[1] | {"lin4.model.1.weight": states[1]["lin4.model.1.weight"] * 2},
+        tmp_path / "other.pth",
+    )
     assert load_lpips(files[0], tmp_path / "other.pth").digest != network.digest
 
 
@@ -141,17 +171,28 @@ def test_files_are_refused_by_name_and_never_unpickled(files, states, tmp_path):
     (tmp_path / "cut.pth").write_bytes(files[1].read_bytes()[:200])
     (tmp_path / "text.safetensors").write_text("no weights")
     for name in ("bomb.pth", "cut.pth", "text.safetensors"):
-        with pytest.raises(PalpateError, match=f"{name} must hold weights and nothing else.*{both}"):
+        with pytest.raises(
+            PalpateError, match=f"{name} must hold weights and nothing else.*{both}"
+        ):
             load_lpips(files[0], tmp_path / name)
     torch.save([1, 2], tmp_path / "list.pth")
     with pytest.raises(PalpateError, match=r"table of weights by name\. Got list"):
         load_lpips(files[0], tmp_path / "list.pth")
-    with pytest.raises(PalpateError, match=r"alex.pth must hold features.0.weight of shape \(64, 3, 11, 11\). Got none of that name"):
+    with pytest.raises(
+        PalpateError,
+        match=r"alex.pth must hold features.0.weight of shape \(64, 3, 11, 11\). Got none of that name",
+    ):
         load_lpips(files[1], files[0])  # the two files, swapped
     torch.save(states[1] | {"lin2.model.1.weight": torch.ones(1, 256, 1, 1)}, tmp_path / "vgg.pth")
-    with pytest.raises(PalpateError, match=r"lin2.model.1.weight of shape \(1, 384, 1, 1\). Got shape \(1, 256, 1, 1\)"):
+    with pytest.raises(
+        PalpateError,
+        match=r"lin2.model.1.weight of shape \(1, 384, 1, 1\). Got shape \(1, 256, 1, 1\)",
+    ):
         load_lpips(files[0], tmp_path / "vgg.pth")
-    torch.save(states[1] | {"lin0.model.1.weight": torch.full((1, 64, 1, 1), torch.nan)}, tmp_path / "nan.pth")
+    torch.save(
+        states[1] | {"lin0.model.1.weight": torch.full((1, 64, 1, 1), torch.nan)},
+        tmp_path / "nan.pth",
+    )
     with pytest.raises(PalpateError, match="must be finite"):
         load_lpips(files[0], tmp_path / "nan.pth")
 
@@ -163,7 +204,10 @@ def test_files_are_refused_by_name_and_never_unpickled(files, states, tmp_path):
         (lambda x: x[:0], "must have shape"),
         (lambda x: x.astype(np.int32), "uint8, or floats"),
         (lambda x: x * 1.0, r"must lie in \[0, 1\].*image 0"),
-        (lambda x: np.where(np.arange(3)[:, None, None, None] == 2, np.nan, x / 255), r"\[nan, nan\] in image 2"),
+        (
+            lambda x: np.where(np.arange(3)[:, None, None, None] == 2, np.nan, x / 255),
+            r"\[nan, nan\] in image 2",
+        ),
         (lambda x: x[:2], "one to one"),
     ],
 )

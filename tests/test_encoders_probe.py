@@ -10,15 +10,20 @@ from palpate.encoders.probe import fit_probe, material_accuracy, retrieval, text
 
 
 def features(x, labels=None, groups=None, encoder="e", start=0):
-    return FeatureSet([f"s{start + k}" for k in range(len(x))], np.asarray(x, np.float32), labels, groups, encoder)
+    return FeatureSet(
+        [f"s{start + k}" for k in range(len(x))], np.asarray(x, np.float32), labels, groups, encoder
+    )
 
 
 def clusters(n=30, classes=3, noise=0.3, seed=0, start=0):
     rng = np.random.default_rng(seed)
-    centre = np.random.default_rng(9).normal(size=(classes, 6))
+    center = np.random.default_rng(9).normal(size=(classes, 6))
     y = np.arange(n) % classes
     return features(
-        centre[y] + noise * rng.normal(size=(n, 6)), [f"m{k}" for k in y], [f"v{seed}-{k // 3 % 10}" for k in range(n)], start=start
+        center[y] + noise * rng.normal(size=(n, 6)),
+        [f"m{k}" for k in y],
+        [f"v{seed}-{k // 3 % 10}" for k in range(n)],
+        start=start,
     )
 
 
@@ -27,7 +32,11 @@ def test_separable_classes_are_found_and_noise_is_not():
     assert good.value == 1.0
     assert good.details["chance"] == pytest.approx(1 / 3)
     rng = np.random.default_rng(0)
-    x = features(rng.normal(size=(600, 6)), [f"m{k % 3}" for k in range(600)], [f"v{k // 6}" for k in range(600)])
+    x = features(
+        rng.normal(size=(600, 6)),
+        [f"m{k % 3}" for k in range(600)],
+        [f"v{k // 6}" for k in range(600)],
+    )
     z = features(rng.normal(size=(600, 6)), x.labels, [f"w{k // 6}" for k in range(600)])
     assert material_accuracy(x, z).value == pytest.approx(1 / 3, abs=0.08)
 
@@ -40,18 +49,31 @@ def test_probe_sits_at_the_minimum_of_its_objective():
 
     def objective(weight, bias):
         logits = x @ weight + bias
-        return float(np.mean([np.log(np.exp(row).sum()) - row[k] for row, k in zip(logits, y, strict=True)]) + 0.01 * (weight**2).sum())
+        return float(
+            np.mean([np.log(np.exp(row).sum()) - row[k] for row, k in zip(logits, y, strict=True)])
+            + 0.01 * (weight**2).sum()
+        )
 
     best = objective(probe.weight, probe.bias)
     rng = np.random.default_rng(0)
     for _ in range(200):
-        assert objective(probe.weight + 0.01 * rng.normal(size=probe.weight.shape), probe.bias + 0.01 * rng.normal(size=3)) > best - 1e-7
+        assert (
+            objective(
+                probe.weight + 0.01 * rng.normal(size=probe.weight.shape),
+                probe.bias + 0.01 * rng.normal(size=3),
+            )
+            > best - 1e-7
+        )
 
 
 def test_accuracy_recall_and_unseen_classes_by_hand():
     x = [[0.0, 1.0], [0.1, 1.0], [1.0, 0.0], [1.0, 0.1]] * 3
     train = features(x, ["a", "a", "b", "b"] * 3, [f"v{k}" for k in range(12)])
-    test = features([[0, 1], [1, 0], [0, 1], [1, 0], [1, 0]], ["a", "b", "b", "b", "zinc"], ["v", "v", "w", "w", "w"])
+    test = features(
+        [[0, 1], [1, 0], [0, 1], [1, 0], [1, 0]],
+        ["a", "b", "b", "b", "zinc"],
+        ["v", "v", "w", "w", "w"],
+    )
     score = material_accuracy(train, test, l2=1e-3)
     assert score.value == pytest.approx(3 / 5)
     assert score.details["recall"] == pytest.approx({"a": 1.0, "b": 2 / 3, "zinc": 0.0})
@@ -82,7 +104,11 @@ def test_penalty_is_chosen_by_groups():
     for v in range(24):
         own = rng.normal(size=40) * 3
         for _ in range(6):
-            rows.append(np.concatenate([[0.4 * (v % 2 * 2 - 1) + 0.5 * rng.normal()], own + 0.01 * rng.normal(size=40)]))
+            rows.append(
+                np.concatenate(
+                    [[0.4 * (v % 2 * 2 - 1) + 0.5 * rng.normal()], own + 0.01 * rng.normal(size=40)]
+                )
+            )
             labels.append("ab"[v % 2])
             groups.append(f"v{v}")
     by_video = fit_probe(features(rows, labels, groups)).l2
@@ -93,7 +119,9 @@ def test_penalty_is_chosen_by_groups():
 def test_rows_without_a_label_are_left_out():
     train = clusters(30)
     labels = [*train.labels[:-1], ""]
-    assert fit_probe(FeatureSet(train.ids, train.features, labels, train.groups), l2=0.01).classes == ("m0", "m1", "m2")
+    assert fit_probe(
+        FeatureSet(train.ids, train.features, labels, train.groups), l2=0.01
+    ).classes == ("m0", "m1", "m2")
 
 
 def test_probe_refusals():
@@ -105,14 +133,20 @@ def test_probe_refusals():
     with pytest.raises(PalpateError, match="rows with a material"):
         material_accuracy(train, features(test.features, [""] * 9))
     with pytest.raises(PalpateError, match="one encoder"):
-        material_accuracy(train, FeatureSet(test.ids, test.features, test.labels, test.groups, "other"))
+        material_accuracy(
+            train, FeatureSet(test.ids, test.features, test.labels, test.groups, "other")
+        )
 
 
 def slow_hit(similar, good, k):
     """Share of all orders of the keys, consistent with similarity, that have a positive in the top k."""
     hits = []
     for row, right in zip(similar, good, strict=True):
-        orders = [o for o in permutations(range(len(row))) if all(row[o[i]] >= row[o[i + 1]] for i in range(len(o) - 1))]
+        orders = [
+            o
+            for o in permutations(range(len(row)))
+            if all(row[o[i]] >= row[o[i + 1]] for i in range(len(o) - 1))
+        ]
         hits.append(np.mean([any(right[j] for j in o[:k]) for o in orders]))
     return np.mean(hits)
 
@@ -128,10 +162,16 @@ def test_retrieval_against_all_orders(ties, many):
     queries = keys + 0.8 * rng.normal(size=(6, 3)).astype(np.float32)
     good = rng.random((6, 6)) < 0.3 if many else np.zeros((6, 6), bool)
     norm = lambda x: np.linalg.norm(x.astype(float), axis=1)  # noqa: E731
-    similar = queries.astype(float) @ keys.astype(float).T / norm(queries)[:, None] / norm(keys)[None]
-    scores = retrieval(features(queries), features(keys), top=(1, 2, 5, 6), positives=good if many else None)
+    similar = (
+        queries.astype(float) @ keys.astype(float).T / norm(queries)[:, None] / norm(keys)[None]
+    )
+    scores = retrieval(
+        features(queries), features(keys), top=(1, 2, 5, 6), positives=good if many else None
+    )
     for k, score in zip((1, 2, 5, 6), scores, strict=True):
-        assert score.value == pytest.approx(slow_hit(similar.round(9), good | np.eye(6, dtype=bool), k))
+        assert score.value == pytest.approx(
+            slow_hit(similar.round(9), good | np.eye(6, dtype=bool), k)
+        )
         assert score.metric == f"retrieval top-{k}"
     assert scores[-1].value == pytest.approx(1.0)
 
@@ -170,4 +210,8 @@ def test_retrieval_refusals():
 
 def test_text_positives():
     x = np.array([[2, 0], [0.8, 0.6], [0, 1]], np.float32)
-    assert text_positives(x).tolist() == [[True, True, False], [True, True, False], [False, False, True]]
+    assert text_positives(x).tolist() == [
+        [True, True, False],
+        [True, True, False],
+        [False, False, True],
+    ]

@@ -12,10 +12,10 @@ from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 from palpate.core import FeatureSet, PalpateError, digest_file
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.preprocess import Preprocess
 from palpate.encoders.presets import preset
 from palpate.encoders.standard import embed_standard, load_standard
-from palpate.encoders.towers import Towers
 
 
 class Pooled(torch.nn.Module):
@@ -63,9 +63,13 @@ def test_inception_features_are_those_of_the_module_asked_for_features(tmp_path,
     path = script(module, tmp_path / "inception.pt")
     found, digest = embed_standard(images, path, batch=3)
     # An independent convolution: windows and sums in float64.
-    weight, bias = (p.detach().numpy().astype(np.float64) for p in (module.conv.weight, module.conv.bias))
+    weight, bias = (
+        p.detach().numpy().astype(np.float64) for p in (module.conv.weight, module.conv.bias)
+    )
     windows = np.lib.stride_tricks.sliding_window_view(images / 127.5 - 1, (3, 3), axis=(1, 2))
-    expect = np.maximum(np.einsum("nhwcij,ocij->nohw", windows, weight) + bias[:, None, None], 0).mean(axis=(2, 3))
+    expect = np.maximum(
+        np.einsum("nhwcij,ocij->nohw", windows, weight) + bias[:, None, None], 0
+    ).mean(axis=(2, 3))
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, expect, atol=1e-6)
     np.testing.assert_allclose(embed_standard(images, path, batch=64)[0], found, atol=1e-6)
@@ -94,7 +98,10 @@ def test_the_digest_is_that_of_the_weights(tmp_path, images):
 def test_a_known_digest_is_compared_before_the_file_is_opened(tmp_path, monkeypatch):
     path = script(Plain(), tmp_path / "plain.pt")
     full = digest_file(path)
-    assert load_standard(path, sha256=full).digest == load_standard(path, sha256=full[:8].upper()).digest
+    assert (
+        load_standard(path, sha256=full).digest
+        == load_standard(path, sha256=full[:8].upper()).digest
+    )
     monkeypatch.setattr(torch.jit, "load", lambda *_, **__: pytest.fail("opened"))
     for wrong in ("0" * 64, full[:7], ""):
         with pytest.raises(PalpateError, match="must have the SHA-256"):
@@ -107,7 +114,9 @@ class Bomb:
 
 
 def test_files_that_are_no_torchscript_are_refused_and_never_unpickled(tmp_path):
-    with pytest.raises(PalpateError, match=r"absent\.pt must be a file.*inception-2015-12-05\.pt .*https://nvlabs"):
+    with pytest.raises(
+        PalpateError, match=r"absent\.pt must be a file.*inception-2015-12-05\.pt .*https://nvlabs"
+    ):
         load_standard(tmp_path / "absent.pt")
     with open(tmp_path / "inception-v3.pkl", "wb") as file:
         pickle.dump(Bomb(), file)
@@ -115,68 +124,102 @@ def test_files_that_are_no_torchscript_are_refused_and_never_unpickled(tmp_path)
     torch.save(Bomb(), tmp_path / "bomb.pth")
     (tmp_path / "empty.pt").write_bytes(b"")
     for name in ("inception-v3.pkl", "state.pth", "bomb.pth", "empty.pt"):
-        with pytest.raises(PalpateError, match=f"{name} must be a TorchScript module.*pickles are never loaded"):
+        with pytest.raises(
+            PalpateError, match=f"{name} must be a TorchScript module.*pickles are never loaded"
+        ):
             load_standard(tmp_path / name)
 
 
 def test_modules_that_give_no_features_are_refused(tmp_path, images):
-    with pytest.raises(PalpateError, match=r"must map 7 images to floats \(7, d\). Got torch.float32 of shape \(\)"):
+    with pytest.raises(
+        PalpateError, match=r"must map 7 images to floats \(7, d\). Got torch.float32 of shape \(\)"
+    ):
         embed_standard(images, script(Flat(), tmp_path / "flat.pt"))
     black = images.copy()
     black[4] = 0
     with pytest.raises(PalpateError, match="NaN or infinity for 1 of 7 images, first number 4"):
         embed_standard(black, script(Broken(), tmp_path / "broken.pt"))
     with pytest.raises(PalpateError, match="must map uint8 images"):
-        embed_standard(images[:, :2, :2], script(Pooled(), tmp_path / "pooled.pt"))  # smaller than its window
+        embed_standard(
+            images[:, :2, :2], script(Pooled(), tmp_path / "pooled.pt")
+        )  # smaller than its window
 
 
 @pytest.fixture
 def clip(tmp_path):
-    clip = new_clip(preset("tiny"), ["a red cloth", "a grey stone"], 0)
+    clip = new_clip(preset("tiny"), ["a red cloth", "a gray stone"], 0)
     clip.save(tmp_path / "clip")
     return tmp_path / "clip", clip
 
 
-def test_clip_is_the_same_tower_as_ours_with_the_same_digest(clip, images):
+def test_clip_is_the_same_encoder_as_ours_with_the_same_digest(clip, images):
     folder, ours = clip
     for source in (folder, str(folder)):
         found, digest = embed_standard(images, source, kind="clip", batch=2)
-        np.testing.assert_allclose(found, embed_images(images, Towers(ours), "vision"), atol=1e-6)
+        np.testing.assert_allclose(
+            found, embed_images(images, EncoderSet(ours), "vision"), atol=1e-6
+        )
         assert digest == ours.digest("vision")
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)
 
 
-def test_clip_sees_the_centre_square_by_the_bicubic_filter(clip):
+def test_clip_sees_the_center_square_by_the_bicubic_filter(clip):
     folder, ours = clip
     size = ours.preprocess.size
     wide = np.random.default_rng(1).integers(0, 256, (2, 50, 90, 3)).astype(np.uint8)
-    square = np.stack([np.asarray(Image.fromarray(x).crop((20, 0, 70, 50)).resize((size, size), Image.Resampling.BICUBIC)) for x in wide])
-    np.testing.assert_allclose(embed_standard(wide, folder, kind="clip")[0], embed_standard(square, folder, kind="clip")[0], atol=1e-6)
+    square = np.stack(
+        [
+            np.asarray(
+                Image.fromarray(x)
+                .crop((20, 0, 70, 50))
+                .resize((size, size), Image.Resampling.BICUBIC)
+            )
+            for x in wide
+        ]
+    )
+    np.testing.assert_allclose(
+        embed_standard(wide, folder, kind="clip")[0],
+        embed_standard(square, folder, kind="clip")[0],
+        atol=1e-6,
+    )
 
 
-def test_a_folder_of_the_vision_tower_alone_and_the_shipped_name(tmp_path, images):
+def test_a_folder_of_the_vision_encoder_alone_and_the_shipped_name(tmp_path, images):
     torch.manual_seed(4)
     config = CLIPVisionConfig(
-        hidden_size=16, intermediate_size=32, num_hidden_layers=2, num_attention_heads=2, image_size=16, patch_size=8, projection_dim=6
+        hidden_size=16,
+        intermediate_size=32,
+        num_hidden_layers=2,
+        num_attention_heads=2,
+        image_size=16,
+        patch_size=8,
+        projection_dim=6,
     )
     model = CLIPVisionModelWithProjection(config).eval()
     model.save_pretrained(tmp_path / "vision")
-    (tmp_path / "vision" / "preprocessor_config.json").write_text(json.dumps(Preprocess.of_size(16).to_config()))
+    (tmp_path / "vision" / "preprocessor_config.json").write_text(
+        json.dumps(Preprocess.of_size(16).to_config())
+    )
     found, _ = embed_standard(images, tmp_path / "vision", kind="clip")
     pre = Preprocess.of_size(16)
     pixels = torch.tensor(pre.fit(images)).permute(0, 3, 1, 2) / 255
     pixels = (pixels - torch.tensor(pre.mean).view(3, 1, 1)) / torch.tensor(pre.std).view(3, 1, 1)
     with torch.no_grad():
-        states = model.visual_projection(model.vision_model(pixel_values=pixels).pooler_output).numpy()
-    np.testing.assert_allclose(found, states / np.linalg.norm(states, axis=1, keepdims=True), atol=1e-6)
+        states = model.visual_projection(
+            model.vision_model(pixel_values=pixels).pooler_output
+        ).numpy()
+    np.testing.assert_allclose(
+        found, states / np.linalg.norm(states, axis=1, keepdims=True), atol=1e-6
+    )
     mini, digest = embed_standard(images, "palpate/mini", kind="clip")
     assert mini.shape[0] == 7
-    assert digest == Towers.load("palpate/mini").digest("vision")
+    assert digest == EncoderSet.load("palpate/mini").digest("vision")
 
 
 def test_clip_folders_that_lack_files_are_refused_by_name(tmp_path, clip, images):
     with pytest.raises(
-        PalpateError, match=r"no config.json, no model.safetensors, no preprocessor_config.json\. .*hf download openai/clip-vit-large"
+        PalpateError,
+        match=r"no config.json, no model.safetensors, no preprocessor_config.json\. .*hf download openai/clip-vit-large",
     ):
         load_standard(tmp_path / "nowhere", kind="clip")
     folder, _ = clip
@@ -187,7 +230,7 @@ def test_clip_folders_that_lack_files_are_refused_by_name(tmp_path, clip, images
     weights = folder / "model.safetensors"
     whole = weights.read_bytes()
     weights.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(PalpateError, match="must be a CLIP with a vision tower"):
+    with pytest.raises(PalpateError, match="must be a CLIP with a vision encoder"):
         load_standard(folder, kind="clip")
     weights.write_bytes(whole)
     config = json.loads((folder / "config.json").read_text())
@@ -195,7 +238,7 @@ def test_clip_folders_that_lack_files_are_refused_by_name(tmp_path, clip, images
     with pytest.raises(PalpateError, match=r"must describe a CLIP. Got model_type 'bert'"):
         load_standard(folder, kind="clip")
     (folder / "config.json").write_text(json.dumps(config | {"projection_dim": 3}))
-    with pytest.raises(PalpateError, match="must be a CLIP with a vision tower"):
+    with pytest.raises(PalpateError, match="must be a CLIP with a vision encoder"):
         load_standard(folder, kind="clip")
 
 

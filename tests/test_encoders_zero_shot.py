@@ -3,16 +3,20 @@
 import numpy as np
 import pytest
 
-from mini_forge import make_towers
+from mini_forge import make_encoders
 from palpate.core import FeatureSet, PalpateError
 from palpate.encoders.zero_shot import zero_shot_accuracy
 
-PROMPTS = {"Cloth": ["a soft cloth"], "Metal": ["smooth cold metal", "cold"], "Wall": ["a rough wall", "rough", "wall"]}
+PROMPTS = {
+    "Cloth": ["a soft cloth"],
+    "Metal": ["smooth cold metal", "cold"],
+    "Wall": ["a rough wall", "rough", "wall"],
+}
 
 
 @pytest.fixture(scope="module")
-def towers():
-    return make_towers()
+def encoders():
+    return make_encoders()
 
 
 def features(labels, seed=0, groups=None):
@@ -21,12 +25,14 @@ def features(labels, seed=0, groups=None):
     return FeatureSet([f"s{k}" for k in range(len(labels))], rows, labels, groups, "encoder")
 
 
-def slow_accuracy(images, towers):
+def slow_accuracy(images, encoders):
     right = 0
     for row, label in zip(images.features, images.labels, strict=True):
         best, chosen = -2.0, None
         for name, texts in PROMPTS.items():
-            mean = sum(towers.clip.encode_text([text])[0].double().numpy() for text in texts) / len(texts)
+            mean = sum(
+                encoders.clip.encode_text([text])[0].double().numpy() for text in texts
+            ) / len(texts)
             cosine = float(row @ mean / np.sqrt((mean**2).sum()))
             if cosine > best:
                 best, chosen = cosine, name
@@ -34,24 +40,28 @@ def slow_accuracy(images, towers):
     return right / len(images.labels)
 
 
-def test_it_equals_a_loop_over_images_classes_and_texts(towers):
+def test_it_equals_a_loop_over_images_classes_and_texts(encoders):
     labels = [sorted(PROMPTS)[k % 3] for k in range(60)]
     images = features(labels, groups=[f"v{k // 6}" for k in range(60)])
-    score = zero_shot_accuracy(images, PROMPTS, towers)
-    assert score.value == pytest.approx(slow_accuracy(images, towers))
+    score = zero_shot_accuracy(images, PROMPTS, encoders)
+    assert score.value == pytest.approx(slow_accuracy(images, encoders))
     assert 0.1 < score.value < 0.9
     assert score.details["chance"] == pytest.approx(1 / 3)
-    assert np.mean(list(score.details["recall"].values())) == pytest.approx(score.value)  # classes of equal size
+    assert np.mean(list(score.details["recall"].values())) == pytest.approx(
+        score.value
+    )  # classes of equal size
     assert score.interval[0] < score.value < score.interval[1]
 
 
-def test_images_that_are_their_text_are_all_named(towers):
-    rows = np.stack([towers.clip.encode_text(PROMPTS[name])[0].numpy() for name in sorted(PROMPTS)])
+def test_images_that_are_their_text_are_all_named(encoders):
+    rows = np.stack(
+        [encoders.clip.encode_text(PROMPTS[name])[0].numpy() for name in sorted(PROMPTS)]
+    )
     images = FeatureSet(["a", "b", "c"], rows, sorted(PROMPTS), None, "encoder")
     prompts = {name: texts[:1] for name, texts in PROMPTS.items()}
-    assert zero_shot_accuracy(images, prompts, towers).value == 1.0
+    assert zero_shot_accuracy(images, prompts, encoders).value == 1.0
     moved = FeatureSet(["a", "b", "c"], rows[[1, 2, 0]], sorted(PROMPTS), None, "encoder")
-    assert zero_shot_accuracy(moved, prompts, towers).value == 0.0
+    assert zero_shot_accuracy(moved, prompts, encoders).value == 0.0
 
 
 @pytest.mark.parametrize(
@@ -63,9 +73,9 @@ def test_images_that_are_their_text_are_all_named(towers):
         (None, PROMPTS, "label for every image"),
     ],
 )
-def test_what_cannot_be_named_is_refused(towers, labels, prompts, message):
+def test_what_cannot_be_named_is_refused(encoders, labels, prompts, message):
     images = features(labels or ["x", "y"])
     if labels is None:
         images = FeatureSet(images.ids, images.features, None, None, "encoder")
     with pytest.raises(PalpateError, match=message):
-        zero_shot_accuracy(images, prompts, towers)
+        zero_shot_accuracy(images, prompts, encoders)

@@ -16,7 +16,14 @@ LINT = Path(sys.executable).parent / "lint-imports"
 
 
 def python(code: str, **kwargs):
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False, **kwargs)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        **kwargs,
+    )
 
 
 def test_help_is_quick_and_loads_neither_torch_nor_polars():
@@ -38,7 +45,9 @@ def test_help_is_quick_and_loads_neither_torch_nor_polars():
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_each_verb_has_help_with_its_example_and_loads_no_torch(verb):
-    done = python(f"import sys; from palpate.cli import main\ntry: main(['{verb}', '--help'])\nfinally: assert 'torch' not in sys.modules")
+    done = python(
+        f"import sys; from palpate.cli import main\ntry: main(['{verb}', '--help'])\nfinally: assert 'torch' not in sys.modules"
+    )
     assert done.returncode == 0, done.stderr
     assert "Example: palpate " + verb in done.stdout
     assert "--json" in done.stdout
@@ -56,18 +65,37 @@ def test_audit_and_split_load_no_torch(tmp_path, small_manifest):
 
 
 @pytest.mark.skipif(not LINT.exists(), reason="import-linter is not installed")
-@pytest.mark.parametrize(("room", "line"), [
-    ("metrics", "import palpate.data.manifest"), ("core", "import polars"), ("leakage", "import palpate.sim"), ("sim", "import palpate.leakage"),
-    ("report", "import palpate.metrics"), ("data", "import palpate.encoders.loop"), ("leakage", "import torch"), ("encoders", "import palpate.leakage"), ("diffusion", "import palpate.sim"), ("data", "import transformers"),
-    ("core", "import av"), ("protocol", "import torch"), ("cli", "import torch"), ("generate", "import palpate.leakage"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("room", "line"),
+    [
+        ("metrics", "import palpate.data.manifest"),
+        ("core", "import polars"),
+        ("leakage", "import palpate.sim"),
+        ("sim", "import palpate.leakage"),
+        ("report", "import palpate.metrics"),
+        ("data", "import palpate.training.loop"),
+        ("leakage", "import torch"),
+        ("encoders", "import palpate.leakage"),
+        ("diffusion", "import palpate.sim"),
+        ("data", "import transformers"),
+        ("core", "import av"),
+        ("protocol", "import torch"),
+        ("cli", "import torch"),
+        ("generate", "import palpate.leakage"),
+    ],
+)
 def test_a_planted_import_against_the_house_is_found(tmp_path, room, line):
     shutil.copytree(TOP / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(TOP / "pyproject.toml", tmp_path)
 
     def run():
         return subprocess.run(
-            [LINT], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path / "src"), "PATH": ""}, capture_output=True, text=True, check=False
+            [LINT],
+            cwd=tmp_path,
+            env={"PYTHONPATH": str(tmp_path / "src"), "PATH": ""},
+            capture_output=True,
+            text=True,
+            check=False,
         )
 
     clean = run()
@@ -82,8 +110,12 @@ def test_no_absolute_paths_no_pickles_no_forbidden_packages():
     for path in (TOP / "src").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"[\"'](/home|/work|/root|/nfs|/mnt|/Users)\b", text), path
-        assert not re.search(r"^\s*(import|from) (torchvision|timm|open_clip|lpips)\b", text, re.MULTILINE), path
-        assert not re.search(r"\bpickle\.(loads?|Unpickler|dumps?)\b|from pickle import (?!UnpicklingError)", text), path
+        assert not re.search(
+            r"^\s*(import|from) (torchvision|timm|open_clip|lpips)\b", text, re.MULTILINE
+        ), path
+        assert not re.search(
+            r"\bpickle\.(loads?|Unpickler|dumps?)\b|from pickle import (?!UnpicklingError)", text
+        ), path
         assert "torch.load(" not in text or "weights_only=True" in text, path
         assert "allow_pickle=True" not in text, path
     for path in (TOP / "src").rglob("*"):

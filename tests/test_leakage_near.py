@@ -18,26 +18,30 @@ from palpate.leakage.compare import Plates, best_matches
 from palpate.leakage.descriptors import thumbnail, thumbnails
 from palpate.leakage.matching import Entries, Found
 from palpate.leakage.near import near_duplicates, near_groups
-from palpate.leakage.pool import quantised
+from palpate.leakage.pool import quantized
 from palpate.leakage.verify import REACH, SIDE, against_all, band_pass, similarities
 
-DROPPED = ("video", "touch", "object", "session", "material", "sensor", "domain")
+DROPPED = ("video", "contact", "object", "session", "material", "sensor", "domain")
 
 
 def anonymous(manifest):
-    table = manifest.table.with_columns(pl.lit(None, pl.String).alias(c) for c in DROPPED).with_columns(frame=pl.lit(None, pl.Int64))
+    table = manifest.table.with_columns(
+        pl.lit(None, pl.String).alias(c) for c in DROPPED
+    ).with_columns(frame=pl.lit(None, pl.Int64))
     return Manifest(table, manifest.root)
 
 
 def fields(n, seed=0, sigma=2.0):
     from scipy import ndimage
 
-    x = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((n, 3, 48, 48)), (0, 0, sigma, sigma))
+    x = ndimage.gaussian_filter(
+        np.random.default_rng(seed).standard_normal((n, 3, 48, 48)), (0, 0, sigma, sigma)
+    )
     return (40 * x / x.std()).astype(np.float32)
 
 
 def test_similarity_is_the_best_overlap_at_whole_offsets_and_more_between():
-    x = quantised(band_pass(fields(6)[:, :, :SIDE, :SIDE]))
+    x = quantized(band_pass(fields(6)[:, :, :SIDE, :SIDE]))
     i, j = np.array([0, 0, 1, 2, 4]), np.array([0, 1, 2, 3, 5])
     found = similarities(x, i, j)
     for s, a, b in zip(found, i, j, strict=True):
@@ -58,7 +62,7 @@ def test_similarity_is_the_best_overlap_at_whole_offsets_and_more_between():
 def test_similarity_survives_gain_offset_and_shift_and_tells_others_apart():
     big = fields(20)
     a, b = big[:, :, 2:34, 2:34], 1.3 * big[:, :, 4:36, 1:33] + 17
-    plates = quantised(band_pass(np.concatenate([a, b])))
+    plates = quantized(band_pass(np.concatenate([a, b])))
     n = np.arange(20)
     assert similarities(plates, n, n + 20).min() > 0.9
     assert similarities(plates, n, (n + 1) % 20 + 20).max() < 0.6
@@ -81,11 +85,13 @@ def test_background_leaves_contact_alone_and_takes_shifted_markers_off():
         outside[8:20, 10:22] = False
         inner = np.s_[:, 4:28, 4:28]
         assert np.abs(left[inner])[:, outside[4:28, 4:28]].mean() < 1.0
-        assert np.corrcoef(left[:, 10:18, 12:20].ravel(), contact[:, 12:20, 14:22].ravel())[0, 1] > 0.9
+        assert (
+            np.corrcoef(left[:, 10:18, 12:20].ravel(), contact[:, 12:20, 14:22].ravel())[0, 1] > 0.9
+        )
 
 
 def gel_with_markers(size=136):
-    """A gel of soft colours with 8 x 8 printed dots, each about a pixel of the thumbnail wide, (size, size, 3)."""
+    """A gel of soft colors with 8 x 8 printed dots, each about a pixel of the thumbnail wide, (size, size, 3)."""
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:size, :size].astype(float)
     gel = np.stack([120 + 0.2 * x, 110 + 0.1 * y, 125 - 0.15 * x], -1)
@@ -102,12 +108,19 @@ def test_markers_do_not_hide_a_faint_print_in_a_shifted_copy():
     waves = np.stack([np.sin(x / 5 + y / 9), np.sin(y / 6 - x / 11), np.cos(x / 7)], -1)
     touch = gel + 8 * np.exp(-((y - 60) ** 2 + (x - 75) ** 2) / 900)[..., None] * waves
     small = lambda p: np.asarray(  # noqa: E731
-        Image.fromarray(np.clip(p + 0.5, 0, 255).astype(np.uint8)).resize((SIDE, SIDE), Image.Resampling.BILINEAR).convert("YCbCr")
+        Image.fromarray(np.clip(p + 0.5, 0, 255).astype(np.uint8))
+        .resize((SIDE, SIDE), Image.Resampling.BILINEAR)
+        .convert("YCbCr")
     )
     background = np.moveaxis(small(crop(gel)), -1, 0)[None].astype(np.float32)
     moves = [(0, 0), (1, 2), (2, -3), (-4, 4), (4, 1), (-1, -2)]
-    left = [remove_background(np.moveaxis(small(crop(touch, *m)), -1, 0)[None].astype(np.float32), background)[0] for m in moves]
-    plates = quantised(band_pass(np.stack(left)))
+    left = [
+        remove_background(
+            np.moveaxis(small(crop(touch, *m)), -1, 0)[None].astype(np.float32), background
+        )[0]
+        for m in moves
+    ]
+    plates = quantized(band_pass(np.stack(left)))
     assert similarities(plates, np.zeros(5, np.int64), np.arange(1, 6)).min() > 0.88
 
 
@@ -115,8 +128,12 @@ def test_candidates_find_what_comparing_all_finds(monkeypatch):
     big = fields(300, sigma=3)
     rng = np.random.default_rng(1)
     shift = rng.integers(0, 5, (300, 2))
-    copies = np.stack([big[k, :, a : a + 32, b : b + 32] for k, (a, b) in enumerate(shift)]) + rng.normal(0, 3, (300, 3, 32, 32))
-    comparer = Plates(quantised(band_pass(np.concatenate([big[:, :, 2:34, 2:34], copies.astype(np.float32)]))))
+    copies = np.stack(
+        [big[k, :, a : a + 32, b : b + 32] for k, (a, b) in enumerate(shift)]
+    ) + rng.normal(0, 3, (300, 3, 32, 32))
+    comparer = Plates(
+        quantized(band_pass(np.concatenate([big[:, :, 2:34, 2:34], copies.astype(np.float32)])))
+    )
     queries, base = np.arange(300, 600), np.arange(300)
     exact, s = best_matches(comparer, queries, base)
     monkeypatch.setattr("palpate.leakage.compare.EXHAUSTIVE", 0)
@@ -130,9 +147,15 @@ def test_copies_across_videos_do_not_move_the_threshold():
     rng = np.random.default_rng(0)
     clean = rng.gumbel(0.3, 0.05, 3000).astype(np.float32)
     plain = calibrate.other_videos(clean, 0.001)
-    assert 0.0002 < (calibrate.score(clean, np.zeros(3000, np.float32)) >= plain.threshold).mean() + 0.0003 < 0.004
+    assert (
+        0.0002
+        < (calibrate.score(clean, np.zeros(3000, np.float32)) >= plain.threshold).mean() + 0.0003
+        < 0.004
+    )
     mixed = np.concatenate([clean, rng.uniform(1.5, 3, 600).astype(np.float32)])
-    assert calibrate.other_videos(mixed, 0.001).threshold == pytest.approx(plain.threshold, abs=0.05)
+    assert calibrate.other_videos(mixed, 0.001).threshold == pytest.approx(
+        plain.threshold, abs=0.05
+    )
 
 
 def test_random_pairs_are_carried_over_to_the_whole_train_part():
@@ -145,21 +168,33 @@ def test_random_pairs_are_carried_over_to_the_whole_train_part():
 
 @pytest.fixture(scope="module")
 def leaky(tmp_path_factory):
-    return forge(tmp_path_factory.mktemp("leaky"), 5, objects=3, materials=MATERIALS[:6], kinds=("near-duplicate",))
+    return forge(
+        tmp_path_factory.mktemp("leaky"),
+        5,
+        objects=3,
+        materials=MATERIALS[:6],
+        kinds=("near-duplicate",),
+    )
 
 
-@pytest.mark.parametrize("modality", ["vision", "touch"])
+@pytest.mark.parametrize("modality", ["vision", "tactile"])
 @pytest.mark.parametrize("known", [True, False])
 def test_planted_copies_are_found_and_others_are_not(leaky, modality, known):
-    train, test = (leaky.train, leaky.test) if known else (anonymous(leaky.train), anonymous(leaky.test))
+    train, test = (
+        (leaky.train, leaky.test) if known else (anonymous(leaky.train), anonymous(leaky.test))
+    )
     found = near_duplicates(train, test, modality)
     truth = leaky.truth("near-duplicate")
     missed = [leaky.change[i] for i, t in zip(test.ids, truth & ~found.flag, strict=True) if t]
-    # A print of half a grey level is no more than what JPEG 60 changes in it, so without videos some copies stay below any safe threshold.
-    assert len(missed) <= (0.25 if modality == "touch" and not known else 0.1) * truth.sum()
+    # A print of half a gray level is no more than what JPEG 60 changes in it, so without videos some copies stay below any safe threshold.
+    assert len(missed) <= (0.25 if modality == "tactile" and not known else 0.1) * truth.sum()
     assert all("jpeg" in how for how in missed)
     assert found.flag[~truth].mean() <= 0.03
-    source = [leaky.planted["near-duplicate"][i] for i, t in zip(test.ids, truth & found.flag, strict=True) if t]
+    source = [
+        leaky.planted["near-duplicate"][i]
+        for i, t in zip(test.ids, truth & found.flag, strict=True)
+        if t
+    ]
     assert [train.ids[k] for k in found.nearest[truth & found.flag]] == source
     assert set(found.cause) <= {"", "content", "nothing touched", "sensor drift"}
     assert sum(found.found) == np.isfinite(found.score).sum() == len(test)
@@ -171,22 +206,36 @@ def test_groups_join_copies_and_nothing_else(leaky):
     label = dict(zip(both.ids, near_groups(both, "vision").tolist(), strict=True))
     pairs = leaky.planted["near-duplicate"].items()
     assert all(label[a] == label[b] >= 0 for a, b in pairs)
-    allowed = {frozenset(i.split("/")[0] for i in pair) for pair in pairs}  # videos that a planted pair joins
-    joined = {frozenset((a.split("/")[0], b.split("/")[0])) for a in label for b in label if label[a] == label[b] >= 0}
-    assert sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 4  # a video between two others joins them
+    allowed = {
+        frozenset(i.split("/")[0] for i in pair) for pair in pairs
+    }  # videos that a planted pair joins
+    joined = {
+        frozenset((a.split("/")[0], b.split("/")[0]))
+        for a in label
+        for b in label
+        if label[a] == label[b] >= 0
+    }
+    assert (
+        sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 4
+    )  # a video between two others joins them
 
 
 def test_groups_join_faint_touches_that_the_slow_part_finds_too(tmp_path, monkeypatch):
     leaky = forge(tmp_path, 12, objects=3, materials=MATERIALS[:6], kinds=("near-duplicate",))
     both = Manifest.join(leaky.train, leaky.test)
-    label = dict(zip(both.ids, near_groups(both, "touch").tolist(), strict=True))
+    label = dict(zip(both.ids, near_groups(both, "tactile").tolist(), strict=True))
     pairs = leaky.planted["near-duplicate"].items()
     assert all(label[a] == label[b] >= 0 for a, b in pairs)
     monkeypatch.setattr("palpate.leakage.near.AGREED", 1.0)
-    alone = dict(zip(both.ids, near_groups(both, "touch").tolist(), strict=True))
+    alone = dict(zip(both.ids, near_groups(both, "tactile").tolist(), strict=True))
     assert not all(alone[a] == alone[b] >= 0 for a, b in pairs)
     allowed = {frozenset(i.split("/")[0] for i in pair) for pair in pairs}
-    joined = {frozenset((a.split("/")[0], b.split("/")[0])) for a in label for b in label if label[a] == label[b] >= 0}
+    joined = {
+        frozenset((a.split("/")[0], b.split("/")[0]))
+        for a in label
+        for b in label
+        if label[a] == label[b] >= 0
+    }
     assert sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 2
 
 
@@ -217,7 +266,13 @@ def gels(root, count=6):
             save(root / f"v{v}b{t}.jpg", crop(video.background()))
             save(root / f"v{v}t{t}.jpg", crop(video.touch(t)))
             samples.append(
-                {"id": f"v{v}/{t}", "video": f"v{v}", "frame": 10 * t, "tactile": f"v{v}t{t}.jpg", "background": f"v{v}b{t}.jpg"}
+                {
+                    "id": f"v{v}/{t}",
+                    "video": f"v{v}",
+                    "frame": 10 * t,
+                    "tactile": f"v{v}t{t}.jpg",
+                    "background": f"v{v}b{t}.jpg",
+                }
             )
     return made, samples
 
@@ -226,10 +281,19 @@ def test_untouched_gel_is_named_and_is_no_leak(tmp_path):
     videos, samples = gels(tmp_path)
     for k in range(2):
         save(tmp_path / f"blank{k}.jpg", crop(videos[0].background()))
-    blank = [{"id": f"blank{k}", "video": f"v{k}", "frame": 500, "tactile": f"blank{k}.jpg", "background": "v0b0.jpg"} for k in range(2)]
+    blank = [
+        {
+            "id": f"blank{k}",
+            "video": f"v{k}",
+            "frame": 500,
+            "tactile": f"blank{k}.jpg",
+            "background": "v0b0.jpg",
+        }
+        for k in range(2)
+    ]
     train = Manifest.from_rows([*samples[:24], blank[0]], tmp_path)
     test = Manifest.from_rows([*samples[24:], blank[1]], tmp_path)
-    found = near_duplicates(train, test, "touch")
+    found = near_duplicates(train, test, "tactile")
     assert found.cause[-1] == "nothing touched"
     assert not found.flag.any()
     assert found.nearest[-1] == 24
@@ -245,10 +309,26 @@ def test_drift_of_the_gel_is_named_and_is_no_leak(tmp_path):
     later = []
     for k in range(2):
         save(tmp_path / f"scar{k}.jpg", crop(worn[k]))
-        later.append({"id": f"scar{k}", "video": "v0", "frame": 500 + k, "tactile": f"scar{k}.jpg", "background": "v0b0.jpg"})
-    other = {"id": "after", "video": "v0", "frame": 900, "tactile": "v0t7.jpg", "background": "worn.jpg"}
+        later.append(
+            {
+                "id": f"scar{k}",
+                "video": "v0",
+                "frame": 500 + k,
+                "tactile": f"scar{k}.jpg",
+                "background": "v0b0.jpg",
+            }
+        )
+    other = {
+        "id": "after",
+        "video": "v0",
+        "frame": 900,
+        "tactile": "v0t7.jpg",
+        "background": "worn.jpg",
+    }
     found = near_duplicates(
-        Manifest.from_rows([*samples[:24], later[0], other], tmp_path), Manifest.from_rows([*samples[24:], later[1]], tmp_path), "touch"
+        Manifest.from_rows([*samples[:24], later[0], other], tmp_path),
+        Manifest.from_rows([*samples[24:], later[1]], tmp_path),
+        "tactile",
     )
     assert found.cause[-1] == "sensor drift"
     assert not found.flag.any()
@@ -260,24 +340,47 @@ def test_a_score_near_the_threshold_counts_where_the_slow_part_finds_the_same_to
     limit = calibrate.Calibration(0.55, np.zeros(0, np.float32), [])
     none, content = np.full(n, "", "<U15"), np.array(["content", "content", "content", ""], "<U15")
     fine = Found(score, np.arange(n), np.full(n, 0.8, np.float32), none, limit, True)
-    slow = Found(np.full(n, 0.7, np.float32), np.array([0, 3, 2, 3]), np.full(n, 0.9, np.float32), content, limit, True)
+    slow = Found(
+        np.full(n, 0.7, np.float32),
+        np.array([0, 3, 2, 3]),
+        np.full(n, 0.9, np.float32),
+        content,
+        limit,
+        True,
+    )
     pool = SimpleNamespace(blank=np.zeros(n, bool), background=None)
-    monkeypatch.setattr("palpate.leakage.near.plates", lambda *_, **__: (np.zeros((n, 3, SIDE, SIDE), np.int8), None))
+    monkeypatch.setattr(
+        "palpate.leakage.near.plates",
+        lambda *_, **__: (np.zeros((n, 3, SIDE, SIDE), np.int8), None),
+    )
     monkeypatch.setattr("palpate.leakage.near.match", lambda *_: slow)
     entries = Entries.of(np.arange(n), np.arange(n))
     named = near._name_drift(fine, pool, None, entries, entries, 0.001, quiet)
     assert list(named.cause) == ["content", "sensor drift", "sensor drift", ""]
     assert named.score == pytest.approx([0.55, 0.7, 0.7, 0.5])
     assert list(named.place) == [0, 3, 2, 3]
-    hidden = near._name_drift(replace(fine, by_videos=False), pool, None, entries, entries, 0.001, quiet)
+    hidden = near._name_drift(
+        replace(fine, by_videos=False), pool, None, entries, entries, 0.001, quiet
+    )
     assert list(hidden.cause) == ["sensor drift"] * 3 + [""]
 
 
 def test_black_photos_show_nothing(tmp_path):
     black = rows(tmp_path, "black", [np.full((64, 64, 3), 3, np.uint8)] * 4)
-    others = [rows(tmp_path, f"n{v}", [crop(NoiseVideo(np.random.default_rng([v, 1]), 72).photo(0)) for _ in range(4)]) for v in range(12)]
-    train = Manifest.from_rows([*black[:2], *(row for rows_ in others[:6] for row in rows_)], tmp_path)
-    test = Manifest.from_rows([*black[2:], *(row for rows_ in others[6:] for row in rows_)], tmp_path)
+    others = [
+        rows(
+            tmp_path,
+            f"n{v}",
+            [crop(NoiseVideo(np.random.default_rng([v, 1]), 72).photo(0)) for _ in range(4)],
+        )
+        for v in range(12)
+    ]
+    train = Manifest.from_rows(
+        [*black[:2], *(row for rows_ in others[:6] for row in rows_)], tmp_path
+    )
+    test = Manifest.from_rows(
+        [*black[2:], *(row for rows_ in others[6:] for row in rows_)], tmp_path
+    )
     found = near_duplicates(train, test, "vision")
     assert list(found.cause[:2]) == ["nothing touched"] * 2
     assert not found.flag.any()
@@ -287,20 +390,30 @@ def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
     picture = crop(NoiseVideo(np.random.default_rng(3), 72).photo(0))
     image = Image.fromarray(picture)
     image.save(tmp_path / "a.jpg", quality=95)
-    for mode, name in (("L", "grey.png"), ("RGBA", "alpha.png"), ("P", "palette.gif"), ("CMYK", "cmyk.jpg"), ("L", "grey.jpg")):
+    for mode, name in (
+        ("L", "gray.png"),
+        ("RGBA", "alpha.png"),
+        ("P", "palette.gif"),
+        ("CMYK", "cmyk.jpg"),
+        ("L", "gray.jpg"),
+    ):
         image.convert(mode).save(tmp_path / name)
-    Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 257).save(tmp_path / "deep.png")
+    Image.fromarray(np.asarray(image.convert("L")).astype(np.uint16) * 257).save(
+        tmp_path / "deep.png"
+    )
     image.resize((301, 97)).save(tmp_path / "wide.jpg")
     (tmp_path / "empty.jpg").write_bytes(b"")
     (tmp_path / "cut.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:600])
     (tmp_path / "text.jpg").write_text("no image")
     names = sorted(p.name for p in tmp_path.iterdir())
-    for name in ("grey.png", "alpha.png", "deep.png", "grey.jpg", "wide.jpg"):
+    for name in ("gray.png", "alpha.png", "deep.png", "gray.jpg", "wide.jpg"):
         seen = thumbnail(tmp_path / name)
         assert isinstance(seen, np.ndarray)
         assert seen.shape == (32, 32, 3)
         assert np.abs(seen[..., 0].astype(float) - thumbnail(tmp_path / "a.jpg")[..., 0]).mean() < 6
-    manifest = Manifest.from_rows([*({"id": n, "vision": n} for n in [*names, "absent.jpg"]), {"id": "none"}], tmp_path)
+    manifest = Manifest.from_rows(
+        [*({"id": n, "vision": n} for n in [*names, "absent.jpg"]), {"id": "none"}], tmp_path
+    )
     found = near_duplicates(manifest, manifest, "vision")
     bad = [i in ("empty.jpg", "cut.jpg", "text.jpg", "absent.jpg", "none") for i in manifest.ids]
     assert np.array_equal(np.isnan(found.score), bad)
@@ -314,7 +427,18 @@ def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
         save(path, crop(NoiseVideo(np.random.default_rng(k % 5), 72).photo(0)))
     order: list[Path | None] = [paths[2], paths[0], None, paths[2], *paths]
     plain = thumbnails(order)
-    assert list(plain.row) == [2, 0, -1, 2, 0, 1, 2, 3, 4, 0]  # the last file is the first one's picture again
+    assert list(plain.row) == [
+        2,
+        0,
+        -1,
+        2,
+        0,
+        1,
+        2,
+        3,
+        4,
+        0,
+    ]  # the last file is the first one's picture again
     assert len(plain.pixels) == 5
     monkeypatch.setattr("palpate.leakage.descriptors.FEW", 1)
     monkeypatch.setattr("palpate.leakage.descriptors.PIECE", 2)
@@ -335,7 +459,8 @@ def test_embeddings_and_their_mistakes(tmp_path):
     train, test = rng.standard_normal((200, 32)), rng.standard_normal((80, 32))
     test[:20] = train[:20] + 0.05 * rng.standard_normal((20, 32))
     parts = [
-        Manifest.from_rows([{"id": f"{p}{k}", "video": f"{p}{k // 4}"} for k in range(n)], tmp_path) for p, n in (("a", 200), ("b", 80))
+        Manifest.from_rows([{"id": f"{p}{k}", "video": f"{p}{k // 4}"} for k in range(n)], tmp_path)
+        for p, n in (("a", 200), ("b", 80))
     ]
     found = near_duplicates(parts[0], parts[1], "vision", features=(train, test))
     assert list(np.flatnonzero(found.flag)) == list(range(20))
@@ -351,9 +476,13 @@ def test_embeddings_and_their_mistakes(tmp_path):
 
 def test_a_million_rows_of_one_picture_and_tiny_sets_are_answered(tmp_path):
     save(tmp_path / "a.jpg", crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
-    table = pl.DataFrame({"id": [str(k) for k in range(100_000)]}).with_columns(vision=pl.lit("a.jpg"), video=pl.lit("v"))
+    table = pl.DataFrame({"id": [str(k) for k in range(100_000)]}).with_columns(
+        vision=pl.lit("a.jpg"), video=pl.lit("v")
+    )
     many = Manifest(
-        Manifest.from_rows([], tmp_path).table.clear(100_000).with_columns(id=table["id"], vision=table["vision"], video=table["video"]),
+        Manifest.from_rows([], tmp_path)
+        .table.clear(100_000)
+        .with_columns(id=table["id"], vision=table["vision"], video=table["video"]),
         tmp_path,
     )
     found = near_duplicates(many, many, "vision")
@@ -361,7 +490,9 @@ def test_a_million_rows_of_one_picture_and_tiny_sets_are_answered(tmp_path):
     assert any("default" in note for note in found.notes)
     empty = Manifest(many.table.clear(), tmp_path)
     assert len(near_duplicates(many, empty, "vision").score) == 0
-    assert np.isnan(near_duplicates(empty, Manifest(many.table.head(3), tmp_path), "vision").score).all()
+    assert np.isnan(
+        near_duplicates(empty, Manifest(many.table.head(3), tmp_path), "vision").score
+    ).all()
 
 
 @pytest.mark.slow
@@ -373,13 +504,15 @@ def test_real_clips_without_metadata(real_data, tmp_path):
     hidden = anonymous(manifest)
     part = lambda keep: Manifest(hidden.table.filter(pl.Series(keep)), hidden.root)  # noqa: E731
     videos = np.array(manifest.column("video"))
-    for modality, least in (("vision", 0.99), ("touch", 0.9)):
+    for modality, least in (("vision", 0.99), ("tactile", 0.9)):
         found = near_duplicates(part(~odd), part(odd), modality)
         assert found.flag.mean() >= least
         same = videos[~odd][found.nearest[found.flag]] == videos[odd][found.flag]
         assert same.all()
         for clip in np.unique(videos):
-            assert not near_duplicates(part(videos != clip), part(videos == clip), modality).flag.any()
+            assert not near_duplicates(
+                part(videos != clip), part(videos == clip), modality
+            ).flag.any()
 
 
 def test_changed_crops_stay_within_the_margin():
@@ -389,7 +522,9 @@ def test_changed_crops_stay_within_the_margin():
     assert abs(out.mean() / crop(picture).mean() - 1) < 0.12
 
 
-def uploads(folder: Path, seeds: range, name: str, count: int, *, copied: bool = False) -> list[dict[str, str]]:
+def uploads(
+    folder: Path, seeds: range, name: str, count: int, *, copied: bool = False
+) -> list[dict[str, str]]:
     """``count`` pictures of each video, copies brighter and saved again at quality 60."""
     rows: list[dict[str, str]] = []
     for seed in seeds:
@@ -398,33 +533,53 @@ def uploads(folder: Path, seeds: range, name: str, count: int, *, copied: bool =
             path = folder / f"{name}{seed}-{k}.{'jpg' if copied else 'png'}"
             picture = crop(video.photo(40 * k))
             if copied:
-                Image.fromarray(np.clip(picture * 1.05, 0, 255).astype(np.uint8)).save(path, quality=60)
+                Image.fromarray(np.clip(picture * 1.05, 0, 255).astype(np.uint8)).save(
+                    path, quality=60
+                )
             else:
                 save(path, picture)
             rows.append({"id": path.stem, "video": f"{name}{seed}", "vision": path.name})
     return rows
 
 
-@pytest.mark.parametrize("case", ["eleven videos", "two videos", "one video", "train twice", "most of train twice"])
+@pytest.mark.parametrize(
+    "case", ["eleven videos", "two videos", "one video", "train twice", "most of train twice"]
+)
 def test_copies_are_found_however_many_they_are(tmp_path, case):
     if case == "eleven videos":  # fewer than a hundred train pictures, and all of test copies
-        train, test = uploads(tmp_path, range(11), "a", 4), uploads(tmp_path, range(11), "b", 4, copied=True)
+        train, test = (
+            uploads(tmp_path, range(11), "a", 4),
+            uploads(tmp_path, range(11), "b", 4, copied=True),
+        )
     elif case in ("two videos", "one video"):
         n = 2 if case == "two videos" else 1
-        train, test = uploads(tmp_path, range(n), "a", 20), uploads(tmp_path, range(n), "b", 20, copied=True)
+        train, test = (
+            uploads(tmp_path, range(n), "a", 20),
+            uploads(tmp_path, range(n), "b", 20, copied=True),
+        )
     elif case == "train twice":  # what test copies stands in train under two names
-        train = uploads(tmp_path, range(8), "a", 5) + uploads(tmp_path, range(3), "c", 5, copied=True)
+        train = uploads(tmp_path, range(8), "a", 5) + uploads(
+            tmp_path, range(3), "c", 5, copied=True
+        )
         test = uploads(tmp_path, range(3), "b", 5, copied=True)
     else:
-        train = uploads(tmp_path, range(12), "a", 4) + uploads(tmp_path, range(4, 12), "c", 4, copied=True)
+        train = uploads(tmp_path, range(12), "a", 4) + uploads(
+            tmp_path, range(4, 12), "c", 4, copied=True
+        )
         test = uploads(tmp_path, range(4), "b", 4, copied=True)
-    found = near_duplicates(Manifest.from_rows(train, tmp_path), Manifest.from_rows(test, tmp_path), "vision")
+    found = near_duplicates(
+        Manifest.from_rows(train, tmp_path), Manifest.from_rows(test, tmp_path), "vision"
+    )
     assert found.flag.mean() >= 0.95, found.notes
 
 
 def test_equal_pictures_score_one_however_many_there_are(tmp_path):
     save(tmp_path / "still.png", crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
-    rows = [{"id": f"{v}/{k}", "video": f"v{v}", "vision": "still.png"} for v in range(40) for k in range(500)]
+    rows = [
+        {"id": f"{v}/{k}", "video": f"v{v}", "vision": "still.png"}
+        for v in range(40)
+        for k in range(500)
+    ]
     whole = Manifest.from_rows(rows, tmp_path)
     train, test = (Manifest(whole.table[a:b], tmp_path) for a, b in ((0, 16_000), (16_000, 20_000)))
     found = near_duplicates(train, test, "vision")
@@ -437,7 +592,9 @@ def test_a_changed_file_is_decoded_again_and_cameras_may_be_held_upright(tmp_pat
     save(path, crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
     before = thumbnails([path], cache=tmp_path / "cache").pixels.copy()
     save(path, crop(NoiseVideo(np.random.default_rng(1), 72).photo(0)))
-    assert np.abs(thumbnails([path], cache=tmp_path / "cache").pixels.astype(int) - before).mean() > 5
+    assert (
+        np.abs(thumbnails([path], cache=tmp_path / "cache").pixels.astype(int) - before).mean() > 5
+    )
     picture = Image.open(path).convert("RGB")
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera was turned: shown rotated by a quarter, clockwise

@@ -64,13 +64,16 @@ def kinds(rng):
         "drift": smooth(rng, 900, steps=30),
         "isotropic": rng.normal(size=(700, 20)).astype(np.float32),
         "lattice": grid.astype(np.float32),
-        "offset": (1e4 + rng.integers(0, 5, size=(600, 12)) * np.float32(2**-10)).astype(np.float32),
+        "offset": (1e4 + rng.integers(0, 5, size=(600, 12)) * np.float32(2**-10)).astype(
+            np.float32
+        ),
         "outlier": outlier,
         "line": rng.integers(0, 300, size=(900, 1)).astype(np.float32),
         "tiny": (smooth(rng, 500) * np.float32(1e-25)).astype(np.float32),
         "huge": (smooth(rng, 500) * np.float32(1e25)).astype(np.float32),
         "wide": rng.normal(size=(300, 200)).astype(np.float32),
-        "pairs": np.repeat(smooth(rng, 300), 2, axis=0) + (rng.normal(size=(600, 48)) * 1e-7).astype(np.float32),
+        "pairs": np.repeat(smooth(rng, 300), 2, axis=0)
+        + (rng.normal(size=(600, 48)) * 1e-7).astype(np.float32),
     }
 
 
@@ -93,7 +96,9 @@ def test_queries_in_base_with_groups_and_radius(kind):
     d2 = squared(x[:cut], x[cut:])
     radius = float(np.sqrt(np.quantile(d2, 0.05)))
     for options in ({}, {"radius": radius}):
-        found = nearest(x[:cut], x[cut:], 3, query_groups=group[:cut], base_groups=group[cut:], **options)
+        found = nearest(
+            x[:cut], x[cut:], 3, query_groups=group[:cut], base_groups=group[cut:], **options
+        )
         same(found, brute(x[:cut], x[cut:], 3, group[:cut], group[cut:], **options))
 
 
@@ -107,10 +112,16 @@ def test_pairs_and_clusters_equal_brute_force(kind):
         wanted = np.argwhere(upper & (d2 <= radius**2))
         blocks = list(pairs_within(x, radius, max_pairs_per_block=100))
         assert all(0 < len(i) <= 100 for i, _, _ in blocks)
-        i, j, distance = (np.concatenate(part) for part in zip(*blocks, strict=True)) if blocks else (np.empty(0, int),) * 3
+        i, j, distance = (
+            (np.concatenate(part) for part in zip(*blocks, strict=True))
+            if blocks
+            else (np.empty(0, int),) * 3
+        )
         order = np.lexsort((j, i))
         np.testing.assert_array_equal(np.c_[i, j][order], wanted)
-        np.testing.assert_array_equal(distance[order], np.sqrt(d2[tuple(wanted.T)]).astype(np.float32))
+        np.testing.assert_array_equal(
+            distance[order], np.sqrt(d2[tuple(wanted.T)]).astype(np.float32)
+        )
         np.testing.assert_array_equal(clusters_within(x, radius), components(len(x), wanted))
 
 
@@ -127,14 +138,22 @@ def components(n, pairs):
 
 def test_a_threshold_exactly_at_the_distance_keeps_the_pair():
     x = np.array([[0, 0], [3, 4], [6, 8]], dtype=np.float32)
-    assert [(int(i[0]), int(j[0])) for i, j, _ in pairs_within(x, 5.0, max_pairs_per_block=1)] == [(0, 1), (1, 2)]
+    assert [(int(i[0]), int(j[0])) for i, j, _ in pairs_within(x, 5.0, max_pairs_per_block=1)] == [
+        (0, 1),
+        (1, 2),
+    ]
     assert not list(pairs_within(x, np.nextafter(5.0, 0)))
     assert clusters_within(x, 5.0).tolist() == [0, 0, 0]
 
 
 def test_nearest_within_a_radius_keeps_what_lies_on_it():
     x = np.array([[0, 0], [3, 4], [6, 8], [20, 0]], dtype=np.float32)
-    assert nearest(x, x, 2, self_join=True, radius=5.0).index.tolist() == [[1, -1], [0, 2], [1, -1], [-1, -1]]
+    assert nearest(x, x, 2, self_join=True, radius=5.0).index.tolist() == [
+        [1, -1],
+        [0, 2],
+        [1, -1],
+        [-1, -1],
+    ]
     found = nearest(x, x, 2, self_join=True, radius=4.99)
     assert (found.index == -1).all()
     assert np.isinf(found.distance).all()
@@ -145,7 +164,10 @@ def test_one_video_that_holds_nearly_everything(share):
     rng = np.random.default_rng(13)
     x = smooth(rng, 1500, steps=30)
     group = np.where(rng.random(1500) < share, rng.integers(1, 5, size=1500), 0)
-    same(nearest(x, x, 2, query_groups=group, base_groups=group, self_join=True), brute(x, x, 2, group, group, self_join=True))
+    same(
+        nearest(x, x, 2, query_groups=group, base_groups=group, self_join=True),
+        brute(x, x, 2, group, group, self_join=True),
+    )
 
 
 def test_near_ties_are_decided_by_exact_distances():
@@ -163,12 +185,17 @@ def test_near_ties_are_decided_by_exact_distances():
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 2**31), st.integers(1, 40), st.integers(1, 12), st.integers(1, 4), st.booleans())
+@given(
+    st.integers(0, 2**31), st.integers(1, 40), st.integers(1, 12), st.integers(1, 4), st.booleans()
+)
 def test_any_small_lattice(seed, n, d, k, grouped):
     rng = np.random.default_rng(seed)
     x = rng.integers(-1, 2, size=(n, d)).astype(np.float32)
     group = rng.integers(-1, 3, size=n) if grouped else None
-    same(nearest(x, x, k, query_groups=group, base_groups=group, self_join=True), brute(x, x, k, group, group, self_join=True))
+    same(
+        nearest(x, x, k, query_groups=group, base_groups=group, self_join=True),
+        brute(x, x, k, group, group, self_join=True),
+    )
 
 
 def test_the_bound_never_exceeds_the_truth():
@@ -198,7 +225,9 @@ def test_results_do_not_depend_on_block_sizes(monkeypatch, queries, rows):
     monkeypatch.setattr(search_exact, "GUESS_ROWS", 5)
     again = nearest(x, x, 3, self_join=True)
     same(again, (plain.index, plain.distance))
-    assert {(int(a), int(b)) for i, j, _ in pairs_within(x, 0.1) for a, b in zip(i, j, strict=True)} == pairs
+    assert {
+        (int(a), int(b)) for i, j, _ in pairs_within(x, 0.1) for a, b in zip(i, j, strict=True)
+    } == pairs
     assert len(pairs) > 100
 
 
@@ -241,7 +270,9 @@ def test_identical_rows():
     for k in (1, 3):
         same(nearest(x, x, k, self_join=True), brute(x, x, k, self_join=True))
         same(nearest(x, x, k, query_groups=group, base_groups=group), brute(x, x, k, group, group))
-    assert sum(len(i) for i, _, _ in pairs_within(x, 0.0)) == sum(n * (n - 1) // 2 for n in np.bincount(which))
+    assert sum(len(i) for i, _, _ in pairs_within(x, 0.0)) == sum(
+        n * (n - 1) // 2 for n in np.bincount(which)
+    )
     np.testing.assert_array_equal(clusters_within(x, 0.0), first)
 
 
@@ -321,7 +352,9 @@ def test_nearly_identical_rows_are_joined_without_listing_their_pairs(monkeypatc
     x = np.concatenate([clump, clump[:300] + np.float32(1.0), [np.full(16, 9.0, np.float32)]])
     seen = []
     real = search_pairs.squared_distances
-    monkeypatch.setattr(search_pairs, "squared_distances", lambda *a: seen.append(len(a[1])) or real(*a))
+    monkeypatch.setattr(
+        search_pairs, "squared_distances", lambda *a: seen.append(len(a[1])) or real(*a)
+    )
     labels = clusters_within(x, 0.01)
     assert np.bincount(labels)[[0, 20_000, 20_300]].tolist() == [20_000, 300, 1]
     assert sum(seen) < 40 * len(x)  # of 2e8 pairs
@@ -369,9 +402,14 @@ def test_faiss_finds_nearly_all_and_measures_exactly(monkeypatch):
 def test_faiss_reaches_across_a_video_that_fills_its_lists():
     pytest.importorskip("faiss")
     rng = np.random.default_rng(12)
-    x = np.concatenate([rng.normal(size=(5000, 8)) * 1e-3, rng.normal(size=(5, 8)) + 50]).astype(np.float32)
+    x = np.concatenate([rng.normal(size=(5000, 8)) * 1e-3, rng.normal(size=(5, 8)) + 50]).astype(
+        np.float32
+    )
     group = np.r_[np.zeros(5000, int), np.ones(5, int)]
-    same(nearest(x, x, 2, query_groups=group, base_groups=group, backend="faiss"), brute(x, x, 2, group, group))
+    same(
+        nearest(x, x, 2, query_groups=group, base_groups=group, backend="faiss"),
+        brute(x, x, 2, group, group),
+    )
     found = nearest(x, x, 6, query_groups=group, base_groups=group, backend="faiss")
     assert (found.index[:5000] >= 0).sum(axis=1).tolist() == [5] * 5000
 

@@ -14,12 +14,22 @@ from PIL import Image
 from palpate.core import Audit, PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.leakage import signals
-from palpate.leakage.audit import audit_parts, inspect_parts, inspect_split, known_group, nearest_in_video
+from palpate.leakage.audit import (
+    audit_parts,
+    inspect_parts,
+    inspect_split,
+    known_group,
+    nearest_in_video,
+)
 
-cells = st.fixed_dictionaries({
-    "video": st.sampled_from(["a", "b", None]), "frame": st.one_of(st.none(), st.integers(0, 90)),
-    "object": st.sampled_from(["cup", "mug", None]), "session": st.sampled_from(["s", None]),
-})  # fmt: skip
+cells = st.fixed_dictionaries(
+    {
+        "video": st.sampled_from(["a", "b", None]),
+        "frame": st.one_of(st.none(), st.integers(0, 90)),
+        "object": st.sampled_from(["cup", "mug", None]),
+        "session": st.sampled_from(["s", None]),
+    }
+)
 rows = st.lists(cells, min_size=1, max_size=14)
 
 
@@ -43,7 +53,11 @@ def test_the_signals_equal_double_loops(train_rows, test_rows, near):
         assert np.isnan(flags.score).tolist() == [v is None for v in asked]
     gaps = [
         min(
-            (abs(r["frame"] - t["frame"]) for r in train_rows if None not in (r["frame"], r["video"]) and r["video"] == t["video"]),
+            (
+                abs(r["frame"] - t["frame"])
+                for r in train_rows
+                if None not in (r["frame"], r["video"]) and r["video"] == t["video"]
+            ),
             default=None,
         )
         if None not in (t["frame"], t["video"])
@@ -55,7 +69,9 @@ def test_the_signals_equal_double_loops(train_rows, test_rows, near):
         assert set(gaps) == {None}
     else:
         assert timed.flag.tolist() == [g is not None and g <= near for g in gaps]
-        assert timed.score == pytest.approx([0 if g is None else 0.5 ** (g / max(near, 1)) for g in gaps], abs=1e-6)
+        assert timed.score == pytest.approx(
+            [0 if g is None else 0.5 ** (g / max(near, 1)) for g in gaps], abs=1e-6
+        )
         assert (timed.score[timed.flag] >= timed.threshold).all()
     same = signals.identical_samples(train, test, gap, row)
     assert same.flag.tolist() == [g == 0 for g in gaps]
@@ -76,7 +92,8 @@ def test_equal_bytes_are_found_under_other_names_and_bad_files_are_no_match(tmp_
     (tmp_path / "v" / "empty1.png").write_bytes(b"")
     (tmp_path / "v" / "empty2.png").write_bytes(b"")
     train = Manifest.from_rows(
-        [{"id": f"r{k}", "vision": f"v/{k}.png", "tactile": f"t/{k}.png"} for k in range(2)] + [{"id": "r2", "vision": "v/empty1.png"}],
+        [{"id": f"r{k}", "vision": f"v/{k}.png", "tactile": f"t/{k}.png"} for k in range(2)]
+        + [{"id": "r2", "vision": "v/empty1.png"}],
         tmp_path,
     )
     test = Manifest.from_rows(
@@ -100,30 +117,58 @@ def test_equal_bytes_are_found_under_other_names_and_bad_files_are_no_match(tmp_
 
 def test_only_the_group_asked_for_counts_and_the_table_holds_every_signal():
     train = Manifest.from_rows(
-        [{"id": "1", "video": "a", "frame": 0, "object": "cup"}, {"id": "2", "video": "a", "frame": 9, "object": "cup"}], "."
+        [
+            {"id": "1", "video": "a", "frame": 0, "object": "cup"},
+            {"id": "2", "video": "a", "frame": 9, "object": "cup"},
+        ],
+        ".",
     )
     test = Manifest.from_rows(
-        [{"id": "3", "video": "b", "frame": 0, "object": "cup"}, {"id": "4", "video": "a", "frame": 300, "object": "mug"}], "."
+        [
+            {"id": "3", "video": "b", "frame": 0, "object": "cup"},
+            {"id": "4", "video": "a", "frame": 300, "object": "mug"},
+        ],
+        ".",
     )
     by_video = inspect_parts(train, test)
     assert by_video.audit.leaking_samples == 1
     kinds = {s.kind: s for s in by_video.audit.signals}
     assert list(kinds) == ["identical sample", "shared video", "shared object", "time gap"]
-    assert (kinds["shared object"].flagged, kinds["time gap"].flagged, kinds["time gap"].checked) == (1, 0, 2)
+    assert (
+        kinds["shared object"].flagged,
+        kinds["time gap"].flagged,
+        kinds["time gap"].checked,
+    ) == (1, 0, 2)
     assert "not counted" in kinds["shared object"].notes[0]
     table = by_video.table
     assert table["leaking"].to_list() == [False, True]
     assert table["gap"].to_list() == [None, 291]
     assert table["time_gap_nearest"].to_list() == [None, "2"]
-    assert {"shared_video_flag", "shared_object_score", "identical_sample_flag"} <= set(table.columns)
+    assert {"shared_video_flag", "shared_object_score", "identical_sample_flag"} <= set(
+        table.columns
+    )
     by_object = audit_parts(train, test, group="object")
     assert (by_object.leaking_samples, by_object.groups_shared) == (1, 1)
-    assert Audit.from_json(json.loads(json.dumps(dataclasses.asdict(by_object)))).signals[1].flagged == 1
+    assert (
+        Audit.from_json(json.loads(json.dumps(dataclasses.asdict(by_object)))).signals[1].flagged
+        == 1
+    )
 
 
 def test_the_matrix_puts_shared_groups_first():
-    rows = [("a", "train", 5), ("b", "train", 1), ("b", "test", 3), ("c", "val", 2), ("c", "test", 4), ("d", "test", 9)]
-    manifest_rows = [{"id": f"{v}{p}{k}", "video": v, "frame": 1000 * len(p) + 40 * k} for v, p, n in rows for k in range(n)]
+    rows = [
+        ("a", "train", 5),
+        ("b", "train", 1),
+        ("b", "test", 3),
+        ("c", "val", 2),
+        ("c", "test", 4),
+        ("d", "test", 9),
+    ]
+    manifest_rows = [
+        {"id": f"{v}{p}{k}", "video": v, "frame": 1000 * len(p) + 40 * k}
+        for v, p, n in rows
+        for k in range(n)
+    ]
     whole = Manifest.from_rows(manifest_rows, ".")
     parts = {f"{v}{p}{k}": p for v, p, n in rows for k in range(n)}
     audit = inspect_split(whole, Split(parts)).audit
@@ -149,7 +194,9 @@ def test_the_group_is_chosen_by_what_both_sides_know():
 def test_the_worst_pairs_come_from_different_videos_first():
     test = manifest([{"video": v} for v in ["a", "a", "a", "b"]], "t")
     train = manifest([{"video": "c"}], "r")
-    flags = signals.Flags("x", np.array([0.9, 0.8, 1.0, 0.7], np.float32), np.ones(4, bool), np.zeros(4, np.int64))
+    flags = signals.Flags(
+        "x", np.array([0.9, 0.8, 1.0, 0.7], np.float32), np.ones(4, bool), np.zeros(4, np.int64)
+    )
     gaps = np.full(4, -1)
     worst = flags.summary(train, test, gaps, gaps, 3).worst
     assert [p.test.id for p in worst] == ["t2", "t3", "t0"]

@@ -15,15 +15,27 @@ def one_class(s, name):
     return keep(s, np.array(s.labels) == name)
 
 
-@pytest.mark.parametrize("options", [{}, {"preset": "paper"}, {"preset": "cmmd"}, {"preset": "paper-tables"}, {"estimator": "biased"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"preset": "paper"},
+        {"preset": "cmmd"},
+        {"preset": "paper-tables"},
+        {"estimator": "biased"},
+    ],
+)
 def test_the_null_of_a_mean_over_classes_is_that_of_independent_classes(options):
     s = world(0, classes=4, videos=(3, 5, 4), frames=(3, 6, 4))
     nulls = [i_tmmd(one_class(s, f"m{c}"), **options).null for c in range(4)]
     sds = np.array([(high - low) / 2 / 1.96 for low, high in nulls])
-    centre, reach = np.mean([(low + high) / 2 for low, high in nulls]), 1.96 * np.sqrt((sds**2).sum()) / 4
+    center, reach = (
+        np.mean([(low + high) / 2 for low, high in nulls]),
+        1.96 * np.sqrt((sds**2).sum()) / 4,
+    )
     score = ci_tmmd(s, **options)
-    assert score.null == pytest.approx((centre - reach, centre + reach), abs=1e-9)
-    assert score.details["z"] == pytest.approx((score.value - centre) / reach * 1.96)
+    assert score.null == pytest.approx((center - reach, center + reach), abs=1e-9)
+    assert score.details["z"] == pytest.approx((score.value - center) / reach * 1.96)
 
 
 def mixed(seed, apart, classes=3, videos=4, frames=3):
@@ -31,7 +43,9 @@ def mixed(seed, apart, classes=3, videos=4, frames=3):
     s = world(seed, classes=1, videos=classes * videos, frames=frames)
     number = np.array([int(v.removeprefix("c0v")) for v in s.groups]) % classes
     x = s.features + apart * np.eye(6)[number]
-    return change(s, features=x / np.linalg.norm(x, axis=1, keepdims=True), labels=[f"m{c}" for c in number])
+    return change(
+        s, features=x / np.linalg.norm(x, axis=1, keepdims=True), labels=[f"m{c}" for c in number]
+    )
 
 
 def means_off_diagonal(score):
@@ -43,14 +57,21 @@ def in_errors(s):
     """D-TMMD, and its mean divergences (C,) of a class from the others in jackknife errors, each recomputed without each video."""
     score = d_tmmd(s, **OFF_DIAGONAL)
     assert "leave-one-group-out" in score.interval_method
-    out = [means_off_diagonal(d_tmmd(keep(s, np.array(s.groups) != v), **OFF_DIAGONAL)) for v in sorted(set(s.groups))]
+    out = [
+        means_off_diagonal(d_tmmd(keep(s, np.array(s.groups) != v), **OFF_DIAGONAL))
+        for v in sorted(set(s.groups))
+    ]
     found = [means_off_diagonal(score), np.array(out)]
     error = lambda v: np.sqrt((len(v) - 1) / len(v) * ((v - v.mean(axis=0)) ** 2).sum(axis=0))  # noqa: E731
     return score, found[0] / error(found[1]), found[0].mean() / error(found[1].mean(axis=1))
 
 
-@pytest.mark.parametrize(("seed", "apart", "low", "high"), [(1, 0.1, 1.0, 2.0), (0, 0.1, 2.0, 2.5), (5, 0.2, 4.0, 6.0)])
-def test_classes_within_two_errors_of_the_others_are_unstable_and_have_no_excess_ratio(seed, apart, low, high):
+@pytest.mark.parametrize(
+    ("seed", "apart", "low", "high"), [(1, 0.1, 1.0, 2.0), (0, 0.1, 2.0, 2.5), (5, 0.2, 4.0, 6.0)]
+)
+def test_classes_within_two_errors_of_the_others_are_unstable_and_have_no_excess_ratio(
+    seed, apart, low, high
+):
     s = mixed(seed, apart)
     score, each, inter = in_errors(s)
     assert score.details["inter"]["value"] == pytest.approx(means_off_diagonal(score).mean())
@@ -86,12 +107,16 @@ def test_a_generator_of_some_classes_has_the_floor_of_these(preset):
     assert d.details["E_ratio_floor"] is None
     whole = four_scores(r, r, floor=r, preset=preset, permutations=0)
     assert whole[2].details["E_floor"] == pytest.approx(np.mean(list(excess.values())), abs=1e-9)
-    assert whole[3].details["E_ratio_floor"] == d_tmmd(r, preset=preset).details["E_ratio"] is not None
+    assert (
+        whole[3].details["E_ratio_floor"] == d_tmmd(r, preset=preset).details["E_ratio"] is not None
+    )
     assert (whole[2].floor, whole[3].floor) == (
         pytest.approx(ci_tmmd(r, preset=preset).value),
         pytest.approx(d_tmmd(r, preset=preset).value),
     )
-    unknown = four_scores(r, g, floor=g, preset=preset, permutations=0)  # and classes that no real touch shows have none
+    unknown = four_scores(
+        r, g, floor=g, preset=preset, permutations=0
+    )  # and classes that no real touch shows have none
     assert unknown[2].details["E_floor"] is None
     assert unknown[2].floor is None
 
@@ -102,21 +127,31 @@ def test_biased_halves_have_a_floor_of_as_many_samples_alone(preset):
 
     def drawn(n, prefix):
         x = rng.normal(size=(n, 6)) + 2
-        return FeatureSet([f"{prefix}{k}" for k in range(n)], x / np.linalg.norm(x, axis=1, keepdims=True), [f"m{k % 3}" for k in range(n)])
+        return FeatureSet(
+            [f"{prefix}{k}" for k in range(n)],
+            x / np.linalg.norm(x, axis=1, keepdims=True),
+            [f"m{k % 3}" for k in range(n)],
+        )
 
     few, many, equal = drawn(60, "a"), drawn(240, "b"), drawn(60, "c")
     for score in four_scores(few, many, floor=many, preset=preset, permutations=0)[1:]:
         assert score.floor is None
         assert "other numbers of samples" in score.note
-    assert all(s.floor is not None for s in four_scores(few, equal, floor=equal, preset=preset, permutations=0)[1:])
-    assert all(s.floor is not None for s in four_scores(few, many, floor=many, preset="paper", permutations=0)[1:])
+    assert all(
+        s.floor is not None
+        for s in four_scores(few, equal, floor=equal, preset=preset, permutations=0)[1:]
+    )
+    assert all(
+        s.floor is not None
+        for s in four_scores(few, many, floor=many, preset="paper", permutations=0)[1:]
+    )
 
 
 def videos_of(per_video, *, videos=12, spread=0.5, draw=0, prefix="", classes=2):
-    """Frames of videos whose centres are the same in every draw; ``per_video`` frames each."""
-    centres = np.random.default_rng(99).normal(size=(videos, 8)) * 0.3 + 2
+    """Frames of videos whose centers are the same in every draw; ``per_video`` frames each."""
+    centers = np.random.default_rng(99).normal(size=(videos, 8)) * 0.3 + 2
     number = np.repeat(np.arange(videos), per_video)
-    x = centres[number] + spread * np.random.default_rng(draw).normal(size=(len(number), 8))
+    x = centers[number] + spread * np.random.default_rng(draw).normal(size=(len(number), 8))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     ids = [f"{prefix}v{v:02d}/{k}" for k, v in enumerate(number)]
     return FeatureSet(ids, x, [f"m{v % classes}" for v in number], [f"v{v:02d}" for v in number])
@@ -128,7 +163,10 @@ def test_halves_of_whole_videos_have_a_floor_of_as_many_frames_alone(options):
     few, many, equal = (videos_of(n, draw=k, prefix=str(k)) for k, n in enumerate((2, 40, 2)))
     for score in four_scores(few, many, floor=many, permutations=0, **options)[1:]:
         assert score.floor is None
-        assert "No floor: real touches of other numbers of samples a group have another value" in score.note
+        assert (
+            "No floor: real touches of other numbers of samples a group have another value"
+            in score.note
+        )
         assert score.metric == "D-TMMD" or score.details["E_floor"] is not None
     for score in four_scores(few, equal, floor=equal, permutations=0, **options)[1:]:
         assert score.floor is not None
@@ -136,16 +174,32 @@ def test_halves_of_whole_videos_have_a_floor_of_as_many_frames_alone(options):
     whole = videos_of([200] * 12)
     one_less = whole.take([i for i in whole.ids if not i.endswith("/0")])
     assert (
-        four_scores(whole, videos_of([190] * 12), floor=videos_of([190] * 12), permutations=0, estimator="biased")[1].floor is None
+        four_scores(
+            whole,
+            videos_of([190] * 12),
+            floor=videos_of([190] * 12),
+            permutations=0,
+            estimator="biased",
+        )[1].floor
+        is None
     )  # 5 %
-    near, exact = (four_scores(whole, s, floor=s, permutations=0, **options)[1] for s in (one_less, whole))
+    near, exact = (
+        four_scores(whole, s, floor=s, permutations=0, **options)[1] for s in (one_less, whole)
+    )
     assert near.floor == pytest.approx(exact.floor, rel=0.02)  # a frame in 2,400 is nothing
-    lost = four_scores(whole, videos_of([150] * 12), floor=videos_of([150] * 12), permutations=0, **options)[1]
-    assert (lost.floor is None) == ("estimator" in options)  # unbiased values of many frames hardly depend on how many
+    lost = four_scores(
+        whole, videos_of([150] * 12), floor=videos_of([150] * 12), permutations=0, **options
+    )[1]
+    assert (lost.floor is None) == (
+        "estimator" in options
+    )  # unbiased values of many frames hardly depend on how many
 
 
 def test_floors_over_classes_of_other_sizes_are_none():
-    few, other = (videos_of(frames, draw=k, prefix=str(k)) for k, frames in enumerate(([4, 12] * 6, [12, 4] * 6)))
+    few, other = (
+        videos_of(frames, draw=k, prefix=str(k))
+        for k, frames in enumerate(([4, 12] * 6, [12, 4] * 6))
+    )
     assert len(few.ids) == len(other.ids)
     for preset in ("cmmd", "paper-tables"):
         own, *of_classes = four_scores(few, other, floor=other, preset=preset, permutations=0)[1:]
@@ -155,10 +209,15 @@ def test_floors_over_classes_of_other_sizes_are_none():
 
 @pytest.mark.parametrize("options", [{"preset": "cmmd"}, {"preset": "paper-tables"}, {}])
 def test_no_generator_is_nearer_to_a_floor_that_is_none(options):
-    right, collapsed = videos_of(3, draw=1, prefix="a"), videos_of(3, draw=2, prefix="a", spread=0.1)
+    right, collapsed = (
+        videos_of(3, draw=1, prefix="a"),
+        videos_of(3, draw=2, prefix="a", spread=0.1),
+    )
     many, equal = videos_of(40, draw=3, prefix="b"), videos_of(3, draw=4, prefix="c")
     for real, known in ((many, False), (equal, True)):
-        found = compare({"right": right, "collapsed": collapsed}, real, floor=real, permutations=0, **options)
+        found = compare(
+            {"right": right, "collapsed": collapsed}, real, floor=real, permutations=0, **options
+        )
         for d in found.differences[1:3]:
             assert (d.details["better"] is not None) == known
             assert ("gap" in d.details) == known
@@ -166,7 +225,9 @@ def test_no_generator_is_nearer_to_a_floor_that_is_none(options):
         for d in found.excess.differences:  # E does not depend on the number of frames
             assert d.details["better"] is not None
     some = videos_of(3, draw=4, prefix="c", classes=3)  # and other classes
-    found = compare({"right": right, "collapsed": collapsed}, some, floor=some, permutations=0, **options)
+    found = compare(
+        {"right": right, "collapsed": collapsed}, some, floor=some, permutations=0, **options
+    )
     assert ["gap" in d.details for d in found.differences] == [False, True, False, False]
 
 
@@ -175,7 +236,9 @@ def test_where_classes_are_left_out_so_they_are_of_differences():
     a, r = (world(9, classes=5, videos=2, frames=3, draw=k) for k in (1, 2))
     b = change(world(9, classes=5, videos=2, frames=3, draw=3), ids=a.ids)
     found = compare({"a": a, "b": b}, r, floor=r, permutations=0)
-    one, two, real = ([v["value"] for v in ci_tmmd(s).details["per_class"].values()] for s in (a, b, r))
+    one, two, real = (
+        [v["value"] for v in ci_tmmd(s).details["per_class"].values()] for s in (a, b, r)
+    )
     delta = np.subtract(one, two)
     d = found.differences[2]
     error = delta.std(ddof=1) / np.sqrt(5)
@@ -189,7 +252,10 @@ def test_where_classes_are_left_out_so_they_are_of_differences():
     assert d.details["gap_interval"] is not None
     assert found.differences[3].interval is not None
     assert found.excess.differences[1].interval is not None
-    assert [s.details["left_out"] for s in found.excess.scores if s.metric == "CI-TMMD E"] == ["class", "class"]
+    assert [s.details["left_out"] for s in found.excess.scores if s.metric == "CI-TMMD E"] == [
+        "class",
+        "class",
+    ]
 
 
 @pytest.mark.parametrize("seed", [1, 2, 6])
@@ -198,9 +264,13 @@ def test_sets_that_leave_out_other_things_are_compared_over_classes(seed):
     rng, of = np.random.default_rng(seed), np.repeat(np.arange(16), 3)
 
     def drawn(apart):
-        x = (0.4 * rng.normal(size=(16, 8)) + 1 + apart * np.eye(8)[np.arange(16) % 4])[of] + 0.3 * rng.normal(size=(48, 8))
+        x = (0.4 * rng.normal(size=(16, 8)) + 1 + apart * np.eye(8)[np.arange(16) % 4])[
+            of
+        ] + 0.3 * rng.normal(size=(48, 8))
         x /= np.linalg.norm(x, axis=1, keepdims=True)
-        return FeatureSet([f"{k}" for k in range(48)], x, [f"m{v % 4}" for v in of], [f"v{v:02d}" for v in of])
+        return FeatureSet(
+            [f"{k}" for k in range(48)], x, [f"m{v % 4}" for v in of], [f"v{v:02d}" for v in of]
+        )
 
     mixed_up, fine, r = drawn(0), drawn(1), drawn(1)
     one, two = (four_scores(s, r, floor=r, permutations=0)[3] for s in (mixed_up, fine))
@@ -218,15 +288,29 @@ def test_sets_that_leave_out_other_things_are_compared_over_classes(seed):
 
 def test_the_excess_over_classes_is_that_of_the_classes():
     """E of real touches without some video is unknown (a class has videos of one frame), so classes are left out, of their E and not of their distance."""
-    a, b = (change(world(3, classes=4, videos=3, frames=4, draw=k), ids=world(3, classes=4, videos=3, frames=4).ids) for k in (1, 2))
+    a, b = (
+        change(
+            world(3, classes=4, videos=3, frames=4, draw=k),
+            ids=world(3, classes=4, videos=3, frames=4).ids,
+        )
+        for k in (1, 2)
+    )
     r = world(3, classes=4, videos=3, frames=4, draw=4)
     lone = [f"c0v{v}/000" for v in (1, 2)]
     r = r.take([i for i in r.ids if not i.startswith(("c0v1", "c0v2")) or i in lone])
-    found = {d.metric: d for d in compare({"a": a, "b": b}, r, floor=r, permutations=0).excess.differences}["CI-TMMD E difference"]
-    one, two, real = (np.array([v["E"] for v in ci_tmmd(s).details["per_class"].values()]) for s in (a, b, r))
+    found = {
+        d.metric: d
+        for d in compare({"a": a, "b": b}, r, floor=r, permutations=0).excess.differences
+    }["CI-TMMD E difference"]
+    one, two, real = (
+        np.array([v["E"] for v in ci_tmmd(s).details["per_class"].values()]) for s in (a, b, r)
+    )
     without = lambda v: np.array([np.delete(v, c).mean() for c in range(4)])  # noqa: E731
     gaps = abs(without(one) - without(real)) - abs(without(two) - without(real))
-    gap, error = abs(one.mean() - real.mean()) - abs(two.mean() - real.mean()), np.sqrt(3 / 4 * ((gaps - gaps.mean()) ** 2).sum())
+    gap, error = (
+        abs(one.mean() - real.mean()) - abs(two.mean() - real.mean()),
+        np.sqrt(3 / 4 * ((gaps - gaps.mean()) ** 2).sum()),
+    )
     reach = stats.t.ppf(0.975, 3) * error
     assert found.details["gap"] == pytest.approx(gap, abs=1e-9)
     assert found.details["gap_interval"] == pytest.approx((gap - reach, gap + reach), abs=1e-9)

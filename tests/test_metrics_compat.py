@@ -26,8 +26,14 @@ def windowed(x, y, window):
         for j in range(x.shape[1] - side + 1):
             u, v = x[i : i + side, j : j + side], y[i : i + side, j : j + side]
             mu, mv = (window * u).sum(), (window * v).sum()
-            vu, vv, uv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum(), (window * (u - mu) * (v - mv)).sum()
-            values.append((2 * mu * mv + 1e-4) * (2 * uv + 9e-4) / ((mu**2 + mv**2 + 1e-4) * (vu + vv + 9e-4)))
+            vu, vv, uv = (
+                (window * (u - mu) ** 2).sum(),
+                (window * (v - mv) ** 2).sum(),
+                (window * (u - mu) * (v - mv)).sum(),
+            )
+            values.append(
+                (2 * mu * mv + 1e-4) * (2 * uv + 9e-4) / ((mu**2 + mv**2 + 1e-4) * (vu + vv + 9e-4))
+            )
     return np.mean(values)
 
 
@@ -40,12 +46,20 @@ def gaussian():
 @pytest.mark.parametrize(("h", "w", "c"), [(20, 17, 3), (7, 7, 3), (64, 64, 1)])
 def test_skimage_is_scikit_image(h, w, c):
     a, b = images(0, 4, h, w, c)
-    expected = [structural_similarity(x, y, data_range=255, channel_axis=-1) for x, y in zip(a, b, strict=True)]
+    expected = [
+        structural_similarity(x, y, data_range=255, channel_axis=-1)
+        for x, y in zip(a, b, strict=True)
+    ]
     np.testing.assert_allclose(ssim_per_image(a, b, compat="skimage"), expected, atol=1e-12)
     assert ssim(a, b, compat="skimage").value == pytest.approx(np.mean(expected), abs=1e-12)
     signed = a / 127.5 - 1, b / 127.5 - 1
-    expected = [structural_similarity(x, y, data_range=2, channel_axis=-1) for x, y in zip(*signed, strict=True)]
-    np.testing.assert_allclose(ssim_per_image(*signed, compat="skimage", data_range=(-1, 1)), expected, atol=1e-12)
+    expected = [
+        structural_similarity(x, y, data_range=2, channel_axis=-1)
+        for x, y in zip(*signed, strict=True)
+    ]
+    np.testing.assert_allclose(
+        ssim_per_image(*signed, compat="skimage", data_range=(-1, 1)), expected, atol=1e-12
+    )
     expected = [peak_signal_noise_ratio(x, y, data_range=255) for x, y in zip(a, b, strict=True)]
     np.testing.assert_allclose(psnr_per_image(a, b, compat="skimage"), expected, rtol=1e-12)
 
@@ -53,7 +67,10 @@ def test_skimage_is_scikit_image(h, w, c):
 def test_torchmetrics_mirrors_the_image_and_averages_every_pixel():
     a, b = images(1, 2)
     padded = [np.pad(v / 255, ((0, 0), (5, 5), (5, 5), (0, 0)), mode="reflect") for v in (a, b)]
-    expected = [np.mean([windowed(x[..., k], y[..., k], gaussian()) for k in range(3)]) for x, y in zip(*padded, strict=True)]
+    expected = [
+        np.mean([windowed(x[..., k], y[..., k], gaussian()) for k in range(3)])
+        for x, y in zip(*padded, strict=True)
+    ]
     np.testing.assert_allclose(ssim_per_image(a, b, compat="torchmetrics"), expected, atol=1e-12)
     assert np.abs(ssim_per_image(a, b) - expected).min() > 1e-4
 
@@ -68,13 +85,18 @@ def test_numbers_that_torchmetrics_and_piq_gave():
 
 def peer_images():
     """(2, 400, 390, 3), the first pair identical."""
-    i, j, k, n = np.meshgrid(np.arange(400), np.arange(390), np.arange(3), np.arange(2), indexing="ij")
+    i, j, k, n = np.meshgrid(
+        np.arange(400), np.arange(390), np.arange(3), np.arange(2), indexing="ij"
+    )
     a = (i * 7 + j * 3 + k * 50 + i * j // 40 + 90 * n) % 256
     b = np.where(n == 0, a, (a + (i * 13 + j * 29 + k * 17) % 41 - 20).clip(0, 255))
     return tuple(np.moveaxis(v, 3, 0).astype(np.uint8) for v in (a, b))
 
 
-PEERS = {"torchmetrics": (0.9563529992212696, 29.865734068782313), "piq": (0.9976571001618828, 53.427707206604325)}
+PEERS = {
+    "torchmetrics": (0.9563529992212696, 29.865734068782313),
+    "piq": (0.9976571001618828, 53.427707206604325),
+}
 
 
 @pytest.mark.parametrize(("side", "factor"), [(384, 2), (383, 1), (385, 2), (640, 2), (641, 3)])
@@ -83,7 +105,10 @@ def test_piq_pools_large_images_before(side, factor):
     a = rng.integers(0, 256, (1, side, side + 2, 1), dtype=np.uint8)
     b = np.clip(a + rng.normal(size=a.shape) * 60, 0, 255).astype(np.uint8)
     h, w = side // factor, (side + 2) // factor
-    small = [v[:, : h * factor, : w * factor].reshape(1, h, factor, w, factor, 1).mean(axis=(2, 4)) / 255 for v in (a, b)]
+    small = [
+        v[:, : h * factor, : w * factor].reshape(1, h, factor, w, factor, 1).mean(axis=(2, 4)) / 255
+        for v in (a, b)
+    ]
     score = ssim(a, b, compat="piq")
     assert score.value == pytest.approx(ssim(*small).value, abs=1e-12)
     assert score.settings["pooling"] == factor
@@ -92,7 +117,9 @@ def test_piq_pools_large_images_before(side, factor):
 def test_piq_of_a_small_image_is_ours():
     a, b = images(2)
     np.testing.assert_array_equal(ssim_per_image(a, b, compat="piq"), ssim_per_image(a, b))
-    expected = np.mean([windowed(a[0, ..., k] / 255, b[0, ..., k] / 255, gaussian()) for k in range(3)])
+    expected = np.mean(
+        [windowed(a[0, ..., k] / 255, b[0, ..., k] / 255, gaussian()) for k in range(3)]
+    )
     assert ssim_per_image(a, b, compat="piq")[0] == pytest.approx(expected, abs=1e-12)
 
 
@@ -178,7 +205,12 @@ def test_torchmetrics_takes_no_negative_variance():
 
     def blur(image):
         at = np.exp(-((np.arange(11) - 5) ** 2) / 4.5)
-        return ndimage.correlate1d(ndimage.correlate1d(image, at / at.sum(), axis=0, mode="mirror"), at / at.sum(), axis=1, mode="mirror")
+        return ndimage.correlate1d(
+            ndimage.correlate1d(image, at / at.sum(), axis=0, mode="mirror"),
+            at / at.sum(),
+            axis=1,
+            mode="mirror",
+        )
 
     x, y = a[0, ..., 0], b[0, ..., 0]
     mx, my = blur(x), blur(y)

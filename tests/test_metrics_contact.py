@@ -46,13 +46,20 @@ def test_the_mask_is_the_square_and_little_more():
     outside = np.ones((48, 48), bool)
     outside[8:40, 8:40] = False
     assert not mask[:, outside].any()
-    np.testing.assert_array_equal(contact_mask((touch * 255).round().astype(np.uint8), (background * 255).round().astype(np.uint8)), mask)
+    np.testing.assert_array_equal(
+        contact_mask(
+            (touch * 255).round().astype(np.uint8), (background * 255).round().astype(np.uint8)
+        ),
+        mask,
+    )
 
 
 def test_the_digest_of_gels_is_one_for_all_processes():
     gels = np.concatenate([gel(1, 16, level) for level in (0.2, 0.5, 0.6, 0.7, 0.8, 0.9)])
     assert masks.pictures_digest(gels) == masks.pictures_digest(gels[::-1]) == "988fd396bc9f00be"
-    assert masks.pictures_digest(np.rint(gels * 255).astype(np.uint8)) == masks.pictures_digest(np.rint(gels * 255) / 255)
+    assert masks.pictures_digest(np.rint(gels * 255).astype(np.uint8)) == masks.pictures_digest(
+        np.rint(gels * 255) / 255
+    )
 
 
 def test_nothing_touched_is_an_empty_mask():
@@ -103,7 +110,9 @@ def test_the_area_is_that_of_the_worlds_own_measure():
             assert not ours.any()
             continue
         np.testing.assert_array_equal(ours, ndimage.binary_dilation(theirs))
-        assert ours.mean() >= contact_area(touch.astype(np.float32), background.astype(np.float32), 4.0)
+        assert ours.mean() >= contact_area(
+            touch.astype(np.float32), background.astype(np.float32), 4.0
+        )
 
 
 def test_the_untouched_gel_of_the_world_has_no_contact():
@@ -129,7 +138,8 @@ def test_values_by_hand():
     assert found.psnr[0] == pytest.approx(20 - 10 * math.log10(share))
     assert found.empty_psnr[0] == pytest.approx(-10 * math.log10(0.04 * share))
     assert found.iou[0] == pytest.approx(
-        (mask & contact_mask(made, background)[0]).sum() / (mask | contact_mask(made, background)[0]).sum()
+        (mask & contact_mask(made, background)[0]).sum()
+        / (mask | contact_mask(made, background)[0]).sum()
     )
     negative = 2 * background - real
     assert contact_per_image(negative, real, background).residual[0] == pytest.approx(2)
@@ -156,8 +166,15 @@ def slow(made, real, mask):
         for i, j in zip(*np.nonzero(mask), strict=True):
             u, v = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
             mu, mv = (window * u).sum(), (window * v).sum()
-            vu, vv, uv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum(), (window * (u - mu) * (v - mv)).sum()
-            bright, alike = (2 * mu * mv + c1) / (mu**2 + mv**2 + c1), (2 * uv + c2) / (vu + vv + c2)
+            vu, vv, uv = (
+                (window * (u - mu) ** 2).sum(),
+                (window * (v - mv) ** 2).sum(),
+                (window * (u - mu) * (v - mv)).sum(),
+            )
+            bright, alike = (
+                (2 * mu * mv + c1) / (mu**2 + mv**2 + c1),
+                (2 * uv + c2) / (vu + vv + c2),
+            )
             values.append(-bright * alike if bright < 0 and alike < 0 else bright * alike)
     return np.mean(values)
 
@@ -173,13 +190,25 @@ def test_equals_loops_over_the_mask():
         error = energy = both = count = 0.0
         for i, j in zip(*np.nonzero(masks[n]), strict=True):
             for k in range(3):
-                d, e = real[n, i, j, k] - background[n, i, j, k], other[n, i, j, k] + 0.05 - own[n, i, j, k]
-                error, energy, both, count = error + (e - d) ** 2, energy + d**2, both + d**2 + e**2, count + 1
+                d, e = (
+                    real[n, i, j, k] - background[n, i, j, k],
+                    other[n, i, j, k] + 0.05 - own[n, i, j, k],
+                )
+                error, energy, both, count = (
+                    error + (e - d) ** 2,
+                    energy + d**2,
+                    both + d**2 + e**2,
+                    count + 1,
+                )
         assert found.residual[n] == pytest.approx(error / both, abs=1e-12)
         assert found.per_real_energy[n] == pytest.approx(error / energy, abs=1e-12)
         assert found.psnr[n] == pytest.approx(-10 * math.log10(error / count))
-        assert found.ssim[n] == pytest.approx(slow(other[n] + 0.05 - own[n], real[n] - background[n], masks[n]), abs=1e-12)
-        assert found.empty_ssim[n] == pytest.approx(slow(np.zeros_like(real[n]), real[n] - background[n], masks[n]), abs=1e-12)
+        assert found.ssim[n] == pytest.approx(
+            slow(other[n] + 0.05 - own[n], real[n] - background[n], masks[n]), abs=1e-12
+        )
+        assert found.empty_ssim[n] == pytest.approx(
+            slow(np.zeros_like(real[n]), real[n] - background[n], masks[n]), abs=1e-12
+        )
         assert found.iou[n] == (masks[n] & made_masks[n]).sum() / (masks[n] | made_masks[n]).sum()
 
 
@@ -188,7 +217,9 @@ def test_what_lies_outside_the_contact_earns_and_costs_nothing():
     made = pressed(5, 3, 64)[1]
     far = np.zeros((64, 64), bool)
     far[44:] = True  # further from the mask than half a window
-    assert not ndimage.binary_dilation(contact_mask(real, background).any(0), iterations=5)[far].any()
+    assert not ndimage.binary_dilation(contact_mask(real, background).any(0), iterations=5)[
+        far
+    ].any()
     junk = made.copy()
     junk[:, far] = np.random.default_rng(6).random((3, int(far.sum()), 3))
     plain, spoilt = (contact_per_image(v, real, background) for v in (made, junk))
@@ -207,7 +238,9 @@ def test_empty_gel_and_the_touch_itself_are_the_two_ends():
     assert several.value == pytest.approx(several.details["empty"], abs=1e-12)
     assert several.value < 0.1
     assert noise.value == pytest.approx(noise.details["empty"])
-    elsewhere = np.clip(background + 0.1, 0, 1)  # empty gel of another sensor, on its own background
+    elsewhere = np.clip(
+        background + 0.1, 0, 1
+    )  # empty gel of another sensor, on its own background
     assert contact_residual(elsewhere, real, background, generated_background=elsewhere).value == 1
     residual, similarity, noise, overlap, several = contact_scores(real, real, background)
     assert (residual.value, overlap.value) == (0, 1)
@@ -218,7 +251,10 @@ def test_empty_gel_and_the_touch_itself_are_the_two_ends():
 
 
 def world_touches():
-    world = World(WorldOptions(objects_per_material=2, touches_per_video=2, frames_per_touch=1, materials=8), cache=40)
+    world = World(
+        WorldOptions(objects_per_material=2, touches_per_video=2, frames_per_touch=1, materials=8),
+        cache=40,
+    )
     samples = [world[k] for k in range(len(world))]
     stacks = [np.stack([s[k] for s in samples]) for k in ("tactile", "background")]
     return (*stacks, [s["material"] for s in samples], [s["video"] for s in samples])
@@ -240,13 +276,21 @@ def test_another_touch_of_the_same_material_does_not_lose_to_empty_gel():
     values = {}
     for name, keep in (("video", same_video), ("material", same_material)):
         i, j = partners(keep)
-        values[name] = contact_scores(touch[j], touch[i], background[i], generated_background=background[j], groups=video[i].tolist())
+        values[name] = contact_scores(
+            touch[j],
+            touch[i],
+            background[i],
+            generated_background=background[j],
+            groups=video[i].tolist(),
+        )
     empty = contact_scores(background, touch, background)
     assert empty[0].value == 1
     for scores in values.values():
         assert scores[0].value < 0.97
         assert scores[0].interval[1] < 1
-        assert scores[0].details["per_real_energy"] > 1.2  # by the real energy alone, and by PSNR, empty gel would win
+        assert (
+            scores[0].details["per_real_energy"] > 1.2
+        )  # by the real energy alone, and by PSNR, empty gel would win
         assert scores[2].value < scores[2].details["empty"]
         assert scores[1].value > scores[1].details["empty"]
         assert scores[3].value > 0.15
@@ -260,7 +304,9 @@ def test_touches_without_contact_are_counted_and_named():
     background, real = pressed(8, 5)
     real[1], real[3] = background[1], background[3]
     made = pressed(9, 5)[1]
-    scores = contact_scores(made, real, background, ids=list("abcde"), groups=list("uuvvw"), subject="mini", split="s")
+    scores = contact_scores(
+        made, real, background, ids=list("abcde"), groups=list("uuvvw"), subject="mini", split="s"
+    )
     kept = [0, 2, 4]
     alone = contact_scores(made[kept], real[kept], background[kept], groups=list("uvw"))
     for score, other in zip(scores, alone, strict=True):
@@ -283,9 +329,19 @@ def test_single_scores_directions_intervals_and_settings():
     background, real = pressed(10, 6)
     made = pressed(11, 6)[1]
     scores = contact_scores(made, real, background)
-    assert [s.metric for s in scores] == ["contact residual", "contact SSIM", "contact PSNR", "contact IoU", "contact MS-SSIM"]
+    assert [s.metric for s in scores] == [
+        "contact residual",
+        "contact SSIM",
+        "contact PSNR",
+        "contact IoU",
+        "contact MS-SSIM",
+    ]
     assert [s.higher_is_better for s in scores] == [False, True, True, True, True]
-    for call, score in zip((contact_residual, contact_ssim, contact_psnr, contact_iou, contact_ms_ssim), scores, strict=True):
+    for call, score in zip(
+        (contact_residual, contact_ssim, contact_psnr, contact_iou, contact_ms_ssim),
+        scores,
+        strict=True,
+    ):
         assert call(made, real, background) == score
     values = contact_per_image(made, real, background).residual
     reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
@@ -296,14 +352,18 @@ def test_single_scores_directions_intervals_and_settings():
             require_comparable([scores[0], contact_residual(made, real, background, **options)])
     require_comparable([scores[0], contact_residual(real, real, background, subject="real")])
     turned = slice(None, None, -1)
-    require_comparable([scores[0], contact_residual(made[turned], real[turned], background[turned])])
+    require_comparable(
+        [scores[0], contact_residual(made[turned], real[turned], background[turned])]
+    )
     some = contact_residual(made[:2], real[:2], background[:2])
     assert (
         some.settings["background"]
-        == contact_residual(*(np.concatenate([v[:2]] * 2) for v in (made, real, background))).settings["background"]
+        == contact_residual(
+            *(np.concatenate([v[:2]] * 2) for v in (made, real, background))
+        ).settings["background"]
     )
-    grey = [v.mean(axis=3, keepdims=True) for v in (made, real, background)]
-    assert 0 < contact_residual(*grey).value < 2
+    gray = [v.mean(axis=3, keepdims=True) for v in (made, real, background)]
+    assert 0 < contact_residual(*gray).value < 2
 
 
 REAL_BACKGROUND, REAL = pressed(12)
@@ -322,7 +382,13 @@ def spoilt(x, value):
     [
         (spoilt(MADE, np.nan), REAL, REAL_BACKGROUND, {}, ["The generated images", "image 2"]),
         (MADE, spoilt(REAL, np.nan), REAL_BACKGROUND, {}, ["The reference images", "image 2"]),
-        (MADE, REAL, spoilt(REAL_BACKGROUND, 1.5), {}, ["The reference background images", "1.5", "image 2"]),
+        (
+            MADE,
+            REAL,
+            spoilt(REAL_BACKGROUND, 1.5),
+            {},
+            ["The reference background images", "1.5", "image 2"],
+        ),
         (
             MADE,
             REAL,
@@ -330,10 +396,22 @@ def spoilt(x, value):
             {"generated_background": spoilt(REAL_BACKGROUND, -1)},
             ["The generated background images", "image 2"],
         ),
-        (MADE, REAL, REAL_BACKGROUND[:2], {}, ["The reference touches and their backgrounds", "one to one"]),
+        (
+            MADE,
+            REAL,
+            REAL_BACKGROUND[:2],
+            {},
+            ["The reference touches and their backgrounds", "one to one"],
+        ),
         (MADE[:2], REAL, REAL_BACKGROUND, {}, ["one to one"]),
         (MADE[:, :40], REAL[:, :40], REAL_BACKGROUND, {}, ["one to one"]),
-        (MADE[:, :40], REAL, REAL_BACKGROUND, {"generated_background": REAL_BACKGROUND[:, :40]}, ["Generated and reference", "one to one"]),
+        (
+            MADE[:, :40],
+            REAL,
+            REAL_BACKGROUND,
+            {"generated_background": REAL_BACKGROUND[:, :40]},
+            ["Generated and reference", "one to one"],
+        ),
         (MADE[:0], REAL[:0], REAL_BACKGROUND[:0], {}, ["n >= 1"]),
         (MADE[0], REAL[0], REAL_BACKGROUND[0], {}, ["shape (n, h, w, 3)"]),
         (MADE[:, :10], REAL[:, :10], REAL_BACKGROUND[:, :10], {}, ["11 x 11", "10 x 48"]),
@@ -350,8 +428,8 @@ def test_refuses_bad_input(call, made, real, background, options, words):
 
 
 def test_refuses_bad_options():
-    with pytest.raises(PalpateError, match="colour"):
-        contact_scores(MADE, REAL, REAL_BACKGROUND, colour=1)
+    with pytest.raises(PalpateError, match="color"):
+        contact_scores(MADE, REAL, REAL_BACKGROUND, color=1)
     with pytest.raises(PalpateError, match="ids"):
         contact_scores(MADE, REAL, REAL_BACKGROUND, ids=["a"])
     with pytest.raises(PalpateError, match="least"):
@@ -366,17 +444,28 @@ def test_the_real_clips(real_data):
     root = real_data / "touch_and_go" / "clips"
     for clip, area in {"clip_stone_0001": (0.25, 0.75), "clip_wood_00001": (0.7, 1.0)}.items():
         lines = (root / "label.txt").read_text().split()
-        numbers = sorted(int(line.split(",")[0].split("/")[1][:-4]) for line in lines if line.startswith(clip + "/"))
+        numbers = sorted(
+            int(line.split(",")[0].split("/")[1][:-4])
+            for line in lines
+            if line.startswith(clip + "/")
+        )
         first = numbers[0]
         with av.open(str(root / "dataset" / clip / "gelsight.mp4")) as file:
-            frames = [f.to_ndarray(format="rgb24")[:480:8, 80:560:8] for _, f in zip(range(first + 20), file.decode(video=0), strict=False)]
+            frames = [
+                f.to_ndarray(format="rgb24")[:480:8, 80:560:8]
+                for _, f in zip(range(first + 20), file.decode(video=0), strict=False)
+            ]
         used = [k for k in numbers if k < len(frames)][8::4]
-        touch, background = np.stack([frames[k] for k in used]), np.stack([frames[first - 4]] * len(used))
+        touch, background = (
+            np.stack([frames[k] for k in used]),
+            np.stack([frames[first - 4]] * len(used)),
+        )
         mask = contact_mask(touch, background)
         assert mask.any(axis=(1, 2)).all()
         assert area[0] <= mask.mean() <= area[1]
         assert not contact_mask(
-            np.stack(frames[4 : first - 15 : 4]), np.stack(frames[0 : first - 19 : 4])[: len(frames[4 : first - 15 : 4])]
+            np.stack(frames[4 : first - 15 : 4]),
+            np.stack(frames[0 : first - 19 : 4])[: len(frames[4 : first - 15 : 4])],
         ).any()
         scores = contact_scores(background, touch, background)
         assert scores[0].value == 1
@@ -413,14 +502,21 @@ def slow_ms_ssim(made, real, kept, scales):
             if j:
                 pad = [(0, n % 2) for n in x.shape]
                 x, y, weight = np.pad(x, pad, "edge"), np.pad(y, pad, "edge"), np.pad(weight, pad)
-                x, y, weight = ((v[::2, ::2] + v[1::2, ::2] + v[::2, 1::2] + v[1::2, 1::2]) / 4 for v in (x, y, weight))
+                x, y, weight = (
+                    (v[::2, ::2] + v[1::2, ::2] + v[::2, 1::2] + v[1::2, 1::2]) / 4
+                    for v in (x, y, weight)
+                )
             above = below = 0.0
             wide = [np.pad(v, 5, "reflect") for v in (x, y)]
             for r in range(x.shape[0]):
                 for c in range(x.shape[1]):
                     a, b = (v[r : r + 11, c : c + 11] for v in wide)
                     ma, mb = (window * a).sum(), (window * b).sum()
-                    va, vb, cov = (window * (a - ma) ** 2).sum(), (window * (b - mb) ** 2).sum(), (window * (a - ma) * (b - mb)).sum()
+                    va, vb, cov = (
+                        (window * (a - ma) ** 2).sum(),
+                        (window * (b - mb) ** 2).sum(),
+                        (window * (a - ma) * (b - mb)).sum(),
+                    )
                     value = (2 * cov + c2) / (va + vb + c2)
                     if j == scales - 1:
                         bright = (2 * ma * mb + c1) / (ma**2 + mb**2 + c1)
@@ -438,25 +534,35 @@ def test_contact_ms_ssim_is_the_definition_by_windows(size):
     real, made = background.copy(), background.copy()
     shape = np.clip(ndimage.gaussian_filter(rng.normal(size=(30, 40, 3)), (2, 2, 0)), -0.4, 0.4)
     real[0, -30:, -40:] += 0.8 * shape
-    made[0, -30:, -40:] += 0.8 * ndimage.shift(shape, (1, 1, 0)) + 0.01 * rng.normal(size=shape.shape)
+    made[0, -30:, -40:] += 0.8 * ndimage.shift(shape, (1, 1, 0)) + 0.01 * rng.normal(
+        size=shape.shape
+    )
     score = contact_ms_ssim(made, real, background, markers="keep")
     kept = contact_mask(real, background)[0]
     scales = 3
     assert score.settings["scales"] == scales
-    assert score.value == pytest.approx(slow_ms_ssim((made - background)[0], (real - background)[0], kept, scales), rel=1e-9)
+    assert score.value == pytest.approx(
+        slow_ms_ssim((made - background)[0], (real - background)[0], kept, scales), rel=1e-9
+    )
     assert 0.05 < score.value < 0.95
 
 
-def test_contact_pictures_are_grey_but_for_the_contact():
+def test_contact_pictures_are_gray_but_for_the_contact():
     background, real = pressed(16)
     made = pressed(17)[1]
     found = contact_pictures(made, real, background)
-    found_8_bit = contact_pictures(*(np.round(v * 255).astype(np.uint8) for v in (made, real, background)))
+    found_8_bit = contact_pictures(
+        *(np.round(v * 255).astype(np.uint8) for v in (made, real, background))
+    )
     for picture, touch in ((found.generated, made), (found.reference, real)):
         assert picture.dtype == np.float32
         assert (picture[~found.mask] == 0.5).all()
-        np.testing.assert_allclose(picture[found.mask], np.clip(0.5 + touch - background, 0, 1)[found.mask], atol=1e-6)
-    assert np.abs(found_8_bit.reference - found.reference)[found.mask & found_8_bit.mask].max() < 0.01
+        np.testing.assert_allclose(
+            picture[found.mask], np.clip(0.5 + touch - background, 0, 1)[found.mask], atol=1e-6
+        )
+    assert (
+        np.abs(found_8_bit.reference - found.reference)[found.mask & found_8_bit.mask].max() < 0.01
+    )
     assert (found.mask & ~contact_mask(real, background)).sum() == 0
     assert found.mask.any(axis=(1, 2)).all()
     assert not contact_pictures(made, background, background).mask.any()

@@ -14,7 +14,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import metric_coverage as study
 
-VIDEOS, EACH, FLAT = (12, 24, 40), 100, 30  # EACH replicates of each number of videos, FLAT of them also without groups
+VIDEOS, EACH, FLAT = (
+    (12, 24, 40),
+    100,
+    30,
+)  # EACH replicates of each number of videos, FLAT of them also without groups
 
 
 @pytest.fixture(scope="module")
@@ -32,28 +36,36 @@ def share(tallies, name):
 
 
 def test_truth_is_that_of_a_closed_form():
-    # Without effects of class, normalised rows aside: E k of Gaussians has a closed form, (s/(s+v))^(d/2) exp(-|m|^2 / (2 (s+v))).
+    # Without effects of class, normalized rows aside: E k of Gaussians has a closed form, (s/(s+v))^(d/2) exp(-|m|^2 / (2 (s+v))).
     model = study.Model.make()
     rng = np.random.default_rng(0)
     labels = np.zeros(20_000, dtype=np.intp)
     raw = study.Model(model.mean, 0 * model.classes, model.shift)
     rows, _ = raw.frames(rng, raw.videos(rng, len(labels)), labels, np.full(len(labels), 2))
     first, second = rows[0::2], rows[1::2]
-    # To first order E = 1000 (variance of the video effect) / sigma^2, of which normalising keeps the part across the mean.
+    # To first order E = 1000 (variance of the video effect) / sigma^2, of which normalizing keeps the part across the mean.
     expected = 1000 * ((first - first.mean(0)) * (second - second.mean(0))).sum(axis=1).mean() / 100
     found = study.truth_of(raw, videos=40_000)
     np.testing.assert_allclose(found.mixture, expected, rtol=0.03)
     np.testing.assert_allclose(found.own, found.mixture, rtol=0.05)
     np.testing.assert_allclose(found.between, 0, atol=0.02)
     shifted, _ = raw.frames(rng, raw.videos(rng, len(labels)), labels, np.full(len(labels), 1), 1.0)
-    np.testing.assert_allclose(found.tmmd[1.0], 9.9 * ((shifted.mean(0) - first.mean(0)) ** 2).sum(), rtol=0.03)
+    np.testing.assert_allclose(
+        found.tmmd[1.0], 9.9 * ((shifted.mean(0) - first.mean(0)) ** 2).sum(), rtol=0.03
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", study.KINDS)
 def test_tmmd_by_video_covers_and_frames_fail(model, truth, kind):
-    found = [study.tally_tmmd(model, truth, videos, kind == "paired", EACH, seed=11, frames=FLAT) for videos in VIDEOS]
-    tallies, rejected = [t for t, _ in found], {k: np.concatenate([r[k] for _, r in found]).mean() for k in ("videos", "frames")}
+    found = [
+        study.tally_tmmd(model, truth, videos, kind == "paired", EACH, seed=11, frames=FLAT)
+        for videos in VIDEOS
+    ]
+    tallies, rejected = (
+        [t for t, _ in found],
+        {k: np.concatenate([r[k] for _, r in found]).mean() for k in ("videos", "frames")},
+    )
     low, high = study.COVERAGE
     assert low <= share(tallies, "TMMD") <= high
     assert study.REJECTION[0] <= rejected["videos"] <= study.REJECTION[1]
@@ -68,15 +80,28 @@ def test_tmmd_by_video_covers_and_frames_fail(model, truth, kind):
 
 @pytest.mark.slow
 def test_what_needs_no_reference_covers(model, truth):
-    tallies = [study.tally_halves(model, truth, videos, EACH, seed=12, frames=FLAT) for videos in VIDEOS]
-    for name in ("I-TMMD", "I-TMMD: E", "CI-TMMD", "CI-TMMD: E", "D: mean inter-class", "D: E_ratio", "D-TMMD"):
+    tallies = [
+        study.tally_halves(model, truth, videos, EACH, seed=12, frames=FLAT) for videos in VIDEOS
+    ]
+    for name in (
+        "I-TMMD",
+        "I-TMMD: E",
+        "CI-TMMD",
+        "CI-TMMD: E",
+        "D: mean inter-class",
+        "D: E_ratio",
+        "D-TMMD",
+    ):
         assert study.COVERAGE[0] <= share(tallies, name) <= study.COVERAGE[1], name
     assert share(tallies, "D: mean inter-class, frames") < 0.75
 
 
 @pytest.mark.slow
 def test_paired_differences_cover(model, truth):
-    tallies, wider = zip(*[study.tally_difference(model, truth, videos, EACH, seed=13) for videos in VIDEOS], strict=True)
+    tallies, wider = zip(
+        *[study.tally_difference(model, truth, videos, EACH, seed=13) for videos in VIDEOS],
+        strict=True,
+    )
     covered = np.concatenate([t.covered for t in tallies]).mean()
     assert study.COVERAGE[0] <= covered <= study.COVERAGE[1]
     assert min(wider) > 1.5  # what pairing is for

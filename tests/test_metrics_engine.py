@@ -12,10 +12,10 @@ from palpate.metrics import Gaussian, Linear, Polynomial, distance, four_scores,
 from palpate.metrics import blocked as blocked_module
 from palpate.metrics import engine as engine_module
 from palpate.metrics.arrays import ArrayApiOps, Ops, ops_of
-from palpate.metrics.blocked import blocked_sums, centred_squares
+from palpate.metrics.blocked import blocked_sums, centered_squares
 from palpate.metrics.engine import kernel_sums
 from palpate.metrics.kernels import gaussian, median_distance
-from palpate.metrics.moments import Moments, centre_of, rest_factor
+from palpate.metrics.moments import Moments, center_of, rest_factor
 from palpate.metrics.sums import PairSums
 from test_metrics_mmd import loop_mmd, unit_rows
 
@@ -39,7 +39,10 @@ def layout(seed, n, segments=3, units=5):
 
 KERNELS = {
     "gaussian": (Gaussian((2.0,)), lambda a, b: np.expm1(-((a - b) ** 2).sum() / 8)),
-    "several": (Gaussian((1.0, 3.0)), lambda a, b: np.mean([np.expm1(-((a - b) ** 2).sum() / (2 * s * s)) for s in (1, 3)])),
+    "several": (
+        Gaussian((1.0, 3.0)),
+        lambda a, b: np.mean([np.expm1(-((a - b) ** 2).sum() / (2 * s * s)) for s in (1, 3)]),
+    ),
     "polynomial": (Polynomial(), lambda a, b: (a @ b / len(a) + 1) ** 3),
     "quadratic": (Polynomial(2, 0.5, 0.25), lambda a, b: (0.5 * a @ b + 0.25) ** 2),
     "linear": (Linear(), lambda a, b: a @ b),
@@ -47,7 +50,12 @@ KERNELS = {
 
 
 @pytest.mark.parametrize("name", KERNELS)
-@given(seed=st.integers(0, 10**6), n=st.integers(1, 24), units=st.sampled_from([1, 3, 30]), block=st.sampled_from([3, 1024]))
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 24),
+    units=st.sampled_from([1, 3, 30]),
+    block=st.sampled_from([3, 1024]),
+)
 @settings(max_examples=15, deadline=None)
 def test_sums_equal_the_double_loop(name, seed, n, units, block):
     kernel, k = KERNELS[name]
@@ -56,7 +64,11 @@ def test_sums_equal_the_double_loop(name, seed, n, units, block):
     rows, same = loop_sums(x, segment, unit, 3, k)
     np.testing.assert_allclose(found.totals.sums, rows, atol=1e-10)
     np.testing.assert_allclose(found.totals.same, same, atol=1e-10)
-    np.testing.assert_allclose(found.totals.own, [sum(k(x[i], x[i]) for i in np.flatnonzero(segment == s)) for s in range(3)], atol=1e-10)
+    np.testing.assert_allclose(
+        found.totals.own,
+        [sum(k(x[i], x[i]) for i in np.flatnonzero(segment == s)) for s in range(3)],
+        atol=1e-10,
+    )
     if found.block is not None:
         item = found.segment * 1000 + found.unit
         at = [np.flatnonzero(segment * 1000 + unit == one) for one in item]
@@ -76,7 +88,13 @@ def test_items_and_rows_give_the_same_sums(most, expected, monkeypatch):
     left = list(found.leave_one_out())
     for u, without in zip(found.unit_order, left, strict=True):
         keep = unit != u
-        rows, same = loop_sums(x[keep], segment[keep], unit[keep], 3, lambda a, b: np.expm1(-((a - b) ** 2).sum() / 200))
+        rows, same = loop_sums(
+            x[keep],
+            segment[keep],
+            unit[keep],
+            3,
+            lambda a, b: np.expm1(-((a - b) ** 2).sum() / 200),
+        )
         np.testing.assert_allclose(without.sums, rows, atol=1e-12)
         np.testing.assert_allclose(without.same, same, atol=1e-12)
         np.testing.assert_array_equal(without.n, np.bincount(segment[keep], minlength=3))
@@ -91,15 +109,23 @@ def test_the_result_does_not_depend_on_threads(monkeypatch):
     np.testing.assert_array_equal(run(), one)
 
 
-def test_centred_squares_are_those_of_the_centred_matrix():
+def test_centered_squares_are_those_of_the_centered_matrix():
     x = unit_rows(2, 40, 5)
     k = np.expm1(-((x[:, None] - x[None]) ** 2).sum(-1) / 2)
     h = np.eye(40) - 1 / 40
     slow = h @ k @ h
     own = np.diagonal(slow)
     expect = ((slow**2).sum() - (own**2).sum(), own.sum(), (own**2).sum())
-    assert centred_squares((k**2).sum(), k.sum(axis=1)) == pytest.approx(expect, rel=1e-10)
-    got = blocked_sums(x, np.zeros(40, int), np.arange(40) % 7, segments=1, kernel=Gaussian((1.0,)), block=9, spread=[np.arange(1)])
+    assert centered_squares((k**2).sum(), k.sum(axis=1)) == pytest.approx(expect, rel=1e-10)
+    got = blocked_sums(
+        x,
+        np.zeros(40, int),
+        np.arange(40) % 7,
+        segments=1,
+        kernel=Gaussian((1.0,)),
+        block=9,
+        spread=[np.arange(1)],
+    )
     assert got.spread[0] == pytest.approx(expect, rel=1e-10)
 
 
@@ -109,9 +135,14 @@ def spread_rows(seed, n, d, scale=0.4):
 
 
 @given(
-    seed=st.integers(0, 10**6), m=st.integers(3, 60), n=st.integers(3, 60), d=st.integers(1, 9), sigma=st.sampled_from([1.0, 3.0, 10.0]),
-    estimator=st.sampled_from(["unbiased", "biased", "grouped"]), scale=st.sampled_from([0.05, 1.0, 5.0]),
-)  # fmt: skip
+    seed=st.integers(0, 10**6),
+    m=st.integers(3, 60),
+    n=st.integers(3, 60),
+    d=st.integers(1, 9),
+    sigma=st.sampled_from([1.0, 3.0, 10.0]),
+    estimator=st.sampled_from(["unbiased", "biased", "grouped"]),
+    scale=st.sampled_from([0.05, 1.0, 5.0]),
+)
 @settings(max_examples=80, deadline=None)
 def test_moments_are_within_their_bound_of_the_loop(seed, m, n, d, sigma, estimator, scale):
     x, y = spread_rows(seed, m, d, scale), spread_rows(seed + 1, n, d, scale)
@@ -140,25 +171,31 @@ def test_float32_moments_keep_1e_minus_6_beside_their_bound():
     y += np.float32(0.01)
     got = distance(x, y, normalize=True, backend="moments")
     assert (
-        abs(got.value - distance(x.astype(np.float64), y.astype(np.float64), normalize=True, backend="blocked").value) <= got.bound + 1e-6
+        abs(
+            got.value
+            - distance(
+                x.astype(np.float64), y.astype(np.float64), normalize=True, backend="blocked"
+            ).value
+        )
+        <= got.bound + 1e-6
     )
 
 
 def test_moments_add_up_over_batches_and_processes():
     x, item = spread_rows(0, 500, 8), np.random.default_rng(0).integers(0, 4, 500)
-    whole = Moments.empty(centre_of([x]), 10.0, 4)
+    whole = Moments.empty(center_of([x]), 10.0, 4)
     whole.add(x, item)
     parts = []
     for at in np.array_split(np.random.default_rng(1).permutation(500), 7):
-        part = Moments.empty(whole.centre, 10.0, 4)
+        part = Moments.empty(whole.center, 10.0, 4)
         part.add(x[at], item[at])
         parts.append(part)
     merged = parts[0].merge(parts[1:])
     for a, b in zip(merged.products(), whole.products(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
     assert merged.rho == whole.rho
-    with pytest.raises(PalpateError, match="share centre"):
-        whole.merge([Moments.empty(whole.centre, 5.0, 4)])
+    with pytest.raises(PalpateError, match="share center"):
+        whole.merge([Moments.empty(whole.center, 5.0, 4)])
     exact = blocked_sums(x, item, item, segments=4, kernel=Gaussian()).sums
     sums = merged.sums(np.arange(4), np.arange(4), 4)
     assert (np.abs(sums.totals.sums - exact.totals.sums) <= sums.bound.totals.sums + 1e-12).all()
@@ -167,8 +204,12 @@ def test_moments_add_up_over_batches_and_processes():
 
 def test_spread_from_moments_is_right_to_leading_order():
     x = spread_rows(3, 300, 12)
-    exact = blocked_sums(x, np.zeros(300, int), np.arange(300), segments=1, kernel=Gaussian(), spread=[np.arange(1)]).spread[0]
-    moments = Moments.empty(np.zeros(12), 10.0, 1)  # a poor centre: only the leading order is lost, not the value
+    exact = blocked_sums(
+        x, np.zeros(300, int), np.arange(300), segments=1, kernel=Gaussian(), spread=[np.arange(1)]
+    ).spread[0]
+    moments = Moments.empty(
+        np.zeros(12), 10.0, 1
+    )  # a poor center: only the leading order is lost, not the value
     moments.add(x)
     found = moments.spread(np.arange(1))
     assert found[:2] == pytest.approx(tuple(exact[:2]), rel=0.03)
@@ -181,7 +222,11 @@ def calls(monkeypatch):
     tried = []
     for name in ("_moments", "blocked_sums"):
         real = getattr(engine_module, name)
-        monkeypatch.setattr(engine_module, name, lambda *a, _n=name, _r=real, **k: (tried.append(_n), _r(*a, **k))[1])
+        monkeypatch.setattr(
+            engine_module,
+            name,
+            lambda *a, _n=name, _r=real, **k: (tried.append(_n), _r(*a, **k))[1],
+        )
     monkeypatch.setattr(engine_module, "LEAST_ROWS", 100)
     return tried
 
@@ -206,11 +251,19 @@ def test_auto_takes_moments_where_they_are_cheaper_and_good_enough(calls, monkey
 
 def features_of(x, prefix, videos=10):
     names = [f"{prefix}{k}" for k in range(len(x))]
-    return FeatureSet(names, x, [f"c{k % 3}" for k in range(len(x))], [f"{prefix}v{k % videos}" for k in range(len(x))])
+    return FeatureSet(
+        names,
+        x,
+        [f"c{k % 3}" for k in range(len(x))],
+        [f"{prefix}v{k % videos}" for k in range(len(x))],
+    )
 
 
 def test_the_four_metrics_take_moments_within_the_tolerance_and_blocks_beyond(calls):
-    g, r = features_of(spread_rows(0, 240, 8), "a", 12), features_of(spread_rows(1, 240, 8), "b", 12)
+    g, r = (
+        features_of(spread_rows(0, 240, 8), "a", 12),
+        features_of(spread_rows(1, 240, 8), "b", 12),
+    )
     easy = four_scores(g, r, permutations=0)
     assert set(calls) == {"_moments"}
     assert {s.details["backend"] for s in easy} == {"moments"}
@@ -225,17 +278,25 @@ def test_the_four_metrics_take_moments_within_the_tolerance_and_blocks_beyond(ca
     one = easy[1].details
     assert abs(one["E"] - hard[1].details["E"]) <= one["E_bound"] + 1e-9
     calls.clear()
-    assert four_scores(g, r, permutations=0, scale=1.0, tolerance=1e-4)[0].details["backend"] == "moments"
     assert (
-        four_scores(g, r, permutations=0, scale=1.0, tolerance=easy[0].details["bound"] / 2)[0].details["backend"] == "blocked"
+        four_scores(g, r, permutations=0, scale=1.0, tolerance=1e-4)[0].details["backend"]
+        == "moments"
+    )
+    assert (
+        four_scores(g, r, permutations=0, scale=1.0, tolerance=easy[0].details["bound"] / 2)[
+            0
+        ].details["backend"]
+        == "blocked"
     )  # tolerances are at scale 1000
 
 
-@pytest.mark.parametrize(("sigma", "scale"), [(0.3, 1.0), (0.05, 1.0), (0.03, 1.0), (0.003, 1.0), (10.0, 300.0)])
+@pytest.mark.parametrize(
+    ("sigma", "scale"), [(0.3, 1.0), (0.05, 1.0), (0.03, 1.0), (0.003, 1.0), (10.0, 300.0)]
+)
 def test_a_bound_that_overflows_is_no_bound(calls, sigma, scale):
     rng = np.random.default_rng(0)
-    centres = unit_rows(0, 20, 8)
-    x = centres[np.arange(400) % 20] + 1e-3 * rng.normal(size=(400, 8))
+    centers = unit_rows(0, 20, 8)
+    x = centers[np.arange(400) % 20] + 1e-3 * rng.normal(size=(400, 8))
     x = scale * x / np.linalg.norm(x, axis=1, keepdims=True)
     options = {"sigma": sigma, "normalize": False}
     got = distance(x[::2], x[1::2], **options)
@@ -244,7 +305,10 @@ def test_a_bound_that_overflows_is_no_bound(calls, sigma, scale):
     with pytest.raises(PalpateError, match="wide against the features"):
         distance(x[::2], x[1::2], backend="moments", **options)
     one = features_of(x, "a", 20)
-    exact, forced = i_tmmd(one, backend="blocked", **options), i_tmmd(one, backend="moments", **options)
+    exact, forced = (
+        i_tmmd(one, backend="blocked", **options),
+        i_tmmd(one, backend="moments", **options),
+    )
     assert i_tmmd(one, **options).value == exact.value
     assert forced.value is None
     assert "do not bound" in forced.note
@@ -254,17 +318,27 @@ def test_a_bound_that_overflows_is_no_bound(calls, sigma, scale):
 def test_the_median_is_that_of_the_rows_that_are_scored(sigma):
     g, r = features_of(spread_rows(0, 60, 5), "a"), features_of(spread_rows(1, 60, 5), "b")
     far = [dataclasses.replace(s, features=30 * s.features) for s in (g, r)]
-    plain, scaled = (four_scores(*sets, floor=sets[1], sigma=sigma, normalize=True, permutations=0) for sets in ((g, r), far))
+    plain, scaled = (
+        four_scores(*sets, floor=sets[1], sigma=sigma, normalize=True, permutations=0)
+        for sets in ((g, r), far)
+    )
     for a, b in zip(plain, scaled, strict=True):
-        assert (a.value, a.floor) == (pytest.approx(b.value, abs=1e-9), pytest.approx(b.floor, abs=1e-9) if b.floor is not None else None)
+        assert (a.value, a.floor) == (
+            pytest.approx(b.value, abs=1e-9),
+            pytest.approx(b.floor, abs=1e-9) if b.floor is not None else None,
+        )
 
 
 def test_more_refusals():
     x = unit_rows(0, 12, 3)
     for options, words in (
-        ({"tolerance": -1}, "tolerance"), ({"tolerance": float("nan")}, "tolerance"), ({"sigma": None}, "sigma"), ({"block": 1.5}, "block"),
-        ({"groups_x": ["a"]}, "groups_x"), ({"groups_y": ["a"] * 3, "sigma": "median"}, "groups_y"),
-    ):  # fmt: skip
+        ({"tolerance": -1}, "tolerance"),
+        ({"tolerance": float("nan")}, "tolerance"),
+        ({"sigma": None}, "sigma"),
+        ({"block": 1.5}, "block"),
+        ({"groups_x": ["a"]}, "groups_x"),
+        ({"groups_y": ["a"] * 3, "sigma": "median"}, "groups_y"),
+    ):
         with pytest.raises(PalpateError, match=words):
             distance(x, x[::-1], **options)
     one = features_of(x, "a", 3)
@@ -277,10 +351,12 @@ def test_more_refusals():
         with pytest.raises(PalpateError, match=words):
             i_tmmd(one, **options)
     assert mmd2(x.astype(">f8"), x[:5]) == mmd2(x, x[:5])
-    assert mmd2(np.asfortranarray(x), x[::-1][:5]) == pytest.approx(mmd2(x, x[::-1][:5].copy()), abs=1e-12)
+    assert mmd2(np.asfortranarray(x), x[::-1][:5]) == pytest.approx(
+        mmd2(x, x[::-1][:5].copy()), abs=1e-12
+    )
     assert mmd2(x, x[:5], sigma=np.array(10.0)) == mmd2(x, x[:5])
     slack = x * (1 + 5e-3)
-    with pytest.raises(PalpateError, match="L2-normalised"):
+    with pytest.raises(PalpateError, match="L2-normalized"):
         mmd2(slack, x)
     assert np.isfinite(mmd2(x * (1 + 5e-4), x))
 
@@ -304,7 +380,12 @@ def test_changes_in_a_private_map_survive(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options", [{"sigma": (5.0, 10.0)}, {"kernel": Linear()}, {"groups_x": range(40), "groups_y": range(40), "estimator": "grouped"}]
+    "options",
+    [
+        {"sigma": (5.0, 10.0)},
+        {"kernel": Linear()},
+        {"groups_x": range(40), "groups_y": range(40), "estimator": "grouped"},
+    ],
 )
 def test_moments_are_refused_where_there_are_none(options, monkeypatch):
     monkeypatch.setattr(engine_module, "MOMENT_BYTES", 1000)
@@ -324,7 +405,9 @@ def test_arrays_on_disk_are_streamed(tmp_path, monkeypatch):
     got = distance(*on_disk)
     assert got.backend == "moments"
     assert got.value == pytest.approx(distance(x, y).value, abs=1e-12)
-    assert distance(*on_disk, backend="blocked").value == pytest.approx(distance(x, y, backend="blocked").value, abs=1e-12)
+    assert distance(*on_disk, backend="blocked").value == pytest.approx(
+        distance(x, y, backend="blocked").value, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("kernel", [Gaussian(), Gaussian((1.0, 4.0)), Polynomial(), Linear()])
@@ -334,7 +417,9 @@ def test_another_array_library_gives_the_same_sums(kernel):
     x, (segment, unit) = unit_rows(0, 80, 6), layout(0, 80)
     assert isinstance(ops_of(torch.from_numpy(x)), ArrayApiOps)
     assert type(ops_of(x)) is Ops
-    run = lambda a: blocked_sums(a, segment, unit, segments=3, kernel=kernel, block=30, spread=[np.arange(2)])  # noqa: E731
+    run = lambda a: blocked_sums(
+        a, segment, unit, segments=3, kernel=kernel, block=30, spread=[np.arange(2)]
+    )
     one, other = run(x), run(torch.from_numpy(x))
     np.testing.assert_allclose(other.sums.block, one.sums.block, atol=1e-10)
     np.testing.assert_allclose(other.sums.own, one.sums.own, atol=1e-10)
@@ -353,11 +438,17 @@ def test_tensors_are_multiplied_in_full_precision_whatever_the_loop_has_set(monk
     pytest.importorskip("array_api_compat")
     seen = []
     values = Gaussian.values
-    monkeypatch.setattr(Gaussian, "values", lambda *args: (seen.append(torch.get_float32_matmul_precision()), values(*args))[1])
+    monkeypatch.setattr(
+        Gaussian,
+        "values",
+        lambda *args: (seen.append(torch.get_float32_matmul_precision()), values(*args))[1],
+    )
     x = torch.from_numpy(unit_rows(0, 30, 4))
     torch.set_float32_matmul_precision("high")
     try:
-        blocked_sums(x, np.zeros(30, int), np.zeros(30, int), segments=1, kernel=Gaussian(), block=10)
+        blocked_sums(
+            x, np.zeros(30, int), np.zeros(30, int), segments=1, kernel=Gaussian(), block=10
+        )
         assert set(seen) == {"highest"}
         assert torch.get_float32_matmul_precision() == "high"
     finally:
@@ -373,11 +464,15 @@ def test_kernels_of_other_names():
     multi = distance(x, y, sigma="multi")
     assert multi.bandwidth is None
     assert multi.kernel["sigmas"] == pytest.approx([middle * f for f in (0.25, 0.5, 1, 2, 4)])
-    assert multi.value == pytest.approx(np.mean([mmd2(x, y, sigma=s) for s in multi.kernel["sigmas"]]), abs=1e-9)
+    assert multi.value == pytest.approx(
+        np.mean([mmd2(x, y, sigma=s) for s in multi.kernel["sigmas"]]), abs=1e-9
+    )
     groups = ["a"] * 10 + ["b"] * 10
     apart = np.sqrt(((y[:10, None] - y[None, 10:]) ** 2).sum(-1))
     assert gaussian("median", y, groups).bandwidth == pytest.approx(np.median(apart))
-    assert mmd2(x, y, kernel=Linear(), estimator="biased", scale=1.0) == pytest.approx(((x.mean(0) - y.mean(0)) ** 2).sum())
+    assert mmd2(x, y, kernel=Linear(), estimator="biased", scale=1.0) == pytest.approx(
+        ((x.mean(0) - y.mean(0)) ** 2).sum()
+    )
     for wrong in ("mean", (), (1.0, -1.0)):
         with pytest.raises(PalpateError, match="sigma must be"):
             mmd2(x, y, sigma=wrong)
@@ -391,7 +486,9 @@ def test_kid_is_the_polynomial_of_float32_features_to_many_digits():
     k = lambda p, q: (p @ q.T / 64 + 1) ** 3  # noqa: E731
     off = lambda m: (m.sum() - np.trace(m)) / (600 * 599)  # noqa: E731
     truth = off(k(a, a)) + off(k(b, b)) - 2 * k(a, b).mean()
-    assert mmd2(x, y, kernel=Polynomial(), scale=1.0, normalize=False) == pytest.approx(truth, rel=1e-9)
+    assert mmd2(x, y, kernel=Polynomial(), scale=1.0, normalize=False) == pytest.approx(
+        truth, rel=1e-9
+    )
 
 
 def test_merging_segments_merges_everything():
@@ -399,14 +496,25 @@ def test_merging_segments_merges_everything():
     found = blocked_sums(x, segment, unit, segments=3, kernel=Polynomial()).sums
     to = np.array([1, -1, 0])
     keep = segment != 1
-    direct = blocked_sums(x[keep], to[segment[keep]], unit[keep], segments=2, kernel=Polynomial()).sums
+    direct = blocked_sums(
+        x[keep], to[segment[keep]], unit[keep], segments=2, kernel=Polynomial()
+    ).sums
     merged = found.merge(to, 2)
     for name in ("n", "sums", "same", "pairs", "own"):
-        np.testing.assert_allclose(getattr(merged.totals, name), getattr(direct.totals, name), atol=1e-9)
+        np.testing.assert_allclose(
+            getattr(merged.totals, name), getattr(direct.totals, name), atol=1e-9
+        )
     np.testing.assert_allclose(found.totals.merge(to, 2).sums, direct.totals.sums, atol=1e-9)
     assert isinstance(merged, PairSums)
 
 
 def test_too_few_rows_for_a_kernel_sum_are_no_error():
-    empty = kernel_sums([unit_rows(0, 1, 3)], np.zeros(1, int), np.zeros(1, int), segments=2, kernel=Gaussian(), bound=lambda _: 0.0)
+    empty = kernel_sums(
+        [unit_rows(0, 1, 3)],
+        np.zeros(1, int),
+        np.zeros(1, int),
+        segments=2,
+        kernel=Gaussian(),
+        bound=lambda _: 0.0,
+    )
     assert not empty.sums.rows.any()

@@ -18,8 +18,10 @@ def two_ends(rows, side, spread, d=64):
 
 def taken(monkeypatch):
     """Types that features have when they are multiplied."""
-    types, centred = [], blocked.centred
-    monkeypatch.setattr(blocked, "centred", lambda *args: (z := centred(*args), types.append(z.dtype))[0])
+    types, centered = [], blocked.centered
+    monkeypatch.setattr(
+        blocked, "centered", lambda *args: (z := centered(*args), types.append(z.dtype))[0]
+    )
     return types
 
 
@@ -37,14 +39,22 @@ def test_sets_that_are_as_far_apart_as_can_be(rows, sigma, side, monkeypatch):
     x, y = two_ends(rows, side, 0.1)
     types = taken(monkeypatch)
     got = mmd2(x, y, sigma=sigma, backend="blocked")
-    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    exact = mmd2(
+        x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False
+    )
     assert types == [np.float32, np.float64]
     assert exact > 1
     assert got == pytest.approx(exact, abs=4e-7)
 
 
 @pytest.mark.parametrize(
-    ("sigmas", "single"), [((6.0, 12.0, 24.0), True), ((24.0, 6.0, 12.0), True), ((8.0, 16.0, 8.0), True), ((8.0, 10.0, 20.0), False)]
+    ("sigmas", "single"),
+    [
+        ((6.0, 12.0, 24.0), True),
+        ((24.0, 6.0, 12.0), True),
+        ((8.0, 16.0, 8.0), True),
+        ((8.0, 10.0, 20.0), False),
+    ],
 )
 def test_several_bandwidths_take_float32_where_it_holds_their_ratios(sigmas, single, monkeypatch):
     x, y = two_ends(1500, -np.eye(64)[0], 0.1)
@@ -57,13 +67,20 @@ def test_several_bandwidths_take_float32_where_it_holds_their_ratios(sigmas, sin
     assert got == pytest.approx(exact, abs=5e-7)
 
 
-@pytest.mark.parametrize(("sigma", "wanted"), [(10.0, "float32"), (3.9, "float64"), (0.5, "float64")])
+@pytest.mark.parametrize(
+    ("sigma", "wanted"), [(10.0, "float32"), (3.9, "float64"), (0.5, "float64")]
+)
 def test_tensors_take_float32_under_the_same_rule(sigma, wanted):
     torch = pytest.importorskip("torch")
     x = np.concatenate(two_ends(600, -np.eye(64)[0], 0.1))
     kernel, order = Gaussian((sigma,)), np.arange(1200)
     for rows in (x, torch.from_numpy(x)):
-        assert str(blocked.centred(rows, order, kernel, ops_of(rows), order // 600).dtype).removeprefix("torch.") == wanted
+        assert (
+            str(
+                blocked.centered(rows, order, kernel, ops_of(rows), order // 600).dtype
+            ).removeprefix("torch.")
+            == wanted
+        )
 
 
 def with_copies(x, distinct):
@@ -73,15 +90,22 @@ def with_copies(x, distinct):
 
 @pytest.mark.parametrize("library", ["numpy", "torch"])
 @pytest.mark.parametrize("both", [False, True])
-@pytest.mark.parametrize(("distinct", "sigma", "single"), [(1, 10.0, False), (1, 30.0, False), (520, 10.0, False), (1500, 10.0, True)])
-def test_copies_of_few_rows_do_not_average_rounding_away(distinct, sigma, single, both, library, monkeypatch):
+@pytest.mark.parametrize(
+    ("distinct", "sigma", "single"),
+    [(1, 10.0, False), (1, 30.0, False), (520, 10.0, False), (1500, 10.0, True)],
+)
+def test_copies_of_few_rows_do_not_average_rounding_away(
+    distinct, sigma, single, both, library, monkeypatch
+):
     """A generator that has collapsed to an image, for all or most of its touches, beside real ones; and two of them."""
     xp = pytest.importorskip(library)
     x, y = two_ends(1500, -np.eye(64)[0], 0.1)
     x, y = with_copies(x, distinct), with_copies(y, distinct) if both else y
     types = taken(monkeypatch)
     got = mmd2(*(xp.asarray(v) for v in (x, y)), sigma=sigma, backend="blocked")
-    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    exact = mmd2(
+        x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False
+    )
     assert str(types[0]).removeprefix("torch.") == ("float32" if single else "float64")
     assert got == pytest.approx(exact, abs=4e-7)
 
@@ -96,7 +120,9 @@ def test_near_copies_are_summed_without_a_direction(spread, sigma, library, monk
     types = taken(monkeypatch)
     got = mmd2(*(xp.asarray(v) for v in (x, y)), sigma=sigma, backend="blocked")
     assert "float32" in str(types[0])
-    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    exact = mmd2(
+        x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False
+    )
     assert got == pytest.approx(exact, abs=1e-6)
 
 
@@ -106,28 +132,41 @@ def test_runs_of_near_equal_numbers_are_summed_in_float64(library):
     k = (0.1 + 1e-9 * np.random.default_rng(0).random((900, 1000))).astype(np.float32)
     starts, wide = np.array([0, 1, 400]), k.astype(np.float64)
     ops, given = ops_of(xp.asarray(k)), xp.asarray(k)
-    np.testing.assert_allclose(ops.sum_rows(given, starts), np.add.reduceat(wide, starts, axis=0), rtol=1e-12)
-    np.testing.assert_allclose(ops.sum_columns(given, starts), np.add.reduceat(wide, starts, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(
+        ops.sum_rows(given, starts), np.add.reduceat(wide, starts, axis=0), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        ops.sum_columns(given, starts), np.add.reduceat(wide, starts, axis=1), rtol=1e-12
+    )
 
 
 def test_copies_are_counted_in_every_segment():
     """Rows of one norm in two segments are no copies of one another; in one they are."""
     x = np.concatenate([np.eye(1200, dtype=np.float32)[:600]] * 2)
     kernel, order = Gaussian((30.0,)), np.arange(1200)
-    spread = x + 0.01 * np.random.default_rng(0).normal(size=x[:600].shape).astype(np.float32)[order % 600]
+    spread = (
+        x
+        + 0.01 * np.random.default_rng(0).normal(size=x[:600].shape).astype(np.float32)[order % 600]
+    )
     for rows, segment, wanted in (
         (spread, order // 600, np.float32),
         (spread[order % 20], order // 600, np.float32),
         (spread[order % 15], order // 600, np.float64),
     ):
-        assert blocked.centred(rows, order, kernel, ops_of(rows), segment).dtype == wanted
+        assert blocked.centered(rows, order, kernel, ops_of(rows), segment).dtype == wanted
 
 
 class Scaled:
     """``x.y`` of rows in units of 2."""
 
     bandwidth, stationary, unit, single, radius_limit = None, False, 2.0, False, float("inf")
-    factors, shift, values, diagonal, settings = Linear().factors, Linear().shift, Linear().values, Linear().diagonal, Linear().settings
+    factors, shift, values, diagonal, settings = (
+        Linear().factors,
+        Linear().shift,
+        Linear().values,
+        Linear().diagonal,
+        Linear().settings,
+    )
 
 
 class Cauchy:
@@ -149,10 +188,12 @@ class Cauchy:
 def test_a_kernel_of_ones_own():
     x, y = unit_rows(0, 30, 5), unit_rows(1, 20, 5)
     options = {"estimator": "biased", "normalize": False}
-    assert distance(x, y, kernel=Scaled(), **options).value == pytest.approx(distance(x / 2, y / 2, kernel=Linear(), **options).value)
+    assert distance(x, y, kernel=Scaled(), **options).value == pytest.approx(
+        distance(x / 2, y / 2, kernel=Linear(), **options).value
+    )
     k = lambda a, b: (1 / (1 + ((a[:, None] - b[None]) ** 2).sum(-1))).mean()  # noqa: E731
     want = 1000 * (k(x, x) + k(y, y) - 2 * k(x, y))
-    for offset in (0.0, 1e6):  # centred: a common mean costs no digits
+    for offset in (0.0, 1e6):  # centered: a common mean costs no digits
         found = distance(x + offset, y + offset, kernel=Cauchy(), **options)
         assert found.value == pytest.approx(want, abs=1e-9 if not offset else 1e-5)
         assert found.kernel == {"kernel": "cauchy"}
@@ -160,12 +201,31 @@ def test_a_kernel_of_ones_own():
 
 @pytest.mark.parametrize("name", [n for n in dir(Scaled) if not n.startswith("_")])
 def test_a_kernel_without_something_is_refused(name):
-    part = type("Part", (), {n: getattr(Scaled, n) for n in dir(Scaled) if not n.startswith("_") and n != name})
+    part = type(
+        "Part",
+        (),
+        {n: getattr(Scaled, n) for n in dir(Scaled) if not n.startswith("_") and n != name},
+    )
     with pytest.raises(PalpateError, match="kernel must be a kernel"):
         distance(unit_rows(0, 30, 5), unit_rows(1, 20, 5), kernel=part())
 
 
-@pytest.mark.parametrize("sigmas", [(), (0.0,), (-1.0,), (float("nan"),), (float("inf"),), ("ten",), "55", b"55", True, 10**400, None])
+@pytest.mark.parametrize(
+    "sigmas",
+    [
+        (),
+        (0.0,),
+        (-1.0,),
+        (float("nan"),),
+        (float("inf"),),
+        ("ten",),
+        "55",
+        b"55",
+        True,
+        10**400,
+        None,
+    ],
+)
 def test_a_gaussian_without_bandwidths_is_refused(sigmas):
     with pytest.raises(PalpateError, match="sigma must be positive"):
         Gaussian(sigmas)

@@ -25,16 +25,26 @@ def definition(x, y):
     one, two = np.cov(x.T).reshape(x.shape[1], -1), np.cov(y.T).reshape(y.shape[1], -1)
     values = linalg.eigvals(one @ two).real
     roots = np.sqrt(np.where(values > 1e-12 * np.abs(values).max(), values, 0)).sum()
-    return ((x.mean(axis=0) - y.mean(axis=0)) ** 2).sum() + np.trace(one) + np.trace(two) - 2 * roots
+    return (
+        ((x.mean(axis=0) - y.mean(axis=0)) ** 2).sum() + np.trace(one) + np.trace(two) - 2 * roots
+    )
 
 
 @settings(max_examples=40, deadline=None)
-@given(n=st.integers(2, 40), m=st.integers(2, 40), d=st.integers(1, 20), seed=st.integers(0, 99), shift=st.sampled_from([0.0, 3.0, 100.0]))
+@given(
+    n=st.integers(2, 40),
+    m=st.integers(2, 40),
+    d=st.integers(1, 20),
+    seed=st.integers(0, 99),
+    shift=st.sampled_from([0.0, 3.0, 100.0]),
+)
 def test_fid_is_the_definition_at_every_rank(n, m, d, seed, shift):
     rng = np.random.default_rng(seed)
     x, y = rng.normal(size=(n, d)) @ rng.normal(size=(d, d)) + shift, 2 * rng.normal(size=(m, d))
     score = fid(features(x), features(y), interval=False)
-    scale = shift**2 * d + np.trace(np.atleast_2d(np.cov(x.T))) + np.trace(np.atleast_2d(np.cov(y.T)))
+    scale = (
+        shift**2 * d + np.trace(np.atleast_2d(np.cov(x.T))) + np.trace(np.atleast_2d(np.cov(y.T)))
+    )
     assert score.value == pytest.approx(definition(x, y), abs=1e-6 * scale)
     assert score.value >= 0
     assert ("Not meaningful" in score.note) == (min(n, m) <= d)
@@ -43,8 +53,12 @@ def test_fid_is_the_definition_at_every_rank(n, m, d, seed, shift):
 def test_one_dimension_and_commuting_covariances_have_closed_forms():
     assert frechet_distance([1.0], [[4.0]], [3.0], [[9.0]]) == pytest.approx(4 + 1)
     a, b = np.array([1.0, 4.0, 9.0]), np.array([4.0, 1.0, 0.0])
-    assert frechet_distance(np.zeros(3), np.diag(a), np.ones(3), np.diag(b)) == pytest.approx(3 + ((np.sqrt(a) - np.sqrt(b)) ** 2).sum())
-    assert frechet_distance(np.zeros(2), np.zeros((2, 2)), np.zeros(2), np.eye(2)) == pytest.approx(2)  # a point against a ball
+    assert frechet_distance(np.zeros(3), np.diag(a), np.ones(3), np.diag(b)) == pytest.approx(
+        3 + ((np.sqrt(a) - np.sqrt(b)) ** 2).sum()
+    )
+    assert frechet_distance(np.zeros(2), np.zeros((2, 2)), np.zeros(2), np.eye(2)) == pytest.approx(
+        2
+    )  # a point against a ball
 
 
 def test_singular_covariances_agree_with_the_thin_route_and_are_never_complex():
@@ -58,9 +72,14 @@ def test_singular_covariances_agree_with_the_thin_route_and_are_never_complex():
 
 def test_float32_and_a_common_mean_far_away_cost_nothing():
     rng = np.random.default_rng(4)
-    x, y = rng.normal(size=(400, 6)).astype(np.float32), (1.1 * rng.normal(size=(500, 6))).astype(np.float32)
+    x, y = (
+        rng.normal(size=(400, 6)).astype(np.float32),
+        (1.1 * rng.normal(size=(500, 6))).astype(np.float32),
+    )
     near = fid(features(x), features(y), interval=False).value
-    far = fid(features(x.astype(np.float64) + 1e6), features(y.astype(np.float64) + 1e6), interval=False).value
+    far = fid(
+        features(x.astype(np.float64) + 1e6), features(y.astype(np.float64) + 1e6), interval=False
+    ).value
     assert near == pytest.approx(definition(x, y), rel=1e-10)
     assert far == pytest.approx(near, rel=1e-6)
 
@@ -75,8 +94,14 @@ def test_normalize_divides_rows_first():
 
 
 @settings(max_examples=25, deadline=None)
-@given(sizes=st.lists(st.integers(0, 9), min_size=1, max_size=6), seed=st.integers(0, 99), shift=st.sampled_from([0.0, 1e5]))
-def test_moments_in_any_parts_are_those_of_the_whole_and_parts_can_be_taken_away(sizes, seed, shift):
+@given(
+    sizes=st.lists(st.integers(0, 9), min_size=1, max_size=6),
+    seed=st.integers(0, 99),
+    shift=st.sampled_from([0.0, 1e5]),
+)
+def test_moments_in_any_parts_are_those_of_the_whole_and_parts_can_be_taken_away(
+    sizes, seed, shift
+):
     rng = np.random.default_rng(seed)
     parts = [rng.normal(size=(k, 4)) + shift for k in sizes]
     streamed, merged = Moments(), Moments()
@@ -128,12 +153,18 @@ def test_many_groups_are_left_out_in_blocks_of_whole_groups_of_about_equal_size(
     groups = [f"v{int(g)}" for g in np.sort(rng.integers(0, 50, 400))]
     parts = frechet._draw_parts(features(x, groups), features(x, groups), (x, x), 20, 0)
     assert parts.count == 20
-    assert all(len({int(parts.block[0][i]) for i in range(400) if groups[i] == g}) == 1 for g in set(groups))
+    assert all(
+        len({int(parts.block[0][i]) for i in range(400) if groups[i] == g}) == 1
+        for g in set(groups)
+    )
     sizes = np.bincount(parts.block[0])
     assert len(sizes) == 20
     assert sizes.max() - sizes.min() <= 10
     score = fid(features(x, groups), features(1.2 * x[::-1], groups))
-    assert score.interval_method == f"leave-one-block-out jackknife, 20 random blocks of whole groups ({len(set(groups))} groups), t, 19 df"
+    assert (
+        score.interval_method
+        == f"leave-one-block-out jackknife, 20 random blocks of whole groups ({len(set(groups))} groups), t, 19 df"
+    )
     again = fid(features(x, groups), features(1.2 * x[::-1], groups))
     assert score == again
     assert Score.from_json(score.to_json()) == score
@@ -171,7 +202,12 @@ def test_infinity_takes_the_bias_away():
     assert np.mean(raw) > 0.3  # truth is 0
     assert abs(np.mean(limit)) < 0.05 * np.mean(raw)
     assert "extrapolation" in score.note
-    assert fid(features(rng.normal(size=(2 * d, d))), features(rng.normal(size=(n, d)))).details["infinity"] is None
+    assert (
+        fid(features(rng.normal(size=(2 * d, d))), features(rng.normal(size=(n, d)))).details[
+            "infinity"
+        ]
+        is None
+    )
 
 
 @pytest.mark.slow
@@ -181,14 +217,20 @@ def test_the_interval_covers_what_is_expected_at_this_size():
     by_group, by_row, values = [], [], []
     for _ in range(300):
         sets = [
-            (s * (rng.normal(size=(30, 1, 3)) + 0.7 * rng.normal(size=(30, 10, 3))) + mu).reshape(-1, 3) for s, mu in ((1, 0.0), (1.3, 1.0))
+            (s * (rng.normal(size=(30, 1, 3)) + 0.7 * rng.normal(size=(30, 10, 3))) + mu).reshape(
+                -1, 3
+            )
+            for s, mu in ((1, 0.0), (1.3, 1.0))
         ]
         names = [[f"{s}{i // 10}" for i in range(300)] for s in "ab"]
         score = fid(features(sets[0], names[0]), features(sets[1], names[1]))
         values.append(score.value)
         by_group.append(score.interval)
         by_row.append(fid(features(sets[0]), features(sets[1])).interval)
-    cover = [np.mean([low <= np.mean(values) <= high for low, high in found]) for found in (by_group, by_row)]
+    cover = [
+        np.mean([low <= np.mean(values) <= high for low, high in found])
+        for found in (by_group, by_row)
+    ]
     assert 0.90 <= cover[0] <= 0.99
     assert cover[1] < 0.7
 
@@ -236,17 +278,28 @@ def test_half_precision_is_widened_and_said_and_copies_are_named():
     assert score.value == pytest.approx(definition(x, y), rel=1e-6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        strided = fid(features(np.asfortranarray(x.astype(np.float32))[::2]), features(y.astype(np.float32)[::-1]), interval=False)
+        strided = fid(
+            features(np.asfortranarray(x.astype(np.float32))[::2]),
+            features(y.astype(np.float32)[::-1]),
+            interval=False,
+        )
     assert strided.value == pytest.approx(definition(x[::2], y), rel=1e-6)
     both = np.concatenate([y[:3], x]).astype(np.float32)
-    assert "3 of 53 generated rows equal a real row" in fid(features(both), features(y.astype(np.float32)), interval=False).note
+    assert (
+        "3 of 53 generated rows equal a real row"
+        in fid(features(both), features(y.astype(np.float32)), interval=False).note
+    )
 
 
 def test_moments_take_torch_tensors():
     torch = pytest.importorskip("torch")
     x = np.random.default_rng(14).normal(size=(40, 4)).astype(np.float32)
-    np.testing.assert_array_equal(Moments.of(torch.tensor(x, requires_grad=True)).scatter, Moments.of(x).scatter)
-    np.testing.assert_allclose(Moments.of(torch.tensor(x).bfloat16()).mean, x.mean(axis=0), atol=0.01)
+    np.testing.assert_array_equal(
+        Moments.of(torch.tensor(x, requires_grad=True)).scatter, Moments.of(x).scatter
+    )
+    np.testing.assert_allclose(
+        Moments.of(torch.tensor(x).bfloat16()).mean, x.mean(axis=0), atol=0.01
+    )
     with pytest.raises(PalpateError, match="floating-point"):
         Moments.of(torch.ones(3, 2, dtype=torch.int64))
 
@@ -261,7 +314,10 @@ def trio(n=84, width=3, videos=7, seed=9):
 def test_the_difference_of_two_fids_is_left_one_out_as_a_whole(width):
     x, z, y, groups = trio(width=width)
     found = compare_fid({"a": features(x, groups), "b": features(z, groups)}, features(y, groups))
-    assert found.scores == [fid(features(v, groups), features(y, groups), subject=name) for name, v in (("a", x), ("b", z))]
+    assert found.scores == [
+        fid(features(v, groups), features(y, groups), subject=name)
+        for name, v in (("a", x), ("b", z))
+    ]
     (one,) = found.differences
     kept = [np.array(groups) != f"v{k}" for k in range(7)]
     out = np.array([definition(x[k], y[k]) - definition(z[k], y[k]) for k in kept])
@@ -296,7 +352,9 @@ def test_paired_fids_share_their_blocks_and_the_order_of_rows_does_not_matter():
 def test_paired_fids_refuse_other_samples_and_nobody():
     x, z, y, groups = trio()
     with pytest.raises(PalpateError, match="same samples"):
-        compare_fid({"a": features(x, groups), "b": features(z[:-1], groups[:-1])}, features(y, groups))
+        compare_fid(
+            {"a": features(x, groups), "b": features(z[:-1], groups[:-1])}, features(y, groups)
+        )
     with pytest.raises(PalpateError, match="same groups"):
         compare_fid({"a": features(x, groups), "b": features(z, groups[::-1])}, features(y, groups))
     with pytest.raises(PalpateError, match="a generator"):
@@ -310,9 +368,14 @@ def test_intervals_of_paired_fids_cover_the_expected_difference_over_videos():
     groups = [f"v{i // frames}" for i in range(videos * frames)]
     differences = []
     for _ in range(replicates):
-        shared, mine, yours = (np.repeat(rng.normal(size=(videos, width)), frames, axis=0) for _ in range(3))
+        shared, mine, yours = (
+            np.repeat(rng.normal(size=(videos, width)), frames, axis=0) for _ in range(3)
+        )
         noise = lambda: 0.5 * rng.normal(size=(videos * frames, width))  # noqa: E731
-        sets = {"a": features(shared + 0.6 * mine + noise(), groups), "b": features(1.2 * shared + 0.4 * yours + noise() + 0.2, groups)}
+        sets = {
+            "a": features(shared + 0.6 * mine + noise(), groups),
+            "b": features(1.2 * shared + 0.4 * yours + noise() + 0.2, groups),
+        }
         differences.append(compare_fid(sets, features(shared + noise(), groups)).differences[0])
     truth = np.mean([d.value for d in differences])
     covered = np.mean([d.interval[0] <= truth <= d.interval[1] for d in differences])

@@ -8,7 +8,7 @@ from palpate.metrics import distance, streaming
 from test_metrics_streaming import CLASSES, both, feed, sets
 from test_metrics_tactile import change
 
-SUMS = {"keep": "sums", "classes": CLASSES, "centre": np.full(6, 0.4)}
+SUMS = {"keep": "sums", "classes": CLASSES, "center": np.full(6, 0.4)}
 
 
 @pytest.fixture(params=["plain", "torch"])
@@ -73,12 +73,12 @@ def test_bandwidths_in_an_array_are_settings_too(metrics):
 
 
 def test_the_bound_still_holds_for_real_touches_that_a_reset_has_kept(metrics):
-    """Real touches far from the centre, generated ones near it: the bound of the latter alone would be too small."""
+    """Real touches far from the center, generated ones near it: the bound of the latter alone would be too small."""
     g, r = sets()
-    centre = g.features.mean(axis=0)
-    near = 0.02 * g.features + 0.98 * centre
+    center = g.features.mean(axis=0)
+    near = 0.02 * g.features + 0.98 * center
     g = change(g, features=near / np.linalg.norm(near, axis=1, keepdims=True))
-    options = {"keep": "sums", "centre": g.features.mean(axis=0), "sigma": 1.0}
+    options = {"keep": "sums", "center": g.features.mean(axis=0), "sigma": 1.0}
     metric = metrics.TMMD(reset_real_features=False, **options)
     feed(metric, r, real=True)
     metric.reset()

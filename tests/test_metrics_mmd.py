@@ -25,7 +25,7 @@ def unit_rows(seed, n, d, spread=1.0):
 
 
 def loop_mmd(x, y, estimator, gx=None, gy=None, sigma=10.0, scale=1000.0):
-    """Eq. 2 by its letter: every pair, in Python floats, with k itself (no k - 1, no centring)."""
+    """Eq. 2 by its letter: every pair, in Python floats, with k itself (no k - 1, no centering)."""
 
     def mean(a, b, ga, gb, same_set):
         terms = []
@@ -34,10 +34,17 @@ def loop_mmd(x, y, estimator, gx=None, gy=None, sigma=10.0, scale=1000.0):
                 continue
             if estimator == "grouped" and ga[i] == gb[j]:
                 continue
-            terms.append(math.exp(-sum((float(p) - float(q)) ** 2 for p, q in zip(a[i], b[j], strict=True)) / (2 * sigma**2)))
+            terms.append(
+                math.exp(
+                    -sum((float(p) - float(q)) ** 2 for p, q in zip(a[i], b[j], strict=True))
+                    / (2 * sigma**2)
+                )
+            )
         return math.fsum(terms) / len(terms)
 
-    return scale * (mean(x, x, gx, gx, True) + mean(y, y, gy, gy, True) - 2 * mean(x, y, gx, gy, False))
+    return scale * (
+        mean(x, x, gx, gx, True) + mean(y, y, gy, gy, True) - 2 * mean(x, y, gx, gy, False)
+    )
 
 
 def cdist_mmd(x, y, sigma=10.0, scale=1000.0):
@@ -48,14 +55,21 @@ def cdist_mmd(x, y, sigma=10.0, scale=1000.0):
         return np.expm1(-np.array([((row - b) ** 2).sum(axis=1) for row in a]) / (2 * sigma**2))
 
     m, n = len(x), len(y)
-    return scale * (k(x, x).sum() / (m * (m - 1)) + k(y, y).sum() / (n * (n - 1)) - 2 * k(x, y).mean())
+    return scale * (
+        k(x, x).sum() / (m * (m - 1)) + k(y, y).sum() / (n * (n - 1)) - 2 * k(x, y).mean()
+    )
 
 
 @given(
-    seed=st.integers(0, 10**6), m=st.integers(3, 9), n=st.integers(3, 9), d=st.integers(1, 5),
-    sigma=st.sampled_from([0.3, 1.0, 10.0]), estimator=st.sampled_from(["unbiased", "biased", "grouped"]),
-    duplicates=st.booleans(), block=st.sampled_from([1, 2, 3, 2048]),
-)  # fmt: skip
+    seed=st.integers(0, 10**6),
+    m=st.integers(3, 9),
+    n=st.integers(3, 9),
+    d=st.integers(1, 5),
+    sigma=st.sampled_from([0.3, 1.0, 10.0]),
+    estimator=st.sampled_from(["unbiased", "biased", "grouped"]),
+    duplicates=st.booleans(),
+    block=st.sampled_from([1, 2, 3, 2048]),
+)
 @settings(max_examples=120, deadline=None)
 def test_equals_the_double_loop(seed, m, n, d, sigma, estimator, duplicates, block):
     x, y = unit_rows(seed, m, d), unit_rows(seed + 1, n, d)
@@ -76,28 +90,48 @@ def test_small_float32_sets_are_computed_in_float64(seed, m, n):
     assert mmd2(x, y) == pytest.approx(loop_mmd(x, y, "unbiased"), abs=1e-9)
 
 
-@pytest.mark.parametrize(("sigma", "m", "n", "spread"), [(10.0, 700, 600, 0.5), (10.0, 1100, 300, 3.0), (4.0, 800, 700, 0.5)])
+@pytest.mark.parametrize(
+    ("sigma", "m", "n", "spread"),
+    [(10.0, 700, 600, 0.5), (10.0, 1100, 300, 3.0), (4.0, 800, 700, 0.5)],
+)
 def test_float32_error_is_below_1e_minus_6(sigma, m, n, spread, monkeypatch):
-    x, y = unit_rows(1, m, 256, spread).astype(np.float32), unit_rows(2, n, 256, spread).astype(np.float32)
+    x, y = (
+        unit_rows(1, m, 256, spread).astype(np.float32),
+        unit_rows(2, n, 256, spread).astype(np.float32),
+    )
     assert m + n > blocked.FLOAT64_BELOW
     dtypes = []
-    centred = blocked.centred
-    monkeypatch.setattr(blocked, "centred", lambda *args: (z := centred(*args), dtypes.append(z.dtype))[0])
+    centered = blocked.centered
+    monkeypatch.setattr(
+        blocked, "centered", lambda *args: (z := centered(*args), dtypes.append(z.dtype))[0]
+    )
     got = mmd2(x, y, sigma=sigma, block=512, backend="blocked")
     assert dtypes == [np.float32]
     truth = cdist_mmd(x, y, sigma)
     assert abs(got - truth) < 1e-6
-    k32 = lambda a, b: np.exp(-((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * a @ b.T) / np.float32(2 * sigma**2))  # noqa: E731
-    plain = 1000 * ((k32(x, x).sum() - m) / (m * (m - 1)) + (k32(y, y).sum() - n) / (n * (n - 1)) - 2 * k32(x, y).mean())
-    assert abs(plain - truth) > 10 * abs(got - truth)  # the usual float32 route is worse: the test can tell
+    k32 = lambda a, b: np.exp(
+        -((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * a @ b.T) / np.float32(2 * sigma**2)
+    )
+    plain = 1000 * (
+        (k32(x, x).sum() - m) / (m * (m - 1))
+        + (k32(y, y).sum() - n) / (n * (n - 1))
+        - 2 * k32(x, y).mean()
+    )
+    assert abs(plain - truth) > 10 * abs(
+        got - truth
+    )  # the usual float32 route is worse: the test can tell
 
 
 def row_sums(x, segment, segments, block=1024):
-    return blocked_sums(x, segment, np.arange(len(x)), segments=segments, kernel=Gaussian(), block=block).sums
+    return blocked_sums(
+        x, segment, np.arange(len(x)), segments=segments, kernel=Gaussian(), block=block
+    ).sums
 
 
 def test_float32_row_sums_keep_their_digits_when_k_is_almost_one():
-    x = unit_rows(3, 1100, 64, spread=0.02).astype(np.float32)  # k - 1 is about -4e-6: exp() in float32 has 5 % error here
+    x = unit_rows(3, 1100, 64, spread=0.02).astype(
+        np.float32
+    )  # k - 1 is about -4e-6: exp() in float32 has 5 % error here
     sums = row_sums(x, np.zeros(1100, dtype=int), 1, block=300)
     wide = x.astype(np.float64)
     expected = [np.expm1(-((row - wide) ** 2).sum(axis=1) / 200).sum() for row in wide]
@@ -123,12 +157,17 @@ def test_random_halves_average_to_zero_and_the_biased_form_to_the_dispersion():
     assert np.mean([mmd2(x[h], x[~h]) for h in halves]) == pytest.approx(0, abs=1e-11)
     k = np.exp(-((x[:, None] - x[None]) ** 2).sum(-1) / 200)
     kbar = (k.sum() - 8) / 56
-    assert np.mean([mmd2(x[h], x[~h], estimator="biased") for h in halves]) == pytest.approx(4 / 8 * 1000 * (1 - kbar), abs=1e-10)
+    assert np.mean([mmd2(x[h], x[~h], estimator="biased") for h in halves]) == pytest.approx(
+        4 / 8 * 1000 * (1 - kbar), abs=1e-10
+    )
 
 
 def test_biased_minus_unbiased_is_the_published_gap():
     x, y = unit_rows(4, 12, 6), unit_rows(5, 7, 6)
-    mean_k = lambda a: (np.exp(-((a[:, None] - a[None]) ** 2).sum(-1) / 200).sum() - len(a)) / (len(a) * (len(a) - 1))  # noqa: E731
+    mean_k = lambda a: (
+        (np.exp(-((a[:, None] - a[None]) ** 2).sum(-1) / 200).sum() - len(a))
+        / (len(a) * (len(a) - 1))
+    )
     gap = 1000 * ((1 - mean_k(x)) / 12 + (1 - mean_k(y)) / 7)
     assert mmd2(x, y, estimator="biased") - mmd2(x, y) == pytest.approx(gap, abs=1e-9)
 
@@ -142,14 +181,18 @@ def test_closed_form_sd_of_random_halves_is_that_of_all_halvings(estimator, size
     parts = [np.isin(np.arange(n), half) for half in itertools.combinations(range(n), sizes[0])]
     values = [mmd2(x[h], x[~h], estimator=estimator) for h in parts]
     one = np.zeros(n, dtype=int)
-    spread = blocked_sums(x, one, np.arange(n), segments=1, kernel=Gaussian(), block=7, spread=[np.arange(1)]).spread
+    spread = blocked_sums(
+        x, one, np.arange(n), segments=1, kernel=Gaussian(), block=7, spread=[np.arange(1)]
+    ).spread
     found = random_halves_sd(spread, np.array([sizes]), estimator, 1000.0)[0]
     assert found == pytest.approx(np.std(values), rel=1e-9)
     if estimator == "biased":  # and what they average
         score = i_tmmd(FeatureSet([str(i) for i in range(n)], x), preset="cmmd")
         if sizes[0] - sizes[1] < 2:
             assert score.details["dispersion"] == pytest.approx(np.mean(values), abs=1e-9)
-            assert score.null == pytest.approx((np.mean(values) - 1.96 * found, np.mean(values) + 1.96 * found))
+            assert score.null == pytest.approx(
+                (np.mean(values) - 1.96 * found, np.mean(values) + 1.96 * found)
+            )
 
 
 @pytest.mark.parametrize("sigma", [2.1, 2.5, 5.0, 10.0])
@@ -159,7 +202,9 @@ def test_float32_keeps_its_promise_in_a_small_set_beside_a_large_one(sigma, m):
     x, y = rng.normal(size=(m, 64)) + 0.3 * rng.normal(size=64), rng.normal(size=(1500, 64))
     x, y = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (x, y))
     x, y = x.astype(np.float32), y.astype(np.float32)
-    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    exact = mmd2(
+        x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False
+    )
     assert mmd2(x, y, sigma=sigma, backend="blocked") == pytest.approx(exact, abs=1e-6)
 
 
@@ -179,7 +224,7 @@ def test_identical_sets_and_the_antipodal_ceiling():
     assert mmd2(one, -one) == pytest.approx(2000 * (1 - math.exp(-4 / 200)), abs=1e-9)
 
 
-def test_normalize_true_equals_normalised_rows():
+def test_normalize_true_equals_normalized_rows():
     x, y = unit_rows(1, 10, 4), unit_rows(2, 10, 4)
     assert mmd2(3 * x, 0.2 * y, normalize=True) == pytest.approx(mmd2(x, y), abs=1e-9)
     assert mmd2(3 * x, 3 * y, normalize=False, sigma=30.0) == pytest.approx(mmd2(x, y), abs=1e-9)
@@ -217,13 +262,28 @@ X = unit_rows(0, 8, 3)
         (X[0], X, {}, ["shape (n, d)", "(3,)"]),
         (bad(X, r2=0.0), X, {}, ["zero vector", "1 row (2)"]),
         (bad(X, r2=0.0), X, {"normalize": True}, ["zero vector"]),
-        (2 * X, X, {}, ["L2-normalised", "norm 2", "8 rows"]),
+        (2 * X, X, {}, ["L2-normalized", "norm 2", "8 rows"]),
         ([[1.0, 0.0], [1.0]], X, {}, ["x must turn into a NumPy array"]),
         (X, X, {"normalize": "yes"}, ["normalize"]),
         (X, X, {"estimator": "grouped"}, ["groups of both sets"]),
-        (X, X, {"estimator": "grouped", "groups_x": ["a"] * 8, "groups_y": ["b"] * 8}, ["two groups", "1 and 1"]),
-        (X, X, {"estimator": "grouped", "groups_x": ["a"] * 7, "groups_y": ["b"] * 8}, ["groups_x", "8", "7"]),
-        (X, X, {"estimator": "grouped", "groups_x": ["a"] * 7 + [None], "groups_y": ["b"] * 8}, ["groups_x", "1 row (7)"]),
+        (
+            X,
+            X,
+            {"estimator": "grouped", "groups_x": ["a"] * 8, "groups_y": ["b"] * 8},
+            ["two groups", "1 and 1"],
+        ),
+        (
+            X,
+            X,
+            {"estimator": "grouped", "groups_x": ["a"] * 7, "groups_y": ["b"] * 8},
+            ["groups_x", "8", "7"],
+        ),
+        (
+            X,
+            X,
+            {"estimator": "grouped", "groups_x": ["a"] * 7 + [None], "groups_y": ["b"] * 8},
+            ["groups_x", "1 row (7)"],
+        ),
         (X, X, {"estimator": "best"}, ["estimator", "best"]),
         (X, X, {"sigma": 0.0}, ["sigma", "positive"]),
         (X, X, {"scale": math.nan}, ["scale", "positive"]),
@@ -257,7 +317,9 @@ def test_the_series_of_expm1_has_no_direction(least):
     found = Ops().expm1_(x.copy(), -least)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, exact, rtol=3e-7, atol=3e-11)
-    assert abs((found - exact).mean()) < 2e-10 + 2e-9 * least  # NumPy's own errs by 5e-10 on some machines
+    assert (
+        abs((found - exact).mean()) < 2e-10 + 2e-9 * least
+    )  # NumPy's own errs by 5e-10 on some machines
     x[0, 0] = -3
     np.testing.assert_allclose(Ops().expm1_(x.copy(), -3.0), np.expm1(x), rtol=1e-6)
 
@@ -266,8 +328,13 @@ def test_the_series_of_expm1_has_no_direction(least):
 @pytest.mark.parametrize("rows", [(3000, 3000), (600, 1100)])
 def test_float32_keeps_its_promise_where_two_sets_are_far_apart(sigma, rows):
     rng = np.random.default_rng(3)
-    x, y = (rng.normal(size=(n, 64)) + side * np.eye(64)[0] * 4 for n, side in zip(rows, (1, -1), strict=True))
+    x, y = (
+        rng.normal(size=(n, 64)) + side * np.eye(64)[0] * 4
+        for n, side in zip(rows, (1, -1), strict=True)
+    )
     x, y = ((v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32) for v in (x, y))
-    exact = mmd2(x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False)
+    exact = mmd2(
+        x.astype(np.float64), y.astype(np.float64), sigma=sigma, backend="blocked", normalize=False
+    )
     assert exact > 5
     assert mmd2(x, y, sigma=sigma, backend="blocked") == pytest.approx(exact, abs=1e-6)

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from palpate.core import PalpateError, require_comparable
-from palpate.metrics.multiscale import WEIGHTS, least_side, ms_ssim, ms_ssim_per_image, scale_weights
+from palpate.metrics.multiscale import (
+    WEIGHTS,
+    least_side,
+    ms_ssim,
+    ms_ssim_per_image,
+    scale_weights,
+)
 from palpate.metrics.pairwise import ssim, ssim_per_image
 
 
@@ -28,14 +34,23 @@ def slow_terms(x, y):
         for j in range(x.shape[1] - 10):
             u, v = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
             mu, mv = (window * u).sum(), (window * v).sum()
-            vu, vv, uv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum(), (window * (u - mu) * (v - mv)).sum()
+            vu, vv, uv = (
+                (window * (u - mu) ** 2).sum(),
+                (window * (v - mv) ** 2).sum(),
+                (window * (u - mu) * (v - mv)).sum(),
+            )
             structure.append((2 * uv + 0.0009) / (vu + vv + 0.0009))
             whole.append(structure[-1] * (2 * mu * mv + 0.0001) / (mu**2 + mv**2 + 0.0001))
     return np.mean(whole), np.mean(structure)
 
 
 def slow_halved(x):
-    return np.array([[x[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean() for j in range(x.shape[1] // 2)] for i in range(x.shape[0] // 2)])
+    return np.array(
+        [
+            [x[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean() for j in range(x.shape[1] // 2)]
+            for i in range(x.shape[0] // 2)
+        ]
+    )
 
 
 def slow(a, b, scales, weights):
@@ -59,8 +74,14 @@ def test_equals_a_loop_over_windows(scales, c):
     weights = np.array([0.0448, 0.2856, 0.3001][:scales]) / sum([0.0448, 0.2856, 0.3001][:scales])
     expected = slow(a, b, scales, weights)
     np.testing.assert_allclose(ms_ssim_per_image(a, b, scales=scales), expected, atol=1e-12)
-    np.testing.assert_allclose(ms_ssim_per_image(a / 255, b / 255, scales=scales), expected, atol=1e-12)
-    np.testing.assert_allclose(ms_ssim_per_image(a / 127.5 - 1, b / 127.5 - 1, scales=scales, data_range=(-1, 1)), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        ms_ssim_per_image(a / 255, b / 255, scales=scales), expected, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        ms_ssim_per_image(a / 127.5 - 1, b / 127.5 - 1, scales=scales, data_range=(-1, 1)),
+        expected,
+        atol=1e-9,
+    )
     assert ms_ssim(a, b, scales=scales).value == pytest.approx(np.mean(expected), abs=1e-12)
 
 
@@ -83,7 +104,20 @@ def test_a_negative_structure_counts_as_nothing():
 
 
 @pytest.mark.parametrize(
-    ("side", "scales"), [(11, 1), (21, 1), (22, 2), (43, 2), (44, 3), (64, 3), (87, 3), (88, 4), (175, 4), (176, 5), (352, 5)]
+    ("side", "scales"),
+    [
+        (11, 1),
+        (21, 1),
+        (22, 2),
+        (43, 2),
+        (44, 3),
+        (64, 3),
+        (87, 3),
+        (88, 4),
+        (175, 4),
+        (176, 5),
+        (352, 5),
+    ],
 )
 def test_as_many_scales_as_fit(side, scales):
     a = np.zeros((1, side, side + 3, 1), dtype=np.uint8)
@@ -111,7 +145,12 @@ def test_unequal_numbers_of_scales_do_not_mix():
         require_comparable([two, three])
     require_comparable([three, ms_ssim(b, a, scales=3, groups=list("uuvv"), subject="other")])
     json.dumps(three.to_json(), allow_nan=False)
-    assert (three.metric, three.higher_is_better, three.n, three.estimator) == ("MS-SSIM", True, 4, "per-image mean")
+    assert (three.metric, three.higher_is_better, three.n, three.estimator) == (
+        "MS-SSIM",
+        True,
+        4,
+        "per-image mean",
+    )
     assert three.interval[1] <= 1
     assert three.value > ssim(a, b).value  # white noise is averaged away at the coarser scales
 

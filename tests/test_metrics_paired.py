@@ -20,8 +20,8 @@ from test_metrics_tactile import change, keep, world
 ESTIMATORS = ["unbiased", "biased", "grouped"]
 
 
-def relabelled(x, label, unit, estimator):
-    """TMMD of a relabelling by the loop over pairs, and over its leave-one-unit-out standard error."""
+def relabeled(x, label, unit, estimator):
+    """TMMD of a relabeling by the loop over pairs, and over its leave-one-unit-out standard error."""
     names, units = unit.astype(str), np.unique(unit)
 
     def value(keep):
@@ -35,8 +35,8 @@ def relabelled(x, label, unit, estimator):
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("shared", [True, False])
-def test_relabelling_items_is_relabelling_samples(estimator, shared):
-    """Every value of the test is that of the loop on samples of some relabelling of whole units, and all relabellings occur."""
+def test_relabeling_items_is_relabeling_samples(estimator, shared):
+    """Every value of the test is that of the loop on samples of some relabeling of whole units, and all relabelings occur."""
     frames = np.repeat(np.arange(4), [3, 2, 2, 4])
     unit = np.r_[frames, frames] if shared else np.r_[frames, frames + 4][:18]
     label = np.r_[np.zeros(11, bool), np.ones(11, bool)][: len(unit)]
@@ -48,21 +48,26 @@ def test_relabelling_items_is_relabelling_samples(estimator, shared):
     if shared:
         assert (found.swapped, found.dealt) == (4, 0)
         for flips in itertools.product([False, True], repeat=4):
-            allowed.add(round(relabelled(x, label ^ np.array(flips)[unit], unit, estimator)[0], 6))
+            allowed.add(round(relabeled(x, label ^ np.array(flips)[unit], unit, estimator)[0], 6))
     else:
         assert (found.swapped, found.dealt) == (0, len(units))
         second = len(np.unique(unit[label]))
         for chosen in itertools.combinations(units, second):
-            allowed.add(round(relabelled(x, np.isin(unit, chosen), unit, estimator)[0], 6))
-    observed, error = relabelled(x, label, unit, estimator)
+            allowed.add(round(relabeled(x, np.isin(unit, chosen), unit, estimator)[0], 6))
+    observed, error = relabeled(x, label, unit, estimator)
     seen = {round(v / error, 6) for v in found.null}
     defined = {v for v in allowed if np.isfinite(v)}
     assert seen == defined or (seen <= defined and len(seen) > 0.8 * len(defined))
-    assert found.p == pytest.approx((1 + sum(v / error >= observed - 1e-9 for v in found.null)) / (1 + len(found.null)))
+    assert found.p == pytest.approx(
+        (1 + sum(v / error >= observed - 1e-9 for v in found.null)) / (1 + len(found.null))
+    )
 
 
 def test_the_test_sees_a_shift_and_keeps_quiet_without_one(monkeypatch):
-    g, r = world(0, classes=1, videos=12, frames=3, draw=1), world(0, classes=1, videos=12, frames=3)
+    g, r = (
+        world(0, classes=1, videos=12, frames=3, draw=1),
+        world(0, classes=1, videos=12, frames=3),
+    )
     quiet = tmmd(g, r)
     moved = g.features + 0.2
     loud = tmmd(change(g, features=moved / np.linalg.norm(moved, axis=1, keepdims=True)), r)
@@ -89,25 +94,35 @@ def draw(rng, sizes, videos=None, shift=0.0):
 @pytest.mark.parametrize(
     ("mine", "theirs", "paired", "shift", "low", "high"),
     [
-        ([1] * 6, [12] * 24, False, 0.0, 0.0, 0.09), ([12] * 6, [2] * 24, False, 0.0, 0.01, 0.09), ([2] * 12, [15] * 12, True, 0.0, 0.01, 0.09),
+        ([1] * 6, [12] * 24, False, 0.0, 0.0, 0.09),
+        ([12] * 6, [2] * 24, False, 0.0, 0.01, 0.09),
+        ([2] * 12, [15] * 12, True, 0.0, 0.01, 0.09),
         ([2] * 12, [15] * 12, True, 0.2, 0.8, 1.0),
     ],
-)  # fmt: skip
+)
 def test_unequal_numbers_of_frames_do_no_harm(mine, theirs, paired, shift, low, high):
-    """TMMD itself, not studentised, rejects true nulls in up to a third of such sets, or never."""
+    """TMMD itself, not studentized, rejects true nulls in up to a third of such sets, or never."""
     rng, hits = np.random.default_rng(3), []
     for seed in range(200):
         x, g, videos = draw(rng, mine, shift=shift)
         y, h, _ = draw(rng, theirs, videos if paired else None)
         unit = np.r_[g, h if paired else h + 100]
-        sums = blocked_sums(np.r_[x, y], np.repeat([0, 1], [len(x), len(y)]), unit, segments=2, kernel=Gaussian((2.0,))).sums
+        sums = blocked_sums(
+            np.r_[x, y],
+            np.repeat([0, 1], [len(x), len(y)]),
+            unit,
+            segments=2,
+            kernel=Gaussian((2.0,)),
+        ).sums
         hits.append(permutation_test(sums, "grouped", 1000.0, count=99, seed=seed).p <= 0.05)
     assert low <= np.mean(hits) <= high
 
 
 def test_nothing_to_exchange_is_no_test():
     s = world(0, classes=1, videos=3, frames=2)
-    one = blocked_sums(s.features, np.zeros(6, int), np.arange(6) // 2, segments=2, kernel=Gaussian()).sums
+    one = blocked_sums(
+        s.features, np.zeros(6, int), np.arange(6) // 2, segments=2, kernel=Gaussian()
+    ).sums
     assert permutation_test(one, "unbiased", 1.0) is None
 
 
@@ -121,7 +136,11 @@ def shifted(s, by):
 def three():
     r = world(0, classes=3, videos=5, frames=4)
     near = world(0, classes=3, videos=5, frames=4, draw=1)
-    return r, {"near": near, "far": shifted(world(0, classes=3, videos=5, frames=4, draw=2), 0.3), "mid": shifted(near, 0.1)}
+    return r, {
+        "near": near,
+        "far": shifted(world(0, classes=3, videos=5, frames=4, draw=2), 0.3),
+        "mid": shifted(near, 0.1),
+    }
 
 
 def test_differences_are_the_jackknife_of_the_difference(three):
@@ -136,7 +155,9 @@ def test_differences_are_the_jackknife_of_the_difference(three):
     for d in found.differences:
         a, b = generators[d.details["a"]], generators[d.details["b"]]
         metric = d.metric.removesuffix(" difference")
-        value = lambda s, ref: {x.metric: x.value for x in four_scores(s, ref, permutations=0)}[metric]  # noqa: B023, E731
+        value = lambda s, ref: {x.metric: x.value for x in four_scores(s, ref, permutations=0)}[
+            metric
+        ]
         assert d.value == pytest.approx(value(a, r) - value(b, r), abs=1e-12)
         if metric == "TMMD":
             out = [[keep(s, np.array(s.groups) != g) for s in (a, b, r)] for g in groups]
@@ -144,14 +165,18 @@ def test_differences_are_the_jackknife_of_the_difference(three):
             error = np.sqrt((len(gaps) - 1) / len(gaps) * ((gaps - gaps.mean()) ** 2).sum())
             reach = stats.t.ppf(0.975, len(gaps) - 1) * error
             assert d.interval == pytest.approx((d.value - reach, d.value + reach), abs=1e-9)
-            assert d.details["p_better"] == pytest.approx(stats.t.cdf(-d.value / error, len(gaps) - 1), abs=1e-9)
+            assert d.details["p_better"] == pytest.approx(
+                stats.t.cdf(-d.value / error, len(gaps) - 1), abs=1e-9
+            )
             assert d.interval_method == "paired leave-one-group-out jackknife, t, 14 df"
     first = found.differences[0]
     assert (first.subject, first.details["better"]) == ("near - far", "near")
     assert first.details["p_better"] > 0.99
     width = lambda s: s.interval[1] - s.interval[0]  # noqa: E731
     ci = [s for s in found.scores if s.metric == "CI-TMMD"]
-    paired = next(d for d in found.differences if d.metric.startswith("CI") and d.subject == "near - mid")
+    paired = next(
+        d for d in found.differences if d.metric.startswith("CI") and d.subject == "near - mid"
+    )
     assert width(paired) < 0.5 * min(width(s) for s in ci)  # what the videos have in common is gone
 
 
@@ -188,13 +213,18 @@ def test_undefined_scores_have_no_difference(three):
 def test_without_a_reference_the_nearer_to_the_floor_is_better(three):
     r, generators = three
     near = generators["near"]
-    centre = near.features.mean(axis=0)
-    x = 0.2 * near.features + 0.8 * centre
+    center = near.features.mean(axis=0)
+    x = 0.2 * near.features + 0.8 * center
     collapsed = change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True))
     sets = {"collapsed": collapsed, "near": near}
     for d in compare(sets, r).differences[1:]:
         assert d.value < 0
-        assert (d.details["better"], d.details["p_better"], d.details["decided"], d.higher_is_better) == (None, None, False, None)
+        assert (
+            d.details["better"],
+            d.details["p_better"],
+            d.details["decided"],
+            d.higher_is_better,
+        ) == (None, None, False, None)
         assert d.details["p_value"] is not None
     found = {d.metric: d for d in compare(sets, r, floor=r).differences}
     one = found["I-TMMD difference"]
@@ -203,7 +233,9 @@ def test_without_a_reference_the_nearer_to_the_floor_is_better(three):
     assert one.details["decided"]
     assert one.details["p_better"] < 0.01
     value = lambda s: i_tmmd(s).value  # noqa: E731
-    assert one.details["gap"] == pytest.approx(abs(value(collapsed) - value(r)) - abs(value(near) - value(r)), abs=1e-9)
+    assert one.details["gap"] == pytest.approx(
+        abs(value(collapsed) - value(r)) - abs(value(near) - value(r)), abs=1e-9
+    )
     low, high = one.details["gap_interval"]
     assert 0 < low < one.details["gap"] < high
     assert "gap" not in found["TMMD difference"].details
@@ -215,7 +247,9 @@ def test_holm_by_hand(three):
     p = [d.details["p_value"] for d in found]
     order = np.argsort(p)
     by_hand = np.maximum.accumulate(np.minimum(1, np.array(p)[order] * [3, 2, 1]))
-    np.testing.assert_allclose(np.array([d.details["p_adjusted"] for d in holm(found)])[order], by_hand)
+    np.testing.assert_allclose(
+        np.array([d.details["p_adjusted"] for d in holm(found)])[order], by_hand
+    )
 
 
 def test_copies_of_reference_rows_are_told():
@@ -236,7 +270,14 @@ def test_one_bandwidth_for_all_generators(three):
     assert len({s.bandwidth for s in found.scores}) == 1
     near = generators["near"]
     assert found.scores[0].value == pytest.approx(
-        mmd2(near.features, r.features, sigma="median", estimator="grouped", groups_x=near.groups, groups_y=r.groups)
+        mmd2(
+            near.features,
+            r.features,
+            sigma="median",
+            estimator="grouped",
+            groups_x=near.groups,
+            groups_y=r.groups,
+        )
     )
     several = compare(generators, r, sigma="multi", permutations=0).scores[0]
     assert several.bandwidth is None
@@ -246,11 +287,16 @@ def test_one_bandwidth_for_all_generators(three):
 def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
     r, generators = three
     near = generators["near"]
-    centre = near.features.mean(axis=0)
-    x = 0.2 * near.features + 0.8 * centre
-    sets = {"collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)), "near": near}
+    center = near.features.mean(axis=0)
+    x = 0.2 * near.features + 0.8 * center
+    sets = {
+        "collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)),
+        "near": near,
+    }
     found = compare(sets, r, floor=r, permutations=0).excess
-    assert [(s.metric, s.subject) for s in found.scores] == [(m, s) for s in ("collapsed", "near") for m in ("I-TMMD E", "CI-TMMD E")]
+    assert [(s.metric, s.subject) for s in found.scores] == [
+        (m, s) for s in ("collapsed", "near") for m in ("I-TMMD E", "CI-TMMD E")
+    ]
     groups = sorted(set(r.groups))
     for metric, function in (("I-TMMD E", i_tmmd), ("CI-TMMD E", ci_tmmd)):
         value = lambda s: function(s).details["E"]  # noqa: B023, E731
@@ -261,12 +307,20 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
             assert score[name].floor == pytest.approx(value(r))
         (d,) = (d for d in found.differences if d.metric == f"{metric} difference")
         a, b, floor = (value(s) for s in (*sets.values(), r))
-        out = np.array([[value(keep(s, np.array(s.groups) != g)) for s in (*sets.values(), r)] for g in groups])
+        out = np.array(
+            [[value(keep(s, np.array(s.groups) != g)) for s in (*sets.values(), r)] for g in groups]
+        )
         for got, interval, values in (
             (d.value, d.interval, out[:, 0] - out[:, 1]),
-            (d.details["gap"], d.details["gap_interval"], np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2])),
+            (
+                d.details["gap"],
+                d.details["gap_interval"],
+                np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2]),
+            ),
         ):
-            reach = stats.t.ppf(0.975, 14) * np.sqrt(14 / 15 * ((values - values.mean()) ** 2).sum())
+            reach = stats.t.ppf(0.975, 14) * np.sqrt(
+                14 / 15 * ((values - values.mean()) ** 2).sum()
+            )
             assert interval == pytest.approx((got - reach, got + reach), abs=1e-9)
         assert d.value == pytest.approx(a - b)
         assert d.details["gap"] == pytest.approx(abs(a - floor) - abs(b - floor))
@@ -275,17 +329,36 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
     assert compare(bare, change(r, groups=None), permutations=0).excess.scores == []
 
 
-@pytest.mark.parametrize(("bound", "note"), [
-    (0.0, ""), (0.9e-5, ""), (2e-4, "Within 0.0002 of the exact value, as the bandwidth is narrow for moments"), (2.5e-5, "Within 2.5e-05 of the exact value, as the bandwidth is narrow for moments"),
-    (201.0, None), (math.inf, None), (None, None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("bound", "note"),
+    [
+        (0.0, ""),
+        (0.9e-5, ""),
+        (2e-4, "Within 0.0002 of the exact value, as the bandwidth is narrow for moments"),
+        (2.5e-5, "Within 2.5e-05 of the exact value, as the bandwidth is narrow for moments"),
+        (201.0, None),
+        (math.inf, None),
+        (None, None),
+    ],
+)
 def test_an_excess_that_moments_do_not_bound_is_undefined(bound, note):
     details = {"E": 3.0, "E_interval": (2.0, 4.0), "E_bound": bound, "unit": "group"}
-    score = Score("I-TMMD", "g", 1.0, scale=100.0, details=details, settings={"halves": "group"}, interval_method="jackknife")
+    score = Score(
+        "I-TMMD",
+        "g",
+        1.0,
+        scale=100.0,
+        details=details,
+        settings={"halves": "group"},
+        interval_method="jackknife",
+    )
     found = excess_of(Scored(score, np.zeros(3), "abc", np.ones(3))).score
     if note is None:
         assert (found.value, found.interval, found.interval_method) == (None, None, "")
-        assert found.note == 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
+        assert (
+            found.note
+            == 'Undefined: moments do not bound this value at this bandwidth; pass backend="blocked"'
+        )
         return
     assert (found.value, found.interval, found.details["bound"]) == (3.0, (2.0, 4.0), bound)
     assert found.note == note
@@ -294,18 +367,36 @@ def test_an_excess_that_moments_do_not_bound_is_undefined(bound, note):
 def test_the_p_value_of_a_metric_without_direction_is_that_of_the_gap_to_the_floor(three):
     r, generators = three
     sets = {"near": generators["near"], "far": generators["far"]}
-    d = {x.metric: x for x in compare(sets, r, floor=r, permutations=0).differences}["I-TMMD difference"]
+    d = {x.metric: x for x in compare(sets, r, floor=r, permutations=0).differences}[
+        "I-TMMD difference"
+    ]
     groups = sorted(set(r.groups))
     value = lambda s: i_tmmd(s).value  # noqa: E731
-    design = i_tmmd(r).value / i_tmmd(r).details["E"]  # what E is multiplied by; leaving out a video keeps it
-    out = np.array([[design * i_tmmd(keep(s, np.array(s.groups) != g)).details["E"] for s in (*sets.values(), r)] for g in groups])
+    design = (
+        i_tmmd(r).value / i_tmmd(r).details["E"]
+    )  # what E is multiplied by; leaving out a video keeps it
+    out = np.array(
+        [
+            [
+                design * i_tmmd(keep(s, np.array(s.groups) != g)).details["E"]
+                for s in (*sets.values(), r)
+            ]
+            for g in groups
+        ]
+    )
     for name, got, values in (
-        ("p_value", d.details["gap"], np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2])),
+        (
+            "p_value",
+            d.details["gap"],
+            np.abs(out[:, 0] - out[:, 2]) - np.abs(out[:, 1] - out[:, 2]),
+        ),
         ("p_difference", value(sets["near"]) - value(sets["far"]), out[:, 0] - out[:, 1]),
     ):
         error = np.sqrt(14 / 15 * ((values - values.mean()) ** 2).sum())
         assert d.details[name] == pytest.approx(2 * stats.t.sf(abs(got) / error, 14), rel=1e-6)
     assert d.details["p_adjusted"] == d.details["p_value"]
-    assert d.details["p_value"] == pytest.approx(2 * min(d.details["p_better"], 1 - d.details["p_better"]))
+    assert d.details["p_value"] == pytest.approx(
+        2 * min(d.details["p_better"], 1 - d.details["p_better"])
+    )
     bare = {x.metric: x for x in compare(sets, r, permutations=0).differences}["I-TMMD difference"]
     assert bare.details["p_value"] == pytest.approx(d.details["p_difference"])

@@ -17,14 +17,25 @@ def error_of(values):
 
 def test_the_gap_is_recomputed_without_each_video_in_all_three_sets():
     """Videos of equal size: the distance of two halves is E times a number of the whole set, with and without a video."""
-    r, near = world(0, classes=3, videos=5, frames=4), world(0, classes=3, videos=5, frames=4, draw=1)
+    r, near = (
+        world(0, classes=3, videos=5, frames=4),
+        world(0, classes=3, videos=5, frames=4, draw=1),
+    )
     x = 0.5 * near.features + 0.5 * near.features.mean(axis=0)
-    sets = {"collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)), "near": near}
+    sets = {
+        "collapsed": change(near, features=x / np.linalg.norm(x, axis=1, keepdims=True)),
+        "near": near,
+    }
     found = {d.metric: d for d in compare(sets, r, floor=r, permutations=0).differences}
     groups, gaps = np.array(r.groups), {}
-    for metric, function, factor in (("I-TMMD", i_tmmd, share(r)), ("CI-TMMD", ci_tmmd, share(r, "m0"))):
+    for metric, function, factor in (
+        ("I-TMMD", i_tmmd, share(r)),
+        ("CI-TMMD", ci_tmmd, share(r, "m0")),
+    ):
         a, b, floor = (
-            factor * np.array([function(keep(s, groups != v)).details["E"] for v in sorted(set(groups))]) for s in (*sets.values(), r)
+            factor
+            * np.array([function(keep(s, groups != v)).details["E"] for v in sorted(set(groups))])
+            for s in (*sets.values(), r)
         )
         whole = [function(s).value for s in (*sets.values(), r)]
         value = abs(whole[0] - whole[2]) - abs(whole[1] - whole[2])

@@ -10,7 +10,14 @@ from skimage.metrics import structural_similarity
 
 from palpate.core import PalpateError
 from palpate.core.score import require_comparable
-from palpate.metrics.pairwise import mean_score, paired_by_id, psnr, psnr_per_image, ssim, ssim_per_image
+from palpate.metrics.pairwise import (
+    mean_score,
+    paired_by_id,
+    psnr,
+    psnr_per_image,
+    ssim,
+    ssim_per_image,
+)
 
 
 def images(seed, n=6, h=20, w=27, c=3, noise=25):
@@ -24,7 +31,13 @@ def test_ssim_equals_scikit_image(h, w, c):
     a, b = images(0, 4, h, w, c)
     expected = [
         structural_similarity(
-            x / 255, y / 255, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
+            x / 255,
+            y / 255,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1,
+            channel_axis=-1,
         )
         for x, y in zip(a, b, strict=True)
     ]
@@ -36,7 +49,9 @@ def test_ssim_equals_scikit_image(h, w, c):
 
 def test_ssim_of_constant_images_by_hand():
     a, b = np.full((1, 12, 12, 3), 0.2), np.full((1, 12, 12, 3), 0.6)
-    assert ssim(a, b).value == pytest.approx((2 * 0.2 * 0.6 + 1e-4) / (0.04 + 0.36 + 1e-4), abs=1e-12)
+    assert ssim(a, b).value == pytest.approx(
+        (2 * 0.2 * 0.6 + 1e-4) / (0.04 + 0.36 + 1e-4), abs=1e-12
+    )
     assert ssim(a, a).value == 1
 
 
@@ -46,7 +61,9 @@ def test_psnr_by_hand():
     b[0] += 0.1  # mse 0.01
     b[1, 0, 0, 0] = 1.0  # mse 1/60
     assert psnr_per_image(a, b) == pytest.approx([20.0, 10 * math.log10(60)])
-    assert psnr(a, b).value == pytest.approx((20 + 10 * math.log10(60)) / 2)  # over images, not over pooled pixels
+    assert psnr(a, b).value == pytest.approx(
+        (20 + 10 * math.log10(60)) / 2
+    )  # over images, not over pooled pixels
     u = np.zeros((1, 4, 5, 3), dtype=np.uint8)
     assert psnr(u, u + np.uint8(255)).value == pytest.approx(0)
 
@@ -88,7 +105,13 @@ def test_scores_name_their_settings_and_the_lowest_images():
     b[2] = 255 - a[2]
     score = ssim(a, b, ids=list("pqrstu"), subject="mini", split="s")
     assert score.details["lowest"][0]["id"] == "r"
-    assert (score.subject, score.split, score.n, score.m, score.higher_is_better) == ("mini", "s", 6, 6, True)
+    assert (score.subject, score.split, score.n, score.m, score.higher_is_better) == (
+        "mini",
+        "s",
+        6,
+        6,
+        True,
+    )
     assert score.settings["size"] == [20, 27]
     assert score.estimator == "per-image mean"
 
@@ -140,7 +163,9 @@ def test_a_score_does_not_depend_on_the_coding_of_the_pictures():
         for metric, first in zip((ssim, psnr), plain, strict=True):
             score = metric(a, b, data_range=given)
             assert score.value == pytest.approx(first.value, abs=1e-9)
-            assert score.details["coding"] == [*(given if isinstance(given, tuple) else (0.0, given))]
+            assert score.details["coding"] == [
+                *(given if isinstance(given, tuple) else (0.0, given))
+            ]
             require_comparable([first, score])
 
 
@@ -188,17 +213,34 @@ def test_one_image_and_identical_images():
 
 def test_means_leave_out_what_has_no_value_and_stay_in_their_bounds():
     score = mean_score(
-        "x", np.array([0.9, np.nan, 1.0, 0.2]), list("abcd"), None, bounds=(0.0, 1.0), level=0.95, subject="s", note="one has none"
+        "x",
+        np.array([0.9, np.nan, 1.0, 0.2]),
+        list("abcd"),
+        None,
+        bounds=(0.0, 1.0),
+        level=0.95,
+        subject="s",
+        note="one has none",
     )
     assert score.value == pytest.approx(0.7)
     assert score.interval == (0, 1)
     assert score.details["identical"] == 0
     assert [row["id"] for row in score.details["lowest"]] == ["d", "a", "c"]
     assert score.note == "one has none"
-    worse = mean_score("x", np.array([0.9, np.nan, 1.0, 0.2]), list("abcd"), None, better=False, level=0.95, subject="s")
+    worse = mean_score(
+        "x",
+        np.array([0.9, np.nan, 1.0, 0.2]),
+        list("abcd"),
+        None,
+        better=False,
+        level=0.95,
+        subject="s",
+    )
     assert [row["id"] for row in worse.details["highest"]] == ["c", "a", "d"]
     assert not worse.higher_is_better
-    none = mean_score("x", np.full(3, np.nan), None, None, level=0.95, subject="s", note="no contact")
+    none = mean_score(
+        "x", np.full(3, np.nan), None, None, level=0.95, subject="s", note="no contact"
+    )
     assert none.value is None
     assert none.note.startswith("Undefined: no pair has a value")
 
@@ -214,7 +256,9 @@ def test_pairs_are_found_by_id():
     np.testing.assert_array_equal(order[first], second)
     a, b = images(5, 3)
     first, second = paired_by_id(made, wanted)
-    assert ssim(a[first], b[second]).value == pytest.approx(np.mean([ssim(a[[made.index(i)]], b[[wanted.index(i)]]).value for i in wanted]))
+    assert ssim(a[first], b[second]).value == pytest.approx(
+        np.mean([ssim(a[[made.index(i)]], b[[wanted.index(i)]]).value for i in wanted])
+    )
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from palpate.metrics import (
     psnr,
     ssim,
     tmmd,
-)  # fmt: skip
+)
 from test_metrics_mmd import unit_rows
 from test_metrics_tactile import change, keep, world
 
@@ -29,9 +29,11 @@ from test_metrics_tactile import change, keep, world
 def test_rows_too_short_are_refused_as_those_too_long(length):
     x = unit_rows(0, 8, 3)
     x[[2, 5]] *= length
-    with pytest.raises(PalpateError, match=rf"x must be L2-normalised. Got norm {length:.4g} in 2 rows \(2, 5\)"):
+    with pytest.raises(
+        PalpateError, match=rf"x must be L2-normalized. Got norm {length:.4g} in 2 rows \(2, 5\)"
+    ):
         mmd2(x, unit_rows(1, 8, 3))
-    with pytest.raises(PalpateError, match=r"L2-normalised.*2 rows \(2, 5\)"):
+    with pytest.raises(PalpateError, match=r"L2-normalized.*2 rows \(2, 5\)"):
         i_tmmd(FeatureSet(list("abcdefgh"), x))
     near = unit_rows(0, 8, 3)
     near[[2, 5]] *= 1 + np.sign(length - 1) * 9e-4
@@ -41,7 +43,9 @@ def test_rows_too_short_are_refused_as_those_too_long(length):
 def test_features_may_be_tensors_with_a_graph():
     torch = pytest.importorskip("torch")
     g, r = world(0), world(0, draw=1)
-    made, real = (change(s, features=torch.tensor(s.features, requires_grad=True) * 1.0) for s in (g, r))
+    made, real = (
+        change(s, features=torch.tensor(s.features, requires_grad=True) * 1.0) for s in (g, r)
+    )
     assert made.features.dtype == np.float64
     np.testing.assert_array_equal(made.features, g.features)
     for a, b in zip(four_scores(made, real, floor=real), four_scores(g, r, floor=r), strict=True):
@@ -54,13 +58,19 @@ def test_features_may_be_tensors_with_a_graph():
 def test_features_may_be_of_bfloat16():
     torch = pytest.importorskip("torch")
     g, r = world(0), world(0, draw=1)
-    made, real = (change(s, features=torch.tensor(s.features, requires_grad=True).bfloat16()) for s in (g, r))
+    made, real = (
+        change(s, features=torch.tensor(s.features, requires_grad=True).bfloat16()) for s in (g, r)
+    )
     bits = np.ascontiguousarray(g.features, dtype=np.float32).view(np.uint32)
-    rounded = ((bits + 0x7FFF + ((bits >> 16) & 1)) & 0xFFFF0000).astype(np.uint32).view(np.float32)  # to the nearest even 16 bits
+    rounded = (
+        ((bits + 0x7FFF + ((bits >> 16) & 1)) & 0xFFFF0000).astype(np.uint32).view(np.float32)
+    )  # to the nearest even 16 bits
     assert made.features.dtype == np.float32
     np.testing.assert_array_equal(made.features, rounded)
     by_hand = [change(s, features=v.features) for s, v in ((g, made), (r, real))]
-    for one, other in zip(four_scores(made, real, normalize=True), four_scores(*by_hand, normalize=True), strict=True):
+    for one, other in zip(
+        four_scores(made, real, normalize=True), four_scores(*by_hand, normalize=True), strict=True
+    ):
         assert one == other
     for f in (i_tmmd, ci_tmmd, d_tmmd):
         assert f(made, normalize=True).value == pytest.approx(f(g).value, rel=0.1)
@@ -83,7 +93,14 @@ class NAType:
         return "<NA>"
 
 
-MISSING = {"None": None, "NaN": float("nan"), "NumPy's NaN": np.float32("nan"), "empty": "", "NA": NAType(), "NaT": np.datetime64("NaT")}
+MISSING = {
+    "None": None,
+    "NaN": float("nan"),
+    "NumPy's NaN": np.float32("nan"),
+    "empty": "",
+    "NA": NAType(),
+    "NaT": np.datetime64("NaT"),
+}
 
 
 @pytest.mark.parametrize("kind", MISSING)
@@ -95,7 +112,10 @@ def test_a_label_that_is_missing_is_no_label(kind):
     rest = keep(world(1), np.array(world(1).labels) != "m1")
     for function in (ci_tmmd, d_tmmd):
         score = function(s)
-        assert (score.details["classes"], score.details["excluded"]) == (["m0", "m2"], {"(no label)": "no label"})
+        assert (score.details["classes"], score.details["excluded"]) == (
+            ["m0", "m2"],
+            {"(no label)": "no label"},
+        )
         assert score.value == pytest.approx(function(rest).value, abs=1e-9)
     metric = CITMMD()
     metric.update(s.features, ids=s.ids, labels=list(label), groups=s.groups)
@@ -110,13 +130,21 @@ def test_a_group_that_is_missing_is_refused(kind):
     for call in (
         lambda: i_tmmd(bad),
         lambda: tmmd(s, bad),
-        lambda: mmd2(s.features, unit_rows(0, 9, 6), estimator="grouped", groups_x=groups, groups_y=s.groups[:9]),
+        lambda: mmd2(
+            s.features,
+            unit_rows(0, 9, 6),
+            estimator="grouped",
+            groups_x=groups,
+            groups_y=s.groups[:9],
+        ),
         lambda: fid(bad, s),
         lambda: prdc(s, bad, 2),
         lambda: psnr(x, x + 0.1, groups=groups),
         lambda: ITMMD().update(s.features, groups=groups),
     ):
-        with pytest.raises(PalpateError, match=r"groups.* must be known for every row. Got none in 1 row \(1\)"):
+        with pytest.raises(
+            PalpateError, match=r"groups.* must be known for every row. Got none in 1 row \(1\)"
+        ):
             call()
 
 
@@ -130,12 +158,24 @@ X, Y, G = unit_rows(0, 8, 3), unit_rows(1, 8, 3), world(2)
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: Polynomial(degree=0), "degree of a polynomial kernel must be a whole number from 1 on. Got 0"),
-        (lambda: Polynomial(degree=2.5), "degree of a polynomial kernel must be a whole number from 1 on. Got 2.5"),
+        (
+            lambda: Polynomial(degree=0),
+            "degree of a polynomial kernel must be a whole number from 1 on. Got 0",
+        ),
+        (
+            lambda: Polynomial(degree=2.5),
+            "degree of a polynomial kernel must be a whole number from 1 on. Got 2.5",
+        ),
         (lambda: Polynomial(degree=True), "whole number from 1 on. Got True"),
-        (lambda: distance(X, Y, kernel="linear"), r"kernel must be a kernel.*Linear\(\). Got 'linear'"),
+        (
+            lambda: distance(X, Y, kernel="linear"),
+            r"kernel must be a kernel.*Linear\(\). Got 'linear'",
+        ),
         (lambda: i_tmmd(G, kernel="linear"), "kernel must be a kernel.*Got 'linear'"),
-        (lambda: ssim(*images(), level=95), r"level must lie in \(0, 1\). Got 95. Pass e.g. level=0.95"),
+        (
+            lambda: ssim(*images(), level=95),
+            r"level must lie in \(0, 1\). Got 95. Pass e.g. level=0.95",
+        ),
         (lambda: psnr(*images(), level=95), "level.*Got 95"),
         (lambda: psnr(*images(), level=95, compat="torchmetrics"), "level.*Got 95"),
         (lambda: fid(G, G, level=2), "level.*Got 2"),
@@ -150,7 +190,13 @@ X, Y, G = unit_rows(0, 8, 3), unit_rows(1, 8, 3), world(2)
         (lambda: tmmd(G, G, level="a"), "level.*Got 'a'"),
         (lambda: ITMMD(level="a"), "level.*Got 'a'"),
         (
-            lambda: distance(X, Y, estimator="grouped", groups_x=np.array(["a"] * 8), groups_y=np.array(["b"] * 8)),
+            lambda: distance(
+                X,
+                Y,
+                estimator="grouped",
+                groups_x=np.array(["a"] * 8),
+                groups_y=np.array(["b"] * 8),
+            ),
             "Each set must have at least two groups, not all shared. Got 1 and 1 groups. Use estimator",
         ),
     ],
@@ -162,5 +208,7 @@ def test_options_are_refused_in_words(call, words):
 
 def test_groups_may_be_an_array():
     x, y, gx, gy = X, Y[:6], np.arange(8) % 3, np.arange(6) % 2 + 2
-    named = mmd2(x, y, estimator="grouped", groups_x=[str(v) for v in gx], groups_y=[str(v) for v in gy])
+    named = mmd2(
+        x, y, estimator="grouped", groups_x=[str(v) for v in gx], groups_y=[str(v) for v in gy]
+    )
     assert mmd2(x, y, estimator="grouped", groups_x=gx, groups_y=gy) == named

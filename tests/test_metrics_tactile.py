@@ -17,7 +17,10 @@ from test_metrics_mmd import loop_mmd, unit_rows
 
 def world(seed, classes=3, videos=4, frames=3, d=6, draw=None, prefix="", encoder="e" * 64):
     """Features with class, video and frame effects; ``videos`` and ``frames`` may be cycled over classes."""
-    fixed, rng = np.random.default_rng(seed), np.random.default_rng([seed, 7 if draw is None else draw])
+    fixed, rng = (
+        np.random.default_rng(seed),
+        np.random.default_rng([seed, 7 if draw is None else draw]),
+    )
     cycle = lambda v, k: v[k % len(v)] if isinstance(v, tuple) else v  # noqa: E731
     rows, ids, labels, groups = [], [], [], []
     for c in range(classes):
@@ -34,7 +37,12 @@ def world(seed, classes=3, videos=4, frames=3, d=6, draw=None, prefix="", encode
 
 
 def change(s, **fields):
-    return FeatureSet(**{**{n: getattr(s, n) for n in ("ids", "features", "labels", "groups", "encoder")}, **fields})
+    return FeatureSet(
+        **{
+            **{n: getattr(s, n) for n in ("ids", "features", "labels", "groups", "encoder")},
+            **fields,
+        }
+    )
 
 
 def keep(s, mask):
@@ -55,18 +63,30 @@ def average_over_group_halvings(s, estimator):
     return np.mean(values)
 
 
-@given(seed=st.integers(0, 10**5), m=st.integers(2, 5), n=st.integers(2, 5), frames=st.sampled_from([1, 3, (1, 2, 4)]))
+@given(
+    seed=st.integers(0, 10**5),
+    m=st.integers(2, 5),
+    n=st.integers(2, 5),
+    frames=st.sampled_from([1, 3, (1, 2, 4)]),
+)
 @settings(max_examples=30, deadline=None)
 def test_tmmd_equals_the_double_loop(seed, m, n, frames):
-    g, r = world(seed, classes=1, videos=m, frames=frames), world(seed, classes=1, videos=n, frames=frames, draw=1)
+    g, r = (
+        world(seed, classes=1, videos=m, frames=frames),
+        world(seed, classes=1, videos=n, frames=frames, draw=1),
+    )
     if m + n > 4:  # two videos in both sets, all shared, is a case of its own
         grouped = tmmd(g, r)
         assert grouped.estimator == "grouped"
-        assert grouped.value == pytest.approx(loop_mmd(g.features, r.features, "grouped", g.groups, r.groups), abs=1e-9)
+        assert grouped.value == pytest.approx(
+            loop_mmd(g.features, r.features, "grouped", g.groups, r.groups), abs=1e-9
+        )
     paper = tmmd(without_groups(g), without_groups(r))
     assert (paper.estimator, paper.settings["preset"]) == ("unbiased", "paper")
     assert paper.value == pytest.approx(loop_mmd(g.features, r.features, "unbiased"), abs=1e-9)
-    assert tmmd(g, r, preset="cmmd").value == pytest.approx(loop_mmd(g.features, r.features, "biased"), abs=1e-9)
+    assert tmmd(g, r, preset="cmmd").value == pytest.approx(
+        loop_mmd(g.features, r.features, "biased"), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("estimator", ["unbiased", "biased"])
@@ -87,9 +107,13 @@ def test_the_excess_is_within_minus_between(seed, frames):
         k = np.exp(-((s.features[i] - s.features[j]) ** 2).sum() / 200)
         (within if s.groups[i] == s.groups[j] else between).append(k)
     score = i_tmmd(s)
-    assert score.details["E"] == pytest.approx(1000 * (np.mean(within) - np.mean(between)), abs=1e-9)
+    assert score.details["E"] == pytest.approx(
+        1000 * (np.mean(within) - np.mean(between)), abs=1e-9
+    )
     half = len(s.ids) / 2
-    assert score.value == pytest.approx(score.details["E"] * len(within) / (half * (half - 1)), abs=1e-9)
+    assert score.value == pytest.approx(
+        score.details["E"] * len(within) / (half * (half - 1)), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize("halves", ["random", "ordered"])
@@ -101,34 +125,60 @@ def test_i_ci_d_equal_the_double_loop(halves, estimator):
     number = np.array([int(v[1:]) for v in s.labels])
     half = half_of(s.ids, np.zeros_like(number), plan)
     x = s.features
-    assert i_tmmd(s, **options).value == pytest.approx(loop_mmd(x[half == 0], x[half == 1], estimator), abs=1e-9)
+    assert i_tmmd(s, **options).value == pytest.approx(
+        loop_mmd(x[half == 0], x[half == 1], estimator), abs=1e-9
+    )
     half = half_of(s.ids, number, plan)
-    assert all(abs((half[number == c] == 0).sum() - (half[number == c] == 1).sum()) <= 1 for c in range(3))
-    own = [loop_mmd(x[(number == c) & (half == 0)], x[(number == c) & (half == 1)], estimator) for c in range(3)]
+    assert all(
+        abs((half[number == c] == 0).sum() - (half[number == c] == 1).sum()) <= 1 for c in range(3)
+    )
+    own = [
+        loop_mmd(x[(number == c) & (half == 0)], x[(number == c) & (half == 1)], estimator)
+        for c in range(3)
+    ]
     ci = ci_tmmd(s, **options)
     assert ci.value == pytest.approx(np.mean(own), abs=1e-9)
     assert [v["value"] for v in ci.details["per_class"].values()] == pytest.approx(own, abs=1e-9)
-    matrix = [[own[a] if a == b else loop_mmd(x[number == a], x[number == b], estimator) for b in range(3)] for a in range(3)]
+    matrix = [
+        [
+            own[a] if a == b else loop_mmd(x[number == a], x[number == b], estimator)
+            for b in range(3)
+        ]
+        for a in range(3)
+    ]
     d = d_tmmd(s, **options)
-    assert d.value == pytest.approx(np.mean([own[c] / sum(matrix[c]) for c in range(3)]), abs=1e-9)  # Eq. 7
+    assert d.value == pytest.approx(
+        np.mean([own[c] / sum(matrix[c]) for c in range(3)]), abs=1e-9
+    )  # Eq. 7
     np.testing.assert_allclose(d.details["matrix"], matrix, atol=1e-9)
     off = [(sum(matrix[c]) - own[c]) / 2 for c in range(3)]
     v = d.details["variants"]
     assert v["mean/mean_of_ratios"] == pytest.approx(3 * d.value)
-    assert v["mean_off_diagonal/mean_of_ratios"] == pytest.approx(np.mean([own[c] / off[c] for c in range(3)]))
+    assert v["mean_off_diagonal/mean_of_ratios"] == pytest.approx(
+        np.mean([own[c] / off[c] for c in range(3)])
+    )
     assert v["mean_off_diagonal/ratio_of_means"] == pytest.approx(np.mean(own) / np.mean(off))
-    assert d_tmmd(s, **options, denominator="mean_off_diagonal", aggregate="ratio_of_means").value == v["mean_off_diagonal/ratio_of_means"]
+    assert (
+        d_tmmd(s, **options, denominator="mean_off_diagonal", aggregate="ratio_of_means").value
+        == v["mean_off_diagonal/ratio_of_means"]
+    )
 
 
 def test_grouped_matrix_leaves_out_pairs_of_one_video():
     s = world(3, classes=3, videos=2, frames=3)
-    groups = ["shared" if g in ("c0v0", "c1v0") else g for g in s.groups]  # one video shows two materials
+    groups = [
+        "shared" if g in ("c0v0", "c1v0") else g for g in s.groups
+    ]  # one video shows two materials
     s = change(s, groups=groups)
     matrix = d_tmmd(s).details["matrix"]
     a, b = np.array(s.labels) == "m0", np.array(s.labels) == "m1"
     gs = np.array(groups)
-    assert matrix[0][1] == pytest.approx(loop_mmd(s.features[a], s.features[b], "grouped", gs[a], gs[b]), abs=1e-9)
-    assert matrix[0][0] == pytest.approx(average_over_group_halvings(keep(s, a), "unbiased"), abs=1e-9)
+    assert matrix[0][1] == pytest.approx(
+        loop_mmd(s.features[a], s.features[b], "grouped", gs[a], gs[b]), abs=1e-9
+    )
+    assert matrix[0][0] == pytest.approx(
+        average_over_group_halvings(keep(s, a), "unbiased"), abs=1e-9
+    )
 
 
 def recomputed_interval(value, replicates, level=0.95):
@@ -141,22 +191,32 @@ def recomputed_interval(value, replicates, level=0.95):
 @pytest.mark.parametrize("preset", ["grouped", "paper"])
 @pytest.mark.parametrize("shared", [True, False])
 def test_tmmd_jackknife_equals_leaving_each_group_out(preset, shared):
-    g, r = world(4, classes=1, videos=5, frames=(2, 4, 3)), world(4, classes=1, videos=4, frames=(3, 2), draw=1)
+    g, r = (
+        world(4, classes=1, videos=5, frames=(2, 4, 3)),
+        world(4, classes=1, videos=4, frames=(3, 2), draw=1),
+    )
     if not shared:
         r = change(r, groups=[f"real-{v}" for v in r.groups])
     score = tmmd(g, r, preset=preset, level=0.9)
     names = sorted({*g.groups, *r.groups})
     replicates = [
-        tmmd(keep(g, np.array(g.groups) != v), keep(r, np.array(r.groups) != v), preset=preset).value
+        tmmd(
+            keep(g, np.array(g.groups) != v), keep(r, np.array(r.groups) != v), preset=preset
+        ).value
         for v in names
-    ]  # fmt: skip
-    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(replicates), 0.9), abs=1e-9)
+    ]
+    assert score.interval == pytest.approx(
+        recomputed_interval(score.value, np.array(replicates), 0.9), abs=1e-9
+    )
     assert score.interval_method == f"leave-one-group-out jackknife, t, {len(names) - 1} df"
 
 
 def share(of, name=None):
     """(s_A + s_B) of halves of whole groups: what E is multiplied by, from the sizes of the groups."""
-    sizes = np.unique([v for v, c in zip(of.groups, of.labels, strict=True) if name in (None, c)], return_counts=True)[1]
+    sizes = np.unique(
+        [v for v, c in zip(of.groups, of.labels, strict=True) if name in (None, c)],
+        return_counts=True,
+    )[1]
     m = sizes.sum() / 2
     return (sizes * (sizes - 1)).sum() / (m * (m - 1))
 
@@ -173,13 +233,21 @@ def test_free_jackknife_equals_leaving_each_group_out():
     def d(of):
         score = d_tmmd(of)
         matrix = np.array(score.details["matrix"])
-        np.fill_diagonal(matrix, [share(s, c) * ci_tmmd(of).details["per_class"][c]["E"] for c in names])
+        np.fill_diagonal(
+            matrix, [share(s, c) * ci_tmmd(of).details["per_class"][c]["E"] for c in names]
+        )
         return np.diagonal(matrix).mean() / matrix.sum(axis=1).mean()
 
-    for metric, value in ((i_tmmd, lambda of: share(s) * i_tmmd(of).details["E"]), (ci_tmmd, ci), (d_tmmd, d)):
+    for metric, value in (
+        (i_tmmd, lambda of: share(s) * i_tmmd(of).details["E"]),
+        (ci_tmmd, ci),
+        (d_tmmd, d),
+    ):
         score = metric(s)
         assert value(s) == pytest.approx(score.value, abs=1e-9)
-        assert score.interval == pytest.approx(recomputed_interval(score.value, np.array([value(of) for of in out])), abs=1e-9)
+        assert score.interval == pytest.approx(
+            recomputed_interval(score.value, np.array([value(of) for of in out])), abs=1e-9
+        )
         assert "leave-one-group-out" in score.interval_method
 
 
@@ -187,32 +255,53 @@ def test_free_jackknife_equals_leaving_each_group_out():
 def test_intervals_of_halves_and_of_their_excess_are_one(metric):
     score = metric(world(5, classes=3, videos=4, frames=3))
     factor = score.value / score.details["E"]  # groups of one size: the same in all classes
-    assert score.interval == pytest.approx([factor * v for v in score.details["E_interval"]], abs=1e-9)
+    assert score.interval == pytest.approx(
+        [factor * v for v in score.details["E_interval"]], abs=1e-9
+    )
 
 
 def test_jackknife_of_random_halves_keeps_the_halves():
     s = world(6, classes=1, videos=6, frames=3)
     score = i_tmmd(s, preset="paper", seed=3)
-    half, groups = half_of(s.ids, np.zeros(18, dtype=int), type("P", (), {"halves": "random", "seed": 3})), np.array(s.groups)
-    replicates = [mmd2(s.features[(half == 0) & (groups != v)], s.features[(half == 1) & (groups != v)]) for v in sorted(set(groups))]
-    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(replicates)), abs=1e-9)
+    half, groups = (
+        half_of(s.ids, np.zeros(18, dtype=int), type("P", (), {"halves": "random", "seed": 3})),
+        np.array(s.groups),
+    )
+    replicates = [
+        mmd2(s.features[(half == 0) & (groups != v)], s.features[(half == 1) & (groups != v)])
+        for v in sorted(set(groups))
+    ]
+    assert score.interval == pytest.approx(
+        recomputed_interval(score.value, np.array(replicates)), abs=1e-9
+    )
     assert "no signal" in score.note
     assert score.seed == 3
 
 
 def test_without_groups_the_interval_leaves_out_samples_and_says_so():
-    g, r = without_groups(world(7, classes=1, videos=3)), without_groups(world(7, classes=1, videos=3, draw=1, prefix="r"))
+    g, r = (
+        without_groups(world(7, classes=1, videos=3)),
+        without_groups(world(7, classes=1, videos=3, draw=1, prefix="r")),
+    )
     score = tmmd(g, r)
     everyone = [(s, i) for s in (g, r) for i in s.ids]
-    out = [tmmd(*(s.take([j for j in s.ids if not (t is s and j == i)]) for s in (g, r))).value for t, i in everyone]
-    assert score.interval == pytest.approx(recomputed_interval(score.value, np.array(out)), abs=1e-9)
+    out = [
+        tmmd(*(s.take([j for j in s.ids if not (t is s and j == i)]) for s in (g, r))).value
+        for t, i in everyone
+    ]
+    assert score.interval == pytest.approx(
+        recomputed_interval(score.value, np.array(out)), abs=1e-9
+    )
     assert "samples taken as independent" in score.interval_method
     same_ids = tmmd(g, change(r, ids=g.ids))  # a generated touch and its reference are one unit
     assert same_ids.details["units"] == 9
 
 
 def test_many_samples_are_left_out_in_blocks(monkeypatch):
-    g, r = without_groups(world(8, classes=1, videos=8, frames=10)), without_groups(world(8, classes=1, videos=8, frames=10, prefix="r"))
+    g, r = (
+        without_groups(world(8, classes=1, videos=8, frames=10)),
+        without_groups(world(8, classes=1, videos=8, frames=10, prefix="r")),
+    )
     exact = tmmd(g, r)
     monkeypatch.setattr("palpate.metrics.halves.BLOCKS", 40)
     blocks = tmmd(g, r)
@@ -247,11 +336,13 @@ def test_group_halves_see_what_random_halves_cannot():
     assert random.details["E"] == pytest.approx(by_video.details["E"])
 
 
-def test_the_biased_null_is_centred_on_the_dispersion():
+def test_the_biased_null_is_centered_on_the_dispersion():
     s = world(11, classes=2, videos=4, frames=6)
     values = [ci_tmmd(s, preset="cmmd", seed=k).value for k in range(60)]
     score = ci_tmmd(s, preset="cmmd")
-    assert np.mean(values) == pytest.approx(score.details["dispersion"], abs=3 * np.std(values) / np.sqrt(60))
+    assert np.mean(values) == pytest.approx(
+        score.details["dispersion"], abs=3 * np.std(values) / np.sqrt(60)
+    )
     assert np.mean([score.null[0] < v < score.null[1] for v in values]) > 0.85
 
 
@@ -260,10 +351,16 @@ def test_scores_do_not_depend_on_row_order_or_block_size():
     p = np.random.default_rng(0).permutation(len(g.ids))
     shuffled = g.take([g.ids[i] for i in p])
     for preset in PRESETS:
-        one, two = four_scores(g, r, preset=preset, floor=r), four_scores(shuffled, r, preset=preset, floor=r, block=5)
+        one, two = (
+            four_scores(g, r, preset=preset, floor=r),
+            four_scores(shuffled, r, preset=preset, floor=r, block=5),
+        )
         for a, b in zip(one, two, strict=True):
             assert a.value == pytest.approx(b.value, abs=1e-9)
-            assert (a.interval, a.null) == (pytest.approx(b.interval, abs=1e-8), a.null and pytest.approx(b.null, abs=1e-8))
+            assert (a.interval, a.null) == (
+                pytest.approx(b.interval, abs=1e-8),
+                a.null and pytest.approx(b.null, abs=1e-8),
+            )
 
 
 @pytest.mark.parametrize("preset", [None, *PRESETS])
@@ -275,10 +372,22 @@ def test_four_scores_equal_the_single_metrics_and_carry_their_settings(preset):
     for score, single in zip(scores, singles, strict=True):
         assert score.value == pytest.approx(single.value, abs=1e-9)
         assert score.interval == pytest.approx(single.interval, abs=1e-9)
-        assert (score.encoder, score.split, score.subject, score.n) == ("e" * 64, "s" * 64, "mini", len(g.ids))
-        assert (score.bandwidth, score.scale, score.higher_is_better) == (10.0, 1000.0, {"TMMD": False}.get(score.metric))
+        assert (score.encoder, score.split, score.subject, score.n) == (
+            "e" * 64,
+            "s" * 64,
+            "mini",
+            len(g.ids),
+        )
+        assert (score.bandwidth, score.scale, score.higher_is_better) == (
+            10.0,
+            1000.0,
+            {"TMMD": False}.get(score.metric),
+        )
         assert score.settings["preset"] == (preset or "grouped")
-        assert Score.from_json(json.loads(json.dumps(score.to_json(), allow_nan=False))).value == score.value
+        assert (
+            Score.from_json(json.loads(json.dumps(score.to_json(), allow_nan=False))).value
+            == score.value
+        )
     assert scores[0].m == len(r.ids)
     assert scores[0].floor is None
     assert scores[1].floor == pytest.approx(i_tmmd(r, preset=preset).value, abs=1e-9)
@@ -287,7 +396,10 @@ def test_four_scores_equal_the_single_metrics_and_carry_their_settings(preset):
         require_comparable([i_tmmd(g, preset="paper"), i_tmmd(g, preset="paper", halves="ordered")])
 
 
-@pytest.mark.parametrize(("classes", "videos", "frames"), [(5, (2, 3), 6), (20, (1, 2), 8), (3, 1, 5), (1, 1, 6), (4, 3, 1), (1, 2, 2)])
+@pytest.mark.parametrize(
+    ("classes", "videos", "frames"),
+    [(5, (2, 3), 6), (20, (1, 2), 8), (3, 1, 5), (1, 1, 6), (4, 3, 1), (1, 2, 2)],
+)
 @pytest.mark.parametrize("preset", [None, "paper", "paper-tables"])
 def test_small_sets_give_a_score_or_a_note(classes, videos, frames, preset, recwarn):
     g, r = world(14, classes, videos, frames), world(14, classes, videos, frames, draw=1)
@@ -323,7 +435,9 @@ def test_classes_left_out_are_listed_with_reasons():
             "m2": "all samples are of one group",
             "m3": "no group has two samples",
         }
-    assert ci_tmmd(s).value == pytest.approx(ci_tmmd(keep(s, np.isin(np.array(s.labels, dtype=str), ["m4", "m5"]))).value, abs=1e-9)
+    assert ci_tmmd(s).value == pytest.approx(
+        ci_tmmd(keep(s, np.isin(np.array(s.labels, dtype=str), ["m4", "m5"]))).value, abs=1e-9
+    )
     assert list(ci_tmmd(s, preset="paper").details["excluded"]) == ["(no label)", "m1"]
 
 
@@ -352,7 +466,9 @@ def test_collapse_is_named():
 
 def test_unstable_classes_are_flagged():
     s = without_groups(world(18, classes=1, videos=40, frames=1))
-    s = change(s, labels=[f"m{k % 4}" for k in range(40)])  # labels without meaning: no class differs from another
+    s = change(
+        s, labels=[f"m{k % 4}" for k in range(40)]
+    )  # labels without meaning: no class differs from another
     score = d_tmmd(s)
     assert score.details["unstable"]
     assert "unreliable" in score.note
@@ -361,15 +477,21 @@ def test_unstable_classes_are_flagged():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda g: tmmd(g, change(g, encoder="f" * 64)), ["one encoder", "eeeeeeeeeeee", "ffffffffffff"]),
+        (
+            lambda g: tmmd(g, change(g, encoder="f" * 64)),
+            ["one encoder", "eeeeeeeeeeee", "ffffffffffff"],
+        ),
         (lambda g: four_scores(g, g, floor=change(g, encoder="f" * 64)), ["floor", "one encoder"]),
         (lambda g: four_scores(g, g, floor=without_groups(g)), ["floor", "groups"]),
         (lambda g: i_tmmd(without_groups(g), halves="group"), ['halves="group"']),
         (lambda g: i_tmmd(without_groups(g), preset="grouped"), ["grouped"]),
         (lambda g: tmmd(g, without_groups(g), estimator="grouped"), ["grouped"]),
         (lambda g: i_tmmd(change(g, groups=[None, *g.groups[1:]])), ["groups", "1 row (0)"]),
-        (lambda g: i_tmmd(change(g, features=3 * g.features)), ["L2-normalised", "norm 3"]),
-        (lambda g: tmmd(g, change(g, features=g.features[:, :4], encoder=None), normalize=True), ["same width"]),
+        (lambda g: i_tmmd(change(g, features=3 * g.features)), ["L2-normalized", "norm 3"]),
+        (
+            lambda g: tmmd(g, change(g, features=g.features[:, :4], encoder=None), normalize=True),
+            ["same width"],
+        ),
         (lambda g: i_tmmd(g, preset="best"), ["preset", "paper-tables"]),
         (lambda g: i_tmmd(g, halves="thirds"), ["halves", "ordered"]),
         (lambda g: d_tmmd(g, denominator="none"), ["denominator"]),

@@ -53,17 +53,26 @@ def test_a_true_metric_with_the_same_score(name, mode):
 
 def rank(number, where, out, mode):
     """One of two processes; the second gets a quarter of the rows, and no real ones."""
-    torch.distributed.init_process_group("gloo", init_method=f"file://{where}", rank=number, world_size=2)
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{where}", rank=number, world_size=2
+    )
     g, r = sets()
     cut = 3 * len(g.ids) // 4
     found = {}
     for name in NAMES:
         metric = made(name, mode)
-        feed(metric, g, order=np.arange(cut) if number == 0 else np.arange(cut, len(g.ids)), step=5 + number)
+        feed(
+            metric,
+            g,
+            order=np.arange(cut) if number == 0 else np.arange(cut, len(g.ids)),
+            step=5 + number,
+        )
         if number == 0:
             feed(metric, r, real=True)
         synced = metric.compute().item(), metric.score().to_json()
-        rows = metric.plain.score_of(metric._state()).n if number == 0 else None  # unsynchronised again
+        rows = (
+            metric.plain.score_of(metric._state()).n if number == 0 else None
+        )  # unsynchronized again
         metric.update(g.features[:0])
         found[name] = (*synced, rows, metric.compute().item())
     alone = made("ITMMD", mode)  # one process has seen nothing
@@ -74,7 +83,11 @@ def rank(number, where, out, mode):
     both(collection, g, r, order=part, step=8)
     together = {k: v.item() for k, v in collection.compute().items()}
     again = both(collection, g, r, order=part[:0]).compute()
-    found["alone"], found["collection"], found["again"] = alone.compute().item(), together, {k: v.item() for k, v in again.items()}
+    found["alone"], found["collection"], found["again"] = (
+        alone.compute().item(),
+        together,
+        {k: v.item() for k, v in again.items()},
+    )
     with open(f"{out}.{number}", "wb") as file:
         pickle.dump(found, file)
     torch.distributed.destroy_process_group()
@@ -83,7 +96,9 @@ def rank(number, where, out, mode):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 def test_two_gloo_processes_give_what_one_gives(tmp_path, mode):
-    torch.multiprocessing.spawn(rank, (str(tmp_path / "meet"), str(tmp_path / "out"), mode), nprocs=2)
+    torch.multiprocessing.spawn(
+        rank, (str(tmp_path / "meet"), str(tmp_path / "out"), mode), nprocs=2
+    )
     found = [pickle.loads((tmp_path / f"out.{k}").read_bytes()) for k in range(2)]
     g, r = sets()
     for name in NAMES:
@@ -101,8 +116,12 @@ def test_two_gloo_processes_give_what_one_gives(tmp_path, mode):
 
 
 def other_settings(number, where, out):
-    torch.distributed.init_process_group("gloo", init_method=f"file://{where}", rank=number, world_size=2)
-    metric = feed(torch_metric.ITMMD(keep="sums", centre=np.zeros(6), sigma=10.0 + number), sets()[0])
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{where}", rank=number, world_size=2
+    )
+    metric = feed(
+        torch_metric.ITMMD(keep="sums", center=np.zeros(6), sigma=10.0 + number), sets()[0]
+    )
     try:
         metric.compute()
         said = ""
@@ -115,7 +134,9 @@ def other_settings(number, where, out):
 
 @pytest.mark.slow
 def test_processes_of_different_settings_are_refused(tmp_path):
-    torch.multiprocessing.spawn(other_settings, (str(tmp_path / "meet"), str(tmp_path / "out")), nprocs=2)
+    torch.multiprocessing.spawn(
+        other_settings, (str(tmp_path / "meet"), str(tmp_path / "out")), nprocs=2
+    )
     assert any("same settings" in (tmp_path / f"out.{k}").read_text() for k in range(2))
 
 
@@ -125,7 +146,9 @@ def test_collections_share_what_they_hold(mode):
     collection = torchmetrics.MetricCollection([made(name, mode) for name in NAMES])
     both(collection, g, r)
     groups = sorted(map(sorted, collection.compute_groups.values()))
-    assert groups == ([sorted(NAMES)] if mode == "features" else [["CITMMD", "DTMMD"], ["ITMMD"], ["TMMD"]])
+    assert groups == (
+        [sorted(NAMES)] if mode == "features" else [["CITMMD", "DTMMD"], ["ITMMD"], ["TMMD"]]
+    )
     if mode == "features":
         lists = [m.records for m in collection.values(copy_state=False)]
         assert all(x is lists[0] for x in lists)
@@ -140,12 +163,16 @@ def test_collections_share_what_they_hold(mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_collection_may_be_called_and_may_keep_real_touches(mode):
     g, r = sets()
-    collection = torchmetrics.MetricCollection([made(name, mode, reset_real_features=False) for name in NAMES])
+    collection = torchmetrics.MetricCollection(
+        [made(name, mode, reset_real_features=False) for name in NAMES]
+    )
     feed(collection, r, real=True)
     for _ in range(2):
         for k in range(0, len(g.ids), 30):
             at = slice(k, k + 30)
-            values = collection(g.features[at], ids=g.ids[at], labels=g.labels[at], groups=g.groups[at])
+            values = collection(
+                g.features[at], ids=g.ids[at], labels=g.labels[at], groups=g.groups[at]
+            )
             assert set(values) == set(NAMES)
         for name, value in collection.compute().items():
             assert same(value, plain_score(name, mode, g, r))
@@ -154,13 +181,18 @@ def test_a_collection_may_be_called_and_may_keep_real_touches(mode):
 
 def test_metrics_of_different_settings_are_not_one_group():
     g, r = sets()
-    options = {"centre": np.full(6, 0.4), "keep": "sums"}
+    options = {"center": np.full(6, 0.4), "keep": "sums"}
     collection = torchmetrics.MetricCollection(
-        {"a": torch_metric.CITMMD(classes=CLASSES, **options), "b": torch_metric.CITMMD(classes=CLASSES[::-1], **options)}
+        {
+            "a": torch_metric.CITMMD(classes=CLASSES, **options),
+            "b": torch_metric.CITMMD(classes=CLASSES[::-1], **options),
+        }
     )
     feed(collection, g)
     assert len(collection.compute_groups) == 2
-    kept = torchmetrics.MetricCollection({"a": torch_metric.TMMD(reset_real_features=False), "b": torch_metric.ITMMD()})
+    kept = torchmetrics.MetricCollection(
+        {"a": torch_metric.TMMD(reset_real_features=False), "b": torch_metric.ITMMD()}
+    )
     both(kept, g, r)
     kept.reset()
     feed(kept, g)
@@ -230,7 +262,12 @@ def test_state_dicts(mode):
 @pytest.mark.parametrize("mode", MODES)
 def test_neither_device_nor_type_harms(mode):
     g, r = sets()
-    for move in (lambda m: m.to("cpu"), lambda m: m.half(), lambda m: m.to(torch.float16), lambda m: m.set_dtype(torch.float16)):
+    for move in (
+        lambda m: m.to("cpu"),
+        lambda m: m.half(),
+        lambda m: m.to(torch.float16),
+        lambda m: m.set_dtype(torch.float16),
+    ):
         metric = move(both(made("DTMMD", mode), g, r, order=np.arange(40)))
         both(metric, g, r, order=np.arange(40, len(g.ids)))
         assert same(metric.compute(), plain_score("DTMMD", mode, g, r))
@@ -269,9 +306,12 @@ def test_on_a_gpu(mode):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_refusals(mode):
-    with pytest.raises(PalpateError, match="must have seen"), pytest.warns(UserWarning, match="before the ``update``"):
+    with (
+        pytest.raises(PalpateError, match="must have seen"),
+        pytest.warns(UserWarning, match="before the ``update``"),
+    ):
         made("TMMD", mode).compute()
-    with pytest.raises(PalpateError, match="centre"):
+    with pytest.raises(PalpateError, match="center"):
         torch_metric.TMMD(keep="sums")
     with pytest.raises(PalpateError, match="nonsense"):
         torch_metric.TMMD(nonsense=1)

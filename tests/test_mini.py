@@ -14,15 +14,15 @@ import torch
 from safetensors.torch import load_file
 
 from diffusion_forge import make_pipeline
-from mini_forge import make_towers, write_shipped
+from mini_forge import make_encoders, write_shipped
 from palpate.core import PalpateError, digest_folder, shipped
 from palpate.core.cards import model_card, write_model_cards
 from palpate.core.shipped import PARTS, SHIPPED, is_hub_id, shipped_folder, shipped_root
 from palpate.diffusion.autoencoder import Autoencoder
-from palpate.diffusion.pipeline import Pipeline
+from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders import hub
+from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.half import round_to_half
-from palpate.encoders.towers import Towers, load_clip
 
 MINI = shipped_root() / "mini"
 needs_mini = pytest.mark.skipif(not MINI.is_dir(), reason="no models in src/palpate/mini yet")
@@ -56,29 +56,50 @@ def photos(n: int = 3) -> np.ndarray:
 
 
 def test_every_loader_takes_the_shipped_name_without_a_network(mini, no_network):
-    clip, towers, autoencoder = load_clip("palpate/mini"), Towers.load("palpate/mini"), Autoencoder.load("palpate/mini")
-    pipeline = Pipeline.load("palpate/mini")
-    assert clip.name == towers.clip.name == "palpate/mini"
-    assert clip.digest("vision") == towers.digest("vision") == pipeline.towers.digest("vision") == mini.towers.digest("vision")
-    assert towers.touch is not None
+    clip, encoders, autoencoder = (
+        load_clip("palpate/mini"),
+        EncoderSet.load("palpate/mini"),
+        Autoencoder.load("palpate/mini"),
+    )
+    pipeline = TactilePipeline.load("palpate/mini")
+    assert clip.name == encoders.clip.name == "palpate/mini"
+    assert (
+        clip.digest("vision")
+        == encoders.digest("vision")
+        == pipeline.encoders.digest("vision")
+        == mini.encoders.digest("vision")
+    )
+    assert encoders.touch is not None
     assert autoencoder.digest == pipeline.autoencoder.digest
     assert pipeline.digest == mini.digest
-    assert np.array_equal(pipeline.touch(photos(), list("abc"), seed=1), mini.touch(photos(), list("abc"), seed=1))
+    assert np.array_equal(
+        pipeline.touch(photos(), list("abc"), seed=1), mini.touch(photos(), list("abc"), seed=1)
+    )
     assert no_network == []
 
 
 def test_a_folder_of_the_same_name_does_not_shadow_what_ships(mini):
-    here = make_towers(seed=5)
+    here = make_encoders(seed=5)
     here.save(Path("palpate/mini"))
-    assert Towers.load("palpate/mini").digest("touch") != here.digest("touch")
-    for own in ("./palpate/mini", Path("palpate/mini"), Path("palpate/mini").resolve(), str(Path("palpate/mini").resolve())):
-        assert Towers.load(own).digest("touch") == here.digest("touch")
+    assert EncoderSet.load("palpate/mini").digest("tactile") != here.digest("tactile")
+    for own in (
+        "./palpate/mini",
+        Path("palpate/mini"),
+        Path("palpate/mini").resolve(),
+        str(Path("palpate/mini").resolve()),
+    ):
+        assert EncoderSet.load(own).digest("tactile") == here.digest("tactile")
 
 
-@pytest.mark.parametrize("load", [load_clip, Towers.load, Autoencoder.load, Pipeline.load])
+@pytest.mark.parametrize(
+    "load", [load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.load]
+)
 def test_names_that_mean_nothing_are_told(mini, load, no_network):
     for name in ("palpate/maxi", "palpate/", "palpate/mini/", "palpate/mini/../mini"):
-        with pytest.raises(PalpateError, match=r"must be one of palpate/mini\. Got 'palpate/.*a folder of that name is written \./palpate"):
+        with pytest.raises(
+            PalpateError,
+            match=r"must be one of palpate/mini\. Got 'palpate/.*a folder of that name is written \./palpate",
+        ):
             load(name)
     for name in ("no-such", "a/b/c", "../x"):
         with pytest.raises(PalpateError):
@@ -88,8 +109,10 @@ def test_names_that_mean_nothing_are_told(mini, load, no_network):
 
 def test_an_installation_without_the_files_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(shipped, "shipped_root", lambda: tmp_path)
-    with pytest.raises(PalpateError, match=r"palpate/mini must lie in the installed package\. Got no towers in"):
-        Towers.load("palpate/mini")
+    with pytest.raises(
+        PalpateError, match=r"palpate/mini must lie in the installed package\. Got no encoders in"
+    ):
+        EncoderSet.load("palpate/mini")
 
 
 def test_what_may_be_asked_of_the_hub(tmp_path, monkeypatch):
@@ -97,28 +120,51 @@ def test_what_may_be_asked_of_the_hub(tmp_path, monkeypatch):
     (tmp_path / "owner" / "local").mkdir(parents=True)
     names = ("owner/name", "openai/clip-vit-large-patch14", "a.b/c_d-1.0")
     assert [n for n in names if is_hub_id(n)] == list(names)
-    assert not any(map(is_hub_id, ("owner/local", "palpate/mini", "name", "a/b/c", "../a", "/a/b", "./a/b", "", Path("owner/name"))))
+    assert not any(
+        map(
+            is_hub_id,
+            (
+                "owner/local",
+                "palpate/mini",
+                "name",
+                "a/b/c",
+                "../a",
+                "/a/b",
+                "./a/b",
+                "",
+                Path("owner/name"),
+            ),
+        )
+    )
     assert shipped_folder(Path("palpate/mini"), "clip") is None
 
 
 def test_a_hub_id_works_like_a_folder(mini, tmp_path, monkeypatch):
     asked = []
-    places = {"o/towers": shipped_folder("palpate/mini", "towers"), "o/generator": shipped_folder("palpate/mini", "generator")}
+    places = {
+        "o/encoders": shipped_folder("palpate/mini", "encoders"),
+        "o/generator": shipped_folder("palpate/mini", "generator"),
+    }
 
     def snapshot(name, allow_patterns):
         asked.append((name, tuple(allow_patterns)))
         return str(places[name])
 
     monkeypatch.setattr(hub, "snapshot_download", snapshot)
-    assert Towers.load("o/towers").digest("touch") == Towers.load("palpate/mini").digest("touch")
-    assert Pipeline.load("o/generator").digest == mini.digest
-    assert [name for name, _ in asked] == ["o/towers", "o/generator"]
+    assert EncoderSet.load("o/encoders").digest("tactile") == EncoderSet.load(
+        "palpate/mini"
+    ).digest("tactile")
+    assert TactilePipeline.load("o/generator").digest == mini.digest
+    assert [name for name, _ in asked] == ["o/encoders", "o/generator"]
     assert not any(".bin" in p or p == "*" for _, patterns in asked for p in patterns)
 
 
 def test_a_hub_out_of_reach_is_a_mistake_in_one_line(monkeypatch, no_network):
-    for load in (load_clip, Towers.load, Autoencoder.load, Pipeline.load):
-        with pytest.raises(PalpateError, match=r"o/none must be a local folder, one of palpate/mini, or a hub id within reach") as caught:
+    for load in (load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.load):
+        with pytest.raises(
+            PalpateError,
+            match=r"o/none must be a local folder, one of palpate/mini, or a hub id within reach",
+        ) as caught:
             load("o/none")
         assert "\n" not in str(caught.value)
 
@@ -129,19 +175,27 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 
 
 def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
-    towers, exact = make_towers(), make_towers()
-    towers.save(tmp_path / "t", half=True)
-    again = Towers.load(tmp_path / "t")
-    assert {v.dtype for part in ("clip", "touch") for v in weights(tmp_path / "t" / part).values()} == {torch.float16}
-    assert {p.dtype for m in (again.clip.model, again.touch) for p in m.parameters()} == {torch.float32}
-    for name in ("vision", "text", "touch"):
-        assert again.digest(name) == towers.digest(name) != exact.digest(name)
-    for mine, before in zip(towers.touch.parameters(), exact.touch.parameters(), strict=True):
-        assert np.array_equal(mine.detach().numpy(), before.detach().numpy().astype(np.float16).astype(np.float32))
+    encoders, exact = make_encoders(), make_encoders()
+    encoders.save(tmp_path / "t", half=True)
+    again = EncoderSet.load(tmp_path / "t")
+    assert {
+        v.dtype for part in ("clip", "tactile") for v in weights(tmp_path / "t" / part).values()
+    } == {torch.float16}
+    assert {p.dtype for m in (again.clip.model, again.touch) for p in m.parameters()} == {
+        torch.float32
+    }
+    for name in ("vision", "text", "tactile"):
+        assert again.digest(name) == encoders.digest(name) != exact.digest(name)
+    for mine, before in zip(encoders.touch.parameters(), exact.touch.parameters(), strict=True):
+        assert np.array_equal(
+            mine.detach().numpy(), before.detach().numpy().astype(np.float16).astype(np.float32)
+        )
     # The same weights in 32 bits are the same model; 16 bits are half the file.
-    towers.save(tmp_path / "full")
-    assert Towers.load(tmp_path / "full").digest("touch") == towers.digest("touch")
-    sizes = [sum(f.stat().st_size for f in (tmp_path / n).rglob("*.safetensors")) for n in ("t", "full")]
+    encoders.save(tmp_path / "full")
+    assert EncoderSet.load(tmp_path / "full").digest("tactile") == encoders.digest("tactile")
+    sizes = [
+        sum(f.stat().st_size for f in (tmp_path / n).rglob("*.safetensors")) for n in ("t", "full")
+    ]
     assert sizes[0] < 0.6 * sizes[1]
     model = make_pipeline().autoencoder
     full = model.digest
@@ -149,15 +203,17 @@ def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
     assert Autoencoder.load(tmp_path / "a").digest == model.digest != full
     stored = weights(tmp_path / "a")
     assert stored["quantize.embedding.weight"].dtype == torch.float16
-    assert torch.equal(stored["quantize.embedding.weight"].float(), model.vq.quantize.embedding.weight)
+    assert torch.equal(
+        stored["quantize.embedding.weight"].float(), model.vq.quantize.embedding.weight
+    )
     assert model.halve().relative == 0  # rounded once is rounded for good
 
 
 def test_a_whole_pipeline_in_half(tmp_path):
-    pipeline = replace(make_pipeline(), towers=None)
+    pipeline = replace(make_pipeline(), encoders=None)
     before = pipeline.digest  # kept by the object: must not outlive the rounding
     pipeline.save(tmp_path / "p", half=True)
-    assert Pipeline.load(tmp_path / "p").digest == pipeline.digest != before
+    assert TactilePipeline.load(tmp_path / "p").digest == pipeline.digest != before
     assert {v.dtype for v in weights(tmp_path / "p" / "unet").values()} == {torch.float16}
 
 
@@ -167,7 +223,9 @@ def test_rounding_is_measured_and_refused_where_it_makes_infinity():
     done = round_to_half({"m": module})
     assert module.weight.tolist() == [[1.0, 1.0 + 2**-10, 0.0]]
     assert (done.where, done.lost) == ("m.weight", 1)
-    assert done.relative == pytest.approx(np.linalg.norm([2**-11 - 2**-20, 1e-9]) / np.linalg.norm([1, 1 + 2**-11 + 2**-20]), rel=1e-3)
+    assert done.relative == pytest.approx(
+        np.linalg.norm([2**-11 - 2**-20, 1e-9]) / np.linalg.norm([1, 1 + 2**-11 + 2**-20]), rel=1e-3
+    )
     for bad in (70000.0, float("nan"), float("inf")):
         other = torch.nn.Linear(2, 1, bias=False)
         other.weight.data = torch.tensor([[0.1, 0.2]])
@@ -177,43 +235,62 @@ def test_rounding_is_measured_and_refused_where_it_makes_infinity():
         assert other.weight.tolist() == torch.tensor([[0.1, 0.2]]).tolist()
 
 
-def test_a_generator_that_refers_carries_no_copies_and_checks_what_it_finds(mini, tmp_path, monkeypatch):
+def test_a_generator_that_refers_carries_no_copies_and_checks_what_it_finds(
+    mini, tmp_path, monkeypatch
+):
     folder = shipped_folder("palpate/mini", "generator")
-    assert sorted(p.name for p in folder.iterdir()) == ["README.md", "palpate.json", "scheduler", "unet"]
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "README.md",
+        "palpate.json",
+        "scheduler",
+        "unet",
+    ]
     about = json.loads((folder / "palpate.json").read_text())
-    assert (about["shared"], about["autoencoder"], about["towers"]) == (
-        "palpate/mini", mini.autoencoder.digest, mini.towers.digest("vision"),
-    )  # fmt: skip
-    with pytest.raises(PalpateError, match="must use its autoencoder and vision tower"):
-        replace(mini, towers=make_towers(seed=9)).save(tmp_path / "other", shared="palpate/mini")
+    assert (about["shared"], about["autoencoder"], about["encoders"]) == (
+        "palpate/mini",
+        mini.autoencoder.digest,
+        mini.encoders.digest("vision"),
+    )
+    with pytest.raises(PalpateError, match="must use its autoencoder and vision encoder"):
+        replace(mini, encoders=make_encoders(seed=9)).save(
+            tmp_path / "other", shared="palpate/mini"
+        )
     assert not (tmp_path / "other").exists()
     with pytest.raises(PalpateError, match="may refer to palpate/mini"):
         mini.save(tmp_path / "other", shared=str(tmp_path))
-    # A later version of the package ships other towers.
+    # A later version of the package ships other encoders.
     import shutil
 
-    place = shipped_folder("palpate/mini", "towers")
+    place = shipped_folder("palpate/mini", "encoders")
     shutil.rmtree(place)
-    make_towers(seed=7).save(place, half=True)
-    with pytest.raises(PalpateError, match="must find the parts of palpate/mini that it was trained on"):
-        Pipeline.load("palpate/mini")
-    (folder / "palpate.json").write_text(json.dumps(about | {"shared": "../../towers"}))
+    make_encoders(seed=7).save(place, half=True)
+    with pytest.raises(
+        PalpateError, match="must find the parts of palpate/mini that it was trained on"
+    ):
+        TactilePipeline.load("palpate/mini")
+    (folder / "palpate.json").write_text(json.dumps(about | {"shared": "../../encoders"}))
     with pytest.raises(PalpateError, match="may refer to palpate/mini"):
-        Pipeline.load("palpate/mini")
+        TactilePipeline.load("palpate/mini")
 
 
 def test_changed_clip_weights_are_noticed(mini):
     note = shipped_folder("palpate/mini", "clip") / "palpate.json"
     about = json.loads(note.read_text())
     note.write_text(json.dumps(about | {"digests": about["digests"] | {"text": "0" * 64}}))
-    with pytest.raises(PalpateError, match=r"text tower in .* must match its digest"):
+    with pytest.raises(PalpateError, match=r"text encoder in .* must match its digest"):
         load_clip("palpate/mini")
 
 
 def test_a_card_is_made_of_the_json_alone(mini):
-    folder = shipped_folder("palpate/mini", "towers").parent
+    folder = shipped_folder("palpate/mini", "encoders").parent
     files = {p: p.read_text() for p in folder.rglob("README.md")}
-    assert sorted(p.parent.relative_to(folder).as_posix() for p in files) == [".", "autoencoder", "generator", "towers", "towers/clip"]
+    assert sorted(p.parent.relative_to(folder).as_posix() for p in files) == [
+        ".",
+        "autoencoder",
+        "generator",
+        "encoders",
+        "encoders/clip",
+    ]
     for path, text in files.items():
         if path.parent != folder:
             assert text == model_card(json.loads(path.with_name("palpate.json").read_text()))
@@ -222,28 +299,54 @@ def test_a_card_is_made_of_the_json_alone(mini):
     assert {p: p.read_text() for p in folder.rglob("README.md")} == files
     contents = (folder / "README.md").read_text()
     for line in (
-        "| [towers/clip](towers/clip/README.md) | Vision and text towers | 0.0 |",
+        "| [encoders/clip](encoders/clip/README.md) | Vision and text encoders | 0.0 |",
         "| [generator](generator/README.md) | From a photo",
     ):
         assert line in contents
 
 
 def test_a_card_says_what_it_must(mini):
-    rows = [{"score": "PSNR", "value": 31.234567, "interval": [30.0, 32.5]}, {"score": "a|b", "n": 3, "value": None}]
+    rows = [
+        {"score": "PSNR", "value": 31.234567, "interval": [30.0, 32.5]},
+        {"score": "a|b", "n": 3, "value": None},
+    ]
     card = {
-        "title": "T", "summary": "S.", "tags": ["x", "clip"], "scores": rows, "data": {"seeds": "1-2"}, "limits": ["Not real."],
-        "recipe": "python recipes/r.py", "digest of split": "ab", "loss": [{"loss": 1.0}] * 50,
-    }  # fmt: skip
-    text = model_card({"format": "palpate-clip/1", "digests": {"vision": "00ff"}, "card": card, "name": "palpate/mini"})
+        "title": "T",
+        "summary": "S.",
+        "tags": ["x", "clip"],
+        "scores": rows,
+        "data": {"seeds": "1-2"},
+        "limits": ["Not real."],
+        "recipe": "python recipes/r.py",
+        "digest of split": "ab",
+        "loss": [{"loss": 1.0}] * 50,
+    }
+    text = model_card(
+        {
+            "format": "palpate-clip/1",
+            "digests": {"vision": "00ff"},
+            "card": card,
+            "name": "palpate/mini",
+        }
+    )
     head, body = text.split("---\n")[1:3]
     assert head == (
         'license: "apache-2.0"\nlibrary_name: "transformers"\npipeline_tag: "zero-shot-image-classification"\n'
         'tags:\n- "palpate"\n- "tactile"\n- "clip"\n- "x"\n'
     )
     for line in (
-        "# T", "S.", "| score | value | interval | n |", "| PSNR | 31.23 | [30, 32.5] |  |", "| a\\|b |  |  | 3 |", "| seeds |", "- Not real.",
-        "python recipes/r.py", "- vision: `00ff`", ' "digest of split": "ab",', 'clip = load_clip("palpate/mini")',
-    ):  # fmt: skip
+        "# T",
+        "S.",
+        "| score | value | interval | n |",
+        "| PSNR | 31.23 | [30, 32.5] |  |",
+        "| a\\|b |  |  | 3 |",
+        "| seeds |",
+        "- Not real.",
+        "python recipes/r.py",
+        "- vision: `00ff`",
+        ' "digest of split": "ab",',
+        'clip = load_clip("palpate/mini")',
+    ):
         assert f"\n{line}\n" in body, line
     assert len(text) < 2500
     with pytest.raises(PalpateError, match="made of one of palpate-clip/1"):
@@ -258,18 +361,20 @@ def size(folder: Path) -> int:
 def test_what_ships_is_small_enough_complete_and_16_bit():
     assert set(SHIPPED) == {"palpate/mini"}
     assert all((MINI / place / "palpate.json").is_file() for place in PARTS.values())
-    assert size(MINI / "towers") + size(MINI / "autoencoder") < 12e6
+    assert size(MINI / "encoders") + size(MINI / "autoencoder") < 12e6
     assert size(MINI / "generator") < 10e6
     files = [p for p in MINI.rglob("*") if p.is_file()]
     assert {p.suffix for p in files} <= {".json", ".md", ".safetensors"}
-    for place in ("towers/clip", "towers/touch", "autoencoder", "generator/unet"):
-        assert {v.dtype for v in weights(MINI / place).values() if v.is_floating_point()} == {torch.float16}
+    for place in ("encoders/clip", "encoders/touch", "autoencoder", "generator/unet"):
+        assert {v.dtype for v in weights(MINI / place).values() if v.is_floating_point()} == {
+            torch.float16
+        }
 
 
 @needs_mini
 def test_what_ships_loads_and_answers_without_a_network(no_network):
-    towers, pipeline = Towers.load("palpate/mini"), Pipeline.load("palpate/mini")
-    assert towers.digest("vision") == pipeline.towers.digest("vision")
+    encoders, pipeline = EncoderSet.load("palpate/mini"), TactilePipeline.load("palpate/mini")
+    assert encoders.digest("vision") == pipeline.encoders.digest("vision")
     assert "synthetic" in pipeline.notice
     made = pipeline.touch(photos(1), ["a"], seed=0, steps=2)
     assert made.shape == (1, pipeline.size, pipeline.size, 3)
@@ -294,20 +399,29 @@ def test_a_fresh_process_with_the_hub_switched_off(tmp_path):
         "import socket\n"
         "def no(*a, **k): raise SystemExit('the network was asked')\n"
         "socket.getaddrinfo = socket.create_connection = socket.socket.connect = no\n"
-        "from palpate.diffusion.pipeline import Pipeline\nfrom palpate.encoders.towers import Towers, load_clip\n"
-        "print(Pipeline.load('palpate/mini').digest, Towers.load('palpate/mini').dim, load_clip('palpate/mini').dim)"
+        "from palpate.diffusion.pipeline import TactilePipeline\nfrom palpate.encoders.encoder_set import EncoderSet, load_clip\n"
+        "print(TactilePipeline.load('palpate/mini').digest, EncoderSet.load('palpate/mini').dim, load_clip('palpate/mini').dim)"
     )
-    env = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | {"HF_HOME": str(tmp_path)}
+    env = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | {
+        "HF_HOME": str(tmp_path)
+    }
     for more in ({}, {"HF_HUB_OFFLINE": "1"}):
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env | more, check=False, cwd=tmp_path)
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            env=env | more,
+            check=False,
+            cwd=tmp_path,
+        )
         assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_equal_towers_are_equal_files(half, tmp_path):
-    made = make_towers()
+def test_equal_encoders_are_equal_files(half, tmp_path):
+    made = make_encoders()
     made.save(tmp_path / "a", half=half)
-    loaded = Towers.load(tmp_path / "a")
+    loaded = EncoderSet.load(tmp_path / "a")
     loaded.clip.name = made.clip.name
     loaded.encode("text", ["a rough wall", "a soft cloth"])  # using it changes nothing
     loaded.save(tmp_path / "b", half=half)
@@ -315,14 +429,18 @@ def test_equal_towers_are_equal_files(half, tmp_path):
     config = json.loads((tmp_path / "a" / "clip" / "config.json").read_text())
     kinds = {part["dtype"] for part in (config, config["text_config"], config["vision_config"])}
     assert kinds == {"float16" if half else "float32"}
-    other = Towers.load(tmp_path / "b")  # 16 bits on disk, saved in 32: nothing of where it came from is left
+    other = EncoderSet.load(
+        tmp_path / "b"
+    )  # 16 bits on disk, saved in 32: nothing of where it came from is left
     other.clip.name = made.clip.name
     other.save(tmp_path / "c")
     made.save(tmp_path / "d")
     assert digest_folder(tmp_path / "c") == digest_folder(tmp_path / "d")
 
 
-@pytest.mark.parametrize("load", [load_clip, Towers.load, Autoencoder.load, Pipeline.load])
+@pytest.mark.parametrize(
+    "load", [load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.load]
+)
 @pytest.mark.parametrize("name", ["", "./palpate/mini"])
 def test_names_of_no_folder_are_told_as_such(load, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

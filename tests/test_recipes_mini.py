@@ -28,24 +28,36 @@ def mini(monkeypatch):
 @pytest.fixture
 def small(mini, monkeypatch, tmp_path):
     """The recipe with worlds and trainings of a few seconds, shipping into a folder of the test."""
-    few = {"materials": ("Wood", "Brick", "Grass"), "objects_per_material": 4, "touches_per_video": 2}
-    monkeypatch.setattr(mini, "WORLDS", {name: replace(options, **few) for name, options in mini.WORLDS.items()})
+    few = {
+        "materials": ("Wood", "Brick", "Grass"),
+        "objects_per_material": 4,
+        "touches_per_video": 2,
+    }
+    monkeypatch.setattr(
+        mini, "WORLDS", {name: replace(options, **few) for name, options in mini.WORLDS.items()}
+    )
     monkeypatch.setattr(mini, "CLIP_EPOCHS", 1.0)
     monkeypatch.setattr(mini, "TOUCH_EPOCHS", 1.0)
-    monkeypatch.setattr(mini, "AUTOENCODER", replace(mini.AUTOENCODER, steps_free=3, steps_quantised=2, codes=32))
+    monkeypatch.setattr(
+        mini, "AUTOENCODER", replace(mini.AUTOENCODER, steps_free=3, steps_quantized=2, codes=32)
+    )
     monkeypatch.setattr(mini, "GENERATOR_STEPS", 3)
     monkeypatch.setattr(sys.modules["mini_scores"], "GENERATED", 8)
     monkeypatch.setattr(sys.modules["mini_scores"], "POOL", 10)
     monkeypatch.setattr(shipped_module, "shipped_root", lambda: tmp_path / "package")
     monkeypatch.setattr(mini, "shipped_root", lambda: tmp_path / "package")
     monkeypatch.setattr(mini, "PAGE", tmp_path / "mini.md")
-    (tmp_path / "mini.md").write_text("before\n<!-- scores of the cards -->\nold\n<!-- end of the scores -->\nafter\n")
+    (tmp_path / "mini.md").write_text(
+        "before\n<!-- scores of the cards -->\nold\n<!-- end of the scores -->\nafter\n"
+    )
     return mini
 
 
 def test_the_page_tells_the_scores_of_the_cards(mini):
     target = shipped_module.shipped_root() / "mini"
-    assert sys.modules["mini_cards"].scores_table(target) in (RECIPES.parent / "docs" / "mini.md").read_text(encoding="utf-8")
+    assert sys.modules["mini_cards"].scores_table(target) in (
+        RECIPES.parent / "docs" / "mini.md"
+    ).read_text(encoding="utf-8")
 
 
 def test_only_reserved_seeds_are_read_and_none_twice(mini):
@@ -58,25 +70,45 @@ def test_only_reserved_seeds_are_read_and_none_twice(mini):
 def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     recipe = small.Recipe(tmp_path / "work", 1.0)
     recipe.make("autoencoder")
-    assert not (tmp_path / "work" / "clip").exists()  # it does not need the towers
+    assert not (tmp_path / "work" / "clip").exists()  # it does not need the encoders
     recipe.make("scores")
     recipe.ship()
     target = tmp_path / "package" / "mini"
     first = digest_folder(target)
-    scores = {part: read_json(target / part / "palpate.json", "card") for part in ("towers", "autoencoder", "generator")}
-    rows = {row["score"]: row for row in scores["towers"]["card"]["scores"]}
-    assert rows["zero-shot material, vision"]["chance"] == pytest.approx(1 / 20)  # of all twenty, though three occur here
+    scores = {
+        part: read_json(target / part / "palpate.json", "card")
+        for part in ("encoders", "autoencoder", "generator")
+    }
+    rows = {row["score"]: row for row in scores["encoders"]["card"]["scores"]}
+    assert rows["zero-shot material, vision"]["chance"] == pytest.approx(
+        1 / 20
+    )  # of all twenty, though three occur here
     assert {"codebook perplexity, gelsight", "PSNR [dB], digit", "codes never used, digit"} <= {
         row["score"] for row in scores["autoencoder"]["card"]["scores"]
     }
-    assert any(row["score"] == "TMMD, generated" for row in scores["generator"]["training"]["scores"])
-    assert "900050" in (target / "towers" / "README.md").read_text()
-    assert not any("touch" in row["score"] for row in read_json(target / "towers" / "clip" / "palpate.json", "card")["card"]["scores"])
+    assert any(
+        row["score"] == "TMMD, generated" for row in scores["generator"]["training"]["scores"]
+    )
+    assert "900050" in (target / "encoders" / "README.md").read_text()
+    assert not any(
+        "touch" in row["score"]
+        for row in read_json(target / "encoders" / "clip" / "palpate.json", "card")["card"][
+            "scores"
+        ]
+    )
     trained = {
-        part: {row["seed"] for row in (about.get("card") or about["training"])["data"] if row["used for"] == "training"}
+        part: {
+            row["seed"]
+            for row in (about.get("card") or about["training"])["data"]
+            if row["used for"] == "training"
+        }
         for part, about in scores.items()
     }
-    assert trained == {"towers": {900_000}, "autoencoder": {900_000, 900_001}, "generator": {900_002}}
+    assert trained == {
+        "encoders": {900_000},
+        "autoencoder": {900_000, 900_001},
+        "generator": {900_002},
+    }
     page = (tmp_path / "mini.md").read_text()
     assert page.startswith("before\n")
     assert page.endswith("after\n")
@@ -106,16 +138,16 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_stop_between_saving_and_the_end_of_a_part_is_mended(small, tmp_path, monkeypatch):
-    from palpate.encoders.towers import FrozenClip
+    from palpate.encoders.encoder_set import ClipEncoders
 
-    save = FrozenClip.save
+    save = ClipEncoders.save
 
     def stopped(self, folder, **how):
         save(self, folder, **how)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(FrozenClip, "save", stopped)
+        patch.setattr(ClipEncoders, "save", stopped)
         with pytest.raises(KeyboardInterrupt):
             small.Recipe(tmp_path / "work", 1.0).make("clip")
     recipe = small.Recipe(tmp_path / "work", 1.0)

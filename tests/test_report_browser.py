@@ -24,10 +24,21 @@ def touch(rng, kind, side):
     """A gel with a soft light and a relief of one of three kinds; (side, side, 3) uint8."""
     y, x = np.mgrid[0:side, 0:side] / side
     phase = rng.uniform(0, 6)
-    relief = (np.sin(40 * x + phase), np.sin(25 * x + phase) * np.sin(25 * y), np.cos(60 * np.hypot(x - 0.5, y - 0.5) + phase))[kind]
+    relief = (
+        np.sin(40 * x + phase),
+        np.sin(25 * x + phase) * np.sin(25 * y),
+        np.cos(60 * np.hypot(x - 0.5, y - 0.5) + phase),
+    )[kind]
     light = np.stack([0.6 - 0.3 * y, 0.5 + 0.1 * x, 0.45 + 0.3 * y], axis=-1)
     return (
-        (255 * (light + 0.12 * relief[..., None] * np.array([1, -0.4, -1]) + rng.normal(0, 0.01, (side, side, 3))))
+        (
+            255
+            * (
+                light
+                + 0.12 * relief[..., None] * np.array([1, -0.4, -1])
+                + rng.normal(0, 0.01, (side, side, 3))
+            )
+        )
         .clip(0, 255)
         .astype(np.uint8)
     )
@@ -43,31 +54,117 @@ def forged(folder):
         names = [f"{what}{k}.png" for what in ("photo", "touch", "made")]
         for name in names:
             Image.fromarray(touch(rng, kind, side)).save(folder / name)
-        sample = SampleRef(f"{LONG}/{k}", LONG if k == 0 else f"video{k % 5}", 10 * k, materials[kind], names[0], names[1])
+        sample = SampleRef(
+            f"{LONG}/{k}",
+            LONG if k == 0 else f"video{k % 5}",
+            10 * k,
+            materials[kind],
+            names[0],
+            names[1],
+        )
         gallery.append(GalleryItem(sample, names[2], names[1] if k == 3 else None))
-    gallery.append(GalleryItem(SampleRef("lost", material="wood", vision=f"{LONG}/{LONG}.png"), "absent.png"))
-    pairs = [LeakPair(a.sample, b.sample, 3 * k + 1) for k, (a, b) in enumerate(pairwise(gallery[:9]))]
-    rows = [{"material": m, "train": 900, "test": 90, "groups_train": 9, "groups_test": 3} for m in materials]
+    gallery.append(
+        GalleryItem(SampleRef("lost", material="wood", vision=f"{LONG}/{LONG}.png"), "absent.png")
+    )
+    pairs = [
+        LeakPair(a.sample, b.sample, 3 * k + 1) for k, (a, b) in enumerate(pairwise(gallery[:9]))
+    ]
+    rows = [
+        {"material": m, "train": 900, "test": 90, "groups_train": 9, "groups_test": 3}
+        for m in materials
+    ]
     audits = [
-        Audit("Orig", "video", 91982, 29879, 120, 106, 100, 29597, 29597 / 29879, 0, 31, 304.0, 2485, [0, 30, 90, 300, 900, 2500],
-              [0, 2400, 12080, 13002, 2115], pairs, rows, ["One remark."], "9f" * 32),
-        Audit("NoLeak", "video", 97000, 24000, 101, 25, 0, 0, 0.0, 0, materials=rows, split="5b" * 32),
-    ]  # fmt: skip
-    common = {"estimator": "grouped", "bandwidth": 10.0, "scale": 1000.0, "encoder": "ab" * 32, "split": "5b" * 32, "n": 24000}
+        Audit(
+            "Orig",
+            "video",
+            91982,
+            29879,
+            120,
+            106,
+            100,
+            29597,
+            29597 / 29879,
+            0,
+            31,
+            304.0,
+            2485,
+            [0, 30, 90, 300, 900, 2500],
+            [0, 2400, 12080, 13002, 2115],
+            pairs,
+            rows,
+            ["One remark."],
+            "9f" * 32,
+        ),
+        Audit(
+            "NoLeak", "video", 97000, 24000, 101, 25, 0, 0, 0.0, 0, materials=rows, split="5b" * 32
+        ),
+    ]
+    common = {
+        "estimator": "grouped",
+        "bandwidth": 10.0,
+        "scale": 1000.0,
+        "encoder": "ab" * 32,
+        "split": "5b" * 32,
+        "n": 24000,
+    }
     scores = []
     for k, metric in enumerate(("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")):
         for subject, value in {"generated": 1.4 + k, "real": 0.05, f"baseline {LONG}": 2.9}.items():
-            scores.append(Score(metric, subject, value, (0.8 * value, 1.2 * value), null=(-0.05, 0.06), floor=0.05, note=LONG, **common))
+            scores.append(
+                Score(
+                    metric,
+                    subject,
+                    value,
+                    (0.8 * value, 1.2 * value),
+                    null=(-0.05, 0.06),
+                    floor=0.05,
+                    note=LONG,
+                    **common,
+                )
+            )
     matrix = rng.uniform(0, 3, (18, 18)).tolist()
-    scores.append(Score("D-TMMD", "background", None, note="Undefined: one picture.", details={"matrix": matrix}, **common))
-    scores.append(Score("SSIM", "generated", 0.49, (0.47, 0.51), higher_is_better=True, settings={"path": f"/{LONG}/{LONG}"}))
+    scores.append(
+        Score(
+            "D-TMMD",
+            "background",
+            None,
+            note="Undefined: one picture.",
+            details={"matrix": matrix},
+            **common,
+        )
+    )
+    scores.append(
+        Score(
+            "SSIM",
+            "generated",
+            0.49,
+            (0.47, 0.51),
+            higher_is_better=True,
+            settings={"path": f"/{LONG}/{LONG}"},
+        )
+    )
     settings = {
-        "data": {"root": f"/data/{LONG}/{LONG}", "digest": "cd" * 32, "split": {"seed": 0, "rule": {"group": "video"}}},
+        "data": {
+            "root": f"/data/{LONG}/{LONG}",
+            "digest": "cd" * 32,
+            "split": {"seed": 0, "rule": {"group": "video"}},
+        },
         LONG: [LONG] * 40,
     }
-    facts = ["99.06 % of the test frames come from a video that train holds as well.", f"A fact about {LONG}.", "Real touch scores 0.05."]
+    facts = [
+        "99.06 % of the test frames come from a video that train holds as well.",
+        f"A fact about {LONG}.",
+        "Real touch scores 0.05.",
+    ]
     return Results(
-        f"Touch from sight, {LONG}", facts, audits, scores, gallery, settings, ["Synthetic data."], [f"palpate audit {LONG} --out {LONG}"]
+        f"Touch from sight, {LONG}",
+        facts,
+        audits,
+        scores,
+        gallery,
+        settings,
+        ["Synthetic data."],
+        [f"palpate audit {LONG} --out {LONG}"],
     )
 
 
@@ -81,7 +178,9 @@ def opened(chromium, file, width, scheme):
     """The page, the folder for screenshots, and lists that fill with what the page says and asks for."""
     artifacts = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
     artifacts.mkdir(parents=True, exist_ok=True)
-    page = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme).new_page()
+    page = chromium.new_context(
+        viewport={"width": width, "height": 900}, color_scheme=scheme
+    ).new_page()
     said, asked = [], []
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
@@ -99,8 +198,12 @@ def test_page_in_chromium(chromium, page_file, width, scheme):
             page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
         page.screenshot(path=artifacts / f"page-{width}-{scheme}-{state}.png", full_page=True)
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), state
-        assert page.evaluate("Math.max(...[...document.body.children].map(e => e.getBoundingClientRect().right)) <= window.innerWidth")
-    pictures = page.evaluate("[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])")
+        assert page.evaluate(
+            "Math.max(...[...document.body.children].map(e => e.getBoundingClientRect().right)) <= window.innerWidth"
+        )
+    pictures = page.evaluate(
+        "[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])"
+    )
     page.context.close()
     assert len(pictures) == 48 * 3 + 1 + 8 * 4
     assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in pictures)
@@ -113,8 +216,14 @@ def test_page_in_chromium(chromium, page_file, width, scheme):
 def audit_page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("audits")
     names = pictures(folder, 16)
-    long = full_audit(names, name=LONG, matrix=[{"group": LONG, "train": 91982, "val": 12000, "test": 29879, "leaking": 29879}])
-    results = Results("Audits", audits=[full_audit(names), clean_audit(), pretraining_audit(names), long])
+    long = full_audit(
+        names,
+        name=LONG,
+        matrix=[{"group": LONG, "train": 91982, "val": 12000, "test": 29879, "leaking": 29879}],
+    )
+    results = Results(
+        "Audits", audits=[full_audit(names), clean_audit(), pretraining_audit(names), long]
+    )
     return write_report(results, folder / "page.html").page
 
 
@@ -138,13 +247,26 @@ def test_audits_in_chromium(chromium, audit_page, width, scheme):
         return boxes.every((a, k) => boxes.every((b, j) => j <= k || a.right <= b.left || b.right <= a.left || a.bottom - 2 <= b.top || b.bottom - 2 <= a.top));
     })"""
     assert page.evaluate(apart) == [True] * 6  # no label lies on another
-    if width == 360:  # the tables of signals and of the cost are read downwards; nothing of them, nor of the matrix, is cut off
-        assert page.evaluate("[...document.querySelectorAll('.stack, .matrix')].every(t => t.scrollWidth <= t.parentElement.clientWidth)")
-        assert page.evaluate("getComputedStyle(document.querySelector('.stack td'), '::before').content") == '"Flagged"'
-    roles = page.evaluate("[...document.querySelectorAll('.stack tbody td')].every(e => e.getAttribute('role') === 'cell')")
+    if (
+        width == 360
+    ):  # the tables of signals and of the cost are read downwards; nothing of them, nor of the matrix, is cut off
+        assert page.evaluate(
+            "[...document.querySelectorAll('.stack, .matrix')].every(t => t.scrollWidth <= t.parentElement.clientWidth)"
+        )
+        assert (
+            page.evaluate(
+                "getComputedStyle(document.querySelector('.stack td'), '::before').content"
+            )
+            == '"Flagged"'
+        )
+    roles = page.evaluate(
+        "[...document.querySelectorAll('.stack tbody td')].every(e => e.getAttribute('role') === 'cell')"
+    )
     page.context.close()
     assert roles
-    assert [url for url in asked if url != audit_page.as_uri() and not url.startswith("data:")] == []
+    assert [
+        url for url in asked if url != audit_page.as_uri() and not url.startswith("data:")
+    ] == []
     assert said == []
 
 
@@ -155,7 +277,7 @@ def test_shaded_counts_and_drawings_can_be_read(chromium, audit_page, scheme):
     page.goto(audit_page.as_uri())
     pairs = page.evaluate("""[...document.querySelectorAll('.matrix td, svg.histogram text')].map(e => {
         const canvas = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
-        const rgb = colour => { canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1); return `rgb(${canvas.getImageData(0, 0, 1, 1).data.slice(0, 3)})`; };
+        const rgb = color => { canvas.fillStyle = color; canvas.fillRect(0, 0, 1, 1); return `rgb(${canvas.getImageData(0, 0, 1, 1).data.slice(0, 3)})`; };
         const style = getComputedStyle(e), text = e.closest('svg') !== null;
         const paper = getComputedStyle(document.body).backgroundColor;
         const clear = text || style.backgroundColor === 'rgba(0, 0, 0, 0)';
@@ -168,9 +290,9 @@ def test_shaded_counts_and_drawings_can_be_read(chromium, audit_page, scheme):
         assert (a + 0.05) / (b + 0.05) >= 4.5, pair
 
 
-def luminance(colour):
+def luminance(color):
     """WCAG relative luminance of an ``rgb(r, g, b)`` string."""
-    channels = [float(c) / 255 for c in colour[colour.index("(") + 1 : -1].split(",")[:3]]
+    channels = [float(c) / 255 for c in color[color.index("(") + 1 : -1].split(",")[:3]]
     r, g, b = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels)
     return 0.2126 * r + 0.7152 * g + 0.0722 * b
 
@@ -201,7 +323,11 @@ def test_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_file):
     reached = []
     for _ in range(40):
         page.keyboard.press("Tab")
-        reached.append(page.evaluate("[document.activeElement.tagName, document.activeElement.getAttribute('aria-label') ?? '']"))
+        reached.append(
+            page.evaluate(
+                "[document.activeElement.tagName, document.activeElement.getAttribute('aria-label') ?? '']"
+            )
+        )
     context.close()
     tags = [tag for tag, _ in reached]
     assert tags[:6] == ["A"] * 6
@@ -216,7 +342,9 @@ def test_printed_page_opens_what_is_folded(chromium, page_file):
     ask = """[...document.querySelectorAll('details img')].map(i => i.getBoundingClientRect().width > 0 && i.checkVisibility())"""
     folded = page.evaluate(ask)
     page.emulate_media(media="print")
-    page.wait_for_function("getComputedStyle(document.querySelector('details'), '::details-content').contentVisibility === 'visible'")
+    page.wait_for_function(
+        "getComputedStyle(document.querySelector('details'), '::details-content').contentVisibility === 'visible'"
+    )
     printed = page.evaluate(ask)
     context.close()
     assert len(folded) == len(printed) > 10

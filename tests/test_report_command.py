@@ -14,7 +14,11 @@ from test_report_page import Tree, an_audit
 
 
 def audit_file(folder, audit, **more):
-    data = {"format": "palpate-audit/1", **json.loads(json.dumps(dataclasses.asdict(audit))), **more}
+    data = {
+        "format": "palpate-audit/1",
+        **json.loads(json.dumps(dataclasses.asdict(audit))),
+        **more,
+    }
     path = folder / "audit.json"
     path.write_text(json.dumps(data))
     return path, data
@@ -22,16 +26,34 @@ def audit_file(folder, audit, **more):
 
 def test_command_takes_audits_with_others_and_a_page_of_them(capsys, tmp_path):
     other = json.loads(json.dumps(dataclasses.asdict(pretraining_audit())))
-    path, _ = audit_file(tmp_path, full_audit(pictures(tmp_path, 8, 32)), others=[other], skipped=["a line"], failed=True)
+    path, _ = audit_file(
+        tmp_path,
+        full_audit(pictures(tmp_path, 8, 32)),
+        others=[other],
+        skipped=["a line"],
+        failed=True,
+    )
     assert main(["report", str(path), "-o", str(tmp_path / "page.html"), "-q"]) == 0
     tree = Tree((tmp_path / "page.html").read_text())
     assert "Test against the pretraining data pretrain.csv / test" in tree.text
     assert len(tree.all("img")) == 4 * (3 + 4 + 8 + 8 + 8)
-    assert main(["report", str(tmp_path / "page.json"), "-o", str(tmp_path / "again.html"), "-q"]) == 0
-    assert (tmp_path / "again.html").read_text().replace("again.", "page.") == (tmp_path / "page.html").read_text()
+    assert (
+        main(["report", str(tmp_path / "page.json"), "-o", str(tmp_path / "again.html"), "-q"]) == 0
+    )
+    assert (tmp_path / "again.html").read_text().replace("again.", "page.") == (
+        tmp_path / "page.html"
+    ).read_text()
     old, _ = audit_file(tmp_path, an_audit())
     data = json.loads(old.read_text())
-    for name in ("against", "signals", "leaking_samples", "matrix", "groups_in_all", "impact", "commands"):
+    for name in (
+        "against",
+        "signals",
+        "leaking_samples",
+        "matrix",
+        "groups_in_all",
+        "impact",
+        "commands",
+    ):
         del data[name]
     old.write_text(json.dumps(data))
     assert main(["report", str(old), "-o", str(tmp_path / "old.html"), "-q"]) == 0
@@ -46,15 +68,30 @@ def broken():
         data[last] = value
 
     cases = [
-        (("new",), 1, "new"), (("signals", 0, "odd"), 1, "odd"), (("signals",), 5, "int"), (("signals", 2, "threshold"), "high", r"signals\[2\]\.threshold must be a number"),
-        (("signals", 4, "found", 3), "x", r"found\[3\] must be a whole number"), (("signals", 4, "causes"), [1], "causes must be an object"),
-        (("signals", 4, "worst", 0, "test"), {"name": "x"}, "name"), (("signals", 4, "worst", 0, "score"), "x", "score must be a number"),
-        (("impact", "rows", 0, "given_interval"), [1], "given_interval must be a list of 2"), (("impact", "headline"), 3, "headline must be text"),
-        (("impact",), {"rows": []}, "clean_splits"), (("matrix", 0), 7, r"matrix\[0\] must be an object"), (("matrix", 0, "test"), "many", r"matrix\[0\]\.test must be a whole number"),
-        (("commands",), "palpate", "commands must be a list"), (("leaking_samples",), None, "leaking_samples must be a whole number"), (("others",), 3, "int"),
-        (("others",), [{"name": "x"}], "missing"), (("test_samples",), True, "test_samples must be a whole number"), (("gap_median",), "x", "gap_median must be a number"),
-    ]  # fmt: skip
-    return [pytest.param(put, place, value, said, id=".".join(map(str, place)) + f"={value!r:.9}") for place, value, said in cases]
+        (("new",), 1, "new"),
+        (("signals", 0, "odd"), 1, "odd"),
+        (("signals",), 5, "int"),
+        (("signals", 2, "threshold"), "high", r"signals\[2\]\.threshold must be a number"),
+        (("signals", 4, "found", 3), "x", r"found\[3\] must be a whole number"),
+        (("signals", 4, "causes"), [1], "causes must be an object"),
+        (("signals", 4, "worst", 0, "test"), {"name": "x"}, "name"),
+        (("signals", 4, "worst", 0, "score"), "x", "score must be a number"),
+        (("impact", "rows", 0, "given_interval"), [1], "given_interval must be a list of 2"),
+        (("impact", "headline"), 3, "headline must be text"),
+        (("impact",), {"rows": []}, "clean_splits"),
+        (("matrix", 0), 7, r"matrix\[0\] must be an object"),
+        (("matrix", 0, "test"), "many", r"matrix\[0\]\.test must be a whole number"),
+        (("commands",), "palpate", "commands must be a list"),
+        (("leaking_samples",), None, "leaking_samples must be a whole number"),
+        (("others",), 3, "int"),
+        (("others",), [{"name": "x"}], "missing"),
+        (("test_samples",), True, "test_samples must be a whole number"),
+        (("gap_median",), "x", "gap_median must be a number"),
+    ]
+    return [
+        pytest.param(put, place, value, said, id=".".join(map(str, place)) + f"={value!r:.9}")
+        for place, value, said in cases
+    ]
 
 
 @pytest.mark.parametrize(("put", "place", "value", "said"), broken())
@@ -73,7 +110,9 @@ def test_command_names_what_is_wrong_with_an_audit(capsys, tmp_path, put, place,
 def test_command_names_a_missing_field(capsys, tmp_path):
     path, data = audit_file(tmp_path, full_audit())
     for place in (data, data["signals"][0], data["impact"], data["impact"]["rows"][0]):
-        name, value = next(iter((k, v) for k, v in place.items() if k in ("name", "kind", "group", "features")))
+        name, value = next(
+            iter((k, v) for k, v in place.items() if k in ("name", "kind", "group", "features"))
+        )
         del place[name]
         path.write_text(json.dumps(data))
         assert main(["report", str(path), "-o", str(tmp_path / "page.html"), "-q"]) == 2
@@ -84,6 +123,8 @@ def test_command_names_a_missing_field(capsys, tmp_path):
 
 
 def test_check_accepts_what_the_rooms_make():
-    check_results(Results("T", audits=[full_audit(["p.png"]), clean_audit(), pretraining_audit(), an_audit()]))
+    check_results(
+        Results("T", audits=[full_audit(["p.png"]), clean_audit(), pretraining_audit(), an_audit()])
+    )
     with pytest.raises(ValueError, match=r"^facts\[0\] must be text"):
         check_results(Results("T", facts=[3]))

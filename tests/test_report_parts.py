@@ -9,7 +9,17 @@ import pytest
 
 from palpate.core import Audit, GalleryItem, PalpateError, Results, SampleRef, Score
 from palpate.report import render_markdown
-from palpate.report.plots import HEIGHT, PAD, WIDTH, axis_of, axis_row, gap_histogram, interval_bar, nice_step, uneven
+from palpate.report.plots import (
+    HEIGHT,
+    PAD,
+    WIDTH,
+    axis_of,
+    axis_row,
+    gap_histogram,
+    interval_bar,
+    nice_step,
+    uneven,
+)
 from palpate.report.tables import family_of, heat_tables, score_tables
 from palpate.report.text import decimals, number, percent, plural
 
@@ -20,14 +30,29 @@ def svg(markup):
 
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
-    [(1.374, 3, "1.374"), (-0.0501, 3, "−0.050"), (-0.0001, 2, "0.00"), (12345.6, 1, "12,345.6"), (None, 2, "–"), (math.nan, 2, "–")],
+    [
+        (1.374, 3, "1.374"),
+        (-0.0501, 3, "−0.050"),
+        (-0.0001, 2, "0.00"),
+        (12345.6, 1, "12,345.6"),
+        (None, 2, "–"),
+        (math.nan, 2, "–"),
+    ],
 )
 def test_number(value, digits, text):
     assert number(value, digits) == text
 
 
 def test_decimals_follow_the_largest():
-    assert [decimals([v]) for v in (12345.0, 123.4, 43.9, 1.37, 0.49, 0.042, 0.00214)] == [0, 1, 2, 3, 3, 4, 5]
+    assert [decimals([v]) for v in (12345.0, 123.4, 43.9, 1.37, 0.49, 0.042, 0.00214)] == [
+        0,
+        1,
+        2,
+        3,
+        3,
+        4,
+        5,
+    ]
     assert decimals([]) == 1
 
 
@@ -41,18 +66,25 @@ def test_percent_never_hides_a_leak():
 
 
 def test_plural():
-    assert [plural(n, "touch", "touches") for n in (0, 1, 1200)] == ["0 touches", "1 touch", "1,200 touches"]
+    assert [plural(n, "touch", "touches") for n in (0, 1, 1200)] == [
+        "0 touches",
+        "1 touch",
+        "1,200 touches",
+    ]
 
 
 @pytest.mark.parametrize(
-    ("span", "parts", "step"), [(10, 3, 5), (1, 3, 0.5), (5.3, 3, 2), (0.0008, 3, 0.0005), (29597, 3, 10000), (3, 3, 1)]
+    ("span", "parts", "step"),
+    [(10, 3, 5), (1, 3, 0.5), (5.3, 3, 2), (0.0008, 3, 0.0005), (29597, 3, 10000), (3, 3, 1)],
 )
 def test_nice_step(span, parts, step):
     assert nice_step(span, parts) == pytest.approx(step)
 
 
 def scored(**changes):
-    return dataclasses.replace(Score("TMMD", "generated", 2.0, (1.0, 3.0), null=(-0.5, 0.5), floor=0.25, n=10), **changes)
+    return dataclasses.replace(
+        Score("TMMD", "generated", 2.0, (1.0, 3.0), null=(-0.5, 0.5), floor=0.25, n=10), **changes
+    )
 
 
 def test_interval_bar_places_everything_on_the_shared_axis():
@@ -98,7 +130,9 @@ def test_histogram_heights_and_median():
     assert bars == pytest.approx([0.4 * bars[1], bars[1], 0.6 * bars[1]], abs=0.11)
     middle = next(e for e in root if e.get("class") == "median")
     starts = [float(e.get("x1").rstrip("%")) for e in root if e.get("class") == "tick"]
-    assert float(middle.get("x1").rstrip("%")) == pytest.approx(starts[0] + (starts[-1] - starts[0]) * 14 / 30, abs=0.01)
+    assert float(middle.get("x1").rstrip("%")) == pytest.approx(
+        starts[0] + (starts[-1] - starts[0]) * 14 / 30, abs=0.01
+    )
     titles = [e[0].text for e in root if e.get("class") == "column"]
     assert titles[0] == "0 to 10 frames (exclusive): 4"
     assert titles[-1] == "20 to 30 frames: 6"
@@ -119,11 +153,19 @@ def test_uneven_bins():
 @pytest.mark.parametrize(
     ("metric", "title"),
     [
-        ("D-TMMD", "Touch features"), ("CMMD", "Image distributions"), ("FID", "Image distributions"), ("PSNR", "Image by image"),
-        ("material accuracy", "Recognition"), ("tac-text top-5", "Recognition"), ("recall@5", "Recognition"), ("novel", "Other metrics"),
-        ("contact residual", "Image by image"), ("contact IoU", "Image by image"), ("contact LPIPS", "Image by image"),
+        ("D-TMMD", "Touch features"),
+        ("CMMD", "Image distributions"),
+        ("FID", "Image distributions"),
+        ("PSNR", "Image by image"),
+        ("material accuracy", "Recognition"),
+        ("tac-text top-5", "Recognition"),
+        ("recall@5", "Recognition"),
+        ("novel", "Other metrics"),
+        ("contact residual", "Image by image"),
+        ("contact IoU", "Image by image"),
+        ("contact LPIPS", "Image by image"),
     ],
-)  # fmt: skip
+)
 def test_families(metric, title):
     assert family_of(metric)[0] == title
 
@@ -132,7 +174,14 @@ def test_score_tables_share_what_is_shared():
     scores = [
         scored(metric="SSIM", estimator="per-image mean", null=None, settings={"window": 11}),
         scored(metric="TMMD", estimator="grouped", encoder="e" * 64, n=10),
-        scored(metric="TMMD", subject="real", estimator="grouped", encoder="e" * 64, n=20, note="A note."),
+        scored(
+            metric="TMMD",
+            subject="real",
+            estimator="grouped",
+            encoder="e" * 64,
+            n=20,
+            note="A note.",
+        ),
         scored(metric="I-TMMD", estimator="grouped", encoder="e" * 64, seed=3, note="A note."),
     ]
     touch, images = score_tables(scores)
@@ -144,7 +193,10 @@ def test_score_tables_share_what_is_shared():
     assert (touch.columns[0].size, touch.columns[1].size) == ("", "n = 10")
     assert [touch.cells[s]["TMMD"][0].size for s in touch.subjects] == ["n = 10", "n = 20"]
     assert touch.notes == ["A note."]
-    assert [touch.cells["real"]["TMMD"][0].footnotes, touch.cells["generated"]["I-TMMD"][0].footnotes] == [[1], [1]]
+    assert [
+        touch.cells["real"]["TMMD"][0].footnotes,
+        touch.cells["generated"]["I-TMMD"][0].footnotes,
+    ] == [[1], [1]]
     assert ("window", "11") in images.columns[0].made
     assert images.shared == []
 
@@ -155,7 +207,12 @@ def test_several_scores_of_one_subject_stand_in_one_cell():
 
 
 def test_incomparable_scores_are_refused():
-    for change in ({"estimator": "biased"}, {"encoder": "other"}, {"bandwidth": 5.0}, {"settings": {"window": 7}}):
+    for change in (
+        {"estimator": "biased"},
+        {"encoder": "other"},
+        {"bandwidth": 5.0},
+        {"settings": {"window": 7}},
+    ):
         with pytest.raises(PalpateError, match="one column must agree in"):
             score_tables([scored(), scored(subject="other", **change)])
         with pytest.raises(PalpateError, match="one column must agree in"):
@@ -163,8 +220,14 @@ def test_incomparable_scores_are_refused():
 
 
 def test_other_presets_and_other_splits_stand_in_tables_of_their_own():
-    alike = [scored(settings={"preset": "grouped"}), scored(subject="real", settings={"preset": "grouped"})]
-    others = [scored(settings={"preset": "paper"}, estimator="unbiased"), scored(settings={"preset": "grouped"}, split="other")]
+    alike = [
+        scored(settings={"preset": "grouped"}),
+        scored(subject="real", settings={"preset": "grouped"}),
+    ]
+    others = [
+        scored(settings={"preset": "paper"}, estimator="unbiased"),
+        scored(settings={"preset": "grouped"}, split="other"),
+    ]
     tables = score_tables(alike + others)
     assert [len(t.subjects) for t in tables] == [2, 1, 1]
     assert len({t.title for t in tables}) == 3
@@ -174,7 +237,9 @@ def test_other_presets_and_other_splits_stand_in_tables_of_their_own():
 
 def test_heat_tables_take_only_squares():
     good = scored(details={"matrix": [[0.5, 2.0], [None, -1.0]], "classes": ["a", "b"]})
-    (heat,) = heat_tables([good, scored(details={"matrix": [[1, 2]]}), scored(details={"matrix": "no"}), scored()])
+    (heat,) = heat_tables(
+        [good, scored(details={"matrix": [[1, 2]]}), scored(details={"matrix": "no"}), scored()]
+    )
     assert heat.labels == ["a", "b"]
     assert heat.values == [["0.500", "2.000"], ["–", "−1.000"]]
     assert heat.shares == [[0.25, 1.0], [0.0, 0.0]]
@@ -187,17 +252,45 @@ def test_markdown_holds_every_score_fact_and_command():
         scored(),
         scored(subject="real", value=0.25, interval=None),
         scored(subject="flat", value=None, interval=None, note="Undefined: no spread"),
-        scored(metric="D-TMMD", value=0.44, details={"matrix": [[0.5, 2.0], [2.0, 0.75]], "classes": ["a|b", "c"]}),
+        scored(
+            metric="D-TMMD",
+            value=0.44,
+            details={"matrix": [[0.5, 2.0], [2.0, 0.75]], "classes": ["a|b", "c"]},
+        ),
         scored(metric="SSIM", value=0.4901, interval=(0.47, 0.51), higher_is_better=True),
     ]
     item = GalleryItem(SampleRef("v/1", "v", 1, "wood", "v.png", "t_1.png"), "g.png")
     text = render_markdown(
-        Results("T", ["A fact."], [audit()], scores, [item], {"a": {"b": "c`d"}}, ["A * warning."], ["palpate audit 'x y'"])
+        Results(
+            "T",
+            ["A fact."],
+            [audit()],
+            scores,
+            [item],
+            {"a": {"b": "c`d"}},
+            ["A * warning."],
+            ["palpate audit 'x y'"],
+        )
     )
     for said in (
-        "# T", "A fact.", "A \\* warning.", "**2.000** [1.000, 3.000]", "**0.250**", "undefined: no spread", "**0.440**", "**0.490** [0.470, 0.510]",
-        "SSIM ↑", "TMMD ↓", "a\\|b", "`t_1.png`", "100 % leaked", "palpate audit 'x y'", "`` c`d ``", "median 14", "10 to 20",
-    ):  # fmt: skip
+        "# T",
+        "A fact.",
+        "A \\* warning.",
+        "**2.000** [1.000, 3.000]",
+        "**0.250**",
+        "undefined: no spread",
+        "**0.440**",
+        "**0.490** [0.470, 0.510]",
+        "SSIM ↑",
+        "TMMD ↓",
+        "a\\|b",
+        "`t_1.png`",
+        "100 % leaked",
+        "palpate audit 'x y'",
+        "`` c`d ``",
+        "median 14",
+        "10 to 20",
+    ):
         assert said in text, said
     tables = [block.splitlines() for block in re.findall(r"(?:^\|.*\n)+", text, flags=re.M)]
     assert len(tables) >= 5

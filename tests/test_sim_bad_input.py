@@ -33,11 +33,15 @@ TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
 
 
 def no_number(tile, rng):
-    return Surface(tile.zeros() * np.nan, np.ones((tile.n, tile.n, 3), np.float32), "only", ("odd", "new"))
+    return Surface(
+        tile.zeros() * np.nan, np.ones((tile.n, tile.n, 3), np.float32), "only", ("odd", "new")
+    )
 
 
 def wrong_shape(tile, rng):
-    return Surface(tile.zeros()[1:], np.ones((tile.n, tile.n, 3), np.float32), "only", ("odd", "new"))
+    return Surface(
+        tile.zeros()[1:], np.ones((tile.n, tile.n, 3), np.float32), "only", ("odd", "new")
+    )
 
 
 def left_behind(folder):
@@ -46,8 +50,12 @@ def left_behind(folder):
 
 
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("draw", "word"), [(no_number, "finite height"), (wrong_shape, "height of shape (64, 64)")])
-def test_a_broken_material_is_one_line_of_the_command(draw, word, workers, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("draw", "word"), [(no_number, "finite height"), (wrong_shape, "height of shape (64, 64)")]
+)
+def test_a_broken_material_is_one_line_of_the_command(
+    draw, word, workers, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", draw, ("only",)))
     out = tmp_path / "w"
     args = [
@@ -74,7 +82,9 @@ def test_a_broken_material_is_one_line_of_the_command(draw, word, workers, tmp_p
     assert "Traceback" not in said
     assert not out.exists()
     assert not left_behind(tmp_path)
-    monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", MATERIALS["Wood"].draw, MATERIALS["Wood"].subtypes))
+    monkeypatch.setitem(
+        MATERIALS, "Cork", Material(20, "cork", MATERIALS["Wood"].draw, MATERIALS["Wood"].subtypes)
+    )
     assert main([*args, "--quiet"]) == 0  # mended, the same call goes on
 
 
@@ -116,7 +126,11 @@ def test_arrays_take_their_space_before_anything_is_rendered(tmp_path, monkeypat
 
     monkeypatch.setattr("os.posix_fallocate", full)
     with pytest.raises(PalpateError, match="must have room"):
-        write_world(tmp_path / "w", dataclasses.replace(TINY, layout="raw"), progress=lambda *_: pytest.fail("rendered"))
+        write_world(
+            tmp_path / "w",
+            dataclasses.replace(TINY, layout="raw"),
+            progress=lambda *_: pytest.fail("rendered"),
+        )
     assert not list(tmp_path.rglob("*.npy"))
     assert not left_behind(tmp_path)
 
@@ -148,7 +162,13 @@ def test_a_limit_on_file_sizes_is_told_as_a_full_disk(tmp_path):
         "64",
         "-q",
     ]
-    done = subprocess.run([*command, "--workers", "1"], preexec_fn=limited, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, "--workers", "1"],
+        preexec_fn=limited,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 2
     assert "must have room for the world. Got File too large" in done.stderr
     assert "Traceback" not in done.stderr
@@ -156,7 +176,9 @@ def test_a_limit_on_file_sizes_is_told_as_a_full_disk(tmp_path):
     assert not left_behind(tmp_path)
 
 
-def test_a_disk_that_is_full_by_the_manifest_is_told_and_a_rerun_goes_on(tmp_path, monkeypatch, capsys):
+def test_a_disk_that_is_full_by_the_manifest_is_told_and_a_rerun_goes_on(
+    tmp_path, monkeypatch, capsys
+):
     size = ["--size", "16", "--tile", "64", "--workers", "1", "-q"]
     args = ["world", "--preset", "tiny", *size, "-o"]
     real = Path.write_bytes
@@ -170,7 +192,9 @@ def test_a_disk_that_is_full_by_the_manifest_is_told_and_a_rerun_goes_on(tmp_pat
         patch.setattr(Path, "write_bytes", full)
         assert main([*args, str(tmp_path / "w")]) == 2
     said = capsys.readouterr().err
-    assert f"The disk of {tmp_path} must have room for the world. Got No space left on device" in said
+    assert (
+        f"The disk of {tmp_path} must have room for the world. Got No space left on device" in said
+    )
     assert "Traceback" not in said
     assert not (tmp_path / "w").exists()
     assert not left_behind(tmp_path)
@@ -184,7 +208,9 @@ def small_disk(tmp_path):
     """A file system of 256 KB and a function that makes it large; only where one may be mounted."""
     place = tmp_path / "disk"
     place.mkdir()
-    mount = lambda *options: subprocess.run(["mount", *options, str(place)], capture_output=True, check=False).returncode  # noqa: E731
+    mount = lambda *options: (
+        subprocess.run(["mount", *options, str(place)], capture_output=True, check=False).returncode
+    )
     try:
         mounted = mount("-t", "tmpfs", "-o", "size=256k", "tmpfs") == 0
     except FileNotFoundError:
@@ -230,14 +256,19 @@ def test_a_world_of_another_version_is_refused(version, tmp_path):
     write_world(tmp_path / "w", TINY)
     changed(tmp_path / "w" / "world.json", version=version)
     for call in (lambda: write_world(tmp_path / "w", TINY), lambda: load_options(tmp_path / "w")):
-        with pytest.raises(PalpateError, match=f"must be of version {VERSION} of the world.*digests would lie"):
+        with pytest.raises(
+            PalpateError, match=f"must be of version {VERSION} of the world.*digests would lie"
+        ):
             call()
 
 
 def test_a_world_of_another_format_is_not_called_one_of_other_options(tmp_path):
     write_world(tmp_path / "w", TINY)
     changed(tmp_path / "w" / "world.json", format="palpate-world/3")
-    with pytest.raises(PalpateError, match=r"must hold a world of the format palpate-world/2\. Got 'palpate-world/3'"):
+    with pytest.raises(
+        PalpateError,
+        match=r"must hold a world of the format palpate-world/2\. Got 'palpate-world/3'",
+    ):
         write_world(tmp_path / "w", TINY)
     with pytest.raises(PalpateError, match="Got 'palpate-world/3'"):
         load_options(tmp_path / "w")
@@ -265,7 +296,16 @@ def test_an_unfinished_world_of_another_version_is_refused_by_name(tmp_path):
 
 
 def test_options_survive_a_file_and_repeat_a_world(tmp_path):
-    options = WorldOptions(seed=5, view_mm=(31, 40), slide_mm=(1,), materials=3, layout="hct", size=16, tile=64, objects_per_material=2)
+    options = WorldOptions(
+        seed=5,
+        view_mm=(31, 40),
+        slide_mm=(1,),
+        materials=3,
+        layout="hct",
+        size=16,
+        tile=64,
+        objects_per_material=2,
+    )
     save_options(options, tmp_path / "o.json")
     assert load_options(tmp_path / "o.json") == options
     write_world(tmp_path / "w", options)
@@ -282,7 +322,10 @@ def test_options_survive_a_file_and_repeat_a_world(tmp_path):
         ({"options": {"seed": 6}}, "digest in .* must match"),
         ({"options": [1]}, "must be a world.json"),
         ({"format": "palpate-split/1"}, "must be a world.json.*Got 'palpate-split/1'"),
-        ({"format": "palpate-world-options/9"}, "have the format palpate-world-options/1.*Got 'palpate-world-options/9'"),
+        (
+            {"format": "palpate-world-options/9"},
+            "have the format palpate-world-options/1.*Got 'palpate-world-options/9'",
+        ),
         ({"format": "palpate-world/3"}, "format palpate-world/2.*Got 'palpate-world/3'"),
         ({"format": "palpate-world/3", "version": VERSION + 1}, f"must be of version {VERSION}"),
         ({"options": {"size": 5}}, "size must be a whole number"),
@@ -331,7 +374,10 @@ def test_a_world_of_the_shipped_models_says_so(tmp_path, capsys):
     said = capsys.readouterr()
     assert "shipped mini models may have been trained on this world" in said.out
     assert "shipped mini models" in said.err
-    assert "shipped mini models" in json.loads((tmp_path / "w" / "world.json").read_text())["seen_by_shipped_models"]
+    assert (
+        "shipped mini models"
+        in json.loads((tmp_path / "w" / "world.json").read_text())["seen_by_shipped_models"]
+    )
     write_world(tmp_path / "v", TINY)
     assert "seen_by_shipped_models" not in json.loads((tmp_path / "v" / "world.json").read_text())
 
@@ -342,7 +388,10 @@ HUGE = 10**400
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *((name, HUGE) for name in ("seed", "size", "hard", "pad_mm", "materials", "look", "view_mm")),
+        *(
+            (name, HUGE)
+            for name in ("seed", "size", "hard", "pad_mm", "materials", "look", "view_mm")
+        ),
         *((name, 10**5000) for name in ("seed", "hard", "materials", "look", "view_mm")),
         ("view_mm", (30.0, HUGE)),
         ("relax_mm", [10**5000]),

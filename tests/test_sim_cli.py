@@ -23,18 +23,35 @@ def test_the_default_is_small():
 
 def test_every_option_can_be_given():
     other = {
-        "materials": ("Wood", "Sand"), "balance": "touch-and-go", "free_written": "all", "look": "digit", "leak": "none", "layout": "raw",
-        "relax_mm": (1.0,), "slide_mm": (1.0, 2.0), "blur_px": (0.5,),
-    }  # fmt: skip
+        "materials": ("Wood", "Sand"),
+        "balance": "touch-and-go",
+        "free_written": "all",
+        "look": "digit",
+        "leak": "none",
+        "layout": "raw",
+        "relax_mm": (1.0,),
+        "slide_mm": (1.0, 2.0),
+        "blur_px": (0.5,),
+    }
     for field in dataclasses.fields(WorldOptions):
         now = getattr(PRESETS["small"], field.name)
         if field.name not in other:
-            other[field.name] = (now[0] * 1.01, now[1] * 0.99) if isinstance(now, tuple) else now + 1 if isinstance(now, int) else now * 0.9
+            other[field.name] = (
+                (now[0] * 1.01, now[1] * 0.99)
+                if isinstance(now, tuple)
+                else now + 1
+                if isinstance(now, int)
+                else now * 0.9
+            )
         value = other[field.name]
         words = [str(v) for v in value] if isinstance(value, tuple) else [str(value)]
         found = named(f"--{field.name.replace('_', '-')}", *words)
         assert getattr(found, field.name) == value, field.name
-        assert {f.name for f in dataclasses.fields(found) if getattr(found, f.name) != getattr(PRESETS["small"], f.name)} == {field.name}
+        assert {
+            f.name
+            for f in dataclasses.fields(found)
+            if getattr(found, f.name) != getattr(PRESETS["small"], f.name)
+        } == {field.name}
 
 
 def test_words_that_stand_for_more():
@@ -48,11 +65,59 @@ def test_words_that_stand_for_more():
 
 def test_a_world_can_be_repeated_from_its_record(tmp_path, capsys):
     size = ["--size", "16", "--tile", "64", "--workers", "1", "-q"]
-    assert main(["world", "-o", str(tmp_path / "a"), "--preset", "tiny", "--layout", "raw", "--view-mm", "30", "40", *size]) == 0
-    assert main(["world", "-o", str(tmp_path / "b"), "--options", str(tmp_path / "a" / "world.json"), "--workers", "1", "-q"]) == 0
-    assert json.loads((tmp_path / "a" / "world.json").read_text()) == json.loads((tmp_path / "b" / "world.json").read_text())
-    assert (tmp_path / "a" / "vision.npy").read_bytes() == (tmp_path / "b" / "vision.npy").read_bytes()
-    assert main(["world", "-o", str(tmp_path / "c"), "--options", str(tmp_path / "a"), "--preset", "tiny"]) == 2
+    assert (
+        main(
+            [
+                "world",
+                "-o",
+                str(tmp_path / "a"),
+                "--preset",
+                "tiny",
+                "--layout",
+                "raw",
+                "--view-mm",
+                "30",
+                "40",
+                *size,
+            ]
+        )
+        == 0
+    )
+    assert (
+        main(
+            [
+                "world",
+                "-o",
+                str(tmp_path / "b"),
+                "--options",
+                str(tmp_path / "a" / "world.json"),
+                "--workers",
+                "1",
+                "-q",
+            ]
+        )
+        == 0
+    )
+    assert json.loads((tmp_path / "a" / "world.json").read_text()) == json.loads(
+        (tmp_path / "b" / "world.json").read_text()
+    )
+    assert (tmp_path / "a" / "vision.npy").read_bytes() == (
+        tmp_path / "b" / "vision.npy"
+    ).read_bytes()
+    assert (
+        main(
+            [
+                "world",
+                "-o",
+                str(tmp_path / "c"),
+                "--options",
+                str(tmp_path / "a"),
+                "--preset",
+                "tiny",
+            ]
+        )
+        == 2
+    )
     assert "Either --preset or --options" in capsys.readouterr().err
 
 

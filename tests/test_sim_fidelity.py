@@ -10,7 +10,7 @@ from palpate.sim.fidelity import (
     BANDS,
     PAD_MM,
     change,
-    colour_grid,
+    color_grid,
     contact_area,
     contrast,
     difference,
@@ -38,7 +38,7 @@ def dotted(n=64, step=8, side=2, value=20.0):
 
 
 def wave(cycles, n=64, amplitude=10.0):
-    """A grey wave of that many cycles on the pad, around 0."""
+    """A gray wave of that many cycles on the pad, around 0."""
     along = amplitude * np.sin(2 * math.pi * cycles * (np.arange(n) + 0.5) / n)
     return np.broadcast_to(along[None, :, None], (n, n, 3)).astype(np.float32)
 
@@ -58,11 +58,13 @@ def test_markers_are_dark_against_what_is_around_them():
     assert not marker_mask(np.broadcast_to(shade, (64, 64, 3))).any()
 
 
-def test_the_colour_grid_leaves_out_the_markers():
+def test_the_color_grid_leaves_out_the_markers():
     image = dotted() * np.float32([1.0, 0.5, 2.0])
-    np.testing.assert_allclose(colour_grid(image), np.broadcast_to([150.0, 75.0, 300.0], (3, 3, 3)), rtol=1e-5)
+    np.testing.assert_allclose(
+        color_grid(image), np.broadcast_to([150.0, 75.0, 300.0], (3, 3, 3)), rtol=1e-5
+    )
     image[:, 40:] = 90.0
-    assert colour_grid(image)[1, 2] == pytest.approx([90.0] * 3, rel=0.05)
+    assert color_grid(image)[1, 2] == pytest.approx([90.0] * 3, rel=0.05)
 
 
 def test_luma_by_hand():
@@ -70,7 +72,9 @@ def test_luma_by_hand():
     assert luma(np.float32([[[255, 0, 0]]]))[0, 0] == pytest.approx(76.245)
 
 
-@pytest.mark.parametrize(("step", "chroma"), [((6.0, 6.0, 6.0), 0.0), ((6.0, -6.0, 0.0), 1.0), ((6.0, 0.0, 0.0), 2 / 3)])
+@pytest.mark.parametrize(
+    ("step", "chroma"), [((6.0, 6.0, 6.0), 0.0), ((6.0, -6.0, 0.0), 1.0), ((6.0, 0.0, 0.0), 2 / 3)]
+)
 def test_contrast_by_hand(step, chroma):
     found = contrast(dotted() + np.float32(step), dotted())
     assert [found[f"rms_{c}"] for c in "rgb"] == pytest.approx(np.abs(step))
@@ -109,7 +113,9 @@ def test_the_slope_of_a_power_law_is_found_at_both_sizes():
         axis = np.fft.fftfreq(n, PAD_MM / n)
         radius = np.hypot(axis[:, None], axis[None])
         radius[0, 0] = 1.0
-        noise = np.fft.ifft2(np.fft.fft2(rng.normal(size=(n, n))) * radius**-1.0).real  # amplitude ~ 1 / f, power ~ f^-2
+        noise = np.fft.ifft2(
+            np.fft.fft2(rng.normal(size=(n, n))) * radius**-1.0
+        ).real  # amplitude ~ 1 / f, power ~ f^-2
         slope = spectrum(plain(n=n) + np.float32(3 * noise)[..., None], plain(n=n))["slope"]
         assert slope == pytest.approx(-2.0, abs=0.35)
 
@@ -131,7 +137,9 @@ def test_the_noise_is_measured_as_documented():
 
 def test_sizes_are_means_over_areas():
     image = np.arange(16 * 16 * 3, dtype=np.float32).reshape(16, 16, 3)
-    np.testing.assert_allclose(to_size(image, 4), image.reshape(4, 4, 4, 4, 3).mean((1, 3)), rtol=1e-5)
+    np.testing.assert_allclose(
+        to_size(image, 4), image.reshape(4, 4, 4, 4, 3).mean((1, 3)), rtol=1e-5
+    )
 
 
 @pytest.mark.slow
@@ -145,20 +153,39 @@ def test_the_world_lies_within_the_spread_of_the_real_clips(real_data):
     medians = []
     for clip, numbers in clips.items():
         first = min(numbers)
-        with av.open(str(real_data / "touch_and_go" / "clips" / "dataset" / clip / "gelsight.mp4")) as file:
-            frames = [f.to_ndarray(format="rgb24")[:, 80:560] for _, f in zip(range(first + 30), file.decode(video=0), strict=False)]
+        with av.open(
+            str(real_data / "touch_and_go" / "clips" / "dataset" / clip / "gelsight.mp4")
+        ) as file:
+            frames = [
+                f.to_ndarray(format="rgb24")[:, 80:560]
+                for _, f in zip(range(first + 30), file.decode(video=0), strict=False)
+            ]
         used = [f for f in sorted(numbers) if f - first < 30 and f < len(frames)]
-        medians.append(describe([(to_size(frames[f], 64), to_size(frames[max(0, first - 4)], 64)) for f in used[::6]]))
+        medians.append(
+            describe(
+                [
+                    (to_size(frames[f], 64), to_size(frames[max(0, first - 4)], 64))
+                    for f in used[::6]
+                ]
+            )
+        )
     options = WorldOptions(objects_per_material=3)
     pairs = []
     for plan in plan_world(options)[::2]:
         video = Video(options, plan)
-        pairs.append((video.tactile(contact_frames(options, 1)[1]), video.tactile(first_contact(options, 1) - 4)))
+        pairs.append(
+            (
+                video.tactile(contact_frames(options, 1)[1]),
+                video.tactile(first_contact(options, 1) - 4),
+            )
+        )
     world = describe(pairs)
     for name, value in world.items():
         real = [m[name] for m in medians]
         margin = 0.25 * (max(real) - min(real))
-        assert min(real) - margin <= value <= max(real) + margin, f"{name}: world {value:.2f}, real {min(real):.2f} .. {max(real):.2f}"
+        assert min(real) - margin <= value <= max(real) + margin, (
+            f"{name}: world {value:.2f}, real {min(real):.2f} .. {max(real):.2f}"
+        )
 
 
 def describe(pairs):
@@ -166,7 +193,10 @@ def describe(pairs):
     rows = []
     for contact, background in pairs:
         row = contrast(contact, background) | spectrum(contact, background)
-        row |= {f"mean_{k}": v for k, v in enumerate(colour_grid(background).mean((0, 1)))}
-        row |= {"area": contact_area(contact, background, 6.0), "count": marker_statistics(background)["count"]}
+        row |= {f"mean_{k}": v for k, v in enumerate(color_grid(background).mean((0, 1)))}
+        row |= {
+            "area": contact_area(contact, background, 6.0),
+            "count": marker_statistics(background)["count"],
+        }
         rows.append(row)
     return {name: float(np.median([row[name] for row in rows])) for name in rows[0]}

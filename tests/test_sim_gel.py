@@ -14,7 +14,9 @@ from palpate.sim.arrays import f32, to_bytes
 from palpate.sim.gel import GRIP_MM, make_sensor, marker_shift, press, shade, solve_approach
 from palpate.sim.plan import contact_frames, first_contact
 
-SMALL = WorldOptions(materials=("Wood", "Brick", "Gravel", "Leather"), objects_per_material=1, tile=128, size=32)
+SMALL = WorldOptions(
+    materials=("Wood", "Brick", "Gravel", "Leather"), objects_per_material=1, tile=128, size=32
+)
 
 
 def bisect(gap, load):
@@ -22,7 +24,11 @@ def bisect(gap, load):
     low, high = -50.0, 50.0
     for _ in range(100):
         middle = (low + high) / 2
-        low, high = (middle, high) if np.maximum(gap.astype(np.float64) + middle, 0).mean() < load else (low, middle)
+        low, high = (
+            (middle, high)
+            if np.maximum(gap.astype(np.float64) + middle, 0).mean() < load
+            else (low, middle)
+        )
     return low
 
 
@@ -91,7 +97,9 @@ def test_the_background_is_the_shading_without_contact():
     flat = shade(video.sensor, np.zeros((32, 32), np.float32), video.gain)
     np.testing.assert_array_equal(video.background(), to_bytes(flat))
     free = np.stack([video.tactile(f) for f in range(5)]).astype(float)
-    assert np.abs(free.mean(0) - video.background()).mean() < 2.0  # free frames differ from it by noise alone
+    assert (
+        np.abs(free.mean(0) - video.background()).mean() < 2.0
+    )  # free frames differ from it by noise alone
     assert np.abs(free[0] - free[1]).mean() > 0.1
     assert np.abs(video.tactile(6).astype(float) - video.background()).mean() > 3.0
 
@@ -107,7 +115,9 @@ def test_the_frame_four_before_a_contact_is_free():
 
 def test_shading_is_the_photometric_formula():
     """A plane membrane of slope (a, b) without texture, against the formula written out in float64."""
-    sensor = dataclasses.replace(make_sensor(SMALL, 1), ink=None, texture=np.zeros((32, 32), np.float32))
+    sensor = dataclasses.replace(
+        make_sensor(SMALL, 1), ink=None, texture=np.zeros((32, 32), np.float32)
+    )
     row, column = np.mgrid[:32, :32]
     a, b = 0.2, -0.1
     membrane = (a * column + b * row) * sensor.px
@@ -115,7 +125,9 @@ def test_shading_is_the_photometric_formula():
     normal = np.array([a, b, 1.0]) / np.sqrt(a * a + b * b + 1.0)
     expected = np.zeros((32, 32, 3)) + sensor.ambient
     for k in range(3):
-        expected += sensor.field[k][..., None] * max(0.0, float(normal @ sensor.light[k])) * sensor.colour[k]
+        expected += (
+            sensor.field[k][..., None] * max(0.0, float(normal @ sensor.light[k])) * sensor.color[k]
+        )
     expected *= 1.0 - sensor.dim * membrane[..., None]
     expected = np.clip(expected * sensor.veil[..., None] * [1.1, 1.0, 0.9], 0, 1.2) ** sensor.gamma
     np.testing.assert_allclose(image, expected, atol=2e-3)
@@ -133,10 +145,16 @@ def test_digit_has_no_markers_and_one_family_many_units():
     digit = make_sensor(dataclasses.replace(SMALL, look="digit"), 0)
     assert digit.ink is None
     assert make_sensor(SMALL, 0).ink.max() > 0.5
-    first, second, other_world = make_sensor(SMALL, 0), make_sensor(SMALL, 1), make_sensor(dataclasses.replace(SMALL, seed=7), 0)
+    first, second, other_world = (
+        make_sensor(SMALL, 0),
+        make_sensor(SMALL, 1),
+        make_sensor(dataclasses.replace(SMALL, seed=7), 0),
+    )
     for unit in (second, other_world):
         assert not np.array_equal(first.veil, unit.veil)
-        assert np.abs(first.light - unit.light).max() < 0.4  # the lights of one product stay nearly in place
+        assert (
+            np.abs(first.light - unit.light).max() < 0.4
+        )  # the lights of one product stay nearly in place
 
 
 @pytest.mark.parametrize(("rows", "pad"), [(8, 14.0), (5, 14.0), (12, 14.0), (8, 28.0)])
@@ -150,7 +168,9 @@ def test_a_pad_shows_its_rows_of_markers(rows, pad):
 
 def test_units_of_other_options_are_other_units():
     plain = make_sensor(SMALL, 0)
-    assert make_sensor(dataclasses.replace(SMALL, named=0.1), 0) is plain  # of no concern to the gel
+    assert (
+        make_sensor(dataclasses.replace(SMALL, named=0.1), 0) is plain
+    )  # of no concern to the gel
     assert make_sensor(dataclasses.replace(SMALL, markers=0), 0).ink is None
     assert make_sensor(dataclasses.replace(SMALL, pad_mm=28.0), 0).px == pytest.approx(2 * plain.px)
     clean = make_sensor(dataclasses.replace(SMALL, dirt=0.0, vignette=(0.1, 0.1)), 0).veil
@@ -177,7 +197,9 @@ def test_markers_are_pushed_apart_along_both_sides():
     depth = gaussian_filter(bump.astype(float), 3.2, mode="nearest")
     expected = -np.gradient(depth, axis=0) / sensor.px * 0.107 / sensor.px
     assert np.abs(expected).max() > 0.02
-    np.testing.assert_allclose(dy[2:-2, 2:-2], expected[2:-2, 2:-2], atol=0.25 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        dy[2:-2, 2:-2], expected[2:-2, 2:-2], atol=0.25 * np.abs(expected).max()
+    )
     assert dy[20, 16] > 0 > dy[11, 16]
 
 
@@ -194,10 +216,12 @@ def test_a_frame_alone_equals_the_frame_in_its_video(look):
     assert vision[0].shape == tactile[0].shape == (32, 32, 3)
 
 
-def test_neighbouring_frames_are_alike_and_materials_are_not():
+def test_neighboring_frames_are_alike_and_materials_are_not():
     video, other = Video(SMALL, 0), Video(SMALL, 1)
     difference = lambda a, b: np.abs(a.astype(float) - b).mean()  # noqa: E731
-    assert difference(video.vision(5), video.vision(6)) < difference(video.vision(5), other.vision(5))
+    assert difference(video.vision(5), video.vision(6)) < difference(
+        video.vision(5), other.vision(5)
+    )
 
 
 def test_a_frame_or_video_that_is_not_there_is_refused():

@@ -47,12 +47,19 @@ def raw(tmp_path_factory):
 def test_hct_is_read_without_a_remark(hct, place):
     seen = validate_dataset(hct.folder / place)
     assert seen.format == "hct"
-    assert (seen.samples, list(seen.missing), list(seen.invalid), list(seen.suspicious)) == (hct.counts["contact_frames"], [], [], [])
+    assert (seen.samples, list(seen.missing), list(seen.invalid), list(seen.suspicious)) == (
+        hct.counts["contact_frames"],
+        [],
+        [],
+        [],
+    )
 
 
 @pytest.mark.parametrize("look", ["gelsight", "digit"])
 def test_hct_of_either_look_shows_no_exchanged_folders(look, tmp_path):
-    options = dataclasses.replace(HCT, look=look, materials=10, objects_per_material=4, sensors=2, touches_per_video=1)
+    options = dataclasses.replace(
+        HCT, look=look, materials=10, objects_per_material=4, sensors=2, touches_per_video=1
+    )
     write_world(tmp_path / "w", options)
     assert list(validate_dataset(tmp_path / "w").suspicious) == []
 
@@ -61,25 +68,53 @@ def test_hct_has_the_layout_of_the_archive(hct):
     root = hct.folder / "hct"
     trajectories = sorted(p for p in root.glob("data*/*") if p.is_dir())
     assert len(trajectories) == hct.counts["videos"]
-    assert all(re.fullmatch(r"data[1-3]/\d+-\d{10}\.\d\d", p.relative_to(root).as_posix()) for p in trajectories)
+    assert all(
+        re.fullmatch(r"data[1-3]/\d+-\d{10}\.\d\d", p.relative_to(root).as_posix())
+        for p in trajectories
+    )
     for folder in trajectories:
-        frames = [sorted(p.name for p in (folder / side).iterdir()) for side in ("vision", "tactile")]
+        frames = [
+            sorted(p.name for p in (folder / side).iterdir()) for side in ("vision", "tactile")
+        ]
         assert frames[0] == frames[1]
         assert all(re.fullmatch(r"\d+-0\.\d{4}\.jpg", name) for name in frames[0])
-        assert sorted(int(name.split("-")[0]) for name in frames[0]) == list(range(HCT.video_length))  # dense
+        assert sorted(int(name.split("-")[0]) for name in frames[0]) == list(
+            range(HCT.video_length)
+        )  # dense
         assert (folder / "background.png").is_file()
     for rig in {p.parent for p in trajectories}:
-        pairs = {name: json.loads((rig / f"{name}.json").read_text()) for name in ("contact", "not_contact")}
-        touching, free = (list(zip(pairs[name]["vision"], pairs[name]["tactile"], strict=True)) for name in ("contact", "not_contact"))
+        pairs = {
+            name: json.loads((rig / f"{name}.json").read_text())
+            for name in ("contact", "not_contact")
+        }
+        touching, free = (
+            list(zip(pairs[name]["vision"], pairs[name]["tactile"], strict=True))
+            for name in ("contact", "not_contact")
+        )
         assert len(touching) + len(free) == sum(1 for _ in rig.glob("*/vision/*"))
         assert all((rig / path).is_file() for pair in (*touching, *free) for path in pair)
-        there = {part: rig / f"{part}.csv" for part in ("train", "test") if (rig / f"{part}.csv").is_file()}
-        listed = {part: list(csv.DictReader(path.read_text().splitlines())) for part, path in there.items()}
+        there = {
+            part: rig / f"{part}.csv"
+            for part in ("train", "test")
+            if (rig / f"{part}.csv").is_file()
+        }
+        listed = {
+            part: list(csv.DictReader(path.read_text().splitlines()))
+            for part, path in there.items()
+        }
         assert {(r["url"], r["tactile"]) for rows in listed.values() for r in rows} == set(touching)
-        assert all((rig / row["tactile_background"]).is_file() for rows in listed.values() for row in rows)
-        assert all(row["caption"] == row["caption"].lower() and "." not in row["caption"] for rows in listed.values() for row in rows)
+        assert all(
+            (rig / row["tactile_background"]).is_file() for rows in listed.values() for row in rows
+        )
+        assert all(
+            row["caption"] == row["caption"].lower() and "." not in row["caption"]
+            for rows in listed.values()
+            for row in rows
+        )
         talks = json.loads((rig / "finetune.json").read_text())
-        assert [t["conversations"][-1]["value"] for t in talks] == [row["caption"] for row in listed["train"]]
+        assert [t["conversations"][-1]["value"] for t in talks] == [
+            row["caption"] for row in listed["train"]
+        ]
     numbers = [p.name.split("-")[0] for p in trajectories]
     assert len(set(numbers)) < len(numbers)  # the number is used again, as in the archive
 
@@ -92,18 +127,36 @@ def test_the_worlds_own_manifest_is_that_of_an_import_and_knows_more(layout, tmp
     imported = import_dataset(tmp_path / "w", tmp_path / "i")
     found = imported.manifest.take(own.ids)
     assert len(found) == len(own) == len(imported.manifest)
-    for name in ("video", "frame", "touch", "session", "text", "vision", "tactile", "background", "domain"):
+    for name in (
+        "video",
+        "frame",
+        "touch",
+        "session",
+        "text",
+        "vision",
+        "tactile",
+        "background",
+        "domain",
+    ):
         assert own.column(name) == found.column(name), name
     assert own.root.resolve() == imported.manifest.root.resolve()
-    assert not any(own.table[name].null_count() for name in ("object", "material", "sensor", "text"))
+    assert not any(
+        own.table[name].null_count() for name in ("object", "material", "sensor", "text")
+    )
     split = Split.load(tmp_path / "w" / "splits" / "Orig.json")
     assert dict(split.parts) == dict(imported.splits["Orig"].parts)
-    assert split.manifest == own.digest == json.loads((tmp_path / "w" / "world.json").read_text())["manifest_digest"]
+    assert (
+        split.manifest
+        == own.digest
+        == json.loads((tmp_path / "w" / "world.json").read_text())["manifest_digest"]
+    )
     assert own.facts["synthetic"] == "yes"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [HCT, RAW, dataclasses.replace(RAW, layout="frames")], ids=lambda o: o.layout)
+@pytest.mark.parametrize(
+    "options", [HCT, RAW, dataclasses.replace(RAW, layout="frames")], ids=lambda o: o.layout
+)
 def test_two_workers_and_a_killed_run_give_the_same_bytes(options, tmp_path):
     write_world(tmp_path / "a", options)
     write_world(tmp_path / "b", options, workers=2)
@@ -112,7 +165,11 @@ def test_two_workers_and_a_killed_run_give_the_same_bytes(options, tmp_path):
     assert not (tmp_path / "c").exists()
     record = write_world(tmp_path / "c", options)
     assert record.rendered == record.counts["videos"] - 4
-    assert digest_folder(tmp_path / "a") == digest_folder(tmp_path / "b") == digest_folder(tmp_path / "c")
+    assert (
+        digest_folder(tmp_path / "a")
+        == digest_folder(tmp_path / "b")
+        == digest_folder(tmp_path / "c")
+    )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b", "c"]
 
 
@@ -170,15 +227,25 @@ def test_lazy_samples_equal_raw_rows(raw):
     np.testing.assert_array_equal(world[-1]["vision"], arrays.vision[-1])
 
 
-@pytest.mark.parametrize("options", [dataclasses.replace(TINY, objects_per_material=1), dataclasses.replace(HCT, objects_per_material=1)])
+@pytest.mark.parametrize(
+    "options",
+    [
+        dataclasses.replace(TINY, objects_per_material=1),
+        dataclasses.replace(HCT, objects_per_material=1),
+    ],
+)
 def test_lazy_samples_equal_written_files(options, tmp_path):
     write_world(tmp_path / "w", options)
     manifest, world = Manifest.load(tmp_path / "w"), World(options)
     assert world.ids == manifest.ids
     rows = list(manifest.table.iter_rows(named=True))
     for row, sample in zip(rows, world, strict=True):
-        assert {name: sample[name] for name in ("id", "video", "frame", "touch", "object", "material", "text", "sensor")} == {
-            name: row[name] for name in ("id", "video", "frame", "touch", "object", "material", "text", "sensor")
+        assert {
+            name: sample[name]
+            for name in ("id", "video", "frame", "touch", "object", "material", "text", "sensor")
+        } == {
+            name: row[name]
+            for name in ("id", "video", "frame", "touch", "object", "material", "text", "sensor")
         }
         for name in IMAGES:
             path, file = manifest.path(row[name]), io.BytesIO()

@@ -26,7 +26,12 @@ def cork(tile, rng, slack={slack}):
 def made(depth=0.1, factor=1.0, slack=0, word="dry"):
     """A function as a user's module has it, without a source that could be read."""
     names = {"__name__": "cork_module"}
-    exec(compile(SOURCE.format(depth=depth, factor=factor, slack=slack, word=word), "<none>", "exec"), names)
+    exec(
+        compile(
+            SOURCE.format(depth=depth, factor=factor, slack=slack, word=word), "<none>", "exec"
+        ),
+        names,
+    )
     return names["cork"]
 
 
@@ -39,8 +44,12 @@ def stop(what, done, total, remark=""):
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("change", [{"depth": 0.2}, {"factor": 2.0}, {"slack": 1}, {"word": "moist"}])
-def test_a_material_edited_between_a_stop_and_its_rerun_makes_no_mixed_world(change, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "change", [{"depth": 0.2}, {"factor": 2.0}, {"slack": 1}, {"word": "moist"}]
+)
+def test_a_material_edited_between_a_stop_and_its_rerun_makes_no_mixed_world(
+    change, tmp_path, monkeypatch
+):
     enter(monkeypatch, made())
     options = dataclasses.replace(TINY, materials=("Wood", "Cork"))
     with pytest.raises(KeyboardInterrupt):
@@ -65,7 +74,11 @@ def test_the_record_names_added_materials_alone(tmp_path, monkeypatch):
     write_world(tmp_path / "w", dataclasses.replace(TINY, materials=("Wood", "Cork")))
     told = json.loads((tmp_path / "w" / "world.json").read_text())["materials"]
     assert told == added_materials(("Wood", "Cork"))
-    assert {k: v for k, v in told["Cork"].items() if k != "function"} == {"label": 20, "noun": "cork", "subtypes": ["only"]}
+    assert {k: v for k, v in told["Cork"].items() if k != "function"} == {
+        "label": 20,
+        "noun": "cork",
+        "subtypes": ["only"],
+    }
     assert len(told["Cork"]["function"]) == 64
 
 
@@ -91,10 +104,20 @@ def test_the_digests_of_the_presets_are_those_that_models_were_trained_on():
 
 def test_the_digest_of_a_world_is_over_its_lists(tmp_path):
     record = write_world(tmp_path / "w", TINY)
-    names = ("leak.csv", "label.txt", "category_reference.txt", "train.txt", "test.txt", "objects.csv", "captions.csv")
+    names = (
+        "leak.csv",
+        "label.txt",
+        "category_reference.txt",
+        "train.txt",
+        "test.txt",
+        "objects.csv",
+        "captions.csv",
+    )
     lists = {name: digest_lines((tmp_path / "w" / name).read_text().splitlines()) for name in names}
     data = json.loads((tmp_path / "w" / "world.json").read_text())
-    assert record.digest == digest_json({"version": data["version"], "options": data["options"], "lists": lists})
+    assert record.digest == digest_json(
+        {"version": data["version"], "options": data["options"], "lists": lists}
+    )
 
 
 def piece(**changes):
@@ -145,14 +168,19 @@ FLAT = np.zeros((64, 64))
 )
 def test_junk_is_refused(changes, message):
     with pytest.raises(PalpateError, match=message) as error:
-        draw_surface("Cork", Material(20, "cork", piece(**changes), ("only",)), 64, np.random.default_rng(0))
+        draw_surface(
+            "Cork", Material(20, "cork", piece(**changes), ("only",)), 64, np.random.default_rng(0)
+        )
     assert "'Cork'" in error.value.must
     assert "\n" not in str(error.value)
 
 
 def test_what_is_odd_but_sound_is_taken():
     draw = piece(
-        words=["odd", "new"], height=np.arange(64 * 64).reshape(64, 64) // 100, albedo=np.full((64, 64, 3), 1.5), gloss=np.float32(0.5)
+        words=["odd", "new"],
+        height=np.arange(64 * 64).reshape(64, 64) // 100,
+        albedo=np.full((64, 64, 3), 1.5),
+        gloss=np.float32(0.5),
     )
     surface = draw_surface("Cork", Material(20, "cork", draw), 64, np.random.default_rng(0))
     assert surface.words == ("odd", "new")
@@ -179,8 +207,12 @@ def test_a_function_that_fails_is_named_with_its_error(workers, tmp_path, monkey
 
 def test_a_function_that_no_worker_can_import_is_told(tmp_path, monkeypatch):
     enter(monkeypatch, piece())
-    with pytest.raises(PalpateError, match=r"'Cork' must be importable for several workers.*workers=1"):
-        write_world(tmp_path / "w", dataclasses.replace(TINY, materials=("Wood", "Cork")), workers=2)
+    with pytest.raises(
+        PalpateError, match=r"'Cork' must be importable for several workers.*workers=1"
+    ):
+        write_world(
+            tmp_path / "w", dataclasses.replace(TINY, materials=("Wood", "Cork")), workers=2
+        )
 
 
 @pytest.mark.parametrize("label", [3, -1, 1.0, "20", True, None, np.int64(20)])
@@ -191,7 +223,9 @@ def test_labels_must_be_whole_numbers_of_their_own(label, monkeypatch):
     WorldOptions(materials=("Sand",))  # of no concern to a world without it
 
 
-@pytest.mark.parametrize("name", ["../Cork", "Cork: 3", "Cork\n", " Cork", "Cork ", "Cork,3", "", "Körk", "a/b"])
+@pytest.mark.parametrize(
+    "name", ["../Cork", "Cork: 3", "Cork\n", " Cork", "Cork ", "Cork,3", "", "Körk", "a/b"]
+)
 def test_names_must_be_safe(name, monkeypatch):
     enter(monkeypatch, piece(), name=name)
     with pytest.raises(PalpateError, match="name of a material must be made of"):
@@ -203,7 +237,11 @@ def test_names_whose_objects_would_be_called_alike_are_refused(monkeypatch):
     for materials in (("natural_fabric", "Sand"), ("Natural Fabric", "Sand"), 21):
         with pytest.raises(PalpateError) as error:
             WorldOptions(materials=materials)
-        found = [p.text for p in error.value.problems] if isinstance(error.value, ProblemsError) else [str(error.value)]
+        found = (
+            [p.text for p in error.value.problems]
+            if isinstance(error.value, ProblemsError)
+            else [str(error.value)]
+        )
         assert all("names of their own. Got 'natural_fabric'" in text for text in found)
 
 

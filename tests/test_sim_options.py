@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 
 from palpate.core import PalpateError, ProblemsError
-from palpate.sim import DEFAULT, MATERIALS, MINI_SEEDS, PRESETS, Material, Video, WorldOptions, plan_world, seen_by_mini
+from palpate.sim import (
+    DEFAULT,
+    MATERIALS,
+    MINI_SEEDS,
+    PRESETS,
+    Material,
+    Video,
+    WorldOptions,
+    plan_world,
+    seen_by_mini,
+)
 from palpate.sim.balance import LEAST, TOUCH_AND_GO_FRAMES, objects_of
 from palpate.sim.motion import make_touches
 from palpate.sim.objects import make_object
@@ -53,7 +63,15 @@ def test_ranges_must_be_in_order_and_within_bounds(name):
 @pytest.mark.parametrize("name", SERIES)
 def test_series_must_be_numbers_within_bounds(name):
     low, high, least = SERIES[name]
-    for value in ((low - 1,), (low, high + 1), (float("inf"),), (low,) * 9, ("a",), None, *([()] if least else [])):
+    for value in (
+        (low - 1,),
+        (low, high + 1),
+        (float("inf"),),
+        (low,) * 9,
+        ("a",),
+        None,
+        *([()] if least else []),
+    ):
         with pytest.raises(PalpateError, match=name):
             WorldOptions(**{name: value})
     assert getattr(WorldOptions(**{name: (low, high)}), name) == (low, high)
@@ -63,12 +81,18 @@ def test_every_option_has_a_range_and_one_digest_per_meaning():
     tables = {*RANGES, *PAIRS, *SERIES, *CHOICES, "materials"}
     assert tables == {field.name for field in dataclasses.fields(WorldOptions)}
     assert all(name in WorldOptions.__doc__ for name in tables)
-    assert WorldOptions(gel_mm=2, view_mm=(30, 40)).digest == WorldOptions(gel_mm=2.0, view_mm=[30.0, 40.0]).digest
+    assert (
+        WorldOptions(gel_mm=2, view_mm=(30, 40)).digest
+        == WorldOptions(gel_mm=2.0, view_mm=[30.0, 40.0]).digest
+    )
     digests = {WorldOptions().digest}
     for name, (_, high) in {**RANGES, **PAIRS}.items():
         digests.add(
             WorldOptions(
-                **{name: high if name in RANGES else (high * 0.9, high * 0.9), **({"load_mm": (0.1, 0.2)} if name == "gel_mm" else {})}
+                **{
+                    name: high if name in RANGES else (high * 0.9, high * 0.9),
+                    **({"load_mm": (0.1, 0.2)} if name == "gel_mm" else {}),
+                }
             ).digest
         )
     assert len(digests) == 1 + len(RANGES) + len(PAIRS)
@@ -110,12 +134,18 @@ def test_several_mistakes_are_told_at_once():
 def test_a_count_of_materials_becomes_names():
     assert WorldOptions().materials == tuple(MATERIALS)
     assert WorldOptions(materials=4).materials == ("Concrete", "Brick", "Rubber", "Rock")
-    assert WorldOptions(materials=4).digest == WorldOptions(materials=("Concrete", "Brick", "Rubber", "Rock")).digest
+    assert (
+        WorldOptions(materials=4).digest
+        == WorldOptions(materials=("Concrete", "Brick", "Rubber", "Rock")).digest
+    )
     assert WorldOptions(tile=512).digest != WorldOptions().digest
 
 
 def test_presets_have_the_frames_that_their_row_says():
-    contact = {name: len(plan_world(o)) * o.touches_per_video * o.frames_per_touch for name, o in PRESETS.items()}
+    contact = {
+        name: len(plan_world(o)) * o.touches_per_video * o.frames_per_touch
+        for name, o in PRESETS.items()
+    }
     assert contact == {"tiny": 32, "demo": 1200, "pretrain": 4000, "small": 8000, "full": 36000}
     assert len(plan_world(PRESETS["demo"])) == 100
     assert DEFAULT == "small"
@@ -154,8 +184,12 @@ def test_classes_are_as_unequal_as_in_touch_and_go():
     for plan in plan_world(options):
         planned[plan.objects[0].material] = planned.get(plan.objects[0].material, 0) + 1
     assert planned == objects
-    assert set(objects_of(WorldOptions(balance="touch-and-go", objects_per_material=2)).values()) == {2}
-    assert set(objects_of(WorldOptions(materials=("Natural Fabric",), balance="touch-and-go")).values()) == {5}
+    assert set(
+        objects_of(WorldOptions(balance="touch-and-go", objects_per_material=2)).values()
+    ) == {2}
+    assert set(
+        objects_of(WorldOptions(materials=("Natural Fabric",), balance="touch-and-go")).values()
+    ) == {5}
 
 
 def test_the_shares_of_touch_and_go_are_those_of_its_lists(real_data):
@@ -168,16 +202,39 @@ def test_the_shares_of_touch_and_go_are_those_of_its_lists(real_data):
 
 
 def test_a_users_material_has_the_mean_share(monkeypatch):
-    monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", MATERIALS["Wood"].draw, MATERIALS["Wood"].subtypes))
-    objects = objects_of(WorldOptions(materials=("Wood", "Sand", "Cork"), balance="touch-and-go", objects_per_material=20))
+    monkeypatch.setitem(
+        MATERIALS, "Cork", Material(20, "cork", MATERIALS["Wood"].draw, MATERIALS["Wood"].subtypes)
+    )
+    objects = objects_of(
+        WorldOptions(
+            materials=("Wood", "Sand", "Cork"), balance="touch-and-go", objects_per_material=20
+        )
+    )
     assert objects["Sand"] < objects["Cork"] < objects["Wood"]
 
 
 def test_motion_and_camera_obey_their_options():
     calm = WorldOptions(
-        materials=2, tile=64, size=16, revisit_mm=0.0, jump=0.0, slide_mm=(0.0,), tilt=0.0, shear=0.0, load_mm=(0.2, 0.2), mixed=0.0, hard=1.0,
-        hand=0.0, shadow=0.0, edge=0.0, stains=0.0, view_mm=(31.0, 32.0), blur_px=(0.5,), curved=1.0, radius_mm=(40.0, 40.0),
-    )  # fmt: skip
+        materials=2,
+        tile=64,
+        size=16,
+        revisit_mm=0.0,
+        jump=0.0,
+        slide_mm=(0.0,),
+        tilt=0.0,
+        shear=0.0,
+        load_mm=(0.2, 0.2),
+        mixed=0.0,
+        hard=1.0,
+        hand=0.0,
+        shadow=0.0,
+        edge=0.0,
+        stains=0.0,
+        view_mm=(31.0, 32.0),
+        blur_px=(0.5,),
+        curved=1.0,
+        radius_mm=(40.0, 40.0),
+    )
     for plan in plan_world(calm):
         video = Video(calm, plan)
         touches = make_touches(calm, plan)
@@ -187,7 +244,9 @@ def test_motion_and_camera_obey_their_options():
         camera = video.camera
         assert (camera.hand, camera.shadow, camera.edge, camera.blur) == (None, None, None, 0.5)
         assert 31.0 <= camera.view <= 32.0
-        assert abs(video.thing(0).curvature) == pytest.approx(1 / 40) or video.thing(0).curvature == pytest.approx(-0.3 / 40)
+        assert abs(video.thing(0).curvature) == pytest.approx(1 / 40) or video.thing(
+            0
+        ).curvature == pytest.approx(-0.3 / 40)
     far = dataclasses.replace(calm, jump=1.0, slide_mm=(5.0,), hand=1.0)
     plan = plan_world(far)[0]
     assert len({touch.place for touch in make_touches(far, plan)}) == far.touches_per_video
@@ -195,7 +254,11 @@ def test_motion_and_camera_obey_their_options():
 
 
 def test_views_never_show_the_tile_repeat():
-    views = [Video(WorldOptions(tile=64, size=16, hard=hard), k).camera.view for hard in (0.0, 0.5, 1.0) for k in range(30)]
+    views = [
+        Video(WorldOptions(tile=64, size=16, hard=hard), k).camera.view
+        for hard in (0.0, 0.5, 1.0)
+        for k in range(30)
+    ]
     assert 30.0 <= min(views) < 32.0
     assert 43.0 < max(views) <= 45.0 < 64.0 / 2**0.5
 
@@ -226,7 +289,11 @@ def test_plans_are_unique_sorted_and_whole():
 
 
 def test_no_video_is_mixed_if_it_may_hold_one_object():
-    for options in (WorldOptions(objects_per_video=1, mixed=1.0), WorldOptions(touches_per_video=1, mixed=1.0), WorldOptions(mixed=0.0)):
+    for options in (
+        WorldOptions(objects_per_video=1, mixed=1.0),
+        WorldOptions(touches_per_video=1, mixed=1.0),
+        WorldOptions(mixed=0.0),
+    ):
         assert all(len(plan.objects) == 1 for plan in plan_world(options))
 
 
@@ -241,9 +308,14 @@ def test_frames_are_numbered_as_in_a_recording():
 
 
 def test_pretrain_and_demo_share_no_object():
-    first, second = (make_object(dataclasses.replace(PRESETS[name], tile=64), ObjectRef("Rock", 0)) for name in ("demo", "pretrain"))
+    first, second = (
+        make_object(dataclasses.replace(PRESETS[name], tile=64), ObjectRef("Rock", 0))
+        for name in ("demo", "pretrain")
+    )
     assert first.ref == second.ref
-    assert np.abs(np.corrcoef(first.surface.height.ravel(), second.surface.height.ravel())[0, 1]) < 0.5
+    assert (
+        np.abs(np.corrcoef(first.surface.height.ravel(), second.surface.height.ravel())[0, 1]) < 0.5
+    )
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,19 @@ def alive(pid):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_workers_follow_a_killed_parent(tmp_path):
-    command = [sys.executable, "-m", "palpate", "world", "-o", str(tmp_path / "w"), "--preset", "small", "--workers", "2", "-q"]
+    command = [
+        sys.executable,
+        "-m",
+        "palpate",
+        "world",
+        "-o",
+        str(tmp_path / "w"),
+        "--preset",
+        "small",
+        "--workers",
+        "2",
+        "-q",
+    ]
     run = subprocess.Popen(command)
     try:
         until = time.monotonic() + 120
@@ -91,7 +103,9 @@ def test_workers_follow_a_killed_parent(tmp_path):
     while any(map(alive, workers)):
         assert time.monotonic() < until
         time.sleep(0.1)
-    assert list(tmp_path.glob(f".w.*.part/.work/{LOCK}"))  # and the lock is free again: see the next test
+    assert list(
+        tmp_path.glob(f".w.*.part/.work/{LOCK}")
+    )  # and the lock is free again: see the next test
 
 
 def test_the_lock_of_a_run_that_was_stopped_is_free(tmp_path):
@@ -140,7 +154,9 @@ def test_links_to_nothing_are_refused_before_rendering(tmp_path):
 
 
 @pytest.mark.parametrize("sheet", ["folder", "notes.txt/sheet.png", "w"])
-def test_a_sheet_that_cannot_be_written_is_told_before_rendering(sheet, tmp_path, monkeypatch, capsys):
+def test_a_sheet_that_cannot_be_written_is_told_before_rendering(
+    sheet, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
     (tmp_path / "notes.txt").write_text("mine")
@@ -149,7 +165,9 @@ def test_a_sheet_that_cannot_be_written_is_told_before_rendering(sheet, tmp_path
     assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "notes.txt"]
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere"
+)
 def test_a_sheet_in_a_folder_without_rights_is_told(tmp_path, capsys):
     (tmp_path / "shut").mkdir(mode=0o500)
     assert main([*RUN, "-o", str(tmp_path / "w"), "--sheet", str(tmp_path / "shut" / "s.png")]) == 2
@@ -157,7 +175,9 @@ def test_a_sheet_in_a_folder_without_rights_is_told(tmp_path, capsys):
 
 
 def test_a_sheet_within_the_world_is_drawn(tmp_path):
-    assert main([*RUN, "-o", str(tmp_path / "w"), "--sheet", str(tmp_path / "w" / "sheet.png")]) == 0
+    assert (
+        main([*RUN, "-o", str(tmp_path / "w"), "--sheet", str(tmp_path / "w" / "sheet.png")]) == 0
+    )
     assert (tmp_path / "w" / "sheet.png").is_file()
 
 

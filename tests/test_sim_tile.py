@@ -21,9 +21,14 @@ def draw(name, k, n=64):
 
 
 def seam(field):
-    """Largest mean step across the two seams, and the largest between any neighbouring rows or columns inside."""
+    """Largest mean step across the two seams, and the largest between any neighboring rows or columns inside."""
     rows = [np.abs(field[0] - field[-1]).mean(), np.abs(field[:, 0] - field[:, -1]).mean()]
-    inside = [np.abs(np.diff(field, axis=a)).mean(axis=tuple(b for b in range(field.ndim) if b != a)).max() for a in (0, 1)]
+    inside = [
+        np.abs(np.diff(field, axis=a))
+        .mean(axis=tuple(b for b in range(field.ndim) if b != a))
+        .max()
+        for a in (0, 1)
+    ]
     return max(rows), max(inside)
 
 
@@ -88,7 +93,13 @@ def test_a_broken_material_is_refused_by_name(change, must):
 
 
 def test_float64_of_a_users_material_becomes_float32():
-    material = Material(20, "cork", lambda tile, rng: Surface(np.ones((tile.n, tile.n)), np.ones((tile.n, tile.n, 3)), "x", ("odd", "new")))
+    material = Material(
+        20,
+        "cork",
+        lambda tile, rng: Surface(
+            np.ones((tile.n, tile.n)), np.ones((tile.n, tile.n, 3)), "x", ("odd", "new")
+        ),
+    )
     surface = draw_surface("Cork", material, 64, rng_for(0))
     assert surface.height.dtype == surface.albedo.dtype == np.float32
     assert surface.noun == "cork"
@@ -118,7 +129,13 @@ def test_noise_is_band_limited_and_standard():
 def test_waves_have_whole_periods_and_stay_at_right_angles():
     t = tile()
     u, v = t.wave(7.3, 0.4), t.wave(7.3, 0.4 + math.pi / 2)
-    steps = [(float((w[1, 0] - w[0, 0]) * 64 / (2 * math.pi)), float((w[0, 1] - w[0, 0]) * 64 / (2 * math.pi))) for w in (u, v)]
+    steps = [
+        (
+            float((w[1, 0] - w[0, 0]) * 64 / (2 * math.pi)),
+            float((w[0, 1] - w[0, 0]) * 64 / (2 * math.pi)),
+        )
+        for w in (u, v)
+    ]
     for step in (*steps[0], *steps[1]):
         assert step == pytest.approx(round(step), abs=1e-2)
     assert steps[0][0] * steps[1][0] + steps[0][1] * steps[1][1] == pytest.approx(0.0, abs=0.2)
@@ -134,23 +151,37 @@ def test_strokes_cross_the_seam_as_any_other_line():
 
 def test_resample_is_the_area_mean_at_any_size():
     field = f32(np.random.default_rng(0).random((24, 24)))
-    np.testing.assert_allclose(resample(field, 8), field.reshape(8, 3, 8, 3).mean((1, 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        resample(field, 8), field.reshape(8, 3, 8, 3).mean((1, 3)), atol=1e-6
+    )
     fine = np.repeat(np.repeat(field, 5, 0), 5, 1)  # 120 = 24 * 5 = 10 * 12
-    np.testing.assert_allclose(resample(field, 10), fine.reshape(10, 12, 10, 12).mean((1, 3)), atol=1e-6)
-    np.testing.assert_allclose(resample(field, 48), np.repeat(np.repeat(field, 2, 0), 2, 1), atol=1e-6)
+    np.testing.assert_allclose(
+        resample(field, 10), fine.reshape(10, 12, 10, 12).mean((1, 3)), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        resample(field, 48), np.repeat(np.repeat(field, 2, 0), 2, 1), atol=1e-6
+    )
 
 
 def test_periodic_lookup_equals_the_wrapped_grid():
     for side in (8, 6):  # a power of two wraps by another way
         field = f32(np.random.default_rng(1).random((3, side, side)))
         y, x = np.meshgrid(np.arange(-9, 20), np.arange(-3, 12), indexing="ij")
-        np.testing.assert_allclose(sample_periodic(field, f32(y), f32(x)), field[:, y % side, x % side], atol=1e-6)
+        np.testing.assert_allclose(
+            sample_periodic(field, f32(y), f32(x)), field[:, y % side, x % side], atol=1e-6
+        )
         half = sample_periodic(field[0], f32([[-0.5]]), f32([[2.0]]))
         np.testing.assert_allclose(half, [[(field[0, -1, 2] + field[0, 0, 2]) / 2]], atol=1e-6)
 
 
 def test_helpers_keep_float32():
     x = f32(np.linspace(-1, 1, 64 * 64)).reshape(64, 64)
-    for result in (smoothstep(x, np.float64(0.2), 0.9), smooth(x, 1.0), smooth(x, 6.0), hsv(0.3, 0.5, 0.5), resample(x, 30)):
+    for result in (
+        smoothstep(x, np.float64(0.2), 0.9),
+        smooth(x, 1.0),
+        smooth(x, 6.0),
+        hsv(0.3, 0.5, 0.5),
+        resample(x, 30),
+    ):
         assert result.dtype == np.float32
     np.testing.assert_allclose(smoothstep(f32([0.0, 0.5, 1.0]), 1.0, 0.0), [1.0, 0.5, 0.0])

@@ -10,7 +10,17 @@ import pytest
 from PIL import Image
 
 from palpate.core import PalpateError, digest_folder
-from palpate.sim import MATERIALS, PRESETS, Material, Surface, Video, WorldOptions, plan_world, render_contact_sheet, write_world
+from palpate.sim import (
+    MATERIALS,
+    PRESETS,
+    Material,
+    Surface,
+    Video,
+    WorldOptions,
+    plan_world,
+    render_contact_sheet,
+    write_world,
+)
 from palpate.sim.plan import contact_frames
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
@@ -62,10 +72,14 @@ def test_the_tree_has_the_layout_of_touch_and_go(world):
         listed |= dict(rows)
         assert rows != sorted(rows)
     assert listed == dict(label)
-    categories = dict(line.split(": ") for line in (out / "category_reference.txt").read_text().splitlines())
+    categories = dict(
+        line.split(": ") for line in (out / "category_reference.txt").read_text().splitlines()
+    )
     assert categories["Synthetic Fabric"] == "8"
     assert len(categories) == 20
-    assert record.counts["written_frames"] == sum(1 for _ in out.glob("dataset/*/video_frame/*.jpg"))
+    assert record.counts["written_frames"] == sum(
+        1 for _ in out.glob("dataset/*/video_frame/*.jpg")
+    )
     for kind in ("video_frame", "gelsight_frame"):
         frames = sorted(p.name for p in (out / "dataset" / plans[0].name / kind).iterdir())
         assert frames == [f"{f:010d}.jpg" for f in range(14)]
@@ -75,7 +89,10 @@ def test_written_frames_are_the_frames_rendered_alone(world):
     out, _ = world
     for index, frame in ((0, 0), (3, 6), (7, 13)):
         video = Video(TINY, index)
-        for kind, image in (("video_frame", video.vision(frame)), ("gelsight_frame", video.tactile(frame))):
+        for kind, image in (
+            ("video_frame", video.vision(frame)),
+            ("gelsight_frame", video.tactile(frame)),
+        ):
             path = out / "dataset" / video.plan.name / kind / f"{frame:010d}.jpg"
             file = io.BytesIO()
             Image.fromarray(image).save(file, "JPEG", quality=95, subsampling=0)
@@ -86,7 +103,10 @@ def test_written_frames_are_the_frames_rendered_alone(world):
 def test_captions_and_objects_follow_the_touched_object(tmp_path):
     options = dataclasses.replace(TINY, mixed=1.0, touches_per_video=4)
     write_world(tmp_path / "w", options)
-    objects, captions = (dict(csv.reader((tmp_path / "w" / f"{name}.csv").read_text().splitlines())) for name in ("objects", "captions"))
+    objects, captions = (
+        dict(csv.reader((tmp_path / "w" / f"{name}.csv").read_text().splitlines()))
+        for name in ("objects", "captions")
+    )
     assert objects.pop("frame") == "object"
     assert captions.pop("frame") == "text"
     label = dict(read_list(tmp_path / "w" / "label.txt")[1])
@@ -98,18 +118,35 @@ def test_captions_and_objects_follow_the_touched_object(tmp_path):
         by_video.setdefault(frame.split("/")[0], set()).add(material)
     assert all(2 <= len(materials) <= 3 for materials in by_video.values())
     for plan in plan_world(options):
-        assert captions[f"{plan.name}/{contact_frames(options, 3)[1]:010d}.jpg"] == Video(options, plan).text(3)
+        assert captions[f"{plan.name}/{contact_frames(options, 3)[1]:010d}.jpg"] == Video(
+            options, plan
+        ).text(3)
 
 
-@pytest.mark.parametrize("leak", ["frame", "touch", "none"])
+@pytest.mark.parametrize("leak", ["frame", "contact", "none"])
 def test_the_known_leak_equals_a_recount_from_the_lists(leak, tmp_path):
-    options = WorldOptions(materials=4, objects_per_material=3, touches_per_video=3, frames_per_touch=2, size=16, tile=64, leak=leak)
+    options = WorldOptions(
+        materials=4,
+        objects_per_material=3,
+        touches_per_video=3,
+        frames_per_touch=2,
+        size=16,
+        tile=64,
+        leak=leak,
+    )
     record = write_world(tmp_path / "w", options)
-    train, test = ([path for path, _ in read_list(tmp_path / "w" / f"{part}.txt")[1]] for part in ("train", "test"))
+    train, test = (
+        [path for path, _ in read_list(tmp_path / "w" / f"{part}.txt")[1]]
+        for part in ("train", "test")
+    )
     videos = {path.split("/")[0] for path in train}
     leaked = sum(path.split("/")[0] in videos for path in test)
     data = json.loads((tmp_path / "w" / "world.json").read_text())
-    assert data["leak"]["test_frames_in_shared_videos"] == leaked == record.leak["test_frames_in_shared_videos"]
+    assert (
+        data["leak"]["test_frames_in_shared_videos"]
+        == leaked
+        == record.leak["test_frames_in_shared_videos"]
+    )
     assert data["leak"]["test_frames"] == len(test) == data["counts"]["test_frames"]
     assert data["leak"]["leaked_fraction"] == leaked / len(test)
     touch = lambda path: (path.split("/")[0], int(path.split("/")[1][:10]) // 7)  # noqa: E731
@@ -180,7 +217,9 @@ def test_a_world_too_small_to_cut_is_refused_before_rendering(tmp_path):
 
 def test_a_users_broken_material_is_named(tmp_path, monkeypatch):
     def broken(tile, rng):
-        return Surface(tile.zeros() * np.nan, np.ones((tile.n, tile.n, 3), np.float32), "only", ("odd", "new"))
+        return Surface(
+            tile.zeros() * np.nan, np.ones((tile.n, tile.n, 3), np.float32), "only", ("odd", "new")
+        )
 
     monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", broken, ("only",)))
     with pytest.raises(PalpateError, match="'Cork' must return a finite height"):
@@ -189,7 +228,12 @@ def test_a_users_broken_material_is_named(tmp_path, monkeypatch):
 
 def test_a_users_material_enters_the_lists(tmp_path, monkeypatch):
     def fine(tile, rng):
-        return Surface(tile.noise(1.0, 8.0) * 0.1, np.ones((tile.n, tile.n, 3), np.float32) * 0.5, "only", ("springy", "dry"))
+        return Surface(
+            tile.noise(1.0, 8.0) * 0.1,
+            np.ones((tile.n, tile.n, 3), np.float32) * 0.5,
+            "only",
+            ("springy", "dry"),
+        )
 
     monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", fine, ("only",)))
     write_world(tmp_path / "w", dataclasses.replace(TINY, materials=("Wood", "Cork")))
@@ -219,9 +263,13 @@ def test_videos_without_pyav_say_how_to_install_it(tmp_path, monkeypatch):
 
 
 def test_sparse_worlds_write_contact_and_background_frames_alone(tmp_path):
-    write_world(tmp_path / "w", dataclasses.replace(TINY, materials=("Brick",), free_written="background"))
+    write_world(
+        tmp_path / "w", dataclasses.replace(TINY, materials=("Brick",), free_written="background")
+    )
     name = plan_world(dataclasses.replace(TINY, materials=("Brick",)))[0].name
-    frames = sorted(int(p.stem) for p in (tmp_path / "w" / "dataset" / name / "gelsight_frame").iterdir())
+    frames = sorted(
+        int(p.stem) for p in (tmp_path / "w" / "dataset" / name / "gelsight_frame").iterdir()
+    )
     assert frames == [1, 5, 6, 8, 12, 13]
 
 

@@ -15,7 +15,9 @@ TOUCH, PHOTO = (48, 64), (64, 48)
 COLUMNS = ("url", "tactile", "tactile_background", "caption")
 
 
-def gel(seed: int, size: tuple[int, int] = TOUCH, rig: int = 0, pressed: bool = True) -> Image.Image:
+def gel(
+    seed: int, size: tuple[int, int] = TOUCH, rig: int = 0, pressed: bool = True
+) -> Image.Image:
     """A gel's shading, of one look for a rig, with a round print somewhere if it is pressed."""
     width, height = size
     y, x = np.mgrid[:height, :width] / height
@@ -27,7 +29,7 @@ def gel(seed: int, size: tuple[int, int] = TOUCH, rig: int = 0, pressed: bool = 
 
 
 def photo(seed: int, size: tuple[int, int] = PHOTO) -> Image.Image:
-    """Coarse patches of any colour."""
+    """Coarse patches of any color."""
     small = np.random.default_rng([2, seed]).integers(0, 256, (4, 4, 3)).astype(np.uint8)
     return Image.fromarray(small).resize(size, Image.Resampling.BICUBIC)
 
@@ -64,10 +66,25 @@ def trajectory(
     start = int(float(folder.split("-", 1)[1])) % 1000
     rows = []
     for frame in frames:
-        sides = {"vision": view(100 * start + frame), "tactile": (touch or (lambda k: gel(k, rig=number)))(100 * start + frame)}
+        sides = {
+            "vision": view(100 * start + frame),
+            "tactile": (touch or (lambda k: gel(k, rig=number)))(100 * start + frame),
+        }
         for side, image in sides.items():
-            put(rig / folder / ({"vision": "tactile", "tactile": "vision"}[side] if swapped else side) / name_of(frame), image)
-        rows.append([f"{folder}/vision/{name_of(frame)}", f"{folder}/tactile/{name_of(frame)}", f"{folder}/background.png"])
+            put(
+                rig
+                / folder
+                / ({"vision": "tactile", "tactile": "vision"}[side] if swapped else side)
+                / name_of(frame),
+                image,
+            )
+        rows.append(
+            [
+                f"{folder}/vision/{name_of(frame)}",
+                f"{folder}/tactile/{name_of(frame)}",
+                f"{folder}/background.png",
+            ]
+        )
     if background:
         put(rig / folder / "background.png", gel(0, rig=number, pressed=False))
     return rows
@@ -79,15 +96,23 @@ def forge_hct(folder: Path) -> Forged:
     count = 0
     for r, rig in enumerate(("data1", "data2")):
         rows: dict[str, list[list[str]]] = {"train": [], "test": []}
-        pairs: dict[str, dict[str, list[str]]] = {n: {"tactile": [], "vision": []} for n in ("contact", "not_contact")}
+        pairs: dict[str, dict[str, list[str]]] = {
+            n: {"tactile": [], "vision": []} for n in ("contact", "not_contact")
+        }
         for k in range(3):
-            own = trajectory(root / rig, f"{7 + k % 2}-{1702596200 + 3600 * r + 40 * k + 25 * k * k}.5", [8, 9, 10, 11, 30, 31])
+            own = trajectory(
+                root / rig,
+                f"{7 + k % 2}-{1702596200 + 3600 * r + 40 * k + 25 * k * k}.5",
+                [8, 9, 10, 11, 30, 31],
+            )
             for n, row in enumerate(own):
                 kind = "not_contact" if n < 2 else "contact"
                 pairs[kind]["vision"].append(row[0])
                 pairs[kind]["tactile"].append(row[1])
                 if kind == "contact":
-                    rows["test" if n == 3 else "train"].append([*row, f"Hard, smooth{' ' * k}, Ridged."])
+                    rows["test" if n == 3 else "train"].append(
+                        [*row, f"Hard, smooth{' ' * k}, Ridged."]
+                    )
                     count += 1
         for part, listed in rows.items():
             write_csv(root / rig / f"{part}.csv", COLUMNS, listed)
@@ -105,8 +130,12 @@ def forge_ssvtp(folder: Path) -> Forged:
         put(root / vision, photo(k))
         put(root / tactile, gel(k))
         (root / "text").mkdir(exist_ok=True)
-        (root / "text" / f"labels_{k}.txt").write_text("Fabric, coarse , deformable.\nsecond line\n")
-        rows["train" if k < 2000 else "test"].append([vision, tactile, "fabric, coarse, deformable"])
+        (root / "text" / f"labels_{k}.txt").write_text(
+            "Fabric, coarse , deformable.\nsecond line\n"
+        )
+        rows["train" if k < 2000 else "test"].append(
+            [vision, tactile, "fabric, coarse, deformable"]
+        )
     write_csv(root / "train.csv", ("url", "tactile", "caption"), rows["train"])
     write_csv(root / "test.csv", ("url", "caption"), [[row[0], row[2]] for row in rows["test"]])
     return Forged(root, 9)

@@ -23,19 +23,61 @@ class Verb:
 
 
 VERBS: dict[str, Verb] = {
-    "import": Verb("importing", "Turn a data set on disk into a manifest", "palpate import touch_and_go/ -o tag/"),
-    "validate": Verb("validate", "Tell what is missing, invalid or suspicious in a data set", "palpate validate touch_and_go/"),
-    "export": Verb("export", "Write a manifest as a Hugging Face data set or a table", "palpate export tag/ --to hf -o tag_hf/"),
-    "audit": Verb("audit", "Tell whether a train/test split leaks", "palpate audit train.txt test.txt --fail-over 0.01"),
-    "split": Verb("split", "Make a split that does not leak, stratified by material", "palpate split tag/ -o noleak.json"),
-    "world": Verb("world", "Write the procedural world: a small synthetic data set", "palpate world -o world/"),
-    "encoder": Verb("encoder", "Train the touch tower against frozen vision and text towers", "palpate encoder tag/ --split noleak.json -o towers/"),
-    "train": Verb("train", "Train a generator of tactile images", "palpate train tag/ --split noleak.json --towers towers/ -o model/"),
-    "generate": Verb("generate", "Make tactile images for photos", "palpate generate photo.jpg -o touch.png"),
-    "score": Verb("score", "Score generated tactile images", "palpate score --generated out/ --reference real/ --encoder palpate/mini"),
-    "report": Verb("report", "Write the page: audit, gallery, scores, settings", "palpate report audit.json scores.json -o page.html"),
-    "demo": Verb("demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"),
-}  # fmt: skip
+    "import": Verb(
+        "importing",
+        "Turn a data set on disk into a manifest",
+        "palpate import touch_and_go/ -o tag/",
+    ),
+    "validate": Verb(
+        "validate",
+        "Tell what is missing, invalid or suspicious in a data set",
+        "palpate validate touch_and_go/",
+    ),
+    "export": Verb(
+        "export",
+        "Write a manifest as a Hugging Face data set or a table",
+        "palpate export tag/ --to hf -o tag_hf/",
+    ),
+    "audit": Verb(
+        "audit",
+        "Tell whether a train/test split leaks",
+        "palpate audit train.txt test.txt --fail-over 0.01",
+    ),
+    "split": Verb(
+        "split",
+        "Make a split that does not leak, stratified by material",
+        "palpate split tag/ -o noleak.json",
+    ),
+    "world": Verb(
+        "world", "Write the procedural world: a small synthetic data set", "palpate world -o world/"
+    ),
+    "encoder": Verb(
+        "encoder",
+        "Train the tactile encoder against frozen vision and text encoders",
+        "palpate encoder tag/ --split noleak.json -o encoders/",
+    ),
+    "train": Verb(
+        "train",
+        "Train a generator of tactile images",
+        "palpate train tag/ --split noleak.json --encoder encoders/ -o model/",
+    ),
+    "generate": Verb(
+        "generate", "Make tactile images for photos", "palpate generate photo.jpg -o touch.png"
+    ),
+    "score": Verb(
+        "score",
+        "Score generated tactile images",
+        "palpate score --generated out/ --reference real/ --encoder palpate/mini",
+    ),
+    "report": Verb(
+        "report",
+        "Write the page: audit, gallery, scores, settings",
+        "palpate report audit.json scores.json -o page.html",
+    ),
+    "demo": Verb(
+        "demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"
+    ),
+}
 
 
 def usage() -> str:

@@ -44,7 +44,7 @@ class Options(Common):
     """Split file, with a manifest."""
     pretrain: Path | None = None
     """What an encoder was pretrained on: a further list, table, manifest or folder that the test part is compared with."""
-    group: Literal["auto", "video", "touch", "object", "session", "domain", "sensor"] = "auto"
+    group: Literal["auto", "video", "contact", "object", "session", "domain", "sensor"] = "auto"
     """What must not be shared between train and test. `auto` takes the video, or what is known instead of it."""
     near_frames: int = 30
     """A gap of up to this many frames within a video is a leak of its own."""
@@ -53,7 +53,7 @@ class Options(Common):
     false_positives: float = 0.001
     """Rate at which unrelated pictures may pass for near-duplicates; the threshold is calibrated to it on the data."""
     encoder: str | None = None
-    """Trained towers (a folder, a hub id, or palpate/mini) whose embeddings replace the built-in picture features."""
+    """Trained encoders (a folder, a hub id, or palpate/mini) whose embeddings replace the built-in picture features."""
     impact: bool = False
     """Also measure what leaking costs: material accuracy under this split and under a leak-free one."""
     fail_over: float | None = None
@@ -72,7 +72,9 @@ class Options(Common):
     """Where the paths of tables start (default: the folder of the table)."""
     processes: int | None = None
     """Processes that decode pictures (default: one a core)."""
-    skip_bad: Annotated[bool, tyro.conf.arg(help="Leave out bad rows and list them, instead of refusing.")] = False
+    skip_bad: Annotated[
+        bool, tyro.conf.arg(help="Leave out bad rows and list them, instead of refusing.")
+    ] = False
 
 
 @dataclass(frozen=True)
@@ -96,22 +98,44 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         found = _audit(options, sides, cache, progress)
         others: list[Audit] = []
         if sides.pretrain is not None:
-            others.append(_against_pretraining(options, sides.pretrain, sides.test, cache, progress))
+            others.append(
+                _against_pretraining(options, sides.pretrain, sides.test, cache, progress)
+            )
         audit = found.audit
         if options.images and (lone := sorted(_modalities(sides.train) ^ _modalities(sides.test))):
-            audit = replace(audit, notes=[*audit.notes, f"Only one side has pictures of {' and '.join(lone)}: they were not compared."])
+            audit = replace(
+                audit,
+                notes=[
+                    *audit.notes,
+                    f"Only one side has pictures of {' and '.join(lone)}: they were not compared.",
+                ],
+            )
         if options.impact and sides.whole is not None and sides.split is not None:
             try:
-                audit = replace(audit, impact=_impact(options, sides.whole, sides.split, audit, cache, progress))
+                audit = replace(
+                    audit, impact=_impact(options, sides.whole, sides.split, audit, cache, progress)
+                )
             except PalpateError as error:  # the audit itself is done, and must not be lost
-                audit = replace(audit, notes=[*audit.notes, f"What leaking costs could not be measured: {error}"])
+                audit = replace(
+                    audit,
+                    notes=[*audit.notes, f"What leaking costs could not be measured: {error}"],
+                )
         audit = replace(audit, commands=_next(options, audit))
     skipped = [str(p) for p in sides.skipped]
-    data = {"format": "palpate-audit/1", **dataclasses.asdict(audit), "others": [dataclasses.asdict(a) for a in others], "skipped": skipped}
+    data = {
+        "format": "palpate-audit/1",
+        **dataclasses.asdict(audit),
+        "others": [dataclasses.asdict(a) for a in others],
+        "skipped": skipped,
+    }
     _write(options, [audit, *others], found, data, _digests(sides), terminal)
-    if options.cache is None and cache is not None:  # a run that is stopped leaves it, to go on from
+    if (
+        options.cache is None and cache is not None
+    ):  # a run that is stopped leaves it, to go on from
         shutil.rmtree(cache, ignore_errors=True)
-    leaked = max(audit.leaked_fraction, *(a.leaking_samples / a.test_samples for a in (audit, *others)))
+    leaked = max(
+        audit.leaked_fraction, *(a.leaking_samples / a.test_samples for a in (audit, *others))
+    )
     failed = options.fail_over is not None and leaked > options.fail_over
     for one in (audit, *others):
         show(one, terminal)
@@ -133,20 +157,38 @@ def _check(options: Options) -> None:
         PalpateError: saying which.
     """
     if options.fail_over is not None and not 0 <= options.fail_over <= 1:
-        raise PalpateError("--fail-over must lie in [0, 1]", str(options.fail_over), "Pass a fraction, e.g. --fail-over 0.01")
+        raise PalpateError(
+            "--fail-over must lie in [0, 1]",
+            str(options.fail_over),
+            "Pass a fraction, e.g. --fail-over 0.01",
+        )
     if not 0 < options.false_positives <= 0.1:
-        raise PalpateError("--false-positives must lie in (0, 0.1]", str(options.false_positives), "Pass e.g. --false-positives 0.001")
+        raise PalpateError(
+            "--false-positives must lie in (0, 0.1]",
+            str(options.false_positives),
+            "Pass e.g. --false-positives 0.001",
+        )
     for name, value, low in (
         ("--worst", options.worst, 0),
         ("--near-frames", options.near_frames, 0),
         ("--processes", 1 if options.processes is None else options.processes, 1),
     ):
         if value < low:
-            raise PalpateError(f"{name} must be at least {low}", str(value), f"Pass e.g. {name} {max(low, 2)}")
+            raise PalpateError(
+                f"{name} must be at least {low}", str(value), f"Pass e.g. {name} {max(low, 2)}"
+            )
     if options.table is not None and options.table.suffix.lower() not in (".parquet", ".csv"):
-        raise PalpateError("--table must end in .parquet or .csv", options.table.name, "Pass e.g. --table signals.parquet")
+        raise PalpateError(
+            "--table must end in .parquet or .csv",
+            options.table.name,
+            "Pass e.g. --table signals.parquet",
+        )
     if options.impact and options.split is None:
-        raise PalpateError("--impact needs a manifest with --split", "lists or no split", "Import the data set first: palpate import")
+        raise PalpateError(
+            "--impact needs a manifest with --split",
+            "lists or no split",
+            "Import the data set first: palpate import",
+        )
     if options.encoder is not None:
         require_extra("palpate audit --encoder")
     inputs = [*options.paths, *(p for p in (options.split, options.pretrain) if p)]
@@ -159,8 +201,10 @@ def _check(options: Options) -> None:
         )
     for output, marks in (
         *((path, (b'"format": "palpate-', b"Audit of", b"palpate")) for path in beside),
-        (options.output, (b'"format": "palpate-',)), (options.page, (b"palpate",)), (options.table, (b"PAR1", b"id,video,frame,material,leaking")),
-    ):  # fmt: skip
+        (options.output, (b'"format": "palpate-',)),
+        (options.page, (b"palpate",)),
+        (options.table, (b"PAR1", b"id,video,frame,material,leaking")),
+    ):
         if output is not None:
             guard_output(output, inputs, marks)
 
@@ -186,7 +230,9 @@ def _read(options: Options, progress: Progress) -> _Sides:
     read: list[Manifest] = []
     for path in (*options.paths, *([options.pretrain] if options.pretrain else [])):
         try:
-            samples, bad = read_samples(path, skip_bad=options.skip_bad, root=options.root, progress=progress)
+            samples, bad = read_samples(
+                path, skip_bad=options.skip_bad, root=options.root, progress=progress
+            )
         except ProblemsError as error:  # told together with those of the other inputs
             problems += error.problems
         else:
@@ -202,34 +248,57 @@ def _read(options: Options, progress: Progress) -> _Sides:
     if options.split is None:
         return _Sides(skipped, read[0], read[1], pretrain=pretrain)
     split = Split.load(options.split)
-    return _Sides(skipped, read[0].part(split, "train"), read[0].part(split, "test"), read[0], split, pretrain)
+    return _Sides(
+        skipped, read[0].part(split, "train"), read[0].part(split, "test"), read[0], split, pretrain
+    )
 
 
 def _audit(options: Options, sides: _Sides, cache: Path | None, progress: Progress) -> Inspection:
     from palpate.leakage.audit import inspect_parts, inspect_split
 
     common: dict[str, Any] = {
-        "group": options.group, "worst": options.worst, "near": options.near_frames, "progress": progress,
+        "group": options.group,
+        "worst": options.worst,
+        "near": options.near_frames,
+        "progress": progress,
         "pictures": _pictures(options, sides.train, sides.test, cache, progress),
-    }  # fmt: skip
+    }
     if sides.whole is not None and sides.split is not None and options.split is not None:
-        return inspect_split(sides.whole, sides.split, name=str(sides.split.rule.get("name", options.split.stem)), **common)
-    return inspect_parts(sides.train, sides.test, name=f"{options.paths[0].name} / {options.paths[1].name}", **common)
+        return inspect_split(
+            sides.whole,
+            sides.split,
+            name=str(sides.split.rule.get("name", options.split.stem)),
+            **common,
+        )
+    return inspect_parts(
+        sides.train, sides.test, name=f"{options.paths[0].name} / {options.paths[1].name}", **common
+    )
 
 
-def _against_pretraining(options: Options, pretrain: Manifest, test: Manifest, cache: Path | None, progress: Progress) -> Audit:
+def _against_pretraining(
+    options: Options, pretrain: Manifest, test: Manifest, cache: Path | None, progress: Progress
+) -> Audit:
     """The test part against what an encoder has seen."""
     from palpate.leakage.audit import inspect_parts
 
     name = f"{options.pretrain.name if options.pretrain else 'pretraining'} / test"
     pictures = _pictures(options, pretrain, test, cache, progress)
     return inspect_parts(
-        pretrain, test, name=name, against="pretraining", group=options.group, worst=options.worst, near=options.near_frames, pictures=pictures,
+        pretrain,
+        test,
+        name=name,
+        against="pretraining",
+        group=options.group,
+        worst=options.worst,
+        near=options.near_frames,
+        pictures=pictures,
         progress=progress,
-    ).audit  # fmt: skip
+    ).audit
 
 
-def _pictures(options: Options, train: Manifest, test: Manifest, cache: Path | None, progress: Progress) -> Pictures | None:
+def _pictures(
+    options: Options, train: Manifest, test: Manifest, cache: Path | None, progress: Progress
+) -> Pictures | None:
     """How pictures are compared; None if there are none on both sides, or none are wanted."""
     from palpate.leakage.audit import Pictures
 
@@ -241,7 +310,7 @@ def _pictures(options: Options, train: Manifest, test: Manifest, cache: Path | N
     if options.encoder is not None:
         a, b = (_embedded(options.encoder, side, there, cache, progress) for side in (train, test))
         features = {m: (a[m].features, b[m].features) for m in there}
-        name = f"towers {Path(options.encoder).name}"
+        name = f"encoders {Path(options.encoder).name}"
     return Pictures(there, options.false_positives, features, name, cache, options.processes)
 
 
@@ -252,28 +321,52 @@ def _modalities(samples: Manifest) -> set[str]:
     return {m for m, c in MODALITIES.items() if samples.table[c].null_count() < len(samples)}
 
 
-def _embedded(encoder: str, samples: Manifest, modalities: Sequence[str], cache: Path | None, progress: Progress) -> dict[str, FeatureSet]:
+def _embedded(
+    encoder: str,
+    samples: Manifest,
+    modalities: Sequence[str],
+    cache: Path | None,
+    progress: Progress,
+) -> dict[str, FeatureSet]:
     """Embeddings of the samples by modality.
 
     Raises:
-        PalpateError: if the towers cannot be loaded, or a sample lacks a picture.
+        PalpateError: if the encoders cannot be loaded, or a sample lacks a picture.
     """
     from palpate.encoders.embed import embed
-    from palpate.encoders.towers import Towers
+    from palpate.encoders.encoder_set import EncoderSet
 
-    towers = Towers.load(encoder)
-    return {m: embed(samples, towers, m, cache=cache, progress=progress) for m in modalities}
+    encoders = EncoderSet.load(encoder)
+    return {m: embed(samples, encoders, m, cache=cache, progress=progress) for m in modalities}
 
 
-def _impact(options: Options, manifest: Manifest, split: Split, audit: Audit, cache: Path | None, progress: Progress) -> Impact:
-    """What leaking costs, on raw pictures or on the towers' embeddings."""
-    from palpate.protocol.impact import impact
+def _impact(
+    options: Options,
+    manifest: Manifest,
+    split: Split,
+    audit: Audit,
+    cache: Path | None,
+    progress: Progress,
+) -> Impact:
+    """What leaking costs, on raw pictures or on the encoders' embeddings."""
+    from palpate.evaluation.impact import impact
 
     features: Any = "pixels"
     if options.encoder is not None:
         there = sorted(_modalities(manifest), reverse=True)
-        features = {f"{m} tower": f for m, f in _embedded(options.encoder, manifest, there, cache, progress).items()}
-    return impact(manifest, split, group=audit.group, features=features, name=audit.name, cache=cache, progress=progress)
+        features = {
+            f"{m} encoder": f
+            for m, f in _embedded(options.encoder, manifest, there, cache, progress).items()
+        }
+    return impact(
+        manifest,
+        split,
+        group=audit.group,
+        features=features,
+        name=audit.name,
+        cache=cache,
+        progress=progress,
+    )
 
 
 def _cache(options: Options) -> Path | None:
@@ -290,7 +383,9 @@ def _next(options: Options, audit: Audit) -> list[str]:
 
     leaks = audit.leaking_samples or audit.leaked_fraction
     near = any(s.flagged for s in audit.signals if s.kind.startswith("near-duplicate"))
-    twice = any(s.flagged for s in audit.signals if s.kind == "identical sample") and not options.split
+    twice = (
+        any(s.flagged for s in audit.signals if s.kind == "identical sample") and not options.split
+    )
     lines: list[str] = []
     source = shlex.join(map(str, options.paths[:1] if options.split else options.paths))
     if leaks and (options.split or all(p.is_file() and is_list(p) for p in options.paths)):
@@ -303,21 +398,30 @@ def _next(options: Options, audit: Audit) -> list[str]:
     if options.split and not options.impact and leaks:
         lines.append(f"palpate audit {source} --split {shlex.quote(str(options.split))} --impact")
     if not options.split and not audit.signals[-1].kind.startswith("near-duplicate"):
-        lines.append("palpate import DATA_SET -o data/ && palpate audit data/ --split data/splits/Orig.json   # pictures too")
+        lines.append(
+            "palpate import DATA_SET -o data/ && palpate audit data/ --split data/splits/Orig.json   # pictures too"
+        )
     return lines
 
 
 def _digests(sides: _Sides) -> dict[str, str]:
     """Digests of everything that was compared."""
-    named = {"manifest": sides.whole, "pretraining": sides.pretrain} if sides.whole is not None else {
-        "train": sides.train, "test": sides.test, "pretraining": sides.pretrain,
-    }  # fmt: skip
+    named = (
+        {"manifest": sides.whole, "pretraining": sides.pretrain}
+        if sides.whole is not None
+        else {"train": sides.train, "test": sides.test, "pretraining": sides.pretrain}
+    )
     split = {"split": sides.split.digest} if sides.split is not None else {}
     return {name: m.digest for name, m in named.items() if m is not None} | split
 
 
 def _write(
-    options: Options, audits: Sequence[Audit], found: Inspection, data: dict[str, Any], digests: dict[str, str], terminal: Terminal
+    options: Options,
+    audits: Sequence[Audit],
+    found: Inspection,
+    data: dict[str, Any],
+    digests: dict[str, str],
+    terminal: Terminal,
 ) -> None:
     """The JSON, the page and the table, as asked."""
     if options.output:
@@ -333,54 +437,97 @@ def _write(
         from palpate.report import write_report
 
         results = Results(
-            title=f"Audit of {audits[0].name}", audits=audits, commands=[terminal.command],
-            settings={"digests": digests, "false positives": options.false_positives, "near frames": options.near_frames, "version": __version__},
+            title=f"Audit of {audits[0].name}",
+            audits=audits,
+            commands=[terminal.command],
+            settings={
+                "digests": digests,
+                "false positives": options.false_positives,
+                "near frames": options.near_frames,
+                "version": __version__,
+            },
             notes=[f"{len(data['skipped'])} bad rows were left out."] if data["skipped"] else [],
-        )  # fmt: skip
+        )
         with terminal.progress() as progress:
             write_report(results, options.page, progress=progress)
 
 
 COUNTS = (
-    "train_samples", "test_samples", "groups_train", "groups_test", "groups_shared", "test_samples_in_shared_groups",
-    "leaked_fraction", "leaking_samples", "gap_min", "gap_median", "gap_max", "identical_samples",
-)  # fmt: skip
+    "train_samples",
+    "test_samples",
+    "groups_train",
+    "groups_test",
+    "groups_shared",
+    "test_samples_in_shared_groups",
+    "leaked_fraction",
+    "leaking_samples",
+    "gap_min",
+    "gap_median",
+    "gap_max",
+    "identical_samples",
+)
 
 
 def _row(row: ImpactRow) -> str:
     """One kind of feature and classifier in a line."""
-    around = f" [{100 * row.cost_interval[0]:.1f}, {100 * row.cost_interval[1]:.1f}]" if row.cost_interval else ""
+    around = (
+        f" [{100 * row.cost_interval[0]:.1f}, {100 * row.cost_interval[1]:.1f}]"
+        if row.cost_interval
+        else ""
+    )
     return f"{row.given:.1%} given, {row.clean:.1%} leak-free: costs {100 * row.cost:.1f} points{around}; chance {row.chance:.1%}"
 
 
 def show(audit: Audit, terminal: Terminal) -> None:
     """Prints the counts of an audit and what they mean."""
-    terminal.facts(f"Audit of {audit.name} (group: {audit.group})", {name: getattr(audit, name) for name in COUNTS})
+    terminal.facts(
+        f"Audit of {audit.name} (group: {audit.group})",
+        {name: getattr(audit, name) for name in COUNTS},
+    )
     facts: dict[str, Any] = {}
     for s in audit.signals:
-        at = f", threshold {s.threshold:.3f} at a false-positive rate of {s.false_positives:g}" if s.false_positives is not None else ""
-        causes = "; " + ", ".join(f"{cause} {n}" for cause, n in s.causes.items()) if s.causes else ""
+        at = (
+            f", threshold {s.threshold:.3f} at a false-positive rate of {s.false_positives:g}"
+            if s.false_positives is not None
+            else ""
+        )
+        causes = (
+            "; " + ", ".join(f"{cause} {n}" for cause, n in s.causes.items()) if s.causes else ""
+        )
         facts[s.kind] = f"{s.flagged} of {s.checked} test samples ({s.fraction:.2%}){at}{causes}"
     if facts:
         terminal.facts("Signals", facts)
     for note in (*audit.notes, *(f"{s.kind}: {note}" for s in audit.signals for note in s.notes)):
         terminal.say(f"Note: {note}")
     if audit.impact is not None:
-        terminal.facts("What leaking costs: material accuracy", {f"{r.features}, {r.classifier}": _row(r) for r in audit.impact.rows})
+        terminal.facts(
+            "What leaking costs: material accuracy",
+            {f"{r.features}, {r.classifier}": _row(r) for r in audit.impact.rows},
+        )
         terminal.print(audit.impact.headline)
         for note in audit.impact.notes:
             terminal.say(f"Note: {note}")
     other = "train" if audit.against == "train" else "the pretraining data"
     if audit.leaked_fraction > 0 or audit.leaking_samples:
         share = audit.leaking_samples / audit.test_samples
-        more = "" if audit.leaking_samples == audit.test_samples_in_shared_groups else f" {share:.3%} leak by one signal or another."
+        more = (
+            ""
+            if audit.leaking_samples == audit.test_samples_in_shared_groups
+            else f" {share:.3%} leak by one signal or another."
+        )
         terminal.print(
             "This split leaks:"
-            + (f" {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with {other}." if audit.leaked_fraction > 0 else "")
+            + (
+                f" {audit.leaked_fraction:.3%} of the test samples share a {audit.group} with {other}."
+                if audit.leaked_fraction > 0
+                else ""
+            )
             + more
             + (" Make one that does not: palpate split" if audit.against == "train" else "")
         )
     elif audit.group == "none":
         terminal.print(f"No test sample was found again in {other}.")
     else:
-        terminal.print(f"No test sample shares a {audit.group} with {other}, and no other signal flags one.")
+        terminal.print(
+            f"No test sample shares a {audit.group} with {other}, and no other signal flags one."
+        )

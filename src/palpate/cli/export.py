@@ -35,11 +35,17 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     manifest = Manifest.load(options.manifest)
     split = None if options.split is None else Split.load(options.split)
     with terminal.progress() as progress:
-        files = export_dataset(manifest, options.output, to=options.to, split=split, progress=progress)
+        files = export_dataset(
+            manifest, options.output, to=options.to, split=split, progress=progress
+        )
     facts = {
-        "form": options.to, "samples": len(manifest), "digest": manifest.digest, "parts": None if split is None else split.counts(),
-        "files": len(files), "root": str(manifest.root),
-    }  # fmt: skip
+        "form": options.to,
+        "samples": len(manifest),
+        "digest": manifest.digest,
+        "parts": None if split is None else split.counts(),
+        "files": len(files),
+        "root": str(manifest.root),
+    }
     terminal.facts(f"Exported {options.output}", facts)
     if options.to == "hf":
         terminal.print(
@@ -47,7 +53,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         )
     else:
         table = next(f for f in files if f.parent == options.output)
-        terminal.print(f"Read it again with: palpate import {_quoted(table)} --root {_quoted(manifest.root)} -o DIR")
+        terminal.print(
+            f"Read it again with: palpate import {_quoted(table)} --root {_quoted(manifest.root)} -o DIR"
+        )
     return facts | {"files": [str(f) for f in files]}
 
 

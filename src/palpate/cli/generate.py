@@ -52,13 +52,17 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     single = _check(options)
     manifest = _manifest(options)
     terminal.say(f"Loading {options.model} ...")  # torch and its friends take seconds to import
-    from palpate.diffusion.pipeline import Pipeline
-    from palpate.encoders.towers import pick_device
-    from palpate.generate import generate, generate_one
+    from palpate.diffusion.generate import generate, generate_one
+    from palpate.diffusion.pipeline import TactilePipeline
+    from palpate.encoders.encoder_set import pick_device
 
     device = pick_device(options.device)
-    pipeline = Pipeline.load(options.model).to(device)
-    sampling: dict[str, Any] = {"seed": options.seed, "guidance": options.guidance, "steps": options.steps}
+    pipeline = TactilePipeline.load(options.model).to(device)
+    sampling: dict[str, Any] = {
+        "seed": options.seed,
+        "guidance": options.guidance,
+        "steps": options.steps,
+    }
     skipped: Sequence[Problem] = ()
     if single:
         new = generate_one(pipeline, options.photos[0], options.output, **sampling)
@@ -67,12 +71,23 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         photos = None if manifest is not None else _photos(options)
         with terminal.progress() as progress:
             made = generate(
-                pipeline, out=options.output, manifest=manifest, photos=photos, batch=options.batch, skip_bad=options.skip_bad,
-                progress=progress, **sampling,
-            )  # fmt: skip
+                pipeline,
+                out=options.output,
+                manifest=manifest,
+                photos=photos,
+                batch=options.batch,
+                skip_bad=options.skip_bad,
+                progress=progress,
+                **sampling,
+            )
         skipped = made.skipped
         facts = {"folder": str(options.output), "images": len(made.ids), "made_now": made.made}
-    facts |= {"skipped": len(skipped), "model": options.model, "pipeline": pipeline.digest, "notice": pipeline.notice or None}
+    facts |= {
+        "skipped": len(skipped),
+        "model": options.model,
+        "pipeline": pipeline.digest,
+        "notice": pipeline.notice or None,
+    }
     terminal.facts(f"Touch{'' if single else 'es'} {options.output}", facts)
     terminal.skipped(skipped)
     return facts | {"skipped": [asdict(p) for p in skipped]}
@@ -82,7 +97,11 @@ def _check(options: Options) -> bool:
     """Refuses what cannot work before anything large is imported; returns whether one PNG is asked for."""
     if bool(options.photos) == (options.manifest is not None):
         given = "both" if options.photos else "neither"
-        raise PalpateError("Generating takes photos or --manifest", given, "E.g. palpate generate photo.jpg -o touch.png")
+        raise PalpateError(
+            "Generating takes photos or --manifest",
+            given,
+            "E.g. palpate generate photo.jpg -o touch.png",
+        )
     if not options.skip_bad and (missing := [p for p in options.photos if not p.exists()]):
         problems = [Problem(str(p), "missing-file", "no such file or folder") for p in missing]
         raise ProblemsError(problems, "Check the names, or pass --skip-bad")
@@ -102,7 +121,7 @@ def _check(options: Options) -> bool:
 def _check_output(options: Options) -> bool:
     """Refuses an output that cannot be written or must not be; returns whether one PNG is asked for."""
     from palpate.data.images import SUFFIXES
-    from palpate.generate import require_place
+    from palpate.diffusion.generate import require_place
 
     suffix = options.output.suffix.lower()
     if suffix not in SUFFIXES:
@@ -110,12 +129,30 @@ def _check_output(options: Options) -> bool:
         return False
     if options.output.is_dir():
         must = f"-o with {options.output.suffix} takes the touch of one photo, as a file"
-        raise PalpateError(must, f"the folder {options.output}", "Choose another name; a folder's must not end like a picture's")
+        raise PalpateError(
+            must,
+            f"the folder {options.output}",
+            "Choose another name; a folder's must not end like a picture's",
+        )
     if suffix != ".png":
-        raise PalpateError("A touch is written as PNG, which loses nothing", f"-o {options.output}", f"E.g. -o {options.output.stem}.png")
+        raise PalpateError(
+            "A touch is written as PNG, which loses nothing",
+            f"-o {options.output}",
+            f"E.g. -o {options.output.stem}.png",
+        )
     if len(options.photos) != 1 or options.photos[0].is_dir():
-        got = "a manifest" if options.manifest else "a folder" if len(options.photos) == 1 else f"{len(options.photos)} photos"
-        raise PalpateError("-o with .png takes the touch of one photo", got, f"Name a folder, e.g. -o {options.output.stem}/")
+        got = (
+            "a manifest"
+            if options.manifest
+            else "a folder"
+            if len(options.photos) == 1
+            else f"{len(options.photos)} photos"
+        )
+        raise PalpateError(
+            "-o with .png takes the touch of one photo",
+            got,
+            f"Name a folder, e.g. -o {options.output.stem}/",
+        )
     # Every touch bears this mark near its head: an earlier one may be replaced, a photo may not.
     guard_output(options.output, options.photos, (b"palpate.settings",))
     return True
@@ -125,7 +162,7 @@ def _check_model(options: Options) -> None:
     """Refuses a device by its name, and a model and settings of sampling by the model's card; one on the hub is not asked for here."""
     from palpate.core.shipped import is_hub_id
     from palpate.diffusion.card import require_sampler
-    from palpate.encoders.device import require_device_name
+    from palpate.training.device import require_device_name
 
     require_device_name(options.device)
     if not is_hub_id(options.model):
@@ -148,4 +185,8 @@ def _manifest(options: Options) -> Manifest | None:
     if options.manifest is None:
         return None
     manifest = Manifest.load(options.manifest)
-    return manifest if options.split is None else manifest.part(Split.load(options.split), options.part)
+    return (
+        manifest
+        if options.split is None
+        else manifest.part(Split.load(options.split), options.part)
+    )

@@ -19,13 +19,28 @@ from palpate.core import PalpateError, Problem
 IMPORT_FILES = {"manifest.parquet", "splits", "images"}
 #: Options of formats that have a flag of their own -> the flag.
 FLAGS = {
-    "columns": "--map", "root": "--root", "side": "--as", "classes": "--classes", "size": "--size", "max_per_touch": "--max-per-touch",
-    "check": "--check", "skip_bad": "--skip-bad", "progress": "--quiet",
-}  # fmt: skip
+    "columns": "--map",
+    "root": "--root",
+    "side": "--as",
+    "classes": "--classes",
+    "size": "--size",
+    "max_per_touch": "--max-per-touch",
+    "check": "--check",
+    "skip_bad": "--skip-bad",
+    "progress": "--quiet",
+}
 WORDS = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
 
-Maps = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="map", metavar="COLUMN=EXPRESSION ...")]
-Settings = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="OPTION=VALUE ...")]
+Maps = Annotated[
+    tuple[tuple[str, ...], ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(name="map", metavar="COLUMN=EXPRESSION ..."),
+]
+Settings = Annotated[
+    tuple[tuple[str, ...], ...],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(name="set", metavar="OPTION=VALUE ..."),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +48,7 @@ class SourceOptions(Common):
     """What names a source and how to read it."""
 
     format: str = "auto"
-    """Name of the format; `auto` recognises it. `palpate validate --list` tells all formats and their options."""
+    """Name of the format; `auto` recognizes it. `palpate validate --list` tells all formats and their options."""
     maps: Maps = ()
     """Manifest columns as expressions over the columns of a table, an interval list or a Hugging Face data set, or over the `path`
     of images in a folder: `--map vision=rgb tactile="replace(rgb, '_rgb', '_tac')" video=rgb[:15]`."""
@@ -74,11 +89,20 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Imports and prints what was found."""
     from palpate.data.importing import import_dataset
 
-    given = source_options(options, options.source) | {"size": options.size, "max_per_touch": options.max_per_touch}
-    strange = {p.name for p in options.output.iterdir()} - IMPORT_FILES if options.output.is_dir() else set[str]()
+    given = source_options(options, options.source) | {
+        "size": options.size,
+        "max_per_touch": options.max_per_touch,
+    }
+    strange = (
+        {p.name for p in options.output.iterdir()} - IMPORT_FILES
+        if options.output.is_dir()
+        else set[str]()
+    )
     if strange:
         raise PalpateError(
-            f"{options.output} must be new, empty, or an earlier import", f"a folder with {sorted(strange)[0]}", "Choose another -o"
+            f"{options.output} must be new, empty, or an earlier import",
+            f"a folder with {sorted(strange)[0]}",
+            "Choose another -o",
         )
     with terminal.progress() as progress:
         done = import_dataset(
@@ -91,21 +115,37 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             **given,
         )
     manifest = done.manifest
-    for path in (options.output / "splits").glob("*.json"):  # of an earlier import of something else
+    for path in (options.output / "splits").glob(
+        "*.json"
+    ):  # of an earlier import of something else
         if path.stem not in done.splits:
             path.unlink()
     facts = {
-        "manifest": str(options.output / "manifest.parquet"), "digest": manifest.digest, "samples": len(manifest),
-        **{many: manifest.table[one].drop_nulls().n_unique() for one, many in (("video", "videos"), ("touch", "touches"), ("material", "materials"))},
+        "manifest": str(options.output / "manifest.parquet"),
+        "digest": manifest.digest,
+        "samples": len(manifest),
+        **{
+            many: manifest.table[one].drop_nulls().n_unique()
+            for one, many in (
+                ("video", "videos"),
+                ("contact", "touches"),
+                ("material", "materials"),
+            )
+        },
         "with_background": len(manifest) - manifest.table["background"].null_count(),
         "with_text": len(manifest) - manifest.table["text"].null_count(),
-        "inconclusive": done.inconclusive, "skipped": len(done.skipped), "splits": {name: split.counts() for name, split in done.splits.items()},
+        "inconclusive": done.inconclusive,
+        "skipped": len(done.skipped),
+        "splits": {name: split.counts() for name, split in done.splits.items()},
         "suspicious": len(done.suspicious),
-    }  # fmt: skip
+    }
     terminal.facts(f"Imported {options.source}", facts)
     terminal.skipped(done.skipped)
     list_problems("Suspicious, but imported", done.suspicious, terminal.say)
-    lists = {"skipped": [asdict(p) for p in done.skipped], "suspicious": [asdict(p) for p in done.suspicious]}
+    lists = {
+        "skipped": [asdict(p) for p in done.skipped],
+        "suspicious": [asdict(p) for p in done.suspicious],
+    }
     return facts | lists | {"facts": dict(manifest.facts)}
 
 
@@ -125,18 +165,36 @@ def source_options(options: SourceOptions, source: Path) -> dict[str, Any]:
     Raises:
         PalpateError: on an item without ``=``, an option that the format lacks, or a value that does not fit it.
     """
-    columns = _pairs("--map", options.maps, "COLUMN=NAME", "E.g. --map vision=rgb_path tactile=gel_path")
-    settings = _pairs("--set", options.settings, "OPTION=VALUE", "E.g. --set image_format=png; see palpate validate --list")
-    given: dict[str, Any] = {"columns": columns or None, "root": options.root, "side": options.side, "classes": options.classes}
+    columns = _pairs(
+        "--map", options.maps, "COLUMN=NAME", "E.g. --map vision=rgb_path tactile=gel_path"
+    )
+    settings = _pairs(
+        "--set",
+        options.settings,
+        "OPTION=VALUE",
+        "E.g. --set image_format=png; see palpate validate --list",
+    )
+    given: dict[str, Any] = {
+        "columns": columns or None,
+        "root": options.root,
+        "side": options.side,
+        "classes": options.classes,
+    }
     if not settings:
         return given
     if used := [name for name in settings if name in FLAGS]:
-        raise PalpateError(f"The option {used[0]} has a flag of its own", f"--set {used[0]}=...", f"Write {FLAGS[used[0]]}")
-    name = _recognised(source, options.format)
+        raise PalpateError(
+            f"The option {used[0]} has a flag of its own",
+            f"--set {used[0]}=...",
+            f"Write {FLAGS[used[0]]}",
+        )
+    name = _recognized(source, options.format)
     kinds = format_options(name)
     if strange := [key for key in settings if key not in kinds]:
         takes = ", ".join(kinds) or "no options"
-        raise PalpateError(f"--set of the format {name} takes {takes}", strange[0], "See: palpate validate --list")
+        raise PalpateError(
+            f"--set of the format {name} takes {takes}", strange[0], "See: palpate validate --list"
+        )
     return given | {key: _value(key, values, kinds[key]) for key, values in settings.items()}
 
 
@@ -148,7 +206,11 @@ def format_options(name: str) -> Mapping[str, Any]:
     for function in (FORMATS[name].scan, FORMATS[name].run):
         if function is not None:
             hints = typing.get_type_hints(function)
-            own = [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+            own = [
+                p.name
+                for p in inspect.signature(function).parameters.values()
+                if p.kind is p.KEYWORD_ONLY
+            ]
             kinds |= {key: hints[key] for key in own if key not in FLAGS}
     return kinds
 
@@ -156,13 +218,23 @@ def format_options(name: str) -> Mapping[str, Any]:
 def described(kind: Any) -> str:
     """A type in the words of the command line."""
     kinds = _plain_kinds(kind)
-    return " or ".join(dict.fromkeys(
-        "|".join(map(str, typing.get_args(k))) if typing.get_origin(k) is Literal else {bool: "yes|no", int: "a whole number", float: "a number",
-        Path: "a path", str: "a text"}.get(k, "several paths" if typing.get_origin(k) else str(k)) for k in kinds
-    ))  # fmt: skip
+    return " or ".join(
+        dict.fromkeys(
+            "|".join(map(str, typing.get_args(k)))
+            if typing.get_origin(k) is Literal
+            else {
+                bool: "yes|no",
+                int: "a whole number",
+                float: "a number",
+                Path: "a path",
+                str: "a text",
+            }.get(k, "several paths" if typing.get_origin(k) else str(k))
+            for k in kinds
+        )
+    )
 
 
-def _recognised(source: Path, name: str) -> str:
+def _recognized(source: Path, name: str) -> str:
     """The named format, or the one that the source looks like.
 
     Raises:
@@ -173,7 +245,11 @@ def _recognised(source: Path, name: str) -> str:
     if name == "auto":
         name = next((n for n, f in FORMATS.items() if f.detect(source)), "")
     if name not in FORMATS:
-        raise PalpateError(f"With --set the format must be known: one of {', '.join(FORMATS)}", f"{source}", "Name it: --format")
+        raise PalpateError(
+            f"With --set the format must be known: one of {', '.join(FORMATS)}",
+            f"{source}",
+            "Name it: --format",
+        )
     return name
 
 
@@ -188,7 +264,9 @@ def _pairs(flag: str, items: Sequence[Sequence[str]], form: str, fix: str) -> di
         if flag == "--set":
             found.setdefault(key, []).append(value.strip())
         elif key in found:
-            raise PalpateError(f"{flag} must name each column once", f"{key} twice", "Leave one out")
+            raise PalpateError(
+                f"{flag} must name each column once", f"{key} twice", "Leave one out"
+            )
         else:
             found[key] = value.strip()
     return found
@@ -196,7 +274,11 @@ def _pairs(flag: str, items: Sequence[Sequence[str]], form: str, fix: str) -> di
 
 def _plain_kinds(kind: Any) -> list[Any]:
     """The members of a union without None."""
-    members = typing.get_args(kind) if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union else (kind,)
+    members = (
+        typing.get_args(kind)
+        if isinstance(kind, types.UnionType) or typing.get_origin(kind) is typing.Union
+        else (kind,)
+    )
     return [m for m in members if m is not types.NoneType]
 
 
@@ -209,7 +291,9 @@ def _value(key: str, texts: Sequence[str], kind: Any) -> Any:
     kinds = _plain_kinds(kind)
     several = [k for k in kinds if typing.get_origin(k) not in (None, Literal)]
     if len(texts) > 1 and not several:
-        raise PalpateError(f"--set {key} must stand once", f"{len(texts)} times", "Leave the others out")
+        raise PalpateError(
+            f"--set {key} must stand once", f"{len(texts)} times", "Leave the others out"
+        )
     single = [k for k in kinds if k not in several] or [typing.get_args(several[0])[0]]
     values = [_single(key, text, single, kind) for text in texts]
     return values if len(values) > 1 else values[0]
@@ -228,4 +312,6 @@ def _single(key: str, text: str, kinds: Sequence[Any], kind: Any) -> Any:
                 return one(text)
             except ValueError:
                 continue
-    raise PalpateError(f"--set {key} must be {described(kind)}", repr(text), "See: palpate validate --list")
+    raise PalpateError(
+        f"--set {key} must be {described(kind)}", repr(text), "See: palpate validate --list"
+    )

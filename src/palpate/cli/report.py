@@ -27,13 +27,19 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Merges the results and writes the page."""
     if not options.results:
-        raise PalpateError("A report needs results", "no file", "E.g. palpate audit train.txt test.txt -o audit.json")
+        raise PalpateError(
+            "A report needs results",
+            "no file",
+            "E.g. palpate audit train.txt test.txt -o audit.json",
+        )
     from palpate.report import write_report
 
     if options.output.suffix == ".html":
         guard_output(options.output, options.results, (b"palpate",))
         guard_output(options.output.with_suffix(".json"), options.results)
-        guard_output(options.output.with_suffix(".md"), options.results, (options.title.encode(), b"palpate"))
+        guard_output(
+            options.output.with_suffix(".md"), options.results, (options.title.encode(), b"palpate")
+        )
     merged = Results(title=options.title)
     for path in options.results:
         merged = _join(merged, _read(path))
@@ -60,15 +66,21 @@ def _read(path: Path) -> Results:
             case "palpate-audit/1":
                 results = Results(title="", audits=_audits(data))
             case "palpate-results/1":
-                results = Results.from_json({k: v for k, v in data.items() if k not in ("skipped", "failed")})
+                results = Results.from_json(
+                    {k: v for k, v in data.items() if k not in ("skipped", "failed")}
+                )
             case _:
                 raise PalpateError(
-                    f"{path} must hold results of palpate", f"format {kind!r}", "Pass the JSON of audit -o, score -o, or of a page"
+                    f"{path} must hold results of palpate",
+                    f"format {kind!r}",
+                    "Pass the JSON of audit -o, score -o, or of a page",
                 )
         check_results(results)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise PalpateError(
-            f"{path} must hold complete results", f"a missing or unknown field ({error})", "Write it again with palpate"
+            f"{path} must hold complete results",
+            f"a missing or unknown field ({error})",
+            "Write it again with palpate",
         ) from None
     return with_paths(results, lambda name: str((path.parent / name).resolve()))
 
@@ -93,7 +105,12 @@ def _mismatch(results: Results) -> list[str]:
 def _join(a: Results, b: Results) -> Results:
     """The two, one after the other; the first non-empty title stays."""
     return Results(
-        title=a.title if a.title != "palpate report" or not b.title else b.title, facts=[*a.facts, *b.facts], audits=[*a.audits, *b.audits],
-        scores=[*a.scores, *b.scores], gallery=[*a.gallery, *b.gallery], settings={**a.settings, **b.settings}, notes=[*a.notes, *b.notes],
+        title=a.title if a.title != "palpate report" or not b.title else b.title,
+        facts=[*a.facts, *b.facts],
+        audits=[*a.audits, *b.audits],
+        scores=[*a.scores, *b.scores],
+        gallery=[*a.gallery, *b.gallery],
+        settings={**a.settings, **b.settings},
+        notes=[*a.notes, *b.notes],
         commands=[*a.commands, *b.commands],
-    )  # fmt: skip
+    )

@@ -16,7 +16,9 @@ import tyro
 from palpate.cli.terminal import Common, Terminal, guard_output
 from palpate.core import PalpateError, Results
 
-Companion = Literal["fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"]
+Companion = Literal[
+    "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,8 +31,8 @@ class Options(Common):
     """What to score, one entry a generator: folders of images or of `palpate generate`, manifests, or embeddings (.npy, .npz, .safetensors, .parquet)."""
     reference: Path | None = None
     """The real touches, instead of a manifest and a split: of the same kinds. Ids are relative file names."""
-    encoder: Annotated[str | None, tyro.conf.arg(aliases=["--towers"])] = None
-    """Folder of `palpate encoder`, a hub id, or palpate/mini; the touch tower gives the features. Embeddings need none."""
+    encoder: Annotated[str | None, tyro.conf.arg(aliases=["--encoder"])] = None
+    """Folder of `palpate encoder`, a hub id, or palpate/mini; the tactile encoder gives the features. Embeddings need none."""
     split: Path | None = None
     """Split file; its test part is scored. With --reference, its train part gives the floor of TMMD."""
     names: tuple[str, ...] = ()
@@ -54,7 +56,7 @@ class Options(Common):
     normalize: Literal["check", "yes", "no"] = "check"
     """Embeddings that are not of unit length: refuse, divide by the norm, or take as they are."""
     permutations: int = 999
-    """Relabellings of the permutation test of TMMD; 0 for none."""
+    """Relabelings of the permutation test of TMMD; 0 for none."""
     companions: tuple[Companion, ...] | None = None
     """Scores beside the TMMD family. Default: all that need no further weights and whose inputs are there; `none` for none."""
     inception: Path | None = None
@@ -63,7 +65,7 @@ class Options(Common):
     """Folder or hub id of a CLIP: CMMD is then of its features, as published."""
     lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
     """The two files of LPIPS: AlexNet's weights and the heads."""
-    group: Literal["auto", "video", "touch", "object"] = "auto"
+    group: Literal["auto", "video", "contact", "object"] = "auto"
     """What stays together in halves and intervals; `auto` takes what the split kept whole, else the video."""
     cache: Path | None = None
     """Folder that keeps embeddings of what was read (with MANIFEST those of the real touches). Default: one beside -o, for a run that is stopped; removed at the end."""
@@ -85,13 +87,19 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if options.latex:
         guard_output(options.latex, inputs, (b"% palpate",))
         if options.output and options.latex.resolve() == options.output.resolve():
-            raise PalpateError("-o and --latex must be two files", str(options.latex), "Give one of them another name")
+            raise PalpateError(
+                "-o and --latex must be two files",
+                str(options.latex),
+                "Give one of them another name",
+            )
     cache = _cache(options)
     with _told(terminal) as told, terminal.progress() as progress:
         results = scoring_runs.score(options, terminal, cache, progress)
     results = replace(results, notes=[*results.notes, *told])
     try:
-        show(results, terminal, said=[] if terminal.silent else told)  # before saving: a disk that fails loses nothing
+        show(
+            results, terminal, said=[] if terminal.silent else told
+        )  # before saving: a disk that fails loses nothing
     finally:  # nor does one behind standard output
         _save(options, results)
     if cache is not None and options.cache is None:
@@ -111,7 +119,18 @@ def _save(options: Options, results: Results) -> None:
 
 def _inputs(options: Options) -> list[Path]:
     """Everything that is read."""
-    return [p for p in (options.manifest, options.reference, options.split, options.labels, options.groups, *options.generated) if p]
+    return [
+        p
+        for p in (
+            options.manifest,
+            options.reference,
+            options.split,
+            options.labels,
+            options.groups,
+            *options.generated,
+        )
+        if p
+    ]
 
 
 def _cache(options: Options) -> Path | None:
@@ -138,7 +157,11 @@ def sigmas(options: Options) -> tuple[float | str, ...]:
         except ValueError:
             value = math.nan
         if not 1e-100 < value < 1e100:
-            raise PalpateError("--sigma must be numbers from 1e-100 to 1e100, median or multi", repr(text), "E.g. --sigma 10 median")
+            raise PalpateError(
+                "--sigma must be numbers from 1e-100 to 1e100, median or multi",
+                repr(text),
+                "E.g. --sigma 10 median",
+            )
         found.append(value)
     return tuple(dict.fromkeys(found))
 
@@ -147,36 +170,83 @@ def _check(options: Options) -> None:
     """Refuses options that do not go together, before anything is read."""
     if not options.generated:
         raise PalpateError(
-            "There must be something to score", "no --generated", "E.g. --generated out/ --reference real/ --encoder palpate/mini"
+            "There must be something to score",
+            "no --generated",
+            "E.g. --generated out/ --reference real/ --encoder palpate/mini",
         )
     if (options.manifest is None) == (options.reference is None):
         got = "neither" if options.manifest is None else "both"
-        fix = "Pass --reference R, or MANIFEST with --split and --towers"
-        raise PalpateError("The real touches must be given once: as --reference, or as a manifest", got, fix)
+        fix = "Pass --reference R, or MANIFEST with --split and --encoder"
+        raise PalpateError(
+            "The real touches must be given once: as --reference, or as a manifest", got, fix
+        )
     if options.manifest is not None and (options.split is None or options.encoder is None):
-        lacking = " and ".join(name for name, v in (("--split", options.split), ("--towers", options.encoder)) if v is None)
-        raise PalpateError("Scoring a manifest must have a split and towers", f"no {lacking}", "Or pass the real touches as --reference")
+        lacking = " and ".join(
+            name
+            for name, v in (("--split", options.split), ("--encoder", options.encoder))
+            if v is None
+        )
+        raise PalpateError(
+            "Scoring a manifest must have a split and encoders",
+            f"no {lacking}",
+            "Or pass the real touches as --reference",
+        )
     if options.names and len(options.names) != len(options.generated):
         got = f"{len(options.names)} names for {len(options.generated)}"
-        raise PalpateError("--names must name every generator", got, "One name for each entry of --generated")
+        raise PalpateError(
+            "--names must name every generator", got, "One name for each entry of --generated"
+        )
     if options.manifest is not None and (options.labels or options.groups):
-        raise PalpateError("--labels and --groups must go with --reference", "a manifest, which has its own", "Leave them out")
+        raise PalpateError(
+            "--labels and --groups must go with --reference",
+            "a manifest, which has its own",
+            "Leave them out",
+        )
     if options.manifest is None and not options.controls:
-        raise PalpateError("--controls must go with MANIFEST and --split", "--reference, which has no controls", "Leave it out")
+        raise PalpateError(
+            "--controls must go with MANIFEST and --split",
+            "--reference, which has no controls",
+            "Leave it out",
+        )
     for flag, kinds in (("inception", ("fid", "kid")), ("clip", ("cmmd",)), ("lpips", ("lpips",))):
-        if getattr(options, flag) is not None and options.companions is not None and not set(kinds) & set(options.companions):
+        if (
+            getattr(options, flag) is not None
+            and options.companions is not None
+            and not set(kinds) & set(options.companions)
+        ):
             fix = f"Add {kinds[0]} to --companions, or leave --{flag} out"
-            raise PalpateError(f"--{flag} must have a score to make", f"--companions {' '.join(options.companions)}", fix)
-    if options.companions is not None and "none" in options.companions and len(options.companions) > 1:
-        raise PalpateError("--companions must be none, or names", " ".join(options.companions), "Leave none out, or all others")
-    if options.cache is not None and (
-        options.cache.is_file() or any(options.cache.resolve().is_relative_to(p.resolve()) for p in _inputs(options))
+            raise PalpateError(
+                f"--{flag} must have a score to make",
+                f"--companions {' '.join(options.companions)}",
+                fix,
+            )
+    if (
+        options.companions is not None
+        and "none" in options.companions
+        and len(options.companions) > 1
     ):
-        raise PalpateError("--cache must be a folder of its own", str(options.cache), "Name another one, outside what is read")
+        raise PalpateError(
+            "--companions must be none, or names",
+            " ".join(options.companions),
+            "Leave none out, or all others",
+        )
+    if options.cache is not None and (
+        options.cache.is_file()
+        or any(options.cache.resolve().is_relative_to(p.resolve()) for p in _inputs(options))
+    ):
+        raise PalpateError(
+            "--cache must be a folder of its own",
+            str(options.cache),
+            "Name another one, outside what is read",
+        )
     if options.permutations < 0:
-        raise PalpateError("--permutations must not be negative", str(options.permutations), "0 makes none")
+        raise PalpateError(
+            "--permutations must not be negative", str(options.permutations), "0 makes none"
+        )
     if not options.sigma:
-        raise PalpateError("--sigma must name at least one bandwidth", "none", "E.g. --sigma 10 median")
+        raise PalpateError(
+            "--sigma must name at least one bandwidth", "none", "E.g. --sigma 10 median"
+        )
     sigmas(options)
 
 
@@ -203,6 +273,9 @@ def _told(terminal: Terminal) -> Generator[list[str]]:
         try:
             yield said
         except PalpateError as error:
-            if type(error) is not PalpateError or (fix := next((v for k, v in flags.items() if k in error.fix), None)) is None:
+            if (
+                type(error) is not PalpateError
+                or (fix := next((v for k, v in flags.items() if k in error.fix), None)) is None
+            ):
                 raise
             raise PalpateError(error.must, error.got, fix) from None

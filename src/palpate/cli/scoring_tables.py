@@ -18,7 +18,7 @@ from rich.text import Text
 from palpate.cli.terminal import Terminal
 from palpate.core import Results, Score
 from palpate.core.score import ARROWS
-from palpate.protocol.comparing import confidence, percent
+from palpate.evaluation.comparing import confidence, percent
 from palpate.report.remarks import INDEPENDENT, Footnotes, no_floor, reason, remarks
 from palpate.report.sides import TAIL
 from palpate.report.tables import gel_of
@@ -73,7 +73,9 @@ def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None
             text = ". ".join([reason(s), *(t for t in remarks(s) if t not in notes.texts)])
             preset = _column(s)[1]
             name = f"{s.metric} ({preset})" if preset else s.metric
-            why.setdefault(text, []).append(name if _column(s) not in known else f"{name} of {s.subject}")
+            why.setdefault(text, []).append(
+                name if _column(s) not in known else f"{name} of {s.subject}"
+            )
     for text, metrics in why.items():
         terminal.print(f"{', '.join(dict.fromkeys(metrics))}: {text}")
     for remark in (r for r in results.notes if r not in said):
@@ -92,13 +94,30 @@ def _scores(scores: Sequence[Score], notes: Footnotes, told: set[str]) -> Grid:
         # A remark of the results says of whom, and is printed anyhow.
         known = [t for t in (*remarks(s), no_floor(s)) if t and f"{s.subject}: {t}" not in told]
         gel = gel_of(s)
-        floor = f"gel {_number(gel)}" if gel is not None else "-" if s.floor is None else _number(s.floor)
+        floor = (
+            f"gel {_number(gel)}"
+            if gel is not None
+            else "-"
+            if s.floor is None
+            else _number(s.floor)
+        )
         cells = [
-            s.subject, _number(s.value), _interval(s.interval), _interval(s.null), _p(s.details.get("p_value")), floor, str(s.n),
+            s.subject,
+            _number(s.value),
+            _interval(s.interval),
+            _interval(s.null),
+            _p(s.details.get("p_value")),
+            floor,
+            str(s.n),
             _marks(notes, known),
-        ]  # fmt: skip
+        ]
         rows.append((f"{s.metric} {ARROWS[s.higher_is_better]}", _column(s)[1], cells))
-    return Grid(("subject", "value", "95 % interval", "null", "p", "floor", "n", "note"), 1, frozenset({"null", "n"}), rows)
+    return Grid(
+        ("subject", "value", "95 % interval", "null", "p", "floor", "n", "note"),
+        1,
+        frozenset({"null", "n"}),
+        rows,
+    )
 
 
 def _differences(scores: Sequence[Score], notes: Footnotes, frames: set[tuple[str, str]]) -> Grid:
@@ -109,12 +128,21 @@ def _differences(scores: Sequence[Score], notes: Footnotes, frames: set[tuple[st
         metric, d = s.metric.removesuffix(TAIL), s.details
         ahead = confidence(s)
         known = [t for t in remarks(s) if t not in ahead]
-        known += [INDEPENDENT] if s.interval and (metric, _column(s)[1]) in frames and INDEPENDENT not in known else []
+        known += (
+            [INDEPENDENT]
+            if s.interval and (metric, _column(s)[1]) in frames and INDEPENDENT not in known
+            else []
+        )
         sure = d.get("p_better")
         cells = [
-            d["a"], d["b"], _number(s.value), _interval(s.interval), "-" if sure is None else percent(sure), _p(d.get("p_adjusted")),
+            d["a"],
+            d["b"],
+            _number(s.value),
+            _interval(s.interval),
+            "-" if sure is None else percent(sure),
+            _p(d.get("p_adjusted")),
             _marks(notes, known),
-        ]  # fmt: skip
+        ]
         rows.append((f"{metric} {ARROWS[s.higher_is_better]}", _column(s)[1], cells))
     heads = ("a", "b", "a - b", "95 % interval", "confidence that a is better", "Holm p", "note")
     return Grid(heads, 2, frozenset({"Holm p"}), rows)
@@ -127,11 +155,16 @@ def _draw(grid: Grid, terminal: Terminal) -> None:
     wide = Table("metric", "preset", box=None, pad_edge=False)
     for k in keep:
         number = k >= grid.left and grid.heads[k] != "note"
-        wide.add_column(grid.heads[k], justify="right" if number else "left", no_wrap=k >= grid.left)
+        wide.add_column(
+            grid.heads[k], justify="right" if number else "left", no_wrap=k >= grid.left
+        )
     for metric, preset, cells in grid.rows:
         wide.add_row(escape(metric), preset, *(escape(cells[k]) for k in keep))
     room = terminal.out.width
-    if terminal.out.measure(wide, options=terminal.out.options.update(width=10_000)).maximum <= room:
+    if (
+        terminal.out.measure(wide, options=terminal.out.options.update(width=10_000)).maximum
+        <= room
+    ):
         terminal.out.print(wide)
         return
     above = [k for k in keep if k >= grid.left]  # the names stand above the numbers
@@ -142,12 +175,17 @@ def _draw(grid: Grid, terminal: Terminal) -> None:
     _sections(grid, shown, terminal)
     if spared := [grid.heads[k] for k in above if k not in shown]:
         are = "They are" if len(spared) > 1 else "It is"
-        terminal.print(f"Left out in this width: {' and '.join(spared)}. {are} in the results of -o, and in a wider window.")
+        terminal.print(
+            f"Left out in this width: {' and '.join(spared)}. {are} in the results of -o, and in a wider window."
+        )
 
 
 def _widths(grid: Grid, keep: Sequence[int]) -> list[int]:
     """The widest cell of each of the columns ``keep``."""
-    return [max(cell_len(_short(grid.heads[k])), *(cell_len(cells[k]) for _, _, cells in grid.rows)) for k in keep]
+    return [
+        max(cell_len(_short(grid.heads[k])), *(cell_len(cells[k]) for _, _, cells in grid.rows))
+        for k in keep
+    ]
 
 
 def _short(head: str) -> str:
@@ -160,14 +198,20 @@ def _fits(grid: Grid, keep: Sequence[int], room: int) -> bool:
 
 def _sections(grid: Grid, keep: Sequence[int], terminal: Terminal) -> None:
     """The columns ``keep`` of a grid, each metric below a line of its own, and so the names that are not among them; as lists where that is too wide."""
-    fits, widths, heads = _fits(grid, keep, terminal.out.width), _widths(grid, keep), [_short(head) for head in grid.heads]
+    fits, widths, heads = (
+        _fits(grid, keep, terminal.out.width),
+        _widths(grid, keep),
+        [_short(head) for head in grid.heads],
+    )
 
     def line(cells: Sequence[str], style: str = "") -> None:
         # Not a row of a rich table: that cuts the numbers of a column that it makes narrower.
         padded: list[str] = []
         for k, width in zip(keep, widths, strict=True):
             space = " " * (width - cell_len(cells[k]))
-            padded.append(cells[k] + space if k < grid.left or grid.heads[k] == "note" else space + cells[k])
+            padded.append(
+                cells[k] + space if k < grid.left or grid.heads[k] == "note" else space + cells[k]
+            )
         terminal.out.print(Text("  ".join(padded).rstrip(), style), soft_wrap=True)
 
     if fits:
@@ -187,7 +231,9 @@ def _list(cells: Sequence[tuple[str, str]], terminal: Terminal) -> None:
     """Numbers beside their heads, or below them where that is too wide."""
     for head, cell in cells:
         beside = f"  {head}: {cell}"
-        for text in [beside] if cell_len(beside) <= terminal.out.width else [f"  {head}:", f"  {cell}"]:
+        for text in (
+            [beside] if cell_len(beside) <= terminal.out.width else [f"  {head}:", f"  {cell}"]
+        ):
             terminal.out.print(Text(text))
 
 

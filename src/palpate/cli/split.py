@@ -12,7 +12,15 @@ import tyro
 
 from palpate.cli.audit import show
 from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output
-from palpate.core import PalpateError, Problem, Split, atomic_folder, digest_file, write_json, write_text
+from palpate.core import (
+    PalpateError,
+    Problem,
+    Split,
+    atomic_folder,
+    digest_file,
+    write_json,
+    write_text,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,14 +28,14 @@ if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
     from palpate.leakage.splits import SplitPlan
 
-Column = Literal["video", "object", "session", "touch", "domain", "sensor"]
+Column = Literal["video", "object", "session", "contact", "domain", "sensor"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
     """Make a split in which no group stands in two parts and every material keeps its share, as nearly as any such split can.
 
-    The largest deviation of any material's share is minimised and proven, or given with its gap. The same data, options and seed
+    The largest deviation of any material's share is minimized and proven, or given with its gap. The same data, options and seed
     give the same split anywhere.
     """
 
@@ -41,7 +49,9 @@ class Options(Common):
     """Share of the validation part; test gets the rest."""
     by: Annotated[tuple[Column, ...], tyro.conf.arg(metavar="COLUMN ...")] = ()
     """What to keep whole; samples that share any of these stay together. Default: what the data set names, or the video."""
-    near: Annotated[Literal["vision", "touch", "both"] | None, tyro.conf.arg(metavar="vision|touch|both")] = None
+    near: Annotated[
+        Literal["vision", "tactile", "both"] | None, tyro.conf.arg(metavar="vision|tactile|both")
+    ] = None
     """Keep near-duplicate pictures together as well."""
     cache: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """With --near: folder that keeps decoded picture features, so that a run that was stopped goes on."""
@@ -64,7 +74,12 @@ class Options(Common):
     """Check an existing split file against the samples instead; exit status 1 if it does not hold."""
     group: Annotated[Literal["auto"] | Column, tyro.conf.arg(metavar="auto|COLUMN")] = "auto"
     """One column to keep whole. `auto` falls back to touches where videos are too few, and says so."""
-    skip_bad: Annotated[bool, tyro.conf.arg(help="Leave out bad rows of lists and tables and list them, instead of refusing.")] = False
+    skip_bad: Annotated[
+        bool,
+        tyro.conf.arg(
+            help="Leave out bad rows of lists and tables and list them, instead of refusing."
+        ),
+    ] = False
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
@@ -79,14 +94,23 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
 
     links, facts = _links(options, manifest, terminal)
     common: dict[str, Any] = {
-        "by": options.by, "group": options.group, "links": links, "link_facts": facts, "nulls": options.nulls, "tolerance": options.tolerance,
-    }  # fmt: skip
+        "by": options.by,
+        "group": options.group,
+        "links": links,
+        "link_facts": facts,
+        "nulls": options.nulls,
+        "tolerance": options.tolerance,
+    }
     if options.folds is not None:
-        plans = leak_free_folds(manifest, options.folds, val=options.val > 0, seed=options.seed, **common)
+        plans = leak_free_folds(
+            manifest, options.folds, val=options.val > 0, seed=options.seed, **common
+        )
         names = [f"fold-{k}" for k in range(options.folds)]
     else:
         seeds = range(options.seed, options.seed + (options.seeds or 1))
-        plans = leak_free_splits(manifest, list(seeds), train=options.train, val=options.val, **common)
+        plans = leak_free_splits(
+            manifest, list(seeds), train=options.train, val=options.val, **common
+        )
         names = [f"seed-{s}" for s in seeds]
     return _write(options, manifest, plans, names, skipped, terminal), 0
 
@@ -98,14 +122,30 @@ def _check(options: Options) -> None:
         PalpateError: saying which.
     """
     if not options.paths:
-        raise PalpateError("A split needs samples", "no path", "E.g. palpate split tag/ -o noleak.json")
-    several = [name for name, value in (("--seeds", options.seeds), ("--folds", options.folds)) if value is not None]
-    asked = [name for name, value in (("--noleak", options.noleak), ("--verify", options.verify)) if value is not None]
+        raise PalpateError(
+            "A split needs samples", "no path", "E.g. palpate split tag/ -o noleak.json"
+        )
+    several = [
+        name
+        for name, value in (("--seeds", options.seeds), ("--folds", options.folds))
+        if value is not None
+    ]
+    asked = [
+        name
+        for name, value in (("--noleak", options.noleak), ("--verify", options.verify))
+        if value is not None
+    ]
     if len(several) > 1 or len(asked) > 1 or (several and asked):
-        raise PalpateError("--seeds, --folds, --noleak and --verify exclude each other", " and ".join(several + asked), "Choose one")
+        raise PalpateError(
+            "--seeds, --folds, --noleak and --verify exclude each other",
+            " and ".join(several + asked),
+            "Choose one",
+        )
     if options.seeds is not None and options.seeds < 1:
         raise PalpateError("--seeds must be at least 1", str(options.seeds), "Pass e.g. --seeds 5")
-    if options.noleak is not None and (options.by or options.near or options.group != "auto" or options.tolerance):
+    if options.noleak is not None and (
+        options.by or options.near or options.group != "auto" or options.tolerance
+    ):
         raise PalpateError(
             "A published split has its own rule",
             "--by, --near, --group or --tolerance with --noleak",
@@ -116,15 +156,31 @@ def _check(options: Options) -> None:
     if options.verify is None and options.output is None:
         raise PalpateError("A split needs an output file", "no -o", "Pass e.g. -o noleak.json")
     if options.lists is not None and (several or options.verify is not None):
-        raise PalpateError("--lists goes with one split", f"{(several or ['--verify'])[0]}", "Make the split you want alone")
-    if options.lists is not None and options.lists.exists() and (not options.lists.is_dir() or any(options.lists.iterdir())):
-        raise PalpateError("--lists must name a new or empty folder", f"something in {options.lists}", "Choose another folder")
+        raise PalpateError(
+            "--lists goes with one split",
+            f"{(several or ['--verify'])[0]}",
+            "Make the split you want alone",
+        )
+    if (
+        options.lists is not None
+        and options.lists.exists()
+        and (not options.lists.is_dir() or any(options.lists.iterdir()))
+    ):
+        raise PalpateError(
+            "--lists must name a new or empty folder",
+            f"something in {options.lists}",
+            "Choose another folder",
+        )
     if options.output is not None and not several:
         inputs = [*options.paths, *(options.noleak or ())]
-        guard_output(options.output, inputs, (b'"format": "palpate-split/', b'"format": "palpate-noleak/'))
+        guard_output(
+            options.output, inputs, (b'"format": "palpate-split/', b'"format": "palpate-noleak/')
+        )
 
 
-def _read(paths: Sequence[Path], options: Options, terminal: Terminal) -> tuple[Manifest, list[Problem]]:
+def _read(
+    paths: Sequence[Path], options: Options, terminal: Terminal
+) -> tuple[Manifest, list[Problem]]:
     """One manifest from one source, or from several lists joined, and what was skipped.
 
     Raises:
@@ -139,19 +195,32 @@ def _read(paths: Sequence[Path], options: Options, terminal: Terminal) -> tuple[
     else:
         for path in paths:
             if not path.is_file():
-                raise PalpateError("Several paths must all be list files", f"no file {path}", "Name one manifest, or lists alone")
+                raise PalpateError(
+                    "Several paths must all be list files",
+                    f"no file {path}",
+                    "Name one manifest, or lists alone",
+                )
             if not is_list(path):
-                raise PalpateError("Several paths must all be list files", f"{path}, which is none", "Name one manifest, or lists alone")
+                raise PalpateError(
+                    "Several paths must all be list files",
+                    f"{path}, which is none",
+                    "Name one manifest, or lists alone",
+                )
         table = paths[0].parent / "category_reference.txt"
         found = read_lists(
-            paths, root=paths[0].parent, skip_bad=options.skip_bad, categories=read_categories(table) if table.is_file() else None
+            paths,
+            root=paths[0].parent,
+            skip_bad=options.skip_bad,
+            categories=read_categories(table) if table.is_file() else None,
         )
         manifest, skipped = found.manifest, found.skipped
     terminal.skipped(skipped)
     return manifest, skipped
 
 
-def _links(options: Options, manifest: Manifest, terminal: Terminal) -> tuple[list[NDArray[Any]], dict[str, Any] | None]:
+def _links(
+    options: Options, manifest: Manifest, terminal: Terminal
+) -> tuple[list[NDArray[Any]], dict[str, Any] | None]:
     """Clusters of near-duplicates by modality, and how they were found.
 
     Raises:
@@ -165,16 +234,26 @@ def _links(options: Options, manifest: Manifest, terminal: Terminal) -> tuple[li
     for modality in wanted:
         if manifest.table[MODALITIES[modality]].null_count() == len(manifest):
             raise PalpateError(
-                f"--near {options.near} needs {modality} pictures", "samples without any", "Import the data set first: palpate import"
+                f"--near {options.near} needs {modality} pictures",
+                "samples without any",
+                "Import the data set first: palpate import",
             )
     from palpate.leakage.near import near_groups
 
     with terminal.progress() as progress:
-        return [near_groups(manifest, modality, cache=options.cache, progress=progress) for modality in wanted], {"modalities": wanted}
+        return [
+            near_groups(manifest, modality, cache=options.cache, progress=progress)
+            for modality in wanted
+        ], {"modalities": wanted}
 
 
 def _write(
-    options: Options, manifest: Manifest, plans: Sequence[SplitPlan], names: Sequence[str], skipped: Sequence[Problem], terminal: Terminal
+    options: Options,
+    manifest: Manifest,
+    plans: Sequence[SplitPlan],
+    names: Sequence[str],
+    skipped: Sequence[Problem],
+    terminal: Terminal,
 ) -> dict[str, Any]:
     """Writes one split file, or a folder of them with ``splits.json``; prints what was achieved."""
     from palpate.leakage.splits import describe
@@ -182,34 +261,51 @@ def _write(
     assert options.output is not None
     for note in plans[0].notes:
         terminal.say(f"Note: {note}")
-    extra = {"notes": plans[0].notes, "skipped": [str(p) for p in skipped], "path": str(options.output)}
+    extra = {
+        "notes": plans[0].notes,
+        "skipped": [str(p) for p in skipped],
+        "path": str(options.output),
+    }
     if options.seeds is None and options.folds is None:
         facts = dict(describe(plans[0]))
         plans[0].split.save(options.output)
         terminal.facts(f"Split {options.output}", facts)
         return facts | extra | _finish(options, manifest, plans[0].split, plans[0].group, terminal)
-    rows = [{"file": f"{name}.json", **describe(plan)} for name, plan in zip(names, plans, strict=True)]
+    rows = [
+        {"file": f"{name}.json", **describe(plan)} for name, plan in zip(names, plans, strict=True)
+    ]
     with atomic_folder(options.output) as folder:
         for name, plan in zip(names, plans, strict=True):
             plan.split.save(folder / f"{name}.json")
-        write_json(folder / "splits.json", {"format": "palpate-splits/1", "manifest": manifest.digest, "splits": rows})
+        write_json(
+            folder / "splits.json",
+            {"format": "palpate-splits/1", "manifest": manifest.digest, "splits": rows},
+        )
     shown = {
-        row["file"]: f"{row['counts']}, largest deviation {row['largest_material_deviation']}, {row['status']}, {row['digest']}"
+        row[
+            "file"
+        ]: f"{row['counts']}, largest deviation {row['largest_material_deviation']}, {row['status']}, {row['digest']}"
         for row in rows
     }
     terminal.facts(f"Splits {options.output}", shown)
     different = len({row["digest"] for row in rows})
     if different < len(rows):
-        terminal.say(f"Note: only {different} of {len(rows)} splits differ; so good ones are few. For more of them: --tolerance 0.02")
+        terminal.say(
+            f"Note: only {different} of {len(rows)} splits differ; so good ones are few. For more of them: --tolerance 0.02"
+        )
     return {"splits": rows, "different": different, **extra}
 
 
-def _finish(options: Options, manifest: Manifest, split: Split, group: str, terminal: Terminal) -> dict[str, Any]:
+def _finish(
+    options: Options, manifest: Manifest, split: Split, group: str, terminal: Terminal
+) -> dict[str, Any]:
     """Audits a new split by its table, and writes the data set's own lists if asked."""
     from palpate.leakage import audit_split
 
     column = group if group in manifest.table.columns else "auto"
-    audit = audit_split(manifest, split, group=column, name=options.output.name if options.output else "")
+    audit = audit_split(
+        manifest, split, group=column, name=options.output.name if options.output else ""
+    )
     show(audit, terminal)
     files: list[str] = []
     if options.lists is not None:
@@ -236,9 +332,13 @@ def write_own_lists(manifest: Manifest, split: Split, folder: Path) -> list[str]
             and not manifest.table["frame"].null_count()
         )
         # Samples without pictures come from bare frame lists, whose own form is a frame list.
-        files = (write_frame_lists if frames and "format" not in manifest.facts else write_lists)(manifest, split, part)
+        files = (write_frame_lists if frames and "format" not in manifest.facts else write_lists)(
+            manifest, split, part
+        )
         names = sorted(p.relative_to(part).as_posix() for p in files)
-        write_text(part / "SHA256SUMS", "".join(f"{digest_file(part / name)}  {name}\n" for name in names))
+        write_text(
+            part / "SHA256SUMS", "".join(f"{digest_file(part / name)}  {name}\n" for name in names)
+        )
     return [*names, "SHA256SUMS"]
 
 
@@ -253,11 +353,14 @@ def _verify(options: Options, path: Path, terminal: Terminal) -> tuple[dict[str,
     by = options.by or ((options.group,) if options.group != "auto" else ())
     checks = recheck(manifest, split, by=by, links=links)
     terminal.facts(
-        f"Check of {path} against {len(manifest)} samples", {c.name: f"{'holds' if c.ok else 'FAILS'}: {c.text}" for c in checks}
+        f"Check of {path} against {len(manifest)} samples",
+        {c.name: f"{'holds' if c.ok else 'FAILS'}: {c.text}" for c in checks},
     )
     audit = None
     ids = set(manifest.ids)
-    known = Split({i: part for i, part in split.parts.items() if i in ids}, split.rule, split.manifest)
+    known = Split(
+        {i: part for i, part in split.parts.items() if i in ids}, split.rule, split.manifest
+    )
     if {"train", "test"} <= set(known.counts()):
         group = (by or columns_of(split, manifest) or ("auto",))[0]
         audit = audit_split(manifest, known, group=group, name=path.name)
@@ -266,11 +369,18 @@ def _verify(options: Options, path: Path, terminal: Terminal) -> tuple[dict[str,
         told = "none does" if quiet else f"{audit.leaking_samples} of {audit.test_samples} leak"
         checks.append(Check("no signal of the audit flags a test sample", quiet, told))
     failed = [c.name for c in checks if not c.ok]
-    terminal.print(f"FAIL: {len(failed)} of {len(checks)} checks do not hold." if failed else f"All {len(checks)} checks hold.")
+    terminal.print(
+        f"FAIL: {len(failed)} of {len(checks)} checks do not hold."
+        if failed
+        else f"All {len(checks)} checks hold."
+    )
     result = {
-        "path": str(path), "digest": split.digest, "checks": [dataclasses.asdict(c) for c in checks], "failed": failed,
+        "path": str(path),
+        "digest": split.digest,
+        "checks": [dataclasses.asdict(c) for c in checks],
+        "failed": failed,
         "audit": audit and dataclasses.asdict(audit),
-    }  # fmt: skip
+    }
     return result, FAILED_CHECK if failed else 0
 
 
@@ -283,10 +393,14 @@ def _noleak(options: Options, samples: Sequence[Path], terminal: Terminal) -> di
     if dataset == "hct":
         if not samples:
             raise PalpateError(
-                "HCT-NoLeak is a rule for your own tree", "no manifest", "Pass it: palpate split hct --noleak hct/ -o noleak.json"
+                "HCT-NoLeak is a rule for your own tree",
+                "no manifest",
+                "Pass it: palpate split hct --noleak hct/ -o noleak.json",
             )
         manifest, skipped = _read(samples, options, terminal)
-        plans = noleak.hct_noleak(manifest, train=options.train, val=options.val, seeds=[options.seed])
+        plans = noleak.hct_noleak(
+            manifest, train=options.train, val=options.val, seeds=[options.seed]
+        )
         return _write(options, manifest, plans, [""], skipped, terminal)
     record = noleak.load_record(dataset)
     chosen = noleak.entry(record, noleak.ratio_name(options.train, options.val), options.seed)
@@ -296,7 +410,9 @@ def _noleak(options: Options, samples: Sequence[Path], terminal: Terminal) -> di
     split, absent = noleak.record_split(chosen, manifest)
     split.save(options.output)
     if absent:
-        terminal.say(f"Note: {len(absent)} of the record's {len(chosen.parts)} videos have no sample here, first {absent[0]}.")
+        terminal.say(
+            f"Note: {len(absent)} of the record's {len(chosen.parts)} videos have no sample here, first {absent[0]}."
+        )
     facts = {
         "digest": split.digest,
         "record": record["sha256"],
@@ -305,16 +421,40 @@ def _noleak(options: Options, samples: Sequence[Path], terminal: Terminal) -> di
         "videos_without_samples": absent,
     }
     terminal.facts(f"{record['name']} {options.output}", facts)
-    return facts | {"rule": dict(chosen.rule), "path": str(options.output)} | _finish(options, manifest, split, "video", terminal)
+    return (
+        facts
+        | {"rule": dict(chosen.rule), "path": str(options.output)}
+        | _finish(options, manifest, split, "video", terminal)
+    )
 
 
-def _record_alone(options: Options, parts: Mapping[str, str], rule: Mapping[str, Any], digest: str, terminal: Terminal) -> dict[str, Any]:
+def _record_alone(
+    options: Options,
+    parts: Mapping[str, str],
+    rule: Mapping[str, Any],
+    digest: str,
+    terminal: Terminal,
+) -> dict[str, Any]:
     """The record's video -> part as a file."""
     assert options.output is not None
     if options.lists is not None:
-        raise PalpateError("--lists needs samples", "a record of videos alone", "Name your manifest or lists after --noleak")
-    data = {"format": "palpate-noleak/1", "digest": digest, "rule": dict(rule), "videos": dict(sorted(parts.items()))}
+        raise PalpateError(
+            "--lists needs samples",
+            "a record of videos alone",
+            "Name your manifest or lists after --noleak",
+        )
+    data = {
+        "format": "palpate-noleak/1",
+        "digest": digest,
+        "rule": dict(rule),
+        "videos": dict(sorted(parts.items())),
+    }
     write_json(options.output, data)
-    counts = {part: sum(p == part for p in parts.values()) for part in dict.fromkeys(parts.values())}
-    terminal.facts(f"{rule['name']} {options.output}", {"digest": digest, "videos": counts, **rule["on_the_official_lists"]})
+    counts = {
+        part: sum(p == part for p in parts.values()) for part in dict.fromkeys(parts.values())
+    }
+    terminal.facts(
+        f"{rule['name']} {options.output}",
+        {"digest": digest, "videos": counts, **rule["on_the_official_lists"]},
+    )
     return data | {"path": str(options.output)}

@@ -17,7 +17,9 @@ class Steady:
     """A text stream whose reader may go away, and whose letters may be few."""
 
     def __init__(self, stream: TextIO | None, *, told: bool = True) -> None:
-        self.told = told  # whether a full disk is an error: behind standard error there is nobody to tell
+        self.told = (
+            told  # whether a full disk is an error: behind standard error there is nobody to tell
+        )
         self.stream: TextIO = open(os.devnull, "w", encoding="utf-8") if stream is None else stream  # noqa: SIM115
 
     def write(self, text: str) -> int:
@@ -48,7 +50,11 @@ class Steady:
         try:
             os.dup2(nowhere.fileno(), self.stream.fileno())
             nowhere.close()
-        except (OSError, ValueError, AttributeError):  # a stream in memory, or a closed one, has no file
+        except (
+            OSError,
+            ValueError,
+            AttributeError,
+        ):  # a stream in memory, or a closed one, has no file
             self.stream = nowhere
         if self.told and not isinstance(error, BrokenPipeError):
             raise error

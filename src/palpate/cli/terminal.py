@@ -38,7 +38,10 @@ from palpate.core.files import NO_ROOM
 #: Lines of problems shown in the terminal; ``--json`` gives all.
 SHOWN_PROBLEMS = 40
 
-JsonFlag = Annotated[bool, tyro.conf.arg(name="json", help="Print one JSON object on standard output instead of text.")]
+JsonFlag = Annotated[
+    bool,
+    tyro.conf.arg(name="json", help="Print one JSON object on standard output instead of text."),
+]
 QuietFlag = Annotated[bool, tyro.conf.arg(aliases=["-q"], help="No progress.")]
 OutPath = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
@@ -59,7 +62,9 @@ class Terminal:
         self.json = options.as_json
         self.silent = options.quiet
         # Piped text is not wrapped: digests and paths must stay whole.
-        self.out = Console(highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400)
+        self.out = Console(
+            highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400
+        )
         self.err = Console(stderr=True, highlight=False, quiet=self.silent)
 
     def say(self, line: str) -> None:
@@ -151,16 +156,29 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
     try:
         with contextlib.redirect_stderr(said):
             text = f"{options.__doc__}\n\nExample: {verb.example}"
-            return tyro.cli(options, prog=f"palpate {name}", args=list(args), description=text, config=(tyro.conf.FlagCreatePairsOff,))
+            return tyro.cli(
+                options,
+                prog=f"palpate {name}",
+                args=list(args),
+                description=text,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
         words = re.sub(r"[\u2500-\u257f]+|─+", " ", said.getvalue())
         words = (
-            re.split(r"For full helptext|Argument helptext|Full error|If your arguments", " ".join(words.split()))[0].strip()
+            re.split(
+                r"For full helptext|Argument helptext|Full error|If your arguments",
+                " ".join(words.split()),
+            )[0].strip()
             or "arguments that cannot be parsed"
         )
-        raise PalpateError(f"The options of palpate {name} must be as its help says", words, f"See: palpate {name} --help") from None
+        raise PalpateError(
+            f"The options of palpate {name} must be as its help says",
+            words,
+            f"See: palpate {name} --help",
+        ) from None
 
 
 def require_extra(purpose: str) -> None:
@@ -182,7 +200,11 @@ def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
         PalpateError: if the output exists already, before any work is done.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise PalpateError(f"{output} must be absent or an empty folder", "something there", "Choose another -o, or remove it")
+        raise PalpateError(
+            f"{output} must be absent or an empty folder",
+            "something there",
+            "Choose another -o, or remove it",
+        )
     work = output.absolute().parent / f".{output.name}.work"
     if work.exists():
         terminal.say(f"Going on from {work}")
@@ -196,7 +218,9 @@ def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
     shutil.rmtree(work, ignore_errors=True)
 
 
-def guard_output(output: Path, inputs: Sequence[Path] = (), marks: Sequence[bytes] = (b'"format": "palpate-',)) -> None:
+def guard_output(
+    output: Path, inputs: Sequence[Path] = (), marks: Sequence[bytes] = (b'"format": "palpate-',)
+) -> None:
     """Refuses an output file that would replace an input, or anything that palpate did not write, or that cannot be written at all.
 
     Args:
@@ -209,14 +233,20 @@ def guard_output(output: Path, inputs: Sequence[Path] = (), marks: Sequence[byte
         OSError: if the disk is full.
     """
     if any(output.exists() and path.exists() and output.samefile(path) for path in inputs):
-        raise PalpateError("An output must not replace an input of the same command", str(output), "Choose another -o")
+        raise PalpateError(
+            "An output must not replace an input of the same command",
+            str(output),
+            "Choose another -o",
+        )
     _require_writable(output)
     if output.is_file():
         with open(output, "rb") as file:
             head = file.read(4096)
         if head and not any(mark in head for mark in marks):
             raise PalpateError(
-                f"{output} must be new, or a file of the kind that this command writes", "another file", "Choose another -o, or remove it"
+                f"{output} must be new, or a file of the kind that this command writes",
+                "another file",
+                "Choose another -o, or remove it",
             )
 
 
@@ -225,12 +255,18 @@ def _require_writable(output: Path) -> None:
     try:
         if output.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        place = next(p for p in output.absolute().parents if p.exists())  # the folders below it are made when the file is
+        place = next(
+            p for p in output.absolute().parents if p.exists()
+        )  # the folders below it are made when the file is
         handle, name = tempfile.mkstemp(dir=place, prefix=f".{output.name}.")
     except OSError as error:
         if error.errno in NO_ROOM:
             raise OSError(error.errno, os.strerror(error.errno), str(output)) from None
-        raise PalpateError(f"{output} must be writable", error.strerror or str(error), "Choose another path, or check its rights") from None
+        raise PalpateError(
+            f"{output} must be writable",
+            error.strerror or str(error),
+            "Choose another path, or check its rights",
+        ) from None
     os.close(handle)
     Path(name).unlink()
 
@@ -241,7 +277,9 @@ def _set_threads() -> None:
     Measured on two cores with the ``mini`` models: one thread trains 59 images a second, two 36, and fitting the probe with two
     BLAS threads takes 16 times as long as with one. Spinning while waiting makes it worse still.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, min(4, cores // 2))))
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -251,16 +289,22 @@ def _file_error(error: OSError) -> PalpateError:
     place = error.filename or "the files of this command"
     if error.errno in NO_ROOM:
         return PalpateError(
-            f"The disk must have room for {place}", error.strerror or str(error), "Free some space and run the same command again"
+            f"The disk must have room for {place}",
+            error.strerror or str(error),
+            "Free some space and run the same command again",
         )
     return PalpateError(
-        f"{place} must be readable and writable as asked", error.strerror or str(error), "Check the path, its rights and the free space"
+        f"{place} must be readable and writable as asked",
+        error.strerror or str(error),
+        "Check the path, its rights and the free space",
     )
 
 
 def _write_json(data: Any) -> None:
     """On standard output, as it is read back whatever letters the stream has."""
-    plain = not (getattr(sys.stdout, "encoding", None) or "").lower().replace("-", "").startswith("utf")
+    plain = (
+        not (getattr(sys.stdout, "encoding", None) or "").lower().replace("-", "").startswith("utf")
+    )
     sys.stdout.write(json.dumps(data, indent=1, ensure_ascii=plain, allow_nan=False) + "\n")
 
 
@@ -299,11 +343,26 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         return INTERRUPTED
     except Exception as bug:  # our own mistake: the traceback helps to report it, and the status differs from a failed check
         traceback.print_exc()
-        sys.stderr.write(f"palpate {name}: this is a bug in palpate; please report the lines above.\n")
+        sys.stderr.write(
+            f"palpate {name}: this is a bug in palpate; please report the lines above.\n"
+        )
         if as_json:
-            told = PalpateError("palpate must not fail of itself", str(bug), "Report the traceback on standard error").to_json()
+            told = PalpateError(
+                "palpate must not fail of itself",
+                str(bug),
+                "Report the traceback on standard error",
+            ).to_json()
             _write_json(told | {"error": type(bug).__name__})
         return BUG
 
 
-__all__ = ["FAILED_CHECK", "Common", "OutPath", "Terminal", "guard_output", "require_extra", "run_verb", "working_folder"]
+__all__ = [
+    "FAILED_CHECK",
+    "Common",
+    "OutPath",
+    "Terminal",
+    "guard_output",
+    "require_extra",
+    "run_verb",
+    "working_folder",
+]

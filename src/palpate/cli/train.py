@@ -20,7 +20,7 @@ class Options(Common):
     """Manifest file or the folder of an import."""
     split: Path
     """Split file; only its train part is read."""
-    towers: str
+    encoders: str
     """Folder of `palpate encoder`, a hub id, or palpate/mini, which ships with palpate."""
     output: OutPath
     """Folder for the pipeline; must be new or empty."""
@@ -33,7 +33,7 @@ class Options(Common):
     background: bool = False
     """The variant that also sees the no-contact image."""
     steps: int | None = None
-    """Optimiser steps instead of the preset's."""
+    """Optimizer steps instead of the preset's."""
     seed: int = 0
     """Of weights, order, noise and condition dropout."""
     device: str = "auto"
@@ -50,34 +50,71 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.diffusion.autoencoder_training import train_autoencoder
     from palpate.diffusion.presets import preset_named
     from palpate.diffusion.recipe import train_pipeline
-    from palpate.encoders.towers import Towers, pick_device
+    from palpate.encoders.encoder_set import EncoderSet, pick_device
 
     if options.steps is not None and options.steps < 1:
-        raise PalpateError("--steps must be at least 1", str(options.steps), "Leave it out for the preset's length")
-    manifest, split, chosen = Manifest.load(options.manifest), Split.load(options.split), preset_named(options.preset)
-    towers = Towers.load(options.towers)
+        raise PalpateError(
+            "--steps must be at least 1", str(options.steps), "Leave it out for the preset's length"
+        )
+    manifest, split, chosen = (
+        Manifest.load(options.manifest),
+        Split.load(options.split),
+        preset_named(options.preset),
+    )
+    encoders = EncoderSet.load(options.encoders)
     with working_folder(options.output, terminal) as work, terminal.progress() as progress:
         if options.autoencoder:
             autoencoder = Autoencoder.load(options.autoencoder)
         elif chosen.autoencoder is None:
-            raise PalpateError(f"The preset {chosen.name} needs a trained autoencoder", "none", "Pass --autoencoder HUB_ID_OR_FOLDER")
+            raise PalpateError(
+                f"The preset {chosen.name} needs a trained autoencoder",
+                "none",
+                "Pass --autoencoder HUB_ID_OR_FOLDER",
+            )
         else:
             train, test = manifest.part(split, "train"), manifest.part(split, "val", "test")
             images = cached_images(train, "tactile", chosen.size, work / "cache", progress)
-            held_out = cached_images(test, "tactile", chosen.size, work / "cache", progress) if len(test) else None
+            held_out = (
+                cached_images(test, "tactile", chosen.size, work / "cache", progress)
+                if len(test)
+                else None
+            )
             autoencoder = train_autoencoder(
-                images, chosen.autoencoder, work / "autoencoder", held_out=held_out, seed=options.seed, key=image_stamp(train, "tactile"),
-                device=pick_device(options.device), progress=progress,
-            )  # fmt: skip
+                images,
+                chosen.autoencoder,
+                work / "autoencoder",
+                held_out=held_out,
+                seed=options.seed,
+                key=image_stamp(train, "tactile"),
+                device=pick_device(options.device),
+                progress=progress,
+            )
         pipeline = train_pipeline(
-            manifest, split, towers, autoencoder, chosen, work, seed=options.seed, steps=options.steps, source=options.source,
-            background=options.background, cache=work / "cache", device=options.device, progress=progress,
-        )  # fmt: skip
+            manifest,
+            split,
+            encoders,
+            autoencoder,
+            chosen,
+            work,
+            seed=options.seed,
+            steps=options.steps,
+            source=options.source,
+            background=options.background,
+            cache=work / "cache",
+            device=options.device,
+            progress=progress,
+        )
         pipeline.save(options.output)
     loop = pipeline.training["loop"]
     facts = {
-        "folder": str(options.output), "digest": pipeline.digest, "parameters": pipeline.training["parameters"], "steps": loop["steps"],
-        "batch": loop["batch"], "effective_learning_rate": loop["lr"], "source": pipeline.training["source"], "background": options.background,
-    }  # fmt: skip
+        "folder": str(options.output),
+        "digest": pipeline.digest,
+        "parameters": pipeline.training["parameters"],
+        "steps": loop["steps"],
+        "batch": loop["batch"],
+        "effective_learning_rate": loop["lr"],
+        "source": pipeline.training["source"],
+        "background": options.background,
+    }
     terminal.facts(f"Generator {options.output}", facts)
     return facts

@@ -10,11 +10,24 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.importing import FLAGS, SourceOptions, described, format_options, list_problems, source_options
+from palpate.cli.importing import (
+    FLAGS,
+    SourceOptions,
+    described,
+    format_options,
+    list_problems,
+    source_options,
+)
 from palpate.cli.terminal import FAILED_CHECK, Terminal
 from palpate.core import PalpateError, Problem
 
-List = Annotated[bool, tyro.conf.arg(name="list", help="Tell the known formats, their facts and their options, and look at nothing.")]
+List = Annotated[
+    bool,
+    tyro.conf.arg(
+        name="list",
+        help="Tell the known formats, their facts and their options, and look at nothing.",
+    ),
+]
 Kind = Literal["missing", "invalid", "suspicious"]
 
 
@@ -40,20 +53,42 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     if options.show_list:
         return {name: _show(name, terminal) for name in FORMATS}, 0
     if options.source is None:
-        raise PalpateError("A validation needs a SOURCE", "none", "E.g. palpate validate touch_and_go/, or palpate validate --list")
+        raise PalpateError(
+            "A validation needs a SOURCE",
+            "none",
+            "E.g. palpate validate touch_and_go/, or palpate validate --list",
+        )
     given = source_options(options, options.source)
     with terminal.progress() as progress:
         found = validate_dataset(
-            options.source, format=options.format, check=options.check, progress=progress, **_of_scan(options, given)
-        )  # fmt: skip
-    lists: dict[str, Sequence[Problem]] = {"missing": found.missing, "invalid": found.invalid, "suspicious": found.suspicious}
+            options.source,
+            format=options.format,
+            check=options.check,
+            progress=progress,
+            **_of_scan(options, given),
+        )
+    lists: dict[str, Sequence[Problem]] = {
+        "missing": found.missing,
+        "invalid": found.invalid,
+        "suspicious": found.suspicious,
+    }
     failed = [kind for kind in dict.fromkeys(options.fail_on) if lists[kind]]
-    counts = {"format": found.format, "samples": found.samples, **{kind: len(problems) for kind, problems in lists.items()}}
+    counts = {
+        "format": found.format,
+        "samples": found.samples,
+        **{kind: len(problems) for kind, problems in lists.items()},
+    }
     facts = asdict(found.facts)
     terminal.facts(f"Validated {options.source}", counts | _readable(facts))
     for kind, problems in lists.items():
         list_problems(kind.capitalize(), problems, terminal.print)
-    terminal.print(f"Not whole: {', '.join(failed)}." if failed else "Whole." if found.ok else "Passed, though not whole.")
+    terminal.print(
+        f"Not whole: {', '.join(failed)}."
+        if failed
+        else "Whole."
+        if found.ok
+        else "Passed, though not whole."
+    )
     data = counts | {kind: [asdict(p) for p in problems] for kind, problems in lists.items()}
     return data | {"ok": found.ok, "failed": failed, "facts": facts}, FAILED_CHECK if failed else 0
 
@@ -64,11 +99,19 @@ def _of_scan(options: Options, given: dict[str, Any]) -> dict[str, Any]:
 
     if options.source is None:
         return given
-    name = options.format if options.format != "auto" else next((n for n, f in FORMATS.items() if f.detect(options.source)), "")
+    name = (
+        options.format
+        if options.format != "auto"
+        else next((n for n, f in FORMATS.items() if f.detect(options.source)), "")
+    )
     if name not in FORMATS:
         return given
     scan = inspect.signature(FORMATS[name].scan).parameters
-    return {key: value for key, value in given.items() if key in scan or key not in FORMATS[name].options}
+    return {
+        key: value
+        for key, value in given.items()
+        if key in scan or key not in FORMATS[name].options
+    }
 
 
 def _show(name: str, terminal: Terminal) -> dict[str, Any]:
@@ -77,8 +120,15 @@ def _show(name: str, terminal: Terminal) -> dict[str, Any]:
 
     facts = asdict(FORMATS[name].facts)
     options = {key: described(kind) for key, kind in format_options(name).items()}
-    flags = [flag for key, flag in FLAGS.items() if key in FORMATS[name].options and key not in ("check", "skip_bad", "progress")]
-    told = _readable(facts) | {"looks for": FORMATS[name].looks_for, "flags": " ".join(flags) or None}
+    flags = [
+        flag
+        for key, flag in FLAGS.items()
+        if key in FORMATS[name].options and key not in ("check", "skip_bad", "progress")
+    ]
+    told = _readable(facts) | {
+        "looks for": FORMATS[name].looks_for,
+        "flags": " ".join(flags) or None,
+    }
     told |= {f"--set {key}=": kind for key, kind in options.items()}
     terminal.facts(name, told)
     return facts | {"looks_for": FORMATS[name].looks_for, "options": options, "flags": flags}
@@ -87,9 +137,11 @@ def _show(name: str, terminal: Terminal) -> dict[str, Any]:
 def _readable(facts: dict[str, Any]) -> dict[str, Any]:
     """Facts for people."""
     size = facts["image_size"]
-    told = {k: v for k, v in facts.items() if k not in ("normalisation", "samples")} | {
+    told = {k: v for k, v in facts.items() if k not in ("normalization", "samples")} | {
         "published": facts["samples"],
         "image_size": f"{size[0]} x {size[1]}" if size else None,
     }
-    normalisation: dict[str, Any] = facts["normalisation"]
-    return told | {f"mean, std of {name}": f"{mean}, {std}" for name, (mean, std) in normalisation.items()}
+    normalization: dict[str, Any] = facts["normalization"]
+    return told | {
+        f"mean, std of {name}": f"{mean}, {std}" for name, (mean, std) in normalization.items()
+    }

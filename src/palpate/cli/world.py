@@ -16,21 +16,28 @@ if TYPE_CHECKING:
 
 Count: TypeAlias = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number: TypeAlias = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
-Range: TypeAlias = Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH", help_behavior_hint="")]
-Several: TypeAlias = Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="X ...", help_behavior_hint="")]
+Range: TypeAlias = Annotated[
+    tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH", help_behavior_hint="")
+]
+Several: TypeAlias = Annotated[
+    tuple[float, ...] | None, tyro.conf.arg(metavar="X ...", help_behavior_hint="")
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Amounts:
     """How much there is of what, and how it is worded and cut; the preset's unless given."""
 
-    materials: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")] = None
+    materials: Annotated[
+        tuple[str, ...] | None, tyro.conf.arg(metavar="NAME ...", help_behavior_hint="")
+    ] = None
     """Names of materials (Wood "Synthetic Fabric"), or how many."""
     objects_per_material: Count = None
     """Objects of each material."""
-    balance: Annotated[Literal["uniform", "touch-and-go"] | None, tyro.conf.arg(metavar="uniform|touch-and-go", help_behavior_hint="")] = (
-        None
-    )
+    balance: Annotated[
+        Literal["uniform", "touch-and-go"] | None,
+        tyro.conf.arg(metavar="uniform|touch-and-go", help_behavior_hint=""),
+    ] = None
     """Equal classes, or classes as unequal as those of Touch and Go, of the same number of objects in all."""
     videos_per_object: Count = None
     """Videos of each object."""
@@ -42,7 +49,10 @@ class Amounts:
     """Frames in contact in each touch."""
     free_frames: Count = None
     """Frames without contact before each touch, 5 or more."""
-    free_written: Annotated[Literal["all", "background"] | None, tyro.conf.arg(metavar="all|background", help_behavior_hint="")] = None
+    free_written: Annotated[
+        Literal["all", "background"] | None,
+        tyro.conf.arg(metavar="all|background", help_behavior_hint=""),
+    ] = None
     """Write all frames without contact, or of each touch the one that shows the background."""
     objects_per_video: Count = None
     """A mixed video touches 2 to this many objects."""
@@ -142,12 +152,19 @@ class Options(Common):
     """Worlds of different seeds share no object. 900000 to 900099 are kept for the shipped models."""
     size: Count = None
     """Side of the images in pixels, 16 to 256."""
-    look: Annotated[Literal["gelsight", "digit"] | None, tyro.conf.arg(metavar="gelsight|digit", help_behavior_hint="")] = None
+    look: Annotated[
+        Literal["gelsight", "digit"] | None,
+        tyro.conf.arg(metavar="gelsight|digit", help_behavior_hint=""),
+    ] = None
     """Sensor family: with or without markers. The layout hct takes digit unless told."""
-    leak: Annotated[Literal["frame", "touch", "none"] | None, tyro.conf.arg(metavar="frame|touch|none", help_behavior_hint="")] = None
+    leak: Annotated[
+        Literal["frame", "contact", "none"] | None,
+        tyro.conf.arg(metavar="frame|contact|none", help_behavior_hint=""),
+    ] = None
     """How its own train and test lists are cut: random frames, random whole touches, or by video; leak.csv tells what that leaks."""
     layout: Annotated[
-        Literal["frames", "videos", "hct", "raw"] | None, tyro.conf.arg(metavar="frames|videos|hct|raw", help_behavior_hint="")
+        Literal["frames", "videos", "hct", "raw"] | None,
+        tyro.conf.arg(metavar="frames|videos|hct|raw", help_behavior_hint=""),
     ] = None
     """Touch and Go as extracted frames or as raw video.mp4 and gelsight.mp4, HCT, or uint8 arrays (vision.npy, tactile.npy, background.npy)."""
     workers: int = 2
@@ -177,9 +194,16 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         record = write_world(options.output, world, workers=options.workers, progress=progress)
         if options.sheet:
             render_contact_sheet(world, options.sheet)
-    facts = {"folder": str(record.folder), "digest": record.digest, **record.counts, "leak": record.leak}
+    facts = {
+        "folder": str(record.folder),
+        "digest": record.digest,
+        **record.counts,
+        "leak": record.leak,
+    }
     facts |= {"seen_by_shipped_models": SEEN} if seen_by_mini(world) else {}
-    shown = {k: v for k, v in facts.items() if k != "leak"} | {f"leak: {k}": v for k, v in record.leak.items()}
+    shown = {k: v for k, v in facts.items() if k != "leak"} | {
+        f"leak: {k}": v for k, v in record.leak.items()
+    }
     terminal.facts(f"World {options.output} (synthetic)", shown)
     return facts
 
@@ -193,8 +217,14 @@ def world_options(options: Options) -> WorldOptions:
     from palpate.sim import DEFAULT, PRESETS, load_options
 
     if options.preset is not None and options.options is not None:
-        raise PalpateError("Either --preset or --options must be given", "both", "Leave one of them out")
-    base = load_options(options.options) if options.options is not None else PRESETS[options.preset or DEFAULT]
+        raise PalpateError(
+            "Either --preset or --options must be given", "both", "Leave one of them out"
+        )
+    base = (
+        load_options(options.options)
+        if options.options is not None
+        else PRESETS[options.preset or DEFAULT]
+    )
     given = {name: getattr(options, name) for name in _OWN}
     for group in (options.amounts, options.physics, options.photos):
         given |= {f.name: getattr(group, f.name) for f in fields(group)}

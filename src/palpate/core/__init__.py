@@ -2,16 +2,73 @@
 
 from palpate.core.digest import digest_file, digest_folder, digest_json, digest_lines, short
 from palpate.core.errors import MissingExtraError, PalpateError, Problem, ProblemsError
-from palpate.core.files import atomic_folder, atomic_path, inside, read_json, read_record, told_of, write_json, write_text
+from palpate.core.files import (
+    atomic_folder,
+    atomic_path,
+    inside,
+    read_json,
+    read_record,
+    told_of,
+    write_json,
+    write_text,
+)
 from palpate.core.progress import Progress, quiet, track
 from palpate.core.random import rng_for, seed_for
-from palpate.core.results import CAUSES, MATRIX_ROWS, Audit, GalleryItem, Impact, ImpactRow, LeakPair, Results, SampleRef, Signal
+from palpate.core.results import (
+    CAUSES,
+    MATRIX_ROWS,
+    Audit,
+    GalleryItem,
+    Impact,
+    ImpactRow,
+    LeakPair,
+    Results,
+    SampleRef,
+    Signal,
+)
 from palpate.core.score import FeatureSet, Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
 from palpate.core.stages import Run, Stage
 
 __all__ = [
-    "CAUSES", "MATRIX_ROWS", "PARTS", "Audit", "FeatureSet", "GalleryItem", "Impact", "ImpactRow", "LeakPair", "MissingExtraError", "PalpateError", "Problem", "ProblemsError", "Progress",
-    "Results", "Run", "SampleRef", "Score", "Signal", "Split", "Stage", "atomic_folder", "atomic_path", "columns", "digest_file", "digest_folder", "digest_json",
-    "digest_lines", "inside", "quiet", "read_json", "read_record", "require_comparable", "rng_for", "seed_for", "short", "told_of", "track", "write_json", "write_text",
-]  # fmt: skip
+    "CAUSES",
+    "MATRIX_ROWS",
+    "PARTS",
+    "Audit",
+    "FeatureSet",
+    "GalleryItem",
+    "Impact",
+    "ImpactRow",
+    "LeakPair",
+    "MissingExtraError",
+    "PalpateError",
+    "Problem",
+    "ProblemsError",
+    "Progress",
+    "Results",
+    "Run",
+    "SampleRef",
+    "Score",
+    "Signal",
+    "Split",
+    "Stage",
+    "atomic_folder",
+    "atomic_path",
+    "columns",
+    "digest_file",
+    "digest_folder",
+    "digest_json",
+    "digest_lines",
+    "inside",
+    "quiet",
+    "read_json",
+    "read_record",
+    "require_comparable",
+    "rng_for",
+    "seed_for",
+    "short",
+    "told_of",
+    "track",
+    "write_json",
+    "write_text",
+]

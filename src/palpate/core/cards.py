@@ -46,22 +46,34 @@ class _Kind:
 
 _KINDS = {
     "palpate-clip/1": _Kind(
-        "Vision and text towers", "transformers", "zero-shot-image-classification", ("clip",),
-        'from palpate.encoders.towers import load_clip\n\nclip = load_clip("{name}")',
+        "Vision and text encoders",
+        "transformers",
+        "zero-shot-image-classification",
+        ("clip",),
+        'from palpate.encoders.encoder_set import load_clip\n\nclip = load_clip("{name}")',
     ),
-    "palpate-towers/1": _Kind(
-        "Vision, text and touch towers", "transformers", "feature-extraction", ("clip", "contrastive"),
-        'from palpate.encoders.towers import Towers\n\ntowers = Towers.load("{name}")',
+    "palpate-encoders/2": _Kind(
+        "Vision, text and tactile encoders",
+        "transformers",
+        "feature-extraction",
+        ("clip", "contrastive"),
+        'from palpate.encoders.encoder_set import EncoderSet\n\nencoders = EncoderSet.load("{name}")',
     ),
     "palpate-autoencoder/1": _Kind(
-        "Autoencoder of touches", "diffusers", "image-to-image", ("vq-gan", "autoencoder"),
+        "Autoencoder of touches",
+        "diffusers",
+        "image-to-image",
+        ("vq-gan", "autoencoder"),
         'from palpate.diffusion.autoencoder import Autoencoder\n\nautoencoder = Autoencoder.load("{name}")',
     ),
-    "palpate-pipeline/1": _Kind(
-        "From a photo to a touch", "diffusers", "image-to-image", ("latent-diffusion",),
-        'from palpate.diffusion.pipeline import Pipeline\n\npipeline = Pipeline.load("{name}")',
+    "palpate-pipeline/2": _Kind(
+        "From a photo to a touch",
+        "diffusers",
+        "image-to-image",
+        ("latent-diffusion",),
+        'from palpate.diffusion.pipeline import TactilePipeline\n\npipeline = TactilePipeline.load("{name}")',
     ),
-}  # fmt: skip
+}
 
 
 def model_card(about: Mapping[str, Any]) -> str:
@@ -79,12 +91,23 @@ def model_card(about: Mapping[str, Any]) -> str:
     kind = _KINDS.get(str(about.get("format")))
     if kind is None:
         raise PalpateError(
-            f"A model card is made of one of {', '.join(_KINDS)}", repr(about.get("format")), "Pass the JSON of palpate.json"
+            f"A model card is made of one of {', '.join(_KINDS)}",
+            repr(about.get("format")),
+            "Pass the JSON of palpate.json",
         )
     card: Mapping[str, Any] = about.get("card", about.get("training")) or {}
     tags = [*dict.fromkeys(("palpate", "tactile", *kind.tags, *map(str, card.get("tags", ()))))]
-    head = {"license": card.get("license", "apache-2.0"), "library_name": kind.library, "pipeline_tag": kind.task}
-    lines = ["---", *(f"{key}: {json.dumps(str(value))}" for key, value in head.items()), "tags:", *(f"- {json.dumps(t)}" for t in tags)]
+    head = {
+        "license": card.get("license", "apache-2.0"),
+        "library_name": kind.library,
+        "pipeline_tag": kind.task,
+    }
+    lines = [
+        "---",
+        *(f"{key}: {json.dumps(str(value))}" for key, value in head.items()),
+        "tags:",
+        *(f"- {json.dumps(t)}" for t in tags),
+    ]
     lines += ["---", "", f"# {card.get('title', kind.title)}", ""]
     if card.get("summary"):
         lines += [str(card["summary"]), ""]
@@ -98,10 +121,26 @@ def model_card(about: Mapping[str, Any]) -> str:
     if card.get("recipe"):
         lines += ["## Made by", "", "```sh", str(card["recipe"]), "```", ""]
     if digests := _digests(about):
-        lines += ["## Digests", "", *(f"- {part}: `{digest}`" for part, digest in digests.items()), ""]
-    if record := {k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")}:
+        lines += [
+            "## Digests",
+            "",
+            *(f"- {part}: `{digest}`" for part, digest in digests.items()),
+            "",
+        ]
+    if record := {
+        k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")
+    }:
         text = json.dumps(record, indent=1, ensure_ascii=False)
-        lines += ["## Record", "", "The whole record stands in `palpate.json`.", "", "```json", *text.splitlines(), "```", ""]
+        lines += [
+            "## Record",
+            "",
+            "The whole record stands in `palpate.json`.",
+            "",
+            "```json",
+            *text.splitlines(),
+            "```",
+            "",
+        ]
     return "\n".join(lines)
 
 
@@ -117,7 +156,10 @@ def write_model_cards(folder: Path) -> list[Path]:
         PalpateError: if a ``palpate.json`` is unreadable or of another format; files written before stay.
     """
     folder = Path(folder)
-    cards = {file.parent: read_json(file, "card of the model") for file in sorted(folder.rglob("palpate.json"))}
+    cards = {
+        file.parent: read_json(file, "card of the model")
+        for file in sorted(folder.rglob("palpate.json"))
+    }
     pages = {place: model_card(about) for place, about in cards.items()}
     if pages and folder not in pages:
         pages[folder] = _contents(folder, cards)
@@ -128,13 +170,27 @@ def write_model_cards(folder: Path) -> list[Path]:
 
 def _contents(folder: Path, cards: Mapping[Path, Mapping[str, Any]]) -> str:
     """A page that lists the models below ``folder`` with the size of their weights."""
-    lines = [f"# Models in {folder.name}", "", "Apache-2.0. Each folder holds its card (`README.md`, made from `palpate.json`).", ""]
+    lines = [
+        f"# Models in {folder.name}",
+        "",
+        "Apache-2.0. Each folder holds its card (`README.md`, made from `palpate.json`).",
+        "",
+    ]
     rows: list[dict[str, Any]] = []
     for place, about in cards.items():
-        name, card = place.relative_to(folder).as_posix(), about.get("card", about.get("training")) or {}
+        name, card = (
+            place.relative_to(folder).as_posix(),
+            about.get("card", about.get("training")) or {},
+        )
         size = sum(file.stat().st_size for file in place.rglob("*.safetensors"))
         title = card.get("title", _KINDS[about["format"]].title)
-        rows.append({"folder": f"[{name}]({name}/README.md)", "what": title, "weights, MB": f"{size / 1e6:.1f}"})
+        rows.append(
+            {
+                "folder": f"[{name}]({name}/README.md)",
+                "what": title,
+                "weights, MB": f"{size / 1e6:.1f}",
+            }
+        )
     return "\n".join([*lines, *_table(rows), ""])
 
 

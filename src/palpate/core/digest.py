@@ -18,7 +18,14 @@ def canonical_json(value: Any) -> str:
     Raises:
         ValueError: for NaN or infinity, which JSON cannot hold.
     """
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), default=_plain, allow_nan=False, ensure_ascii=False)
+    return json.dumps(
+        value,
+        sort_keys=True,
+        separators=(",", ":"),
+        default=_plain,
+        allow_nan=False,
+        ensure_ascii=False,
+    )
 
 
 def _plain(value: Any) -> Any:

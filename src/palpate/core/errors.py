@@ -67,7 +67,9 @@ class ProblemsError(PalpateError):
         got = f"{len(self.problems)} problem{'s' * (len(self.problems) != 1)}: " + ", ".join(
             f"{n} {kind}" for kind, n in sorted(kinds.items())
         )
-        super().__init__(must or "Every row and file of the input must be readable and consistent", got, fix)
+        super().__init__(
+            must or "Every row and file of the input must be readable and consistent", got, fix
+        )
 
     def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
         return type(self), (self.problems, self.fix, self.must)

@@ -31,11 +31,17 @@ def atomic_path(path: Path) -> Generator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
+        handle, name = tempfile.mkstemp(
+            dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix
+        )
     except OSError as error:  # told with the user's path, not with that of the temporary file
         if error.errno in NO_ROOM:
             raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
-        raise PalpateError(f"{path} must be writable", error.strerror or str(error), "Choose another path, or check its rights") from None
+        raise PalpateError(
+            f"{path} must be writable",
+            error.strerror or str(error),
+            "Choose another path, or check its rights",
+        ) from None
     os.close(handle)
     part = Path(name)
     part.chmod(0o644)
@@ -55,7 +61,11 @@ def atomic_folder(folder: Path) -> Generator[Path]:
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PalpateError(f"{folder} must be absent or an empty folder", "something there", "Choose another folder or remove it")
+        raise PalpateError(
+            f"{folder} must be absent or an empty folder",
+            "something there",
+            "Choose another folder or remove it",
+        )
     folder.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
     part.chmod(0o755)
@@ -94,18 +104,27 @@ def read_json(path: Path, what: str) -> Any:
     except FileNotFoundError:
         raise PalpateError(f"The {what} must exist", f"no file {path}", "Check the path") from None
     except IsADirectoryError:
-        raise PalpateError(f"The {what} must be a file", f"the folder {path}", "Name the file itself") from None
-    except (ValueError, RecursionError) as error:  # no JSON, no UTF-8, a number of too many digits, too deep
-        raise PalpateError(f"The {what} {path} must be JSON", str(error), "Write it again with palpate") from None
+        raise PalpateError(
+            f"The {what} must be a file", f"the folder {path}", "Name the file itself"
+        ) from None
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # no JSON, no UTF-8, a number of too many digits, too deep
+        raise PalpateError(
+            f"The {what} {path} must be JSON", str(error), "Write it again with palpate"
+        ) from None
 
 
-def read_record(path: Path, what: str, *, form: str | None = None, keys: Sequence[str] = ()) -> dict[str, Any]:
+def read_record(
+    path: Path, what: str, *, form: str | Sequence[str] | None = None, keys: Sequence[str] = ()
+) -> dict[str, Any]:
     """Reads a JSON object that a loader takes its settings from.
 
     Args:
         path: the file.
         what: its role, for the error (``"pipeline card"``).
-        form: what its ``format`` must be; None: a file of others, which has none.
+        form: what its ``format`` must be, newest first where several are read; None: a foreign file without one.
         keys: that it must have.
 
     Raises:
@@ -113,11 +132,20 @@ def read_record(path: Path, what: str, *, form: str | None = None, keys: Sequenc
     """
     record, fix = read_json(path, what), "Name another folder, or copy the whole folder again"
     if not isinstance(record, dict):
-        raise PalpateError(f"The {what} {path} must be a JSON object", f"a {type(record).__name__}", fix)
-    if form is not None and record.get("format") != form:
-        raise PalpateError(f"The {what} {path} must have the format {form}", repr(record.get("format")), fix)
+        raise PalpateError(
+            f"The {what} {path} must be a JSON object", f"a {type(record).__name__}", fix
+        )
+    forms = [form] if isinstance(form, str) else form
+    if forms is not None and record.get("format") not in forms:
+        raise PalpateError(
+            f"The {what} {path} must have the format {forms[0]}", repr(record.get("format")), fix
+        )
     if missing := [name for name in keys if name not in record]:
-        raise PalpateError(f"The {what} {path} must have the keys {', '.join(keys)}", f"no {', no '.join(missing)}", fix)
+        raise PalpateError(
+            f"The {what} {path} must have the keys {', '.join(keys)}",
+            f"no {', no '.join(missing)}",
+            fix,
+        )
     try:
         json.dumps(record, allow_nan=False)
     except ValueError as error:
@@ -132,7 +160,9 @@ def told_of(path: Path, key: str) -> Generator[None]:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         must = f"{key} in {path} must be as palpate writes it"
-        raise PalpateError(must, f"{type(error).__name__}: {error}", "Copy the whole folder again") from None
+        raise PalpateError(
+            must, f"{type(error).__name__}: {error}", "Copy the whole folder again"
+        ) from None
 
 
 def inside(root: Path, relative: str) -> Path | None:

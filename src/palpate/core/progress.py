@@ -23,7 +23,9 @@ def quiet(what: str, done: int, total: int, remark: str = "") -> None:
     """Shows nothing."""
 
 
-def track(items: Sequence[T] | Iterable[T], what: str, progress: Progress, total: int | None = None) -> Iterator[T]:
+def track(
+    items: Sequence[T] | Iterable[T], what: str, progress: Progress, total: int | None = None
+) -> Iterator[T]:
     """Yields ``items`` and reports after each."""
     count = total if total is not None else len(items) if isinstance(items, Sequence) else 0
     progress(what, 0, count)

@@ -135,7 +135,11 @@ class Impact:
     def from_json(cls, data: Mapping[str, Any]) -> Impact:
         """The inverse of ``dataclasses.asdict``."""
         rows = [_impact_row(row) for row in data["rows"]]
-        splits, settings, notes = data["clean_splits"], data.get("settings", {}), data.get("notes", ())
+        splits, settings, notes = (
+            data["clean_splits"],
+            data.get("settings", {}),
+            data.get("notes", ()),
+        )
         return cls(rows, data["headline"], data["group"], splits, settings, notes)
 
 
@@ -194,7 +198,12 @@ class Audit:
         """The inverse of ``dataclasses.asdict``."""
         signals = [_signal(s) for s in data.get("signals", ())]
         impact = Impact.from_json(data["impact"]) if data.get("impact") else None
-        fields: dict[str, Any] = {**data, "worst": _pairs(data.get("worst", ())), "signals": signals or (), "impact": impact}
+        fields: dict[str, Any] = {
+            **data,
+            "worst": _pairs(data.get("worst", ())),
+            "signals": signals or (),
+            "impact": impact,
+        }
         for name in ("matrix", "commands"):  # an empty list reads as the default does
             fields[name] = fields.get(name) or ()
         return cls(**fields)
@@ -211,7 +220,16 @@ def _signal(data: Mapping[str, Any]) -> Signal:
 
 
 def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[LeakPair]:
-    return [LeakPair(SampleRef(**r["test"]), SampleRef(**r["train"]), r["gap"], r.get("score"), r.get("cause", "")) for r in rows]
+    return [
+        LeakPair(
+            SampleRef(**r["test"]),
+            SampleRef(**r["train"]),
+            r["gap"],
+            r.get("score"),
+            r.get("cause", ""),
+        )
+        for r in rows
+    ]
 
 
 @dataclass(frozen=True)
@@ -257,7 +275,10 @@ class Results:
         data = {k: v for k, v in data.items() if k != "format"}
         data["audits"] = [Audit.from_json(a) for a in data.get("audits", ())]
         data["scores"] = [Score.from_json(s) for s in data.get("scores", ())]
-        data["gallery"] = [GalleryItem(SampleRef(**g["sample"]), g["generated"], g.get("background")) for g in data.get("gallery", ())]
+        data["gallery"] = [
+            GalleryItem(SampleRef(**g["sample"]), g["generated"], g.get("background"))
+            for g in data.get("gallery", ())
+        ]
         return cls(**data)
 
     def save(self, path: Path) -> None:

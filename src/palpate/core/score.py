@@ -19,14 +19,27 @@ from palpate.core.errors import PalpateError
 from palpate.core.files import atomic_path
 
 #: Settings that must agree before two scores may stand in one column.
-COMPARABLE = ("metric", "estimator", "bandwidth", "scale", "settings", "encoder", "reference", "split")
+COMPARABLE = (
+    "metric",
+    "estimator",
+    "bandwidth",
+    "scale",
+    "settings",
+    "encoder",
+    "reference",
+    "split",
+)
 
 
 #: Rows of an array on disk that are looked at together.
 SLAB = 8192
 #: Arrow and words for ``Score.higher_is_better``.
 ARROWS: Mapping[bool | None, str] = {True: "↑", False: "↓", None: "→"}
-BETTER: Mapping[bool | None, str] = {True: "higher is better", False: "lower is better", None: "closer to the floor is better"}
+BETTER: Mapping[bool | None, str] = {
+    True: "higher is better",
+    False: "lower is better",
+    None: "closer to the floor is better",
+}
 
 
 @dataclass(frozen=True)
@@ -83,7 +96,9 @@ class Score:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Score:
         """The inverse of :meth:`to_json`."""
-        pairs = {k: tuple(data[k]) if data.get(k) is not None else None for k in ("interval", "null")}
+        pairs = {
+            k: tuple(data[k]) if data.get(k) is not None else None for k in ("interval", "null")
+        }
         fields: dict[str, Any] = {**data, **pairs}
         if not isinstance(fields.get("value"), int | float | None):
             raise TypeError(f"the value of a score must be a number, got {fields['value']!r}")
@@ -143,13 +158,20 @@ def _finite_rows(features: np.ndarray) -> np.ndarray:
 def _give_back(features: np.ndarray) -> None:
     """Lets the system forget the pages of an array on disk that were read."""
     held = getattr(features, "_mmap", None)
-    if held is not None and hasattr(held, "madvise") and getattr(features, "mode", "c") != "c":  # own changes would be lost
+    if (
+        held is not None and hasattr(held, "madvise") and getattr(features, "mode", "c") != "c"
+    ):  # own changes would be lost
         held.madvise(mmap.MADV_DONTNEED)
 
 
 def is_missing(name: Any) -> bool:
     """Whether a label or group is none: None, an empty string, NaN, or what a table has in their place (pandas' NA and NaT)."""
-    return name is None or type(name).__name__ in ("NAType", "NaTType") or name == "" or bool(name != name)
+    return (
+        name is None
+        or type(name).__name__ in ("NAType", "NaTType")
+        or name == ""
+        or bool(name != name)
+    )
 
 
 def _on_host(features: Any) -> np.ndarray:
@@ -158,11 +180,17 @@ def _on_host(features: Any) -> np.ndarray:
         if hasattr(features, "detach"):
             features = features.detach().cpu()
             if str(features.dtype).endswith("bfloat16"):
-                warnings.warn("bfloat16 features were widened to float32; their rounding stays", stacklevel=4)
+                warnings.warn(
+                    "bfloat16 features were widened to float32; their rounding stays", stacklevel=4
+                )
                 features = features.float()
         return np.asarray(features)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise PalpateError("Features must turn into an array (n, d)", str(error).splitlines()[0], "Pass rows of one width") from None
+        raise PalpateError(
+            "Features must turn into an array (n, d)",
+            str(error).splitlines()[0],
+            "Pass rows of one width",
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -171,7 +199,7 @@ class FeatureSet:
 
     Attributes:
         ids: n sample ids.
-        features: float32 array (n, d), or a tensor, which is copied to the host; towers give L2-normalised rows.
+        features: float32 array (n, d), or a tensor, which is copied to the host; encoders give L2-normalized rows.
         labels: n materials, or None.
         groups: n groups (videos, or touches), or None.
         encoder: digest of the encoder that made them.
@@ -190,20 +218,36 @@ class FeatureSet:
         if not isinstance(self.features, np.ndarray):  # a tensor, or a list of rows
             object.__setattr__(self, "features", _on_host(self.features))
         if self.features.dtype.kind not in "fiub":
-            raise PalpateError("Features must be numbers", f"dtype {self.features.dtype}", "Pass the encoder's output, one row an id")
+            raise PalpateError(
+                "Features must be numbers",
+                f"dtype {self.features.dtype}",
+                "Pass the encoder's output, one row an id",
+            )
         shape = self.features.shape
         if len(shape) != 2 or shape[0] != len(self.ids):
-            raise PalpateError(f"Features must have shape ({len(self.ids)}, d), one row an id", f"shape {shape}", "Pass one row per id")
+            raise PalpateError(
+                f"Features must have shape ({len(self.ids)}, d), one row an id",
+                f"shape {shape}",
+                "Pass one row per id",
+            )
         for name in ("labels", "groups"):
             column = getattr(self, name)
             if column is not None and len(column) != shape[0]:
-                raise PalpateError(f"{name} must have one entry a row ({shape[0]})", f"{len(column)}", f"Pass {name} in the order of ids")
+                raise PalpateError(
+                    f"{name} must have one entry a row ({shape[0]})",
+                    f"{len(column)}",
+                    f"Pass {name} in the order of ids",
+                )
         bad = np.flatnonzero(~_finite_rows(self.features))
         if bad.size:
             names = list(self.ids)  # a column of pandas may be numbered otherwise
-            named = ", ".join(f"{int(k)}: {names[int(k)]!r}" for k in bad[:5]) + ", ..." * (bad.size > 5)
+            named = ", ".join(f"{int(k)}: {names[int(k)]!r}" for k in bad[:5]) + ", ..." * (
+                bad.size > 5
+            )
             got = f"NaN or infinity in {bad.size} row{'s' * (bad.size != 1)} ({named})"
-            raise PalpateError("Features must be finite", got, "Check what those rows were made from")
+            raise PalpateError(
+                "Features must be finite", got, "Check what those rows were made from"
+            )
 
     @cached_property
     def digest(self) -> str:
@@ -211,8 +255,13 @@ class FeatureSet:
         rows: list[tuple[str, bytes]] = []
         for k in range(0, len(self.features), SLAB):
             with np.errstate(over="ignore"):
-                slab = np.ascontiguousarray(self.features[k : k + SLAB], dtype="<f4") + np.float32(0)  # one zero: -0 equals it
-            rows += [(str(i), hashlib.blake2b(row.tobytes(), digest_size=16).digest()) for i, row in zip(self.ids[k:], slab, strict=False)]
+                slab = np.ascontiguousarray(self.features[k : k + SLAB], dtype="<f4") + np.float32(
+                    0
+                )  # one zero: -0 equals it
+            rows += [
+                (str(i), hashlib.blake2b(row.tobytes(), digest_size=16).digest())
+                for i, row in zip(self.ids[k:], slab, strict=False)
+            ]
             _give_back(self.features)
         found = hashlib.sha256(str(self.features.shape[1]).encode())
         for name, row in sorted(rows):
@@ -229,15 +278,22 @@ class FeatureSet:
         missing = [i for i in ids if i not in row]
         if missing:
             raise PalpateError(
-                "Every id asked for must have features", f"{len(missing)} without, first {missing[0]!r}", "Embed those samples as well"
+                "Every id asked for must have features",
+                f"{len(missing)} without, first {missing[0]!r}",
+                "Embed those samples as well",
             )
         at = [row[i] for i in ids]
         pick = lambda column: None if column is None else [column[k] for k in at]  # noqa: E731
-        return FeatureSet(list(ids), self.features[at], pick(self.labels), pick(self.groups), self.encoder)
+        return FeatureSet(
+            list(ids), self.features[at], pick(self.labels), pick(self.groups), self.encoder
+        )
 
     def save(self, path: Path) -> None:
         """Writes an ``.npz`` of plain arrays (no pickles), atomically."""
-        arrays: dict[str, np.ndarray] = {"ids": np.array(list(self.ids), dtype=str), "features": self.features}
+        arrays: dict[str, np.ndarray] = {
+            "ids": np.array(list(self.ids), dtype=str),
+            "features": self.features,
+        }
         for name in ("labels", "groups"):
             if (column := getattr(self, name)) is not None:
                 arrays[name] = np.array(["" if is_missing(c) else c for c in column], dtype=str)

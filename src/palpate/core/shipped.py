@@ -2,7 +2,7 @@
 
 ::
 
-    palpate/mini/towers/        vision, text and touch (the format of palpate.encoders.towers); clip/ in it is a plain CLIP folder
+    palpate/mini/encoders/        vision, text and touch (the format of palpate.encoders.encoder_set); clip/ in it is a plain CLIP folder
     palpate/mini/autoencoder/   the autoencoder of touches (palpate.diffusion.autoencoder)
     palpate/mini/generator/     photo to touch (palpate.diffusion.pipeline); refers to the other two by name and digest
 
@@ -19,11 +19,16 @@ from typing import Literal
 
 from palpate.core.errors import PalpateError
 
-Part = Literal["clip", "towers", "autoencoder", "generator"]
+Part = Literal["clip", "encoders", "autoencoder", "generator"]
 #: The shipped names, and the folder of each in :func:`shipped_root`.
 SHIPPED = {"palpate/mini": "mini"}
 #: Where the parts lie in the folder of a name.
-PARTS: dict[Part, str] = {"clip": "towers/clip", "towers": "towers", "autoencoder": "autoencoder", "generator": "generator"}
+PARTS: dict[Part, str] = {
+    "clip": "encoders/clip",
+    "encoders": "encoders",
+    "autoencoder": "autoencoder",
+    "generator": "generator",
+}
 _PREFIX = "palpate/"
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
@@ -53,15 +58,26 @@ def shipped_folder(name: str | Path, part: Part) -> Path | None:
     name = str(name)
     if name not in SHIPPED:
         fix = f"Choose one of these; a folder of that name is written ./{name}"
-        raise PalpateError(f"A name that begins with {_PREFIX} must be one of {', '.join(SHIPPED)}", repr(name), fix)
+        raise PalpateError(
+            f"A name that begins with {_PREFIX} must be one of {', '.join(SHIPPED)}",
+            repr(name),
+            fix,
+        )
     folder = shipped_root() / SHIPPED[name] / PARTS[part]
     if not (folder / "palpate.json").is_file():
         raise PalpateError(
-            f"The model {name} must lie in the installed package", f"no {part} in {shipped_root()}", "Install palpate again, from its wheel"
+            f"The model {name} must lie in the installed package",
+            f"no {part} in {shipped_root()}",
+            "Install palpate again, from its wheel",
         )
     return folder
 
 
 def is_hub_id(name: str | Path) -> bool:
     """Whether ``name`` may be asked of the hub: a string ``owner/name`` that is neither shipped nor a folder here."""
-    return isinstance(name, str) and not is_shipped(name) and bool(_HUB_ID.fullmatch(name)) and not Path(name).is_dir()
+    return (
+        isinstance(name, str)
+        and not is_shipped(name)
+        and bool(_HUB_ID.fullmatch(name))
+        and not Path(name).is_dir()
+    )

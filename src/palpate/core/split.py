@@ -44,7 +44,9 @@ class Split:
     def __post_init__(self) -> None:
         unknown = sorted(set(self.parts.values()) - set(PARTS))
         if unknown:
-            raise PalpateError(f"A part must be one of {', '.join(PARTS)}", repr(unknown[0]), "Rename the part")
+            raise PalpateError(
+                f"A part must be one of {', '.join(PARTS)}", repr(unknown[0]), "Rename the part"
+            )
 
     @cached_property
     def digest(self) -> str:
@@ -60,7 +62,13 @@ class Split:
         return {part: n for part in PARTS if (n := len(self.ids(part)))}
 
     @classmethod
-    def from_ids(cls, *, rule: Mapping[str, Any] | None = None, manifest: str | None = None, **parts: Iterable[str]) -> Split:
+    def from_ids(
+        cls,
+        *,
+        rule: Mapping[str, Any] | None = None,
+        manifest: str | None = None,
+        **parts: Iterable[str],
+    ) -> Split:
         """A split from ``train=[...], test=[...]``.
 
         Raises:
@@ -70,14 +78,27 @@ class Split:
         for part, ids in parts.items():
             for i in ids:
                 if i in table:
-                    raise PalpateError("An id must stand in one part only", f"{i!r} in {table[i]} and {part}", "Remove one of the two")
+                    raise PalpateError(
+                        "An id must stand in one part only",
+                        f"{i!r} in {table[i]} and {part}",
+                        "Remove one of the two",
+                    )
                 table[i] = part
         return cls(table, rule or {}, manifest)
 
     def save(self, path: Path) -> None:
         """Writes the split file atomically."""
         parts = {part: self.ids(part) for part in PARTS if part in self.counts()}
-        write_json(path, {"format": FORMAT, "digest": self.digest, "rule": dict(self.rule), "manifest": self.manifest, "parts": parts})
+        write_json(
+            path,
+            {
+                "format": FORMAT,
+                "digest": self.digest,
+                "rule": dict(self.rule),
+                "manifest": self.manifest,
+                "parts": parts,
+            },
+        )
 
     @classmethod
     def load(cls, path: Path) -> Split:
@@ -88,17 +109,29 @@ class Split:
         """
         data = read_json(path, "split file")
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise PalpateError(f"{path} must be a split file ({FORMAT})", "another kind of file", "Write one with: palpate split")
-        parts: dict[str, list[str]] = data["parts"] if isinstance(data.get("parts"), dict) else {"": []}
+            raise PalpateError(
+                f"{path} must be a split file ({FORMAT})",
+                "another kind of file",
+                "Write one with: palpate split",
+            )
+        parts: dict[str, list[str]] = (
+            data["parts"] if isinstance(data.get("parts"), dict) else {"": []}
+        )
         rule: Any = data.get("rule")
         whole = set(parts) <= set(PARTS) and isinstance(rule, dict)
-        if not whole or not all(isinstance(ids, list) and all(isinstance(i, str) for i in ids) for ids in parts.values()):
+        if not whole or not all(
+            isinstance(ids, list) and all(isinstance(i, str) for i in ids) for ids in parts.values()
+        ):
             raise PalpateError(
-                f"{path} must hold a rule and lists of ids by part", "an incomplete split file", "Write it again with: palpate split"
+                f"{path} must hold a rule and lists of ids by part",
+                "an incomplete split file",
+                "Write it again with: palpate split",
             )
         split = cls.from_ids(rule=rule, manifest=data.get("manifest"), **parts)
         if split.digest != data.get("digest"):
             raise PalpateError(
-                f"The digest in {path} must match its content", "a split that was edited by hand", "Write it again with: palpate split"
+                f"The digest in {path} must match its content",
+                "a split that was edited by hand",
+                "Write it again with: palpate split",
             )
         return split

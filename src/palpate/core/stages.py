@@ -58,7 +58,12 @@ class Run:
     say: Callable[[str], None] = lambda line: None
     stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
 
-    def stage(self, name: str, inputs: Mapping[str, Any], build: Callable[[Path], Mapping[str, Any] | None]) -> Stage:
+    def stage(
+        self,
+        name: str,
+        inputs: Mapping[str, Any],
+        build: Callable[[Path], Mapping[str, Any] | None],
+    ) -> Stage:
         """Returns the stage, building it unless it is there for the same inputs.
 
         Args:
@@ -77,13 +82,17 @@ class Run:
             stage = Stage(final, digest, done["facts"], done["seconds"], reused=True)
         else:
             begun = part / "inputs.json"
-            if part.exists() and (not begun.is_file() or read_json(begun, "stage record").get("digest") != digest):
+            if part.exists() and (
+                not begun.is_file() or read_json(begun, "stage record").get("digest") != digest
+            ):
                 shutil.rmtree(part)
             try:
                 part.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise PalpateError(
-                    f"The run folder {self.folder} must be writable", str(error), "Choose another folder with --out"
+                    f"The run folder {self.folder} must be writable",
+                    str(error),
+                    "Choose another folder with --out",
                 ) from None
             if not begun.is_file():
                 write_json(begun, {"digest": digest, "inputs": json.loads(canonical_json(inputs))})
@@ -91,12 +100,17 @@ class Run:
             start = time.monotonic()
             try:
                 facts = dict(build(part) or {})
-            except PalpateError:  # a refused input leaves nothing behind, unless there is work to go on from
+            except (
+                PalpateError
+            ):  # a refused input leaves nothing behind, unless there is work to go on from
                 if [p.name for p in part.iterdir()] == [begun.name]:
                     shutil.rmtree(part)
                 raise
             seconds = time.monotonic() - start
-            write_json(part / "stage.json", {**read_json(begun, "stage record"), "facts": facts, "seconds": round(seconds, 2)})
+            write_json(
+                part / "stage.json",
+                {**read_json(begun, "stage record"), "facts": facts, "seconds": round(seconds, 2)},
+            )
             begun.unlink()
             shutil.rmtree(final, ignore_errors=True)
             part.replace(final)

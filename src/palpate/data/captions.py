@@ -69,10 +69,14 @@ def caption(material: str, sample_id: str, seed: int = 0, with_name: bool = Fals
     name = known.get(material.strip().lower())
     if name is None:
         raise PalpateError(
-            "A caption can be made for these materials: " + ", ".join(ADJECTIVES), repr(material), "Give the samples a text column instead"
+            "A caption can be made for these materials: " + ", ".join(ADJECTIVES),
+            repr(material),
+            "Give the samples a text column instead",
         )
     rng = rng_for(seed, "caption", sample_id)
     words = [ADJECTIVES[name][k] for k in rng.permutation(len(ADJECTIVES[name]))[:3]]
     forms = NAMED if with_name else TEMPLATES
     article = "an" if words[0][0] in "aeiou" else "a"
-    return forms[int(rng.integers(len(forms)))].format(*words, a=article, name="another material" if name == "Others" else name.lower())
+    return forms[int(rng.integers(len(forms)))].format(
+        *words, a=article, name="another material" if name == "Others" else name.lower()
+    )

@@ -33,7 +33,14 @@ Form = Literal["hf", "csv", "jsonl", "parquet"]
 THEIRS = {"train": "train", "val": "validation", "test": "test"}
 
 
-def export_dataset(manifest: Manifest, out: Path, *, to: Form, split: Split | None = None, progress: Progress = quiet) -> list[Path]:
+def export_dataset(
+    manifest: Manifest,
+    out: Path,
+    *,
+    to: Form,
+    split: Split | None = None,
+    progress: Progress = quiet,
+) -> list[Path]:
     """Writes a manifest in another form, whole or not at all.
 
     Args:
@@ -65,19 +72,28 @@ def export_dataset(manifest: Manifest, out: Path, *, to: Form, split: Split | No
 
 
 def _write_table(manifest: Manifest, folder: Path, to: Form, split: Split | None) -> None:
-    table = manifest.table.select(name for name in SCHEMA if manifest.table[name].null_count() < len(manifest))
+    table = manifest.table.select(
+        name for name in SCHEMA if manifest.table[name].null_count() < len(manifest)
+    )
     if split is not None:
-        table = table.with_columns(split=pl.Series([split.parts.get(i) for i in manifest.ids], dtype=pl.String))
+        table = table.with_columns(
+            split=pl.Series([split.parts.get(i) for i in manifest.ids], dtype=pl.String)
+        )
     if to == "csv":
         write_text(folder / "manifest.csv", table.write_csv())
     elif to == "jsonl":
-        lines = (json.dumps({k: v for k, v in row.items() if v is not None}, ensure_ascii=False) for row in table.iter_rows(named=True))
+        lines = (
+            json.dumps({k: v for k, v in row.items() if v is not None}, ensure_ascii=False)
+            for row in table.iter_rows(named=True)
+        )
         write_text(folder / "manifest.jsonl", "".join(f"{line}\n" for line in lines))
     else:
         write_parquet(table, folder / "samples.parquet")
 
 
-def _save_to_disk(manifest: Manifest, folder: Path, split: Split | None, progress: Progress) -> None:
+def _save_to_disk(
+    manifest: Manifest, folder: Path, split: Split | None, progress: Progress
+) -> None:
     """Writes the DatasetDict; the library reads the image files itself, a batch at a time."""
     try:
         import datasets
@@ -85,20 +101,37 @@ def _save_to_disk(manifest: Manifest, folder: Path, split: Split | None, progres
         raise MissingExtraError("datasets", "hf", "Writing Hugging Face data sets") from None
     features: dict[str, Any] = {}
     for name, kind in SCHEMA.items():
-        features[name] = datasets.Image() if name in IMAGE_COLUMNS else datasets.Value("int64" if kind is pl.Int64 else "string")
+        features[name] = (
+            datasets.Image()
+            if name in IMAGE_COLUMNS
+            else datasets.Value("int64" if kind is pl.Int64 else "string")
+        )
         if name in IMAGE_COLUMNS:
             features[f"{name}_path"] = datasets.Value("string")
     features[ROW] = datasets.Value("int64")
-    about: dict[str, Any] = {"format": MARK, "digest": manifest.digest, "facts": dict(manifest.facts)}
+    about: dict[str, Any] = {
+        "format": MARK,
+        "digest": manifest.digest,
+        "facts": dict(manifest.facts),
+    }
     about |= {} if split is None else {"rule": dict(split.rule), "split": split.digest}
     facts = manifest.facts
     info = datasets.DatasetInfo(
-        description=json.dumps(about, ensure_ascii=False), citation=facts.get("citation", ""), license=facts.get("licence", ""),
-        homepage=facts.get("url", ""), features=datasets.Features(features),
-    )  # fmt: skip
+        description=json.dumps(about, ensure_ascii=False),
+        citation=facts.get("citation", ""),
+        license=facts.get("license", ""),
+        homepage=facts.get("url", ""),
+        features=datasets.Features(features),
+    )
     table = manifest.table.with_row_index(ROW).with_columns(pl.col(ROW).cast(pl.Int64))
     part_of = {} if split is None else split.parts
-    parts = pl.Series([THEIRS[part_of[i]] if i in part_of else "all" if split is None else "unused" for i in manifest.ids], dtype=pl.String)
+    parts = pl.Series(
+        [
+            THEIRS[part_of[i]] if i in part_of else "all" if split is None else "unused"
+            for i in manifest.ids
+        ],
+        dtype=pl.String,
+    )
     saved: Any = datasets.DatasetDict()
     for part in (*THEIRS.values(), "unused", "all"):
         rows = table.filter(parts == part)
@@ -108,8 +141,14 @@ def _save_to_disk(manifest: Manifest, folder: Path, split: Split | None, progres
         for name in features:
             source = name.removesuffix("_path")
             values = rows[source].to_list()
-            columns[name] = [v if v is None else str(manifest.root / v) for v in values] if name in IMAGE_COLUMNS else values
-        saved[part] = datasets.Dataset.from_dict(columns, features=datasets.Features(features), info=info)
+            columns[name] = (
+                [v if v is None else str(manifest.root / v) for v in values]
+                if name in IMAGE_COLUMNS
+                else values
+            )
+        saved[part] = datasets.Dataset.from_dict(
+            columns, features=datasets.Features(features), info=info
+        )
     progress("writing images", 0, 1)
     with _silent(datasets):
         saved.save_to_disk(str(folder))

@@ -1,7 +1,7 @@
 """One side of a recording, as a folder of numbered pictures or as a video whose needed frames are cached as pictures.
 
 Both answer the same questions: how long is it, is frame ``k`` there, and in which file does it lie. A cached frame is
-``<cache>/%010d.jpg`` (quality 95, no chroma subsampling, since a gel's colour carries the surface normal) or ``.png``,
+``<cache>/%010d.jpg`` (quality 95, no chroma subsampling, since a gel's color carries the surface normal) or ``.png``,
 written whole or not at all, so an interrupted run goes on where it stopped.
 """
 
@@ -148,7 +148,10 @@ def save_picture(path: Path, picture: NDArray[np.uint8], size: int | None) -> No
     image = Image.fromarray(picture)
     if size is not None and min(image.size) > size:
         scale = size / min(image.size)
-        image = image.resize((max(size, round(image.width * scale)), max(size, round(image.height * scale))), Image.Resampling.BICUBIC)
+        image = image.resize(
+            (max(size, round(image.width * scale)), max(size, round(image.height * scale))),
+            Image.Resampling.BICUBIC,
+        )
     with atomic_path(path) as part:
         if path.suffix == ".png":
             image.save(part, format="PNG")
@@ -172,7 +175,11 @@ def nearest_to_median(frames: Frames, indices: Sequence[int]) -> tuple[int, NDAr
     else:
         pictures = [np.asarray(read_image(frames.path(k))) for k in order]
     if len({p.shape for p in pictures}) > 1:
-        raise PalpateError(f"The frames in {frames.source} must have one size", "several", "Extract them again from the video")
+        raise PalpateError(
+            f"The frames in {frames.source} must have one size",
+            "several",
+            "Extract them again from the video",
+        )
     stack = np.stack(pictures)
     median = np.median(stack, axis=0).astype(np.float32)
     best = int(np.argmin([np.abs(p - median).mean() for p in stack]))

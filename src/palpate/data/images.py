@@ -1,8 +1,8 @@
 """Images: one way in (8-bit RGB, whole or refused) and one way out (8-bit PNG, fixed range).
 
-Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit grey ``v`` becomes
+Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit gray ``v`` becomes
 ``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of an animation the first picture counts.
-A batch for a network is the centre square, resized by Pillow's antialiased bicubic filter. No step depends on the
+A batch for a network is the center square, resized by Pillow's antialiased bicubic filter. No step depends on the
 content of other images: the range is never stretched.
 """
 
@@ -22,13 +22,32 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from palpate.core import PalpateError, Problem, ProblemsError, Progress, atomic_path, digest_json, quiet, short
+from palpate.core import (
+    PalpateError,
+    Problem,
+    ProblemsError,
+    Progress,
+    atomic_path,
+    digest_json,
+    quiet,
+    short,
+)
 from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 #: What Pillow raises for files that are cut, empty, or no images.
-BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, struct.error, zlib.error, Image.DecompressionBombError)
+BROKEN = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    IndexError,
+    TypeError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
 #: What to do about unreadable files that are not being imported now.
 REFETCH = "Fetch these files again, or leave them out (palpate import does, with --skip-bad)"
 T = TypeVar("T")
@@ -47,7 +66,11 @@ def read_image(path: Path) -> Image.Image:
             image.load()
             return _rgb(ImageOps.exif_transpose(image))
     except BROKEN as error:
-        raise PalpateError(f"The image {path} must be whole and readable", _reason(path, error), "Fetch the file again") from None
+        raise PalpateError(
+            f"The image {path} must be whole and readable",
+            _reason(path, error),
+            "Fetch the file again",
+        ) from None
 
 
 def check_image(path: Path, how: Check = "decode") -> str | None:
@@ -71,7 +94,9 @@ def check_image(path: Path, how: Check = "decode") -> str | None:
         return _reason(path, error)
 
 
-def load_images(paths: Sequence[Path], size: int, *, progress: Progress = quiet) -> NDArray[np.uint8]:
+def load_images(
+    paths: Sequence[Path], size: int, *, progress: Progress = quiet
+) -> NDArray[np.uint8]:
     """Images as one array; a path that stands twice is decoded once.
 
     Args:
@@ -90,7 +115,13 @@ def load_images(paths: Sequence[Path], size: int, *, progress: Progress = quiet)
     return out
 
 
-def cached_images(manifest: Manifest, column: str, size: int, cache: Path | None = None, progress: Progress = quiet) -> NDArray[np.uint8]:
+def cached_images(
+    manifest: Manifest,
+    column: str,
+    size: int,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> NDArray[np.uint8]:
     """One image column of a manifest as an array, decoded once and then mapped from a file.
 
     Args:
@@ -111,7 +142,10 @@ def cached_images(manifest: Manifest, column: str, size: int, cache: Path | None
     paths = manifest.paths(column)
     if cache is None:
         return load_images(paths, size, progress=progress)
-    file = Path(cache) / f"{column}-{size}-{short(digest_json([2, size, image_stamp(manifest, column)]))}.npy"
+    file = (
+        Path(cache)
+        / f"{column}-{size}-{short(digest_json([2, size, image_stamp(manifest, column)]))}.npy"
+    )
     shape = (len(paths), size, size, 3)
     if (mapped := _mapped(file, shape)) is not None:
         return mapped
@@ -133,7 +167,12 @@ def image_stamp(manifest: Manifest, column: str) -> str:
     """
     paths = manifest.paths(column)
     stamps = {path: file_stamp(path) for path in dict.fromkeys(paths)}
-    return digest_json([column, [[name, *stamps[p]] for name, p in zip(manifest.column(column), paths, strict=True)]])
+    return digest_json(
+        [
+            column,
+            [[name, *stamps[p]] for name, p in zip(manifest.column(column), paths, strict=True)],
+        ]
+    )
 
 
 def write_png(path: Path, array: NDArray[np.uint8]) -> None:
@@ -142,7 +181,9 @@ def write_png(path: Path, array: NDArray[np.uint8]) -> None:
     Raises:
         PalpateError: if the array is not of that type and shape.
     """
-    if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
+    if array.dtype != np.uint8 or not (
+        array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)
+    ):
         raise PalpateError(
             f"An image to write to {path} must be uint8 of shape (h, w, 3) or (h, w)",
             f"{array.dtype} of shape {array.shape}",
@@ -153,7 +194,7 @@ def write_png(path: Path, array: NDArray[np.uint8]) -> None:
 
 
 def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
-    """The centre square of an RGB image, resized: (size, size, 3), 0 to 255."""
+    """The center square of an RGB image, resized: (size, size, 3), 0 to 255."""
     width, height = image.size
     side = min(width, height)
     left, top = (width - side) // 2, (height - side) // 2
@@ -165,7 +206,10 @@ def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
 
 
 def in_threads(
-    function: Callable[[T], R], items: Iterable[T], threads: int | None = None, stop: Event | None = None
+    function: Callable[[T], R],
+    items: Iterable[T],
+    threads: int | None = None,
+    stop: Event | None = None,
 ) -> Iterator[tuple[T, R]]:
     """Yields ``(item, function(item))`` as they finish; few are in flight, so that Ctrl-C and errors end it soon.
 
@@ -174,7 +218,9 @@ def in_threads(
     threads = threads or min(16, os.cpu_count() or 1)
     source = iter(items)
     with ThreadPoolExecutor(threads) as pool:
-        running: dict[Future[R], T] = {pool.submit(function, item): item for item in islice(source, 4 * threads)}
+        running: dict[Future[R], T] = {
+            pool.submit(function, item): item for item in islice(source, 4 * threads)
+        }
         try:
             while running:
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -233,7 +279,7 @@ def _rgb(image: Image.Image) -> Image.Image:
     """8-bit RGB by the rules in the head of this file."""
     if image.mode == "RGB":
         return image
-    if image.mode.startswith("I"):  # 16-bit grey; "I" is the same in 32-bit cells
+    if image.mode.startswith("I"):  # 16-bit gray; "I" is the same in 32-bit cells
         values = np.clip(np.asarray(image).astype(np.int64), 0, 65535)
         return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
     if image.mode == "F":

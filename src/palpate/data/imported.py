@@ -39,7 +39,9 @@ class Imported:
 
     def save(self, out: Path, created: list[Path]) -> Imported:
         """Writes ``splits/<name>.json`` and, last, ``manifest.parquet`` into ``out``; new files are added to ``created``."""
-        targets = {Path(out) / "splits" / f"{name}.json": split for name, split in self.splits.items()}
+        targets = {
+            Path(out) / "splits" / f"{name}.json": split for name, split in self.splits.items()
+        }
         for path, split in targets.items():
             created += [] if path.exists() else [path]
             split.save(path)
@@ -69,7 +71,11 @@ def require_some(samples: int, source: Path, skipped: Sequence[Problem]) -> None
     if samples == 0 and skipped:
         raise ProblemsError(skipped, "No sample is left without these: mend the data set")
     if samples == 0:
-        raise PalpateError(f"{source} must hold at least one usable sample", "none", "Check the labels and the folder")
+        raise PalpateError(
+            f"{source} must hold at least one usable sample",
+            "none",
+            "Check the labels and the folder",
+        )
 
 
 @contextmanager
@@ -83,7 +89,10 @@ def removing_on_error(out: Path) -> Generator[list[Path]]:
     except Exception:
         for path in created:
             path.unlink(missing_ok=True)
-        for folder in sorted({p for path in created for p in path.parents if p.is_relative_to(out)} | {out}, reverse=True):
+        for folder in sorted(
+            {p for path in created for p in path.parents if p.is_relative_to(out)} | {out},
+            reverse=True,
+        ):
             if folder.is_dir() and folder not in existed and not any(folder.iterdir()):
                 shutil.rmtree(folder)
         raise

@@ -48,10 +48,14 @@ def import_dataset(
     if found.run is not None:
         if size is not None and "size" in found.options:
             given["size"] = size
-        return found.run(Path(source), Path(out), skip_bad=skip_bad, check=check, progress=progress, **given)
+        return found.run(
+            Path(source), Path(out), skip_bad=skip_bad, check=check, progress=progress, **given
+        )
     facts = {**found.facts.of_manifest(), "format": name}
     scan = found.scan(Path(source), progress=progress, **given)
-    return import_scanned(scan, Path(source), Path(out), facts, skip_bad=skip_bad, check=check, progress=progress)
+    return import_scanned(
+        scan, Path(source), Path(out), facts, skip_bad=skip_bad, check=check, progress=progress
+    )
 
 
 def validate_dataset(
@@ -77,10 +81,18 @@ def validate_dataset(
     name, found = _format(Path(source), format)
     given = _given(name, found, options)
     taken = inspect.signature(found.scan).parameters
-    given = {key: value for key, value in given.items() if key in taken}  # some options matter to an import alone
+    given = {
+        key: value for key, value in given.items() if key in taken
+    }  # some options matter to an import alone
     if "check" in taken:
         given["check"] = check
-    looked = validation(name, found, found.scan(Path(source), progress=progress, **given), check=check, progress=progress)
+    looked = validation(
+        name,
+        found,
+        found.scan(Path(source), progress=progress, **given),
+        check=check,
+        progress=progress,
+    )
     # palpate's own world comes in the layouts of real sets, and must not be introduced as one of them.
     return replace(looked, facts=WORLD) if world_facts(Path(source)) else looked
 
@@ -97,26 +109,39 @@ def write_lists(manifest: Manifest, split: Split, out: Path) -> list[Path]:
     found = FORMATS.get(str(manifest.facts.get("format", "")))
     if found is not None and found.write_lists is not None:
         return found.write_lists(manifest, split, Path(out))
-    return [write_table(Path(out) / f"{part}.csv", manifest.part(split, part)) for part in split.counts()]
+    return [
+        write_table(Path(out) / f"{part}.csv", manifest.part(split, part))
+        for part in split.counts()
+    ]
 
 
 def _format(source: Path, name: str) -> tuple[str, Format]:
-    """The named or recognised format.
+    """The named or recognized format.
 
     Raises:
         PalpateError: if there is no source, no such format, or none that fits.
     """
     if name != "auto" and name not in FORMATS:
-        raise PalpateError(f"The format must be auto or one of {', '.join(FORMATS)}", repr(name), "Choose one of these")
+        raise PalpateError(
+            f"The format must be auto or one of {', '.join(FORMATS)}",
+            repr(name),
+            "Choose one of these",
+        )
     if not source.exists() and (name == "auto" or not FORMATS[name].remote):
         raise PalpateError(
-            "The source of an import must exist", f"nothing at {source}", "Check the path; for a data set on the hub: --format hf"
+            "The source of an import must exist",
+            f"nothing at {source}",
+            "Check the path; for a data set on the hub: --format hf",
         )
     if name == "auto":
         name = next((n for n, f in FORMATS.items() if f.detect(source)), "")
     if not name:
         wanted = "; ".join(f"{n}: {f.looks_for}" for n, f in FORMATS.items())
-        raise PalpateError(f"{source} must look like a known data set. Looked for {wanted}", _contents(source), "Name the format: --format")
+        raise PalpateError(
+            f"{source} must look like a known data set. Looked for {wanted}",
+            _contents(source),
+            "Name the format: --format",
+        )
     return name, FORMATS[name]
 
 
@@ -124,7 +149,11 @@ def _given(name: str, found: Format, options: dict[str, Any]) -> dict[str, Any]:
     """The options that were given, if they all belong to the format."""
     given = {key: value for key, value in options.items() if value is not None}
     if strange := sorted(set(given) - set(found.options)):
-        raise PalpateError(f"The format {name} takes the options {', '.join(found.options)}", ", ".join(strange), "Leave the others out")
+        raise PalpateError(
+            f"The format {name} takes the options {', '.join(found.options)}",
+            ", ".join(strange),
+            "Leave the others out",
+        )
     return given
 
 
@@ -133,4 +162,8 @@ def _contents(source: Path) -> str:
     if source.is_file():
         return f"the file {source.name}"
     names = sorted(p.name + "/" * p.is_dir() for p in source.iterdir())
-    return "an empty folder" if not names else "a folder with " + ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+    return (
+        "an empty folder"
+        if not names
+        else "a folder with " + ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+    )

@@ -52,7 +52,9 @@ class FrameList:
     contact: pl.DataFrame
 
 
-def read_list(path: Path, *, skip_bad: bool = False, categories: Mapping[int, str] | None = None) -> FrameList:
+def read_list(
+    path: Path, *, skip_bad: bool = False, categories: Mapping[int, str] | None = None
+) -> FrameList:
     """Reads one frame list.
 
     Args:
@@ -72,7 +74,13 @@ def read_list(path: Path, *, skip_bad: bool = False, categories: Mapping[int, st
     return read_lists([path], root=path.parent, skip_bad=skip_bad, categories=categories)
 
 
-def read_lists(paths: Sequence[Path], *, root: Path, skip_bad: bool = False, categories: Mapping[int, str] | None = None) -> FrameList:
+def read_lists(
+    paths: Sequence[Path],
+    *,
+    root: Path,
+    skip_bad: bool = False,
+    categories: Mapping[int, str] | None = None,
+) -> FrameList:
     """Reads several lists as one, so that frames which stand in two of them are found and touches are numbered together.
 
     Args:
@@ -99,18 +107,32 @@ def read_lists(paths: Sequence[Path], *, root: Path, skip_bad: bool = False, cat
     if problems and not skip_bad:
         raise ProblemsError(_in_order(problems, paths), FIX)
     labels = rows["label"]
-    names = {label: str(label) for label in labels.unique()} if categories is None else dict(categories)
+    names = (
+        {label: str(label) for label in labels.unique()} if categories is None else dict(categories)
+    )
     table = rows.select("id", "video", "frame").with_columns(
         touch=pl.Series(touches(rows["video"], rows["frame"], labels), dtype=pl.String),
-        material=labels.replace_strict(names, return_dtype=pl.String) if rows.height else pl.Series([], dtype=pl.String),
+        material=labels.replace_strict(names, return_dtype=pl.String)
+        if rows.height
+        else pl.Series([], dtype=pl.String),
     )
-    empty = [pl.lit(None, dtype=kind).alias(name) for name, kind in SCHEMA.items() if name not in table.columns]
+    empty = [
+        pl.lit(None, dtype=kind).alias(name)
+        for name, kind in SCHEMA.items()
+        if name not in table.columns
+    ]
     table = table.with_columns(empty).select(list(SCHEMA))
     facts = {"source": ", ".join(Path(p).name for p in paths)}
-    return FrameList(Manifest(table, Path(root), facts), _in_order(problems, paths), inconclusive, rows, contact)
+    return FrameList(
+        Manifest(table, Path(root), facts), _in_order(problems, paths), inconclusive, rows, contact
+    )
 
 
-def touches(videos: Sequence[str] | pl.Series, frames: Sequence[int] | pl.Series, labels: Sequence[object] | pl.Series | None) -> list[str]:
+def touches(
+    videos: Sequence[str] | pl.Series,
+    frames: Sequence[int] | pl.Series,
+    labels: Sequence[object] | pl.Series | None,
+) -> list[str]:
     """The touch that each frame belongs to, in the order given.
 
     Args:
@@ -121,12 +143,22 @@ def touches(videos: Sequence[str] | pl.Series, frames: Sequence[int] | pl.Series
     Returns:
         ``n`` names ``video#0001``; the numbers count a video's touches from 1 in the order of frames.
     """
-    table = pl.DataFrame({"video": pl.Series(videos, dtype=pl.String), "frame": pl.Series(frames, dtype=pl.Int64)}).with_row_index("row")
-    table = table.with_columns(label=pl.lit(0) if labels is None else pl.Series(labels)).sort("video", "frame", maintain_order=True)
-    other = (pl.col("video") != pl.col("video").shift(1)) | (pl.col("label") != pl.col("label").shift(1))
+    table = pl.DataFrame(
+        {"video": pl.Series(videos, dtype=pl.String), "frame": pl.Series(frames, dtype=pl.Int64)}
+    ).with_row_index("row")
+    table = table.with_columns(label=pl.lit(0) if labels is None else pl.Series(labels)).sort(
+        "video", "frame", maintain_order=True
+    )
+    other = (pl.col("video") != pl.col("video").shift(1)) | (
+        pl.col("label") != pl.col("label").shift(1)
+    )
     opens = (other | (pl.col("frame").diff() > 1)).fill_null(True)
     table = table.with_columns(number=opens.cast(pl.Int64).cum_sum().over("video")).sort("row")
-    return table.select(pl.format("{}#{}", "video", pl.col("number").cast(pl.String).str.zfill(4))).to_series().to_list()
+    return (
+        table.select(pl.format("{}#{}", "video", pl.col("number").cast(pl.String).str.zfill(4)))
+        .to_series()
+        .to_list()
+    )
 
 
 def number_together(*manifests: Manifest) -> list[Manifest]:
@@ -139,11 +171,19 @@ def number_together(*manifests: Manifest) -> list[Manifest]:
     whole = pl.concat([m.table.select("video", "frame", "material") for m in manifests])
     # A frame that stands in two lists belongs to one touch there and here.
     alone = whole.unique(["video", "frame"], maintain_order=True)
-    names = alone.with_columns(touch=pl.Series(touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String))
-    found = whole.join(names, on=["video", "frame"], how="left", maintain_order="left")["touch"]
+    names = alone.with_columns(
+        touch=pl.Series(touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String)
+    )
+    found = whole.join(names, on=["video", "frame"], how="left", maintain_order="left")["contact"]
     out: list[Manifest] = []
     for m in manifests:
-        out.append(Manifest(m.table.with_columns(touch=found.slice(sum(len(o) for o in out), len(m))), m.root, m.facts))
+        out.append(
+            Manifest(
+                m.table.with_columns(touch=found.slice(sum(len(o) for o in out), len(m))),
+                m.root,
+                m.facts,
+            )
+        )
     return out
 
 
@@ -162,8 +202,15 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
     for number, (name, label) in enumerate(rows, 1):
         name = name if re.search(r"\.[A-Za-z][A-Za-z0-9]*$", name) else f"{name}.jpg"
         match = re.match(PATH, name)
-        if match is None or not match["stem"].isdecimal() or re.search(CLIMBS, name) or "\n" in name:
-            problems.append(Problem(f"row {number}", "bad-path", f"{name!r} is not video/frame.ext"))
+        if (
+            match is None
+            or not match["stem"].isdecimal()
+            or re.search(CLIMBS, name)
+            or "\n" in name
+        ):
+            problems.append(
+                Problem(f"row {number}", "bad-path", f"{name!r} is not video/frame.ext")
+            )
         lines.append(f"{name},{int(label)}\n")
     if problems:
         raise ProblemsError(problems, "Name samples video/frame, with an integer frame")
@@ -172,7 +219,9 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
 
 def write_table(path: Path, manifest: Manifest) -> Path:
     """Writes a manifest's rows as CSV, without its empty columns, atomically; paths stay relative to its root."""
-    table = manifest.table.select(name for name in SCHEMA if manifest.table[name].null_count() < len(manifest))
+    table = manifest.table.select(
+        name for name in SCHEMA if manifest.table[name].null_count() < len(manifest)
+    )
     write_text(Path(path), table.write_csv())
     return Path(path)
 
@@ -198,14 +247,24 @@ def read_categories(path: Path) -> dict[int, str]:
         if match is None:
             problems.append(Problem(f"{path}:{number}", "bad-line", f"{line!r} is not 'Name: id'"))
         elif (label := int(match[2])) in names:
-            problems.append(Problem(f"{path}:{number}", "duplicate-id", f"the id {label} names {names[label]!r} already"))
+            problems.append(
+                Problem(
+                    f"{path}:{number}",
+                    "duplicate-id",
+                    f"the id {label} names {names[label]!r} already",
+                )
+            )
         else:
             name = " ".join(match[1].split())
             names[label] = SPELLING.get(name, name)
     if problems:
         raise ProblemsError(problems, "Write one 'Name: id' a line")
     if not names:
-        raise PalpateError(f"{path} must list classes as 'Name: id'", "an empty file", "Fetch category_reference.txt again")
+        raise PalpateError(
+            f"{path} must list classes as 'Name: id'",
+            "an empty file",
+            "Fetch category_reference.txt again",
+        )
     return names
 
 
@@ -229,7 +288,9 @@ def read_frame_table(path: Path) -> FrameTable:
     reader = csv.reader(_text(path).splitlines())
     for fields in reader:
         where = f"{path}:{reader.line_num}"
-        if not any(field.strip() for field in fields) or (reader.line_num == 1 and fields[0].strip().lower() == "frame"):
+        if not any(field.strip() for field in fields) or (
+            reader.line_num == 1 and fields[0].strip().lower() == "frame"
+        ):
             continue
         match = re.match(PATH, fields[0].strip())
         words = ",".join(fields[1:]).strip()
@@ -238,7 +299,9 @@ def read_frame_table(path: Path) -> FrameTable:
         elif not words:
             skipped.append(Problem(where, "bad-line", f"{fields[0]!r} has no words"))
         elif values.setdefault((match["video"], int(match["stem"])), words) != words:
-            skipped.append(Problem(where, "two-labels", f"{fields[0]!r} has other words on an earlier line"))
+            skipped.append(
+                Problem(where, "two-labels", f"{fields[0]!r} has other words on an earlier line")
+            )
     return FrameTable(values, skipped)
 
 
@@ -249,23 +312,33 @@ def _text(path: Path) -> str:
     except FileNotFoundError:
         raise PalpateError("The list must exist", f"no file {path}", "Check the path") from None
     except IsADirectoryError:
-        raise PalpateError("The list must be a file", f"the folder {path}", "Name the file itself") from None
+        raise PalpateError(
+            "The list must be a file", f"the folder {path}", "Name the file itself"
+        ) from None
 
 
 def _parse(path: Path) -> tuple[pl.DataFrame, list[Problem]]:
     """The well-formed rows of one list, and a problem for each other line."""
-    lines = pl.DataFrame({"text": pl.Series(lines_of(_text(path)), dtype=pl.String)}).with_row_index("line", offset=1)
+    lines = pl.DataFrame(
+        {"text": pl.Series(lines_of(_text(path)), dtype=pl.String)}
+    ).with_row_index("line", offset=1)
     lines = lines.with_columns(pl.col("text").str.strip_chars()).filter(pl.col("text") != "")
-    table = lines.with_columns(pl.col("text").str.extract_groups(LINE).alias("parts")).unnest("parts")
+    table = lines.with_columns(pl.col("text").str.extract_groups(LINE).alias("parts")).unnest(
+        "parts"
+    )
     table = table.with_columns(
         source=pl.lit(str(path)),
         id=pl.format("{}/{}", "video", "stem"),
         frame=pl.col("stem").cast(pl.Int64, strict=False),
         label=pl.col("label").cast(pl.Int64, strict=False),
-        odd=pl.col("text").str.contains(CLIMBS) | pl.col("text").str.contains("\ufffd", literal=True),
+        odd=pl.col("text").str.contains(CLIMBS)
+        | pl.col("text").str.contains("\ufffd", literal=True),
     )
     bad = table.filter(pl.col("odd") | pl.col("frame").is_null() | pl.col("label").is_null())
-    problems = [Problem(f"{path}:{line}", *_reason(text)) for line, text in bad.select("line", "text").iter_rows()]
+    problems = [
+        Problem(f"{path}:{line}", *_reason(text))
+        for line, text in bad.select("line", "text").iter_rows()
+    ]
     if not table.height:
         problems = [Problem(str(path), "empty-list", "the list has no lines")]
     table = table if not bad.height else table.filter(~pl.col("line").is_in(bad["line"].to_list()))
@@ -289,12 +362,25 @@ def _reason(line: str) -> tuple[str, str]:
     return "bad-label", f"the label {label!r} is not an integer"
 
 
-def _unknown_labels(rows: pl.DataFrame, categories: Mapping[int, str] | None) -> tuple[pl.DataFrame, list[Problem]]:
-    known = pl.col("label") >= 0 if categories is None else pl.col("label").is_in([k for k in categories if k != INCONCLUSIVE])
+def _unknown_labels(
+    rows: pl.DataFrame, categories: Mapping[int, str] | None
+) -> tuple[pl.DataFrame, list[Problem]]:
+    known = (
+        pl.col("label") >= 0
+        if categories is None
+        else pl.col("label").is_in([k for k in categories if k != INCONCLUSIVE])
+    )
     bad = rows.filter(~known)
-    what = "is negative, but not -1 (inconclusive)" if categories is None else "is not in the category table"
+    what = (
+        "is negative, but not -1 (inconclusive)"
+        if categories is None
+        else "is not in the category table"
+    )
     return rows.filter(known), [
-        Problem(f"{row['source']}:{row['line']}", "unknown-label", f"the label {row['label']} {what}") for row in bad.iter_rows(named=True)
+        Problem(
+            f"{row['source']}:{row['line']}", "unknown-label", f"the label {row['label']} {what}"
+        )
+        for row in bad.iter_rows(named=True)
     ]
 
 
@@ -311,13 +397,23 @@ def _duplicates(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[Problem]]:
         places = [f"{row['source']}:{row['line']}" for row in same]
         if group["label"].n_unique() > 1:
             for place, row in zip(places, same, strict=True):
-                others = ", ".join(f"{o['label']} at {p}" for o, p in zip(same, places, strict=True) if o["label"] != row["label"])
+                others = ", ".join(
+                    f"{o['label']} at {p}"
+                    for o, p in zip(same, places, strict=True)
+                    if o["label"] != row["label"]
+                )
                 text = f"frame {frame} of {video!r} has two labels: {row['label']} here, {others}"
                 problems.append(Problem(place, "two-labels", text))
             drop += group["row"].to_list()
         else:
             for place in places[1:]:
-                problems.append(Problem(place, "duplicate-row", f"frame {frame} of {video!r} is listed at {places[0]} already"))
+                problems.append(
+                    Problem(
+                        place,
+                        "duplicate-row",
+                        f"frame {frame} of {video!r} is listed at {places[0]} already",
+                    )
+                )
             drop += group["row"].to_list()[1:]
     return rows.filter(~pl.col("row").is_in(drop)).drop("row"), problems
 

@@ -6,9 +6,9 @@ column         type     meaning (null where the data set has none; never invente
 ``id``         string   unique; ``video/frame`` for video data
 ``video``      string   the continuous recording it comes from
 ``frame``      int      position in both videos of the recording
-``touch``      string   the run of consecutive in-contact frames it belongs to, unique across videos
+``contact``    string   the run of consecutive in-contact frames it belongs to, unique across videos
 ``object``     string   the thing touched
-``session``    string   recordings made in one sitting, of which neighbours may share the object
+``session``    string   recordings made in one sitting, of which neighbors may share the object
 ``material``   string   class name
 ``text``       string   what the touch feels like, in words
 ``vision``     string   path of the photo, relative to the root
@@ -34,21 +34,45 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, ProblemsError, SampleRef, Split, atomic_path, digest_lines, inside
+from palpate.core import (
+    PalpateError,
+    Problem,
+    ProblemsError,
+    SampleRef,
+    Split,
+    atomic_path,
+    digest_lines,
+    inside,
+)
 
 SCHEMA: dict[str, type[pl.DataType]] = {
-    "id": pl.String, "video": pl.String, "frame": pl.Int64, "touch": pl.String, "object": pl.String, "session": pl.String,
-    "material": pl.String, "text": pl.String, "vision": pl.String, "tactile": pl.String, "background": pl.String, "sensor": pl.String, "domain": pl.String,
-}  # fmt: skip
+    "id": pl.String,
+    "video": pl.String,
+    "frame": pl.Int64,
+    "contact": pl.String,
+    "object": pl.String,
+    "session": pl.String,
+    "material": pl.String,
+    "text": pl.String,
+    "vision": pl.String,
+    "tactile": pl.String,
+    "background": pl.String,
+    "sensor": pl.String,
+    "domain": pl.String,
+}
 IMAGE_COLUMNS = ("vision", "tactile", "background")
 #: Modality -> its image column.
-MODALITIES = {"vision": "vision", "touch": "tactile"}
-FORMAT = "palpate-manifest/2"
+MODALITIES = {"vision": "vision", "tactile": "tactile"}
+FORMAT = "palpate-manifest/3"
+#: Format 2 called the column ``contact`` ``touch``; it is read and upgraded.
+FORMAT_2 = "palpate-manifest/2"
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 
 
-def write_parquet(table: pl.DataFrame, path: Path, metadata: Mapping[str, str] | None = None) -> None:
+def write_parquet(
+    table: pl.DataFrame, path: Path, metadata: Mapping[str, str] | None = None
+) -> None:
     """Writes a table as Parquet, whole or not at all.
 
     polars encodes in memory and Python writes, so that a full disk is the OSError that it is, not an error of polars.
@@ -78,7 +102,9 @@ class Manifest:
     facts: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def from_rows(cls, rows: Iterable[Mapping[str, Any]], root: Path, facts: Mapping[str, str] | None = None) -> Manifest:
+    def from_rows(
+        cls, rows: Iterable[Mapping[str, Any]], root: Path, facts: Mapping[str, str] | None = None
+    ) -> Manifest:
         """A manifest from dictionaries; absent columns become null.
 
         Raises:
@@ -87,8 +113,16 @@ class Manifest:
         rows = list(rows)
         unknown = sorted({name for row in rows for name in row} - set(SCHEMA))
         if unknown:
-            raise PalpateError(f"Manifest columns must be among {', '.join(SCHEMA)}", repr(unknown[0]), "Map the column to one of these")
-        return cls(pl.DataFrame({name: [row.get(name) for row in rows] for name in SCHEMA}, schema=SCHEMA), Path(root), facts or {})
+            raise PalpateError(
+                f"Manifest columns must be among {', '.join(SCHEMA)}",
+                repr(unknown[0]),
+                "Map the column to one of these",
+            )
+        return cls(
+            pl.DataFrame({name: [row.get(name) for row in rows] for name in SCHEMA}, schema=SCHEMA),
+            Path(root),
+            facts or {},
+        )
 
     def __len__(self) -> int:
         return self.table.height
@@ -105,7 +139,11 @@ class Manifest:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over all rows in order, columns in the order of ``SCHEMA``."""
-        text = self.table.select(pl.concat_str([pl.col(c).cast(pl.String).fill_null("\x00") for c in SCHEMA], separator="\x1f"))
+        text = self.table.select(
+            pl.concat_str(
+                [pl.col(c).cast(pl.String).fill_null("\x00") for c in SCHEMA], separator="\x1f"
+            )
+        )
         return digest_lines(text.to_series().to_list())
 
     def path(self, relative: str) -> Path:
@@ -151,11 +189,16 @@ class Manifest:
             PalpateError: if the split names ids that the manifest lacks.
         """
         self.take(split.ids(*parts))  # names ids that are missing
-        return Manifest(self.table.filter(pl.col("id").is_in(split.ids(*parts))), self.root, self.facts)
+        return Manifest(
+            self.table.filter(pl.col("id").is_in(split.ids(*parts))), self.root, self.facts
+        )
 
     def prefixed(self, prefix: str) -> Manifest:
         """The same samples with ``prefix`` before their ids, videos, touches and sessions."""
-        named = self.table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in ("id", "video", "touch", "session"))
+        named = self.table.with_columns(
+            (pl.lit(prefix) + pl.col(name)).alias(name)
+            for name in ("id", "video", "contact", "session")
+        )
         return Manifest(named, self.root, self.facts)
 
     @classmethod
@@ -170,19 +213,29 @@ class Manifest:
         for m in manifests:
             prefix = m.root.resolve().relative_to(root).as_posix()
             prefix = "" if prefix == "." else prefix + "/"
-            tables.append(m.table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in IMAGE_COLUMNS))
+            tables.append(
+                m.table.with_columns(
+                    (pl.lit(prefix) + pl.col(name)).alias(name) for name in IMAGE_COLUMNS
+                )
+            )
         table = pl.concat(tables)
         double = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
         if len(double):
             raise PalpateError(
-                "Joined manifests must not share ids", f"{len(double)} shared, first {double[0]!r}", "Rename the videos of one of them"
+                "Joined manifests must not share ids",
+                f"{len(double)} shared, first {double[0]!r}",
+                "Rename the videos of one of them",
             )
-        return cls(table, root, {"dataset": " + ".join(m.facts.get("dataset", "?") for m in manifests)})
+        return cls(
+            table, root, {"dataset": " + ".join(m.facts.get("dataset", "?") for m in manifests)}
+        )
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row (a dictionary of the table) as a reference with absolute image paths, for reports."""
         full = lambda name: str(self.path(row[name]).resolve()) if row[name] else None  # noqa: E731
-        return SampleRef(row["id"], row["video"], row["frame"], row["material"], full("vision"), full("tactile"))
+        return SampleRef(
+            row["id"], row["video"], row["frame"], row["material"], full("vision"), full("tactile")
+        )
 
     def problems(self, *, files: bool = True) -> list[Problem]:
         """Everything wrong with the table: empty, null or double ids, paths outside the root and, if ``files``, missing files."""
@@ -192,7 +245,13 @@ class Manifest:
             if not i:
                 found.append(Problem(f"row {line}", "null-id", "the id is empty"))
             elif i in seen:
-                found.append(Problem(f"row {line}", "duplicate-id", f"the id {i!r} stands in row {seen[i]} already"))
+                found.append(
+                    Problem(
+                        f"row {line}",
+                        "duplicate-id",
+                        f"the id {i!r} stands in row {seen[i]} already",
+                    )
+                )
             else:
                 seen[i] = line
         known: dict[str, str | None] = {}
@@ -202,11 +261,25 @@ class Manifest:
                     continue
                 if value not in known:
                     path = inside(self.root, value)
-                    known[value] = "outside-root" if path is None else "missing-file" if files and not path.is_file() else None
+                    known[value] = (
+                        "outside-root"
+                        if path is None
+                        else "missing-file"
+                        if files and not path.is_file()
+                        else None
+                    )
                 if known[value] == "outside-root":
-                    found.append(Problem(f"row {line}", "outside-root", f"the {name} path {value!r} leaves the root"))
+                    found.append(
+                        Problem(
+                            f"row {line}",
+                            "outside-root",
+                            f"the {name} path {value!r} leaves the root",
+                        )
+                    )
                 elif known[value] == "missing-file":
-                    found.append(Problem(f"row {line}", "missing-file", f"no {name} file {value!r}"))
+                    found.append(
+                        Problem(f"row {line}", "missing-file", f"no {name} file {value!r}")
+                    )
         return found
 
     def require_valid(self, *, files: bool = True) -> Manifest:
@@ -224,7 +297,16 @@ class Manifest:
         path = Path(path)
         root = os.path.relpath(self.root.resolve(), path.parent.resolve())
         facts = {f"palpate.fact.{k}": v for k, v in self.facts.items()}
-        write_parquet(self.table, path, {"palpate.format": FORMAT, "palpate.digest": self.digest, "palpate.root": root, **facts})
+        write_parquet(
+            self.table,
+            path,
+            {
+                "palpate.format": FORMAT,
+                "palpate.digest": self.digest,
+                "palpate.root": root,
+                **facts,
+            },
+        )
 
     @classmethod
     def load(cls, path: Path, root: Path | None = None) -> Manifest:
@@ -247,19 +329,40 @@ class Manifest:
                 meta = pl.read_parquet_metadata(file)
             table = pl.read_parquet(path, glob=False)  # a path may hold brackets
         except Exception as error:  # polars raises several kinds for a file that is not Parquet
-            raise PalpateError(f"The manifest {path} must be a Parquet file", str(error).splitlines()[0], fix) from None
+            raise PalpateError(
+                f"The manifest {path} must be a Parquet file", str(error).splitlines()[0], fix
+            ) from None
+        if meta.get("palpate.format") == FORMAT_2 and "touch" in table.columns:
+            table = table.rename({"touch": "contact"})
+            meta["palpate.format"] = FORMAT
         if meta.get("palpate.format") != FORMAT or list(table.columns) != list(SCHEMA):
             raise PalpateError(
-                f"The manifest {path} must have the format {FORMAT}", meta.get("palpate.format") or "a foreign Parquet file", fix
+                f"The manifest {path} must have the format {FORMAT}",
+                meta.get("palpate.format") or "a foreign Parquet file",
+                fix,
             )
-        facts = {k.removeprefix("palpate.fact."): v for k, v in meta.items() if k.startswith("palpate.fact.")}
-        manifest = cls(table, Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"])), facts)
+        facts = {
+            k.removeprefix("palpate.fact."): v
+            for k, v in meta.items()
+            if k.startswith("palpate.fact.")
+        }
+        manifest = cls(
+            table,
+            Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"])),
+            facts,
+        )
         for name in IMAGE_COLUMNS:
             climbing = table.filter(pl.col(name).str.contains(CLIMBS))[name]
             if len(climbing):
                 raise PalpateError(
-                    f"Paths in {path} must stay inside the root", f"the {name} path {climbing[0]!r}", "Remove the row, or import again"
+                    f"Paths in {path} must stay inside the root",
+                    f"the {name} path {climbing[0]!r}",
+                    "Remove the row, or import again",
                 )
         if manifest.digest != meta["palpate.digest"]:
-            raise PalpateError(f"The digest in {path} must match its rows", "rows that were changed by another program", fix)
+            raise PalpateError(
+                f"The digest in {path} must match its rows",
+                "rows that were changed by another program",
+                fix,
+            )
         return manifest

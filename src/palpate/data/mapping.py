@@ -88,7 +88,9 @@ class Expression:
         """
         return self.step([cells.get(name) for name in self.inputs]) or None
 
-    def values(self, column: Callable[[str], Sequence[Cell]], count: int) -> tuple[list[Cell], dict[int, str]]:
+    def values(
+        self, column: Callable[[str], Sequence[Cell]], count: int
+    ) -> tuple[list[Cell], dict[int, str]]:
         """The values for all rows.
 
         Args:
@@ -103,10 +105,16 @@ class Expression:
         found: list[Cell] = []
         failed: dict[int, str] = {}
         step = self.step
-        rows = zip(*(column(name) for name in self.inputs), strict=True) if self.inputs else repeat((), count)
+        rows = (
+            zip(*(column(name) for name in self.inputs), strict=True)
+            if self.inputs
+            else repeat((), count)
+        )
         before: tuple[Cell, ...] | None = None
         for k, row in enumerate(rows):
-            if row == before and k - 1 not in failed:  # columns of groups repeat: no second evaluation, no second copy
+            if (
+                row == before and k - 1 not in failed
+            ):  # columns of groups repeat: no second evaluation, no second copy
                 found.append(found[-1])
                 continue
             before = row
@@ -118,7 +126,9 @@ class Expression:
         return found, failed
 
 
-def compile_maps(maps: Mapping[str, str], columns: Sequence[str], targets: Sequence[str]) -> dict[str, Expression]:
+def compile_maps(
+    maps: Mapping[str, str], columns: Sequence[str], targets: Sequence[str]
+) -> dict[str, Expression]:
     """Reads map expressions; they may name the table's columns and each other's targets, columns first.
 
     Args:
@@ -134,10 +144,15 @@ def compile_maps(maps: Mapping[str, str], columns: Sequence[str], targets: Seque
     """
     if unknown := sorted(set(maps) - set(targets)):
         raise PalpateError(
-            f"Mapped columns must be among {', '.join(targets)}", repr(unknown[0]), "Write it as manifest column = expression over yours"
+            f"Mapped columns must be among {', '.join(targets)}",
+            repr(unknown[0]),
+            "Write it as manifest column = expression over yours",
         )
     wanted = {name: f'"{name}"' for name in targets if name in columns} | dict(maps)
-    return {target: _Reader(target, text, columns, maps, ()).expression() for target, text in wanted.items()}
+    return {
+        target: _Reader(target, text, columns, maps, ()).expression()
+        for target, text in wanted.items()
+    }
 
 
 def _first(row: Sequence[Cell]) -> Cell:
@@ -156,13 +171,23 @@ class _Reader:
         within: tuple[str, ...],
         inputs: list[str] | None = None,
     ) -> None:
-        self.target, self.text, self.columns, self.maps, self.within = target, text, columns, maps, (*within, target)
+        self.target, self.text, self.columns, self.maps, self.within = (
+            target,
+            text,
+            columns,
+            maps,
+            (*within, target),
+        )
         self.inputs: list[str] = [] if inputs is None else inputs
         self.at = self.depth = 0
 
     def expression(self) -> Expression:
         step = self.whole()
-        return Expression(self.text, tuple(self.inputs), _first if len(self.inputs) == 1 and self._plain() else step)
+        return Expression(
+            self.text,
+            tuple(self.inputs),
+            _first if len(self.inputs) == 1 and self._plain() else step,
+        )
 
     def whole(self) -> Step:
         """The step of the text as a whole: a column's name, or an expression."""
@@ -176,7 +201,11 @@ class _Reader:
 
     def _plain(self) -> bool:
         bare = self.text.strip()
-        return bare in self.columns or (len(bare) > 2 and bare[1:-1].replace('""', '"') in self.columns and bare[0] == bare[-1] == '"')
+        return bare in self.columns or (
+            len(bare) > 2
+            and bare[1:-1].replace('""', '"') in self.columns
+            and bare[0] == bare[-1] == '"'
+        )
 
     def sum(self) -> Step:
         self.depth += 1
@@ -281,7 +310,9 @@ class _Reader:
         if name in self.maps:
             if name in self.within:
                 raise self.error(f"{name!r}, which is made of itself", start)
-            return _Reader(name, self.maps[name], self.columns, self.maps, self.within, self.inputs).whole()
+            return _Reader(
+                name, self.maps[name], self.columns, self.maps, self.within, self.inputs
+            ).whole()
         raise self.error(f"no {name} among {', '.join(self.columns)}", start)
 
     def skip(self) -> None:
@@ -314,7 +345,11 @@ class _Reader:
         return self.error(f"{there} where {wanted} must stand", self.at)
 
     def error(self, got: str, at: int) -> PalpateError:
-        return PalpateError(f"The expression for {self.target} must be readable: {self.text}", f"{got}, at character {at + 1}", GRAMMAR)
+        return PalpateError(
+            f"The expression for {self.target} must be readable: {self.text}",
+            f"{got}, at character {at + 1}",
+            GRAMMAR,
+        )
 
 
 def _over(of: Step, function: Callable[[str], str]) -> Step:
@@ -382,7 +417,9 @@ def _replacer(old: str, new: str) -> Callable[[str], str]:
 
 
 #: Function -> (kinds of its further arguments with what they are called, how to make it of them).
-_FUNCTIONS: dict[str, tuple[list[tuple[re.Pattern[str], str]], Callable[..., Callable[[str], str]]]] = {
+_FUNCTIONS: dict[
+    str, tuple[list[tuple[re.Pattern[str], str]], Callable[..., Callable[[str], str]]]
+] = {
     "stem": ([], lambda: _stem),
     "name": ([], lambda: _name),
     "parent": ([], lambda: _parent),

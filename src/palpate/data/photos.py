@@ -25,15 +25,25 @@ def photo_ids(photos: Path | Sequence[Path] | Mapping[str, Path]) -> dict[str, P
         if photos.is_file():
             return {photos.name: photos}
         if not photos.is_dir():
-            raise PalpateError("The photos must be a folder or files", f"no such path {photos}", "Check the path")
+            raise PalpateError(
+                "The photos must be a folder or files", f"no such path {photos}", "Check the path"
+            )
         if (photos / "palpate.json").is_file():
-            raise PalpateError("The photos must be a folder of images", f"{photos}, a saved model", "Pass models with --model")
+            raise PalpateError(
+                "The photos must be a folder of images",
+                f"{photos}, a saved model",
+                "Pass models with --model",
+            )
         files = sorted(p for p in photos.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
         return {p.relative_to(photos).as_posix(): p for p in files}
     table: dict[str, Path] = {}
     for path in map(Path, photos):
         if path.name in table:
-            raise PalpateError("Photos in a list must differ in name", f"{path.name!r} twice", "Pass their common folder instead")
+            raise PalpateError(
+                "Photos in a list must differ in name",
+                f"{path.name!r} twice",
+                "Pass their common folder instead",
+            )
         table[path.name] = path
     return table
 
@@ -45,7 +55,9 @@ def require_some(photos: Sized) -> None:
         PalpateError: saying so.
     """
     if not len(photos):
-        raise PalpateError("There must be at least one photo", "none", "Check the folder, the split or the ids")
+        raise PalpateError(
+            "There must be at least one photo", "none", "Check the folder, the split or the ids"
+        )
 
 
 def require_readable(photos: Path | Sequence[Path], fix: str = MEND) -> None:
@@ -63,7 +75,13 @@ def require_readable(photos: Path | Sequence[Path], fix: str = MEND) -> None:
     """
     paths = list(photo_ids(photos).values())
     require_some(paths)
-    if len(paths) > 1 and (len(paths) > FEW or sum(p.stat().st_size for p in paths if p.is_file()) > FEW_BYTES):
+    if len(paths) > 1 and (
+        len(paths) > FEW or sum(p.stat().st_size for p in paths if p.is_file()) > FEW_BYTES
+    ):
         return
-    if bad := [Problem(str(p), "bad-image", reason) for p in paths if (reason := check_image(p)) is not None]:
+    if bad := [
+        Problem(str(p), "bad-image", reason)
+        for p in paths
+        if (reason := check_image(p)) is not None
+    ]:
         raise ProblemsError(bad, fix)

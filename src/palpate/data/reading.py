@@ -43,23 +43,43 @@ def read_samples(
     """
     path = Path(path)
     if not path.exists():
-        raise PalpateError("Samples must be a manifest, a list, a table or a folder", f"nothing at {path}", "Check the path")
+        raise PalpateError(
+            "Samples must be a manifest, a list, a table or a folder",
+            f"nothing at {path}",
+            "Check the path",
+        )
     if is_manifest(path):
         return Manifest.load(path), []
     if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
         found = read_list(path, skip_bad=skip_bad)
         return found.manifest, found.skipped
-    name = "pairs" if path.is_file() else next((n for n, f in FORMATS.items() if f.detect(path)), "")
-    options: dict[str, Any] = {"root": root} if root is not None and path.is_file() and name == "pairs" else {}
+    name = (
+        "pairs" if path.is_file() else next((n for n, f in FORMATS.items() if f.detect(path)), "")
+    )
+    options: dict[str, Any] = (
+        {"root": root} if root is not None and path.is_file() and name == "pairs" else {}
+    )
     if path.is_dir() and name in ("", "pairs"):
-        sides: list[str] = [s for s, names in (("vision", VISION), ("tactile", TACTILE)) if any((path / n).is_dir() for n in names)]
-        if not sides and not any(p.suffix.lower() in SUFFIXES for p in (*path.glob("*"), *path.glob("*/*"))):
+        sides: list[str] = [
+            s
+            for s, names in (("vision", VISION), ("tactile", TACTILE))
+            if any((path / n).is_dir() for n in names)
+        ]
+        if not sides and not any(
+            p.suffix.lower() in SUFFIXES for p in (*path.glob("*"), *path.glob("*/*"))
+        ):
             raise PalpateError(
-                f"{path} must hold a manifest, pictures, or a data set of a known format", "none of them", "Import it first: palpate import"
+                f"{path} must hold a manifest, pictures, or a data set of a known format",
+                "none of them",
+                "Import it first: palpate import",
             )
         name = "pairs"
-        if len(sides) < 2:  # pictures of one modality: photos, unless the folder's name says that they are touches
-            options["side"] = sides[0] if sides else "tactile" if path.name.lower() in TACTILE else "vision"
+        if (
+            len(sides) < 2
+        ):  # pictures of one modality: photos, unless the folder's name says that they are touches
+            options["side"] = (
+                sides[0] if sides else "tactile" if path.name.lower() in TACTILE else "vision"
+            )
     # Pictures are not decoded here: who looks at them reports those that cannot be read.
     if "check" in inspect.signature(FORMATS[name].scan).parameters:
         options["check"] = "none"
@@ -79,8 +99,12 @@ def is_manifest(path: Path) -> bool:
         return False
     try:
         with open(path, "rb") as file:
-            return str(pl.read_parquet_metadata(file).get("palpate.format", "")).startswith("palpate-manifest/")
-    except Exception:  # polars raises several kinds for a file that is not Parquet; whoever reads it next says so
+            return str(pl.read_parquet_metadata(file).get("palpate.format", "")).startswith(
+                "palpate-manifest/"
+            )
+    except (
+        Exception
+    ):  # polars raises several kinds for a file that is not Parquet; whoever reads it next says so
         return False
 
 

@@ -17,8 +17,24 @@ from threading import Event
 
 import numpy as np
 
-from palpate.core import PalpateError, Problem, Progress, atomic_path, inside, read_json, rng_for, write_json
-from palpate.data.frames import FolderFrames, Frames, ImageFormat, VideoFrames, nearest_to_median, save_picture
+from palpate.core import (
+    PalpateError,
+    Problem,
+    Progress,
+    atomic_path,
+    inside,
+    read_json,
+    rng_for,
+    write_json,
+)
+from palpate.data.frames import (
+    FolderFrames,
+    Frames,
+    ImageFormat,
+    VideoFrames,
+    nearest_to_median,
+    save_picture,
+)
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.listing import FrameList, FrameTable
 from palpate.data.manifest import Manifest
@@ -41,7 +57,7 @@ class VideoFiles:
 
 @dataclass(frozen=True)
 class Row:
-    """A labelled frame on its way into the manifest; ``where`` is ``list:line``."""
+    """A labeled frame on its way into the manifest; ``where`` is ``list:line``."""
 
     where: str
     id: str
@@ -62,9 +78,19 @@ class _Job:
 
 def rows_of(listed: FrameList) -> list[Row]:
     """The rows of a list, sorted by video and frame."""
-    table = listed.rows.with_columns(listed.manifest.table["touch"], listed.manifest.table["material"]).sort("video", "frame")
+    table = listed.rows.with_columns(
+        listed.manifest.table["contact"], listed.manifest.table["material"]
+    ).sort("video", "frame")
     return [
-        Row(f"{r['source']}:{r['line']}", r["id"], r["video"], r["frame"], r["touch"], r["material"]) for r in table.iter_rows(named=True)
+        Row(
+            f"{r['source']}:{r['line']}",
+            r["id"],
+            r["video"],
+            r["frame"],
+            r["contact"],
+            r["material"],
+        )
+        for r in table.iter_rows(named=True)
     ]
 
 
@@ -144,14 +170,24 @@ class Recordings:
         for done, (name, found) in enumerate(in_threads(self._open_one, sorted(first)), 1):
             if isinstance(found, dict):
                 self.sides[name] = found
-                for frames in (frames for frames in found.values() if isinstance(frames, FolderFrames)):
+                for frames in (
+                    frames for frames in found.values() if isinstance(frames, FolderFrames)
+                ):
                     self.suspicious += [
-                        Problem(str(frames.source / other), "duplicate-frame", f"{read} has the same number, and is read")
+                        Problem(
+                            str(frames.source / other),
+                            "duplicate-frame",
+                            f"{read} has the same number, and is read",
+                        )
                         for other, read in frames.doubled
                     ]
             else:
                 kind, text = found
-                self.problems.append(Problem(first[name].where, kind, f"{text} ({_rows(count[name])} of this recording)"))
+                self.problems.append(
+                    Problem(
+                        first[name].where, kind, f"{text} ({_rows(count[name])} of this recording)"
+                    )
+                )
             progress("reading recordings", done, len(first))
         return [row for row in rows if row.video in self.sides and self._has(row)]
 
@@ -167,11 +203,16 @@ class Recordings:
                 return "missing-video", f"the recording {name!r} has no {side} side"
             if source.is_dir():
                 if inside(self.root, os.path.relpath(source, self.root)) is None:
-                    return "outside-root", f"{source} is a link that leaves the data set; import from the folder that really holds it"
+                    return (
+                        "outside-root",
+                        f"{source} is a link that leaves the data set; import from the folder that really holds it",
+                    )
                 sides[side] = FolderFrames(source, self.root)
                 continue
             try:
-                sides[side] = VideoFrames(source, self.out / "images" / name / side, self.image_format, self.size)
+                sides[side] = VideoFrames(
+                    source, self.out / "images" / name / side, self.image_format, self.size
+                )
             except PalpateError as error:
                 return "bad-video", f"{source}: {error.got}"
         return sides
@@ -188,9 +229,21 @@ class Recordings:
         for side in missing:
             source = sides[side]
             if isinstance(source, FolderFrames) and row.frame in source.leaving:
-                self.problems.append(Problem(row.where, "outside-root", f"{source.path(row.frame)} is a link that leaves the data set"))
+                self.problems.append(
+                    Problem(
+                        row.where,
+                        "outside-root",
+                        f"{source.path(row.frame)} is a link that leaves the data set",
+                    )
+                )
             else:
-                self.problems.append(Problem(row.where, "missing-file", f"no picture of frame {row.frame} in {source.source}"))
+                self.problems.append(
+                    Problem(
+                        row.where,
+                        "missing-file",
+                        f"no picture of frame {row.frame} in {source.source}",
+                    )
+                )
         return not missing
 
     def choose_backgrounds(self, rows: Sequence[Row], starts: Mapping[str, int]) -> None:
@@ -212,10 +265,22 @@ class Recordings:
         contact = np.array(sorted(self.contact.get(video, set())), np.int64)
         for margin in (BACKGROUND_BEFORE, 0):
             # A frame is near a touch if some frame of contact lies between it less and it plus the margin.
-            near = np.searchsorted(contact, there - margin, "left") < np.searchsorted(contact, there + margin, "right")
+            near = np.searchsorted(contact, there - margin, "left") < np.searchsorted(
+                contact, there + margin, "right"
+            )
             free = there[~near].tolist()
             if free:
-                return [free[i] for i in sorted({int(p) for p in np.linspace(0, len(free) - 1, min(MEDIAN_OF, len(free))).round()})]
+                return [
+                    free[i]
+                    for i in sorted(
+                        {
+                            int(p)
+                            for p in np.linspace(
+                                0, len(free) - 1, min(MEDIAN_OF, len(free))
+                            ).round()
+                        }
+                    )
+                ]
         return []
 
     def check(self, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
@@ -230,14 +295,24 @@ class Recordings:
         bad: set[Path] = set()
         if how != "none":
             progress("checking images", 0, len(first))
-            for done, (path, reason) in enumerate(in_threads(lambda p: check_image(p, how), first), 1):
+            for done, (path, reason) in enumerate(
+                in_threads(lambda p: check_image(p, how), first), 1
+            ):
                 if reason:
                     bad.add(path)
-                    self.problems.append(Problem(first[path].where, "bad-image", f"{path}: {reason}"))
+                    self.problems.append(
+                        Problem(first[path].where, "bad-image", f"{path}: {reason}")
+                    )
                 progress("checking images", done, len(first))
-        self.background = {touch: path for touch, path in self.background.items() if path not in bad}
+        self.background = {
+            touch: path for touch, path in self.background.items() if path not in bad
+        }
         self.problems.sort(key=lambda p: _place(p.where))
-        return [row for row in rows if not any(frames.path(row.frame) in bad for frames in self.sides[row.video].values())]
+        return [
+            row
+            for row in rows
+            if not any(frames.path(row.frame) in bad for frames in self.sides[row.video].values())
+        ]
 
     def decode(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Decodes what ``extract`` would cache, and writes nothing; keeps the rows whose pictures are whole."""
@@ -252,7 +327,14 @@ class Recordings:
                 frames.decode(wanted[job.video, job.side], whole[job.video, job.side], stop)
 
         self._do("decoding frames", rows, wanted, work, progress)
-        return [row for row in rows if all(not f.raw or row.frame in whole[row.video, s] for s, f in self.sides[row.video].items())]
+        return [
+            row
+            for row in rows
+            if all(
+                not f.raw or row.frame in whole[row.video, s]
+                for s, f in self.sides[row.video].items()
+            )
+        ]
 
     def extract(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Caches the needed frames of raw videos and the medians; keeps the rows whose pictures are there."""
@@ -273,9 +355,15 @@ class Recordings:
                 frames.extract(wanted[job.video, job.side], self.created, stop)
 
         self._do("extracting frames", rows, wanted, work, progress)
-        self.background |= {touch: typical[video] for touch, video in self.resting.items() if video in typical}
+        self.background |= {
+            touch: typical[video] for touch, video in self.resting.items() if video in typical
+        }
         self.background = {touch: path for touch, path in self.background.items() if path.is_file()}
-        rows = [row for row in rows if all(not f.raw or f.path(row.frame).is_file() for f in self.sides[row.video].values())]
+        rows = [
+            row
+            for row in rows
+            if all(not f.raw or f.path(row.frame).is_file() for f in self.sides[row.video].values())
+        ]
         if len({f.raw for row in rows for f in self.sides[row.video].values()}) > 1:
             self._gather(rows)
         return rows
@@ -292,13 +380,21 @@ class Recordings:
         return wanted
 
     def _do(
-        self, what: str, rows: Sequence[Row], wanted: Iterable[tuple[str, str]], work: Callable[[_Job, Event], None], progress: Progress
+        self,
+        what: str,
+        rows: Sequence[Row],
+        wanted: Iterable[tuple[str, str]],
+        work: Callable[[_Job, Event], None],
+        progress: Progress,
     ) -> None:
         """Does the work for every wanted side and for the typical frame of every resting recording; what breaks off is a problem."""
         first = {row.video: row for row in reversed(rows)}
         touches = {row.touch for row in rows}
         resting = sorted({video for touch, video in self.resting.items() if touch in touches})
-        jobs = [*(_Job(video, side, False) for video, side in wanted), *(_Job(video, "tactile", True) for video in resting)]
+        jobs = [
+            *(_Job(video, side, False) for video, side in wanted),
+            *(_Job(video, "tactile", True) for video in resting),
+        ]
         stop = Event()
 
         def told(job: _Job) -> str | None:
@@ -340,7 +436,10 @@ class Recordings:
         """Refuses to mix cached frames of other settings or other videos with new ones."""
         path = self.out / "images" / "settings.json"
         now = {"format": self.image_format, "size": self.size}
-        videos = {f"{video}/{side}": self.sides[video][side].source.stat().st_size for video, side in sorted(wanted)}
+        videos = {
+            f"{video}/{side}": self.sides[video][side].source.stat().st_size
+            for video, side in sorted(wanted)
+        }
         if path.is_file():
             then = read_json(path, "record of the cached frames")
             before: dict[str, int] = then.pop("videos")
@@ -348,7 +447,9 @@ class Recordings:
             if then != now or changed:
                 raise PalpateError(
                     f"The frames cached in {path.parent} must have been made from the same videos with the same settings",
-                    f"other videos: {', '.join(changed)}" if changed else f"{then} there, {now} here",
+                    f"other videos: {', '.join(changed)}"
+                    if changed
+                    else f"{then} there, {now} here",
                     "Choose another folder, or remove that one",
                 )
             videos = before | videos
@@ -356,7 +457,13 @@ class Recordings:
             self.created.append(path)
         write_json(path, {**now, "videos": videos})
 
-    def manifest(self, rows: Sequence[Row], facts: Mapping[str, str], sensor: str, words: Mapping[str, FrameTable | None]) -> Manifest:
+    def manifest(
+        self,
+        rows: Sequence[Row],
+        facts: Mapping[str, str],
+        sensor: str,
+        words: Mapping[str, FrameTable | None],
+    ) -> Manifest:
         """The manifest of the rows; ``words`` fills columns by (video, frame).
 
         Its root is the data set if all recordings are extracted, else ``out``.
@@ -374,19 +481,39 @@ class Recordings:
 
         table = [
             {
-                "id": row.id, "video": row.video, "frame": row.frame, "touch": row.touch, "material": row.material, "sensor": sensor,
+                "id": row.id,
+                "video": row.video,
+                "frame": row.frame,
+                "contact": row.touch,
+                "material": row.material,
+                "sensor": sensor,
                 "vision": name(self.sides[row.video]["vision"].path(row.frame)),
                 "tactile": name(self.sides[row.video]["tactile"].path(row.frame)),
-                "background": name(self.background[row.touch]) if row.touch in self.background else None,
-                **{column: t.values.get((row.video, row.frame)) for column, t in words.items() if t is not None},
+                "background": name(self.background[row.touch])
+                if row.touch in self.background
+                else None,
+                **{
+                    column: t.values.get((row.video, row.frame))
+                    for column, t in words.items()
+                    if t is not None
+                },
             }
             for row in rows
-        ]  # fmt: skip
+        ]
         layout = "mixed" if len(raws) > 1 else "raw" if True in raws else "extracted"
         used = {row.touch: row.video for row in rows}
-        kinds = Counter("none" if t not in self.background else "frame" if t in self.background_frames else "typical" for t in used)
+        kinds = Counter(
+            "none"
+            if t not in self.background
+            else "frame"
+            if t in self.background_frames
+            else "typical"
+            for t in used
+        )
         background = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
-        return Manifest.from_rows(table, root, {**facts, "layout": layout, "backgrounds": background})
+        return Manifest.from_rows(
+            table, root, {**facts, "layout": layout, "backgrounds": background}
+        )
 
 
 def _rows(count: int) -> str:

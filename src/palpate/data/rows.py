@@ -16,7 +16,14 @@ from palpate.data.tables import sign_of
 from palpate.data.texts import decoded
 
 #: What tools call the parts of a split.
-PART_NAMES = {**{part: part for part in PARTS}, "training": "train", "validation": "val", "valid": "val", "dev": "val", "testing": "test"}
+PART_NAMES = {
+    **{part: part for part in PARTS},
+    "training": "train",
+    "validation": "val",
+    "valid": "val",
+    "dev": "val",
+    "testing": "test",
+}
 #: What the columns of a split keep whole; where only some rows have a value, a person should look.
 GROUPS = ("video", "object", "session")
 #: What other tools write for an empty cell, in lower case.
@@ -54,7 +61,9 @@ def manifest_rows(
         found, failed = expression.values(column, count)
         values.append((target, found))
         for k, text in failed.items():
-            bad.setdefault(k, []).append(Problem(where(k), "bad-map", f"{target} has no value: {text}"))
+            bad.setdefault(k, []).append(
+                Problem(where(k), "bad-map", f"{target} has no value: {text}")
+            )
     known = set(classes.values()) if classes is not None else set[str]()
     rows: list[tuple[int, Row]] = []
     inconclusive = 0
@@ -70,11 +79,23 @@ def manifest_rows(
             if number is not None and number in classes:
                 row["material"] = classes[number]
             else:
-                wrong.append(Problem(where(k), "unknown-label", f"the class {material!r} is not in the table of classes"))
+                wrong.append(
+                    Problem(
+                        where(k),
+                        "unknown-label",
+                        f"the class {material!r} is not in the table of classes",
+                    )
+                )
         if "split" in row:
             part = PART_NAMES.get(row["split"].lower())
             if part is None:
-                wrong.append(Problem(where(k), "unknown-part", f"the split {row['split']!r} is none of {', '.join(PARTS)}"))
+                wrong.append(
+                    Problem(
+                        where(k),
+                        "unknown-part",
+                        f"the split {row['split']!r} is none of {', '.join(PARTS)}",
+                    )
+                )
             row["split"] = part
         problems += wrong
         if not wrong:
@@ -91,14 +112,20 @@ def read_classes(path: Path) -> dict[int, str]:
     """
     path = Path(path)
     if not path.is_file():
-        raise PalpateError("The table of classes must be a file", f"no file {path}", "Check the path given as --classes")
+        raise PalpateError(
+            "The table of classes must be a file",
+            f"no file {path}",
+            "Check the path given as --classes",
+        )
     text = decoded(path.read_bytes())
     lines = [line for line in text.splitlines() if line.strip()]
     if lines and all(re.search(r":\s*[\"']?[+-]?\d+", line) for line in lines):
         return read_categories(path)
     names: dict[int, str] = {}
     problems: list[Problem] = []
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=sign_of(path, lines[0] if lines else ""))
+    reader = csv.reader(
+        io.StringIO(text, newline=""), delimiter=sign_of(path, lines[0] if lines else "")
+    )
     for first, cells in enumerate(c for c in reader if any(c)):
         pair = [c.strip() for c in cells]
         label = [_whole(c) for c in pair]
@@ -106,15 +133,29 @@ def read_classes(path: Path) -> dict[int, str]:
         number = None if at is None else label[at]
         if len(pair) != 2 or number is None or at is None or not pair[1 - at]:
             if first:
-                problems.append(Problem(f"{path}:{reader.line_num}", "bad-line", f"{', '.join(pair)!r} is not an id and a name"))
+                problems.append(
+                    Problem(
+                        f"{path}:{reader.line_num}",
+                        "bad-line",
+                        f"{', '.join(pair)!r} is not an id and a name",
+                    )
+                )
         elif number in names:
-            problems.append(Problem(f"{path}:{reader.line_num}", "duplicate-id", f"the id {number} names {names[number]!r} already"))
+            problems.append(
+                Problem(
+                    f"{path}:{reader.line_num}",
+                    "duplicate-id",
+                    f"the id {number} names {names[number]!r} already",
+                )
+            )
         else:
             names[number] = SPELLING.get(pair[1 - at], pair[1 - at])
     if problems:
         raise ProblemsError(problems, "Write one 'Name: id' or 'id,name' a line")
     if not names:
-        raise PalpateError(f"{path} must list classes as 'Name: id' or 'id,name'", "none", "Write one a line")
+        raise PalpateError(
+            f"{path} must list classes as 'Name: id' or 'id,name'", "none", "Write one a line"
+        )
     return names
 
 
@@ -129,7 +170,11 @@ def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
         worded = [where for where, row in rows if str(row.get(name, "")).lower() in NULL_WORDS]
         if worded:
             text = f"{len(worded)} of {len(rows)} rows have the {name} NA, NaN, None or null, taken as a name; the first is {worded[0]}"
-            found.append(Problem(str(source), "word-for-null", f"{text}. An empty cell means that there is none"))
+            found.append(
+                Problem(
+                    str(source), "word-for-null", f"{text}. An empty cell means that there is none"
+                )
+            )
     return found
 
 

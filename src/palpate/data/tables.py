@@ -55,7 +55,11 @@ class Table:
             PalpateError: if one of them stands twice in the header, or holds no texts and numbers.
         """
         if twice := [name for name in needed if self.names.count(name) > 1]:
-            raise PalpateError(f"A column of {self.path} must stand once", f"{twice[0]} twice or more", "Rename one of them")
+            raise PalpateError(
+                f"A column of {self.path} must stand once",
+                f"{twice[0]} twice or more",
+                "Rename one of them",
+            )
         self.lines, self.cells = self.load(list(dict.fromkeys(needed)))
         return self
 
@@ -79,17 +83,23 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
         raise PalpateError("The table must be a file", f"no file {path}", "Check the path")
     suffix = path.suffix.lower()
     if names and suffix in (".jsonl", ".json", ".parquet"):
-        raise PalpateError("Only CSV and TSV files can be without names of columns", path.name, "Leave names out")
+        raise PalpateError(
+            "Only CSV and TSV files can be without names of columns", path.name, "Leave names out"
+        )
     opener: Callable[[Path, list[Problem]], tuple[list[str], _Load]] | None = {
-        ".jsonl": _json_lines, ".json": _json_array, ".parquet": _parquet,
-    }.get(suffix)  # fmt: skip
+        ".jsonl": _json_lines,
+        ".json": _json_array,
+        ".parquet": _parquet,
+    }.get(suffix)
     problems: list[Problem] = []
     if opener is not None:
         header, load = opener(path, problems)
     elif names or suffix in TABLES:
         header, load = _csv(path, problems, list(names) if names else None)
     else:
-        raise PalpateError(f"A table must be one of {', '.join(TABLES)}", path.name, "Convert it, or rename it")
+        raise PalpateError(
+            f"A table must be one of {', '.join(TABLES)}", path.name, "Convert it, or rename it"
+        )
     return Table(path, header, problems, load, [], {})
 
 
@@ -105,7 +115,9 @@ def header_of(path: Path) -> list[str]:
             return next(
                 (
                     [c.strip() for c in cells]
-                    for cells in csv.reader(io.StringIO(head, newline=""), delimiter=sign_of(path, head))
+                    for cells in csv.reader(
+                        io.StringIO(head, newline=""), delimiter=sign_of(path, head)
+                    )
                     if any(cells)
                 ),
                 [],
@@ -142,14 +154,28 @@ def _csv(path: Path, problems: list[Problem], names: list[str] | None) -> tuple[
         lines: list[int] = []
         for line, cells in records:
             if len(cells) != len(header):
-                problems.append(Problem(f"{path}:{line}", "bad-row", f"{len(cells)} cells under {len(header)} columns"))
+                problems.append(
+                    Problem(
+                        f"{path}:{line}",
+                        "bad-row",
+                        f"{len(cells)} cells under {len(header)} columns",
+                    )
+                )
             elif odd and any(map(_unfit, cells)):
-                problems.append(Problem(f"{path}:{line}", "bad-encoding", "the row holds bytes that are not UTF-8, or a zero byte"))
+                problems.append(
+                    Problem(
+                        f"{path}:{line}",
+                        "bad-encoding",
+                        "the row holds bytes that are not UTF-8, or a zero byte",
+                    )
+                )
             else:
                 lines.append(line)
                 for i, store in places:
                     cell = text_of(cells[i])
-                    store.append(store[-1] if store and store[-1] == cell else cell)  # one copy of what repeats
+                    store.append(
+                        store[-1] if store and store[-1] == cell else cell
+                    )  # one copy of what repeats
         return lines, dict(zip(needed, stores, strict=True))
 
     return header, load
@@ -172,12 +198,24 @@ def _records(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[i
             first, start = start, reader.line_num + 1
             # A mark that stays open takes in all that follows it.
             if reader.line_num > first and quotes % 2:
-                problems.append(Problem(f"{path}:{first}", "open-quote", f"a quotation mark stays open up to line {reader.line_num}"))
+                problems.append(
+                    Problem(
+                        f"{path}:{first}",
+                        "open-quote",
+                        f"a quotation mark stays open up to line {reader.line_num}",
+                    )
+                )
             elif any(cell.strip() for cell in cells):
                 yield first, cells
             quotes = 0
     except csv.Error as error:
-        problems.append(Problem(f"{path}:{start}", "bad-row", f"{error}; is a quotation mark open? No row after it was read"))
+        problems.append(
+            Problem(
+                f"{path}:{start}",
+                "bad-row",
+                f"{error}; is a quotation mark open? No row after it was read",
+            )
+        )
 
 
 def _json_lines(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
@@ -187,7 +225,9 @@ def _json_lines(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
                 try:
                     yield number, json.loads(line)
                 except (json.JSONDecodeError, RecursionError) as error:
-                    problems.append(Problem(f"{path}:{number}", "bad-row", f"not JSON: {_said(error)}"))
+                    problems.append(
+                        Problem(f"{path}:{number}", "bad-row", f"not JSON: {_said(error)}")
+                    )
 
     return _of_objects(path, items(), problems)
 
@@ -200,7 +240,11 @@ def _json_array(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
         decoder = json.JSONDecoder()
         at, line, counted = len(text) - len(text.lstrip()), 1, 0
         if not text.startswith("[", at):
-            raise PalpateError(f"{path} must hold a JSON list of objects", repr(text[at : at + 20]), "Write [{...}, {...}], or JSON lines")
+            raise PalpateError(
+                f"{path} must hold a JSON list of objects",
+                repr(text[at : at + 20]),
+                "Write [{...}, {...}], or JSON lines",
+            )
         while True:
             at = _past(text, at + 1)
             line, counted = line + text.count("\n", counted, at), at
@@ -209,12 +253,24 @@ def _json_array(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
             try:
                 item, at = decoder.raw_decode(text, at)
             except (json.JSONDecodeError, RecursionError) as error:
-                problems.append(Problem(f"{path}:{line}", "bad-row", f"not JSON: {_said(error)}; no row after it was read"))
+                problems.append(
+                    Problem(
+                        f"{path}:{line}",
+                        "bad-row",
+                        f"not JSON: {_said(error)}; no row after it was read",
+                    )
+                )
                 return
             yield line, item
             at = _past(text, at)
             if not text.startswith((",", "]"), at):
-                problems.append(Problem(f"{path}:{line}", "bad-row", "no comma or bracket after the object; no row after it was read"))
+                problems.append(
+                    Problem(
+                        f"{path}:{line}",
+                        "bad-row",
+                        "no comma or bracket after the object; no row after it was read",
+                    )
+                )
                 return
             at -= text.startswith("]", at)
 
@@ -231,7 +287,9 @@ def _said(error: Exception) -> str:
     return error.msg if isinstance(error, json.JSONDecodeError) else "nested too deep"
 
 
-def _of_objects(path: Path, items: Iterator[tuple[int, Any]], problems: list[Problem]) -> tuple[list[str], _Load]:
+def _of_objects(
+    path: Path, items: Iterator[tuple[int, Any]], problems: list[Problem]
+) -> tuple[list[str], _Load]:
     rows: list[tuple[int, Row]] = []
     names: dict[str, None] = {}
     for line, item in items:
@@ -246,12 +304,26 @@ def _of_objects(path: Path, items: Iterator[tuple[int, Any]], problems: list[Pro
         lines: list[int] = []
         for line, row in rows:
             cells = [row.get(name) for name in needed]
-            if nested := [name for name, cell in zip(needed, cells, strict=True) if isinstance(cell, (list, dict))]:
+            if nested := [
+                name
+                for name, cell in zip(needed, cells, strict=True)
+                if isinstance(cell, (list, dict))
+            ]:
                 problems.append(
-                    Problem(f"{path}:{line}", "bad-row", f"{nested[0]} is a list or an object, where a text or number must stand")
+                    Problem(
+                        f"{path}:{line}",
+                        "bad-row",
+                        f"{nested[0]} is a list or an object, where a text or number must stand",
+                    )
                 )
             elif any(isinstance(cell, str) and _unfit(cell) for cell in cells):
-                problems.append(Problem(f"{path}:{line}", "bad-encoding", "the row holds bytes that are not UTF-8, or a zero character"))
+                problems.append(
+                    Problem(
+                        f"{path}:{line}",
+                        "bad-encoding",
+                        "the row holds bytes that are not UTF-8, or a zero character",
+                    )
+                )
             else:
                 lines.append(line)
                 for cell, store in zip(cells, stores, strict=True):
@@ -271,24 +343,46 @@ def _parquet(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
     try:
         schema = _schema(path)
     except Exception as error:  # polars raises several kinds for a file that is not Parquet
-        problems.append(Problem(str(path), "bad-table", f"not Parquet: {str(error).splitlines()[0]}"))
+        problems.append(
+            Problem(str(path), "bad-table", f"not Parquet: {str(error).splitlines()[0]}")
+        )
         return [], lambda needed: ([], {name: [] for name in needed})
 
     def load(needed: Sequence[str]) -> tuple[list[int], _Cells]:
-        if unfit := [name for name in needed if schema[name].is_nested() or schema[name].base_type() in (pl.Binary, pl.Object)]:
+        if unfit := [
+            name
+            for name in needed
+            if schema[name].is_nested() or schema[name].base_type() in (pl.Binary, pl.Object)
+        ]:
             got = f"{unfit[0]} of type {schema[unfit[0]]}"
             raise PalpateError(
-                f"Columns of {path} must hold texts or numbers", got, "For images inside the table: --format hf on its folder"
+                f"Columns of {path} must hold texts or numbers",
+                got,
+                "For images inside the table: --format hf on its folder",
             )
         try:
             table = pl.read_parquet(path, columns=list(needed), glob=False)
         except Exception as error:
-            problems.append(Problem(str(path), "bad-table", f"not Parquet: {str(error).splitlines()[0]}"))
+            problems.append(
+                Problem(str(path), "bad-table", f"not Parquet: {str(error).splitlines()[0]}")
+            )
             return [], {name: [] for name in needed}
         cells = {name: [text_of(cell) for cell in table[name].to_list()] for name in needed}
-        odd = frozenset({k for column in cells.values() for k, cell in enumerate(column) if cell is not None and "\x00" in cell})
-        problems.extend(Problem(f"{path}:{k + 1}", "bad-encoding", "the row holds a zero character") for k in sorted(odd))
+        odd = frozenset(
+            {
+                k
+                for column in cells.values()
+                for k, cell in enumerate(column)
+                if cell is not None and "\x00" in cell
+            }
+        )
+        problems.extend(
+            Problem(f"{path}:{k + 1}", "bad-encoding", "the row holds a zero character")
+            for k in sorted(odd)
+        )
         keep = [k for k in range(table.height) if k not in odd]
-        return [k + 1 for k in keep], {name: [column[k] for k in keep] for name, column in cells.items()} if odd else cells
+        return [k + 1 for k in keep], {
+            name: [column[k] for k in keep] for name, column in cells.items()
+        } if odd else cells
 
     return list(schema), load

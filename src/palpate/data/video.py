@@ -73,7 +73,9 @@ class VideoReader:
         """
         if not 0 <= k < len(self):
             raise PalpateError(
-                f"A frame of {self.path} must lie between 0 and {len(self) - 1}", str(k), "Take the numbers from this video's own list"
+                f"A frame of {self.path} must lie between 0 and {len(self) - 1}",
+                str(k),
+                "Take the numbers from this video's own list",
             )
         if self._last is None or self._last[0] != k:
             self._last = (k, self._reach(k))
@@ -96,7 +98,12 @@ class VideoReader:
     def __enter__(self) -> VideoReader:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.close()
 
     def _index(self) -> tuple[list[int], list[tuple[int, int]]]:
@@ -117,18 +124,27 @@ class VideoReader:
                 if packet.is_discard:  # needed to decode what follows, never presented
                     continue
                 if packet.pts is None:
-                    raise self._broken("pictures without timestamps", "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4")
+                    raise self._broken(
+                        "pictures without timestamps",
+                        "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4",
+                    )
                 times.append(packet.pts)
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
         except self._errors as error:
-            raise self._broken(f"{packets} readable of {declared or 'an unknown number of'} frames ({_said(error)})") from None
+            raise self._broken(
+                f"{packets} readable of {declared or 'an unknown number of'} frames ({_said(error)})"
+            ) from None
         if packets - cut < declared:
-            raise self._broken(f"{packets - cut} readable of {declared} declared frames: the file is cut short")
+            raise self._broken(
+                f"{packets - cut} readable of {declared} declared frames: the file is cut short"
+            )
         if not times:
             raise self._broken("0 frames")
         if len(set(times)) < len(times):
-            raise self._broken("two pictures with one timestamp", "Write it again: ffmpeg -i FILE -c copy NEW.mp4")
+            raise self._broken(
+                "two pictures with one timestamp", "Write it again: ffmpeg -i FILE -c copy NEW.mp4"
+            )
         return sorted(times), sorted(keys)
 
     def _reach(self, k: int) -> NDArray[np.uint8]:
@@ -136,7 +152,11 @@ class VideoReader:
         target = self._pts[k]
         key = bisect_right(self._keys, target, key=lambda pair: pair[0]) - 1
         ahead = self._decoded is not None and self._last is not None and self._last[0] < k
-        if ahead and self._last is not None and self._pts[self._last[0]] >= self._keys[max(key, 0)][0]:
+        if (
+            ahead
+            and self._last is not None
+            and self._pts[self._last[0]] >= self._keys[max(key, 0)][0]
+        ):
             found = self._until(target)
             if found is not None:
                 return found
@@ -154,7 +174,9 @@ class VideoReader:
 
     def _seek(self, time: int | None) -> None:
         try:
-            self._container.seek(self._pts[0] if time is None else time, stream=self._stream, backward=True)
+            self._container.seek(
+                self._pts[0] if time is None else time, stream=self._stream, backward=True
+            )
         except self._errors as error:
             raise self._broken(_said(error)) from None
         self._decoded = self._container.decode(self._stream)

@@ -1,7 +1,7 @@
 """The frozen VQ autoencoder: touches to latents and back (paper section 2: z = E(x), x_hat = D(z)).
 
 A diffusers ``VQModel`` in its own folder format, so that any VQModel (e.g. latent diffusion's ``vq-f4``) loads
-as it is. *Encode* gives the latents before quantisation, *decode* quantises first: the semantics of latent
+as it is. *Encode* gives the latents before quantization, *decode* quantizes first: the semantics of latent
 diffusion's ``VQModelInterface``.
 
 A patch stem makes a small model fast: patches of ``patch`` x ``patch`` pixels become channels (pixel unshuffle)
@@ -70,15 +70,22 @@ class Autoencoder(nn.Module):
     @property
     def digest(self) -> str:
         """SHA-256 of patch, architecture and weights."""
-        return digest_json([self.patch, architecture(self.vq.config), digest_tensors(self.vq.state_dict())])
+        return digest_json(
+            [self.patch, architecture(self.vq.config), digest_tensors(self.vq.state_dict())]
+        )
 
     def latents(self, unit: Tensor) -> Tensor:
-        """Images (n, 3, h, w) in [-1, 1] -> latents before quantisation (n, c, h / f, w / f); with gradients."""
-        return cast("Tensor", self.vq.encode(pixel_unshuffle(unit, self.patch), return_dict=False)[0])
+        """Images (n, 3, h, w) in [-1, 1] -> latents before quantization (n, c, h / f, w / f); with gradients."""
+        return cast(
+            "Tensor", self.vq.encode(pixel_unshuffle(unit, self.patch), return_dict=False)[0]
+        )
 
-    def image(self, latents: Tensor, *, quantise: bool = True) -> tuple[Tensor, Tensor]:
+    def image(self, latents: Tensor, *, quantize: bool = True) -> tuple[Tensor, Tensor]:
         """Latents -> images (n, 3, h, w) near [-1, 1], and the codebook loss; with (straight-through) gradients."""
-        image, loss = cast("tuple[Tensor, Tensor]", self.vq.decode(latents, force_not_quantize=not quantise, return_dict=False))
+        image, loss = cast(
+            "tuple[Tensor, Tensor]",
+            self.vq.decode(latents, force_not_quantize=not quantize, return_dict=False),
+        )
         return pixel_shuffle(image, self.patch), loss
 
     def codes(self, latents: Tensor) -> Tensor:
@@ -88,7 +95,7 @@ class Autoencoder(nn.Module):
 
     @torch.no_grad()
     def encode(self, images: np.ndarray | Tensor, batch: int = 32) -> Tensor:
-        """Bytes (n, h, w, 3) -> float32 latents before quantisation (n, c, h / f, w / f), on the CPU.
+        """Bytes (n, h, w, 3) -> float32 latents before quantization (n, c, h / f, w / f), on the CPU.
 
         Raises:
             PalpateError: if height or width is no multiple of the factor.
@@ -96,17 +103,29 @@ class Autoencoder(nn.Module):
         height, width = images.shape[1:3]
         if height % self.factor or width % self.factor:
             raise PalpateError(
-                f"Images must have sides that are multiples of {self.factor}", f"{height} x {width} pixels", "Resize or crop them first"
+                f"Images must have sides that are multiples of {self.factor}",
+                f"{height} x {width} pixels",
+                "Resize or crop them first",
             )
         device = next(self.parameters()).device
-        parts = [self.latents(to_unit(images[k : k + batch]).to(device)).float().cpu() for k in range(0, len(images), batch)]
-        return torch.cat(parts) if parts else torch.empty(0, self.channels, height // self.factor, width // self.factor)
+        parts = [
+            self.latents(to_unit(images[k : k + batch]).to(device)).float().cpu()
+            for k in range(0, len(images), batch)
+        ]
+        return (
+            torch.cat(parts)
+            if parts
+            else torch.empty(0, self.channels, height // self.factor, width // self.factor)
+        )
 
     @torch.no_grad()
     def decode(self, latents: Tensor, batch: int = 32) -> np.ndarray:
-        """Latents (n, c, h, w), quantised first -> bytes (n, f h, f w, 3)."""
+        """Latents (n, c, h, w), quantized first -> bytes (n, f h, f w, 3)."""
         device = next(self.parameters()).device
-        parts = [to_bytes(self.image(latents[k : k + batch].to(device))[0]) for k in range(0, len(latents), batch)]
+        parts = [
+            to_bytes(self.image(latents[k : k + batch].to(device))[0])
+            for k in range(0, len(latents), batch)
+        ]
         side = (latents.shape[2] * self.factor, latents.shape[3] * self.factor)
         return np.concatenate(parts) if parts else np.empty((0, *side, 3), np.uint8)
 
@@ -127,7 +146,10 @@ class Autoencoder(nn.Module):
         if half:
             self.halve()
         save_weights(self.vq, folder, half=half)
-        write_json(Path(folder) / "palpate.json", {"format": FORMAT, "patch": self.patch, "digest": self.digest, "card": self.card})
+        write_json(
+            Path(folder) / "palpate.json",
+            {"format": FORMAT, "patch": self.patch, "digest": self.digest, "card": self.card},
+        )
         write_model_cards(Path(folder))
 
     @classmethod
@@ -144,24 +166,44 @@ class Autoencoder(nn.Module):
         place = shipped_folder(source, "autoencoder") or Path(source)
         fix = f"Name {', '.join(SHIPPED)}, a folder with config.json and plain weights, or a hub id that can be reached"
         remote = is_hub_id(source)
-        if not remote and (not str(source) or not place.is_dir()):  # an empty name is not the folder that one is in
-            raise PalpateError("The autoencoder must be a diffusers VQModel", f"no folder {source or repr('')}", fix)
-        note = (fetch(str(source), ("config.json", "palpate.json"), "autoencoder", fix) if remote else place) / "palpate.json"
+        if not remote and (
+            not str(source) or not place.is_dir()
+        ):  # an empty name is not the folder that one is in
+            raise PalpateError(
+                "The autoencoder must be a diffusers VQModel",
+                f"no folder {source or repr('')}",
+                fix,
+            )
+        note = (
+            fetch(str(source), ("config.json", "palpate.json"), "autoencoder", fix)
+            if remote
+            else place
+        ) / "palpate.json"
         try:
             vq = VQModel.from_pretrained(
-                str(source) if remote else str(place), low_cpu_mem_usage=False, local_files_only=not remote
+                str(source) if remote else str(place),
+                low_cpu_mem_usage=False,
+                local_files_only=not remote,
             ).float()
         except (*UNREADABLE, AttributeError) as error:
             got = (str(error).splitlines() or [type(error).__name__])[0]
-            raise PalpateError("The autoencoder must be a diffusers VQModel", f"{source}: {got}", fix) from None
+            raise PalpateError(
+                "The autoencoder must be a diffusers VQModel", f"{source}: {got}", fix
+            ) from None
         if not note.is_file():
             return cls(vq).eval().requires_grad_(requires_grad=False)
         about = read_record(note, "autoencoder card", form=FORMAT, keys=("patch", "digest", "card"))
         patch, card = about["patch"], about["card"]
         if type(patch) is not int or patch < 1 or not isinstance(card, dict):
             must = f"In {note}, patch must be a whole number from 1 on and card an object"
-            raise PalpateError(must, f"{patch!r} and a {type(card).__name__}", "Copy the whole folder again")
+            raise PalpateError(
+                must, f"{patch!r} and a {type(card).__name__}", "Copy the whole folder again"
+            )
         model = cls(vq, patch, card)
         if model.digest != about["digest"]:
-            raise PalpateError(f"The weights in {source} must match palpate.json", "other weights", "Copy the whole folder again")
+            raise PalpateError(
+                f"The weights in {source} must match palpate.json",
+                "other weights",
+                "Copy the whole folder again",
+            )
         return model.eval().requires_grad_(requires_grad=False)

@@ -1,15 +1,15 @@
 """Training of a small VQ autoencoder, in stages that leave no code unused.
 
-1. *Free*: encoder and decoder without quantisation, with Gaussian noise on the latents (relative to their
+1. *Free*: encoder and decoder without quantization, with Gaussian noise on the latents (relative to their
    spread), so that the decoder is smooth around each latent.
 2. *Codebook*: k-means of encoder outputs (Lloyd's iterations; an empty cell moves to the point farthest from
-   its centre) becomes the codebook, so that every code starts in use.
-3. *Quantised*: everything together with straight-through gradients (van den Oord et al. 2017).
+   its center) becomes the codebook, so that every code starts in use.
+3. *Quantized*: everything together with straight-through gradients (van den Oord et al. 2017).
 
 Loss: ``l1 * L1 + l2 * L2 + edge * L2 of the first differences`` (+ the codebook loss of VQModel in stage 3). Squares
 where the texture is: where a pattern is not yet known, an absolute error is least for none at all. Stage 1 sees
 random crops: the network is convolutional, and crops give it more steps a second. Stage 3 sees whole images, because
-group normalisation takes its statistics over the image: trained on crops alone, whole images come out too dark.
+group normalization takes its statistics over the image: trained on crops alone, whole images come out too dark.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for, seed_for
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.pixels import to_bytes, to_unit
-from palpate.encoders.loop import LoopOptions, fit
+from palpate.training.loop import LoopOptions, fit
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class AutoencoderOptions:
         layers: residual blocks a level.
         codes: entries of the codebook.
         channels: latent channels.
-        groups: of the group normalisation.
+        groups: of the group normalization.
         attention: whether the middle block attends.
-        steps_free, steps_quantised: optimiser steps of the two stages.
+        steps_free, steps_quantized: optimizer steps of the two stages.
         batch, lr: of both stages; the last starts at half the rate.
         crop: side of the random crops of stage 1 in pixels (0: whole images).
         noise: standard deviation of the noise of stage 1, as a share of the latents'.
@@ -56,7 +56,7 @@ class AutoencoderOptions:
     groups: int = 16
     attention: bool = False
     steps_free: int = 1700
-    steps_quantised: int = 200
+    steps_quantized: int = 200
     batch: int = 8
     lr: float = 2e-3
     crop: int = 32
@@ -115,17 +115,39 @@ def train_autoencoder(
     factor = options.patch * 2 ** (len(options.widths) - 1)
     if side % factor or side > min(images.shape[1:3]):
         raise PalpateError(
-            f"Crops must be multiples of {factor} and fit into the images", f"{side} for {images.shape[1:3]}", "Choose another crop"
+            f"Crops must be multiples of {factor} and fit into the images",
+            f"{side} for {images.shape[1:3]}",
+            "Choose another crop",
         )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_for(seed, "autoencoder"))
         model = build_autoencoder(options).to(device)
     key = digest_json([key, asdict(options), seed])
-    free = LoopOptions(steps=options.steps_free, batch=options.batch, lr=options.lr, weight_decay=1e-4, seed=seed)
-    fit(model, _Loss(images, options, quantise=False), len(images), free, folder / "free", what="autoencoder", key=key, progress=progress)
+    free = LoopOptions(
+        steps=options.steps_free, batch=options.batch, lr=options.lr, weight_decay=1e-4, seed=seed
+    )
+    fit(
+        model,
+        _Loss(images, options, quantize=False),
+        len(images),
+        free,
+        folder / "free",
+        what="autoencoder",
+        key=key,
+        progress=progress,
+    )
     _set_codebook(model, images, options, seed)
-    last = replace(free, steps=options.steps_quantised, lr=options.lr / 2)
-    fit(model, _Loss(images, options, quantise=True), len(images), last, folder / "quantised", what="codebook", key=key, progress=progress)
+    last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
+    fit(
+        model,
+        _Loss(images, options, quantize=True),
+        len(images),
+        last,
+        folder / "quantized",
+        what="codebook",
+        key=key,
+        progress=progress,
+    )
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "key": key}
     if held_out is not None and len(held_out):
         model.card["held_out"] = asdict(measure_reconstruction(model, held_out))
@@ -135,22 +157,28 @@ def train_autoencoder(
 class _Loss:
     """The loss of one step; see the head of this file."""
 
-    def __init__(self, images: np.ndarray, options: AutoencoderOptions, *, quantise: bool) -> None:
-        self.images, self.options, self.quantise = images, options, quantise
+    def __init__(self, images: np.ndarray, options: AutoencoderOptions, *, quantize: bool) -> None:
+        self.images, self.options, self.quantize = images, options, quantize
 
-    def __call__(self, module: nn.Module, rows: Tensor, generator: torch.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+    def __call__(
+        self, module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
+    ) -> tuple[Tensor, dict[str, float]]:
         assert isinstance(module, Autoencoder)
         options, device = self.options, next(module.parameters()).device
-        x = _crops(to_unit(self.images[rows.numpy()]), 0 if self.quantise else options.crop, generator).to(device)
+        x = _crops(
+            to_unit(self.images[rows.numpy()]), 0 if self.quantize else options.crop, generator
+        ).to(device)
         z = module.latents(x)
-        if not self.quantise and options.noise:
-            z = z + options.noise * z.detach().std() * torch.randn(z.shape, generator=generator).to(device)
-        y, codebook = module.image(z, quantise=self.quantise)
+        if not self.quantize and options.noise:
+            z = z + options.noise * z.detach().std() * torch.randn(z.shape, generator=generator).to(
+                device
+            )
+        y, codebook = module.image(z, quantize=self.quantize)
         error = y - x
         edges = torch.diff(error, dim=3).square().mean() + torch.diff(error, dim=2).square().mean()
         square = error.square().mean()
         loss = options.l1 * error.abs().mean() + options.l2 * square + options.edge * edges
-        if self.quantise:
+        if self.quantize:
             loss = loss + options.codebook * codebook
         return loss, {"psnr": float(10 * torch.log10(4 / square.detach()))}
 
@@ -162,44 +190,65 @@ def _crops(x: Tensor, side: int, generator: torch.Generator) -> Tensor:
     n, _, height, width = x.shape
     top = torch.randint(0, height - side + 1, (n,), generator=generator).tolist()
     left = torch.randint(0, width - side + 1, (n,), generator=generator).tolist()
-    return torch.stack([x[k, :, t : t + side, c : c + side] for k, (t, c) in enumerate(zip(top, left, strict=True))])
+    return torch.stack(
+        [
+            x[k, :, t : t + side, c : c + side]
+            for k, (t, c) in enumerate(zip(top, left, strict=True))
+        ]
+    )
 
 
-def _set_codebook(model: Autoencoder, images: np.ndarray, options: AutoencoderOptions, seed: int) -> None:
-    """Makes the centres of encoder outputs the codebook."""
+def _set_codebook(
+    model: Autoencoder, images: np.ndarray, options: AutoencoderOptions, seed: int
+) -> None:
+    """Makes the centers of encoder outputs the codebook."""
     rng = rng_for(seed, "codebook")
     side = images.shape[1] // model.factor
     count = max(8, -(-options.codes * 32 // side**2))
     chosen = np.sort(rng.choice(len(images), size=min(len(images), count), replace=False))
-    points = model.encode(images[chosen]).permute(0, 2, 3, 1).reshape(-1, model.channels).double().numpy()
-    centres = torch.from_numpy(k_means(points, options.codes, rng))
-    model.vq.quantize.embedding.weight.data.copy_(centres)
+    points = (
+        model.encode(images[chosen])
+        .permute(0, 2, 3, 1)
+        .reshape(-1, model.channels)
+        .double()
+        .numpy()
+    )
+    centers = torch.from_numpy(k_means(points, options.codes, rng))
+    model.vq.quantize.embedding.weight.data.copy_(centers)
 
 
-def k_means(points: np.ndarray, k: int, rng: np.random.Generator, iterations: int = 12) -> np.ndarray:
+def k_means(
+    points: np.ndarray, k: int, rng: np.random.Generator, iterations: int = 12
+) -> np.ndarray:
     """Lloyd's k-means in few dimensions.
 
     Args:
         points: (n, d).
-        k: centres; more than n gives points twice, with a little noise.
-        rng: draws the first centres.
+        k: centers; more than n gives points twice, with a little noise.
+        rng: draws the first centers.
         iterations: of assignment and mean.
 
     Returns:
         (k, d).
     """
-    centres = points[rng.choice(len(points), size=k, replace=len(points) < k)].copy()
-    centres += 1e-4 * points.std() * rng.standard_normal(centres.shape)
+    centers = points[rng.choice(len(points), size=k, replace=len(points) < k)].copy()
+    centers += 1e-4 * points.std() * rng.standard_normal(centers.shape)
     for _ in range(iterations):
-        distance, nearest = KDTree(centres).query(points)
+        distance, nearest = KDTree(centers).query(points)
         counts = np.bincount(nearest, minlength=k)
-        sums = np.stack([np.bincount(nearest, weights=points[:, j], minlength=k) for j in range(points.shape[1])], axis=1)
+        sums = np.stack(
+            [
+                np.bincount(nearest, weights=points[:, j], minlength=k)
+                for j in range(points.shape[1])
+            ],
+            axis=1,
+        )
         used = counts > 0
-        centres[used] = sums[used] / counts[used, None]
+        centers[used] = sums[used] / counts[used, None]
         empty = np.flatnonzero(~used)
         farthest = np.argsort(-np.asarray(distance))[: len(empty)]
-        centres[empty[: len(farthest)]] = points[farthest]
-    return centres
+        centers[empty[: len(farthest)]] = points[farthest]
+    return centers
 
 
 @dataclass(frozen=True)
@@ -209,7 +258,7 @@ class Reconstruction:
     Attributes:
         n: images.
         psnr: mean over images of 10 log10(1 / MSE), values in [0, 1].
-        psnr_free: the same without quantisation.
+        psnr_free: the same without quantization.
         ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range 1).
         perplexity: exp of the entropy of the codes used; at most the number of codes.
         dead: codes never used on these images.
@@ -226,7 +275,9 @@ class Reconstruction:
 
 
 @torch.no_grad()
-def measure_reconstruction(autoencoder: Autoencoder, images: np.ndarray, batch: int = 64) -> Reconstruction:
+def measure_reconstruction(
+    autoencoder: Autoencoder, images: np.ndarray, batch: int = 64
+) -> Reconstruction:
     """Scores reconstructions of bytes (n, h, w, 3), a batch at a time."""
     device = next(autoencoder.parameters()).device
     codes = int(autoencoder.vq.config["num_vq_embeddings"])
@@ -236,15 +287,23 @@ def measure_reconstruction(autoencoder: Autoencoder, images: np.ndarray, batch: 
         x = to_unit(images[k : k + batch]).to(device)
         z = autoencoder.latents(x)
         # Rounded to bytes first: what is scored is the picture that anybody gets.
-        y, free = (to_unit(to_bytes(autoencoder.image(z, quantise=q)[0])).to(device) for q in (True, False))
+        y, free = (
+            to_unit(to_bytes(autoencoder.image(z, quantize=q)[0])).to(device) for q in (True, False)
+        )
         rows["psnr"].append(10 * torch.log10(4 / (y - x).square().mean((1, 2, 3)).clamp_min(1e-12)))
-        rows["psnr_free"].append(10 * torch.log10(4 / (free - x).square().mean((1, 2, 3)).clamp_min(1e-12)))
+        rows["psnr_free"].append(
+            10 * torch.log10(4 / (free - x).square().mean((1, 2, 3)).clamp_min(1e-12))
+        )
         rows["ssim"].append(_ssim((x + 1) / 2, (y + 1) / 2))
         counts += np.bincount(autoencoder.codes(z).flatten().cpu().numpy(), minlength=codes)
     share = counts[counts > 0] / counts.sum()
     mean = {name: float(torch.cat(values).double().mean()) for name, values in rows.items()}
     return Reconstruction(
-        len(images), **mean, perplexity=float(np.exp(-(share * np.log(share)).sum())), dead=int((counts == 0).sum()), codes=codes
+        len(images),
+        **mean,
+        perplexity=float(np.exp(-(share * np.log(share)).sum())),
+        dead=int((counts == 0).sum()),
+        codes=codes,
     )
 
 
@@ -256,9 +315,15 @@ def _ssim(x: Tensor, y: Tensor) -> Tensor:
 
     def blur(z: Tensor) -> Tensor:
         z = nn.functional.conv2d(z.flatten(0, 1).unsqueeze(1), window.reshape(1, 1, 1, -1))
-        return nn.functional.conv2d(z, window.reshape(1, 1, -1, 1)).unflatten(0, (x.shape[0], x.shape[1])).squeeze(2)
+        return (
+            nn.functional.conv2d(z, window.reshape(1, 1, -1, 1))
+            .unflatten(0, (x.shape[0], x.shape[1]))
+            .squeeze(2)
+        )
 
     mx, my = blur(x), blur(y)
     vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
     c1, c2 = 0.01**2, 0.03**2
-    return ((2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean((1, 2, 3))
+    return ((2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean(
+        (1, 2, 3)
+    )

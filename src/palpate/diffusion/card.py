@@ -13,9 +13,21 @@ from typing import Any, Literal, get_args
 
 from palpate.core import PalpateError, read_record, told_of
 
-FORMAT = "palpate-pipeline/1"
+FORMAT = "palpate-pipeline/2"
+#: Format 1 called the encoders ``towers``; it is still read.
+FORMAT_1 = "palpate-pipeline/1"
 #: What the card must have beside the format.
-KEYS = ("digest", "preset", "size", "condition", "schedule", "sampler", "latents", "autoencoder", "towers", "training")
+KEYS = (
+    "digest",
+    "preset",
+    "size",
+    "condition",
+    "schedule",
+    "sampler",
+    "latents",
+    "autoencoder",
+    "training",
+)
 Method = Literal["ddim", "dpm"]
 
 
@@ -45,7 +57,11 @@ def read_card(folder: Path) -> dict[str, Any]:
     Raises:
         PalpateError: if there is none, or it is of another format or lacks an entry.
     """
-    return read_record(folder / "palpate.json", "card of the pipeline", form=FORMAT, keys=KEYS)
+    about = read_record(
+        folder / "palpate.json", "card of the pipeline", form=(FORMAT, FORMAT_1), keys=KEYS
+    )
+    about.setdefault("encoders", about.pop("towers", None))
+    return about
 
 
 def require_settings(options: SamplerOptions, *, most: int, dropout: float | None = None) -> None:
@@ -61,11 +77,23 @@ def require_settings(options: SamplerOptions, *, most: int, dropout: float | Non
     """
     if options.steps < 1 or options.batch < 1 or options.steps > most:
         got = f"steps {options.steps}, batch {options.batch}"
-        raise PalpateError(f"Sampling needs 1 to {most} steps and a batch of at least 1", got, "Choose e.g. 50 steps and batch 16")
+        raise PalpateError(
+            f"Sampling needs 1 to {most} steps and a batch of at least 1",
+            got,
+            "Choose e.g. 50 steps and batch 16",
+        )
     if options.method not in get_args(Method):
-        raise PalpateError(f"The sampling method must be {' or '.join(get_args(Method))}", repr(options.method), "Choose one of these")
+        raise PalpateError(
+            f"The sampling method must be {' or '.join(get_args(Method))}",
+            repr(options.method),
+            "Choose one of these",
+        )
     if not (math.isfinite(options.guidance) and options.guidance >= 0):
-        raise PalpateError("Guidance must be a finite number from 0 on", str(options.guidance), "Choose e.g. 2; 1 is none")
+        raise PalpateError(
+            "Guidance must be a finite number from 0 on",
+            str(options.guidance),
+            "Choose e.g. 2; 1 is none",
+        )
     if dropout is not None and options.guidance != 1 and not dropout:
         raise PalpateError(
             "Guidance needs a generator trained with condition dropout",
@@ -74,7 +102,13 @@ def require_settings(options: SamplerOptions, *, most: int, dropout: float | Non
         )
 
 
-def require_sampler(folder: Path, *, guidance: float | None = None, steps: int | None = None, batch: int | None = None) -> None:
+def require_sampler(
+    folder: Path,
+    *,
+    guidance: float | None = None,
+    steps: int | None = None,
+    batch: int | None = None,
+) -> None:
     """Refuses settings that the pipeline in ``folder`` cannot sample with, by its card alone.
 
     Args:
@@ -87,7 +121,11 @@ def require_sampler(folder: Path, *, guidance: float | None = None, steps: int |
         PalpateError: see :func:`require_settings`; or if the card cannot be used.
     """
     about, note = read_card(folder), folder / "palpate.json"
-    given = {k: v for k, v in {"guidance": guidance, "steps": steps, "batch": batch}.items() if v is not None}
+    given = {
+        k: v
+        for k, v in {"guidance": guidance, "steps": steps, "batch": batch}.items()
+        if v is not None
+    }
     with told_of(note, "sampler"):
         options = replace(SamplerOptions(**about["sampler"]), **given)
     with told_of(note, "schedule"):

@@ -10,7 +10,7 @@ which closes the constant part of the gap between text and vision embeddings). T
 classifier-free guidance is all zeros, or learned. Everything here is part of the checkpoint.
 
 Beside cross-attention the token may also be added, through two layers, to the embedding of the time step (``UNetOptions.modulate``), which
-then shifts every residual block: beyond the paper, cheap, and learnt much sooner by a small network than one token of attention.
+then shifts every residual block: beyond the paper, cheap, and learned much sooner by a small network than one token of attention.
 
 The variant "w/ BG" concatenates the latent of the no-contact image to the noisy latent along channels.
 """
@@ -76,7 +76,7 @@ class UNetOptions:
         attention: whether each level attends (to itself and to the condition); the middle block always does.
         layers: residual blocks a level.
         head_width: channels of an attention head.
-        groups: of the group normalisation.
+        groups: of the group normalization.
         modulate: also add the (first) token to the time embedding; the paper has cross-attention alone.
     """
 
@@ -88,19 +88,29 @@ class UNetOptions:
     modulate: bool = False
 
 
-def build_unet(options: UNetOptions, *, channels: int, size: int, width: int, background: bool) -> UNet2DConditionModel:
+def build_unet(
+    options: UNetOptions, *, channels: int, size: int, width: int, background: bool
+) -> UNet2DConditionModel:
     """An untrained U-Net for latents (channels, size, size) and tokens of ``width``; weights from torch's global generator.
 
     With ``background`` it takes twice the channels: noisy latent, then background latent.
     """
     if len(options.widths) != len(options.attention):
-        raise PalpateError("Every level of the U-Net needs a width and an attention flag", str(options), "Make both tuples equally long")
+        raise PalpateError(
+            "Every level of the U-Net needs a width and an attention flag",
+            str(options),
+            "Make both tuples equally long",
+        )
     return UNet2DConditionModel(
         sample_size=size,
         in_channels=channels * (2 if background else 1),
         out_channels=channels,
-        down_block_types=tuple("CrossAttnDownBlock2D" if a else "DownBlock2D" for a in options.attention),
-        up_block_types=tuple("CrossAttnUpBlock2D" if a else "UpBlock2D" for a in reversed(options.attention)),
+        down_block_types=tuple(
+            "CrossAttnDownBlock2D" if a else "DownBlock2D" for a in options.attention
+        ),
+        up_block_types=tuple(
+            "CrossAttnUpBlock2D" if a else "UpBlock2D" for a in reversed(options.attention)
+        ),
         block_out_channels=options.widths,
         layers_per_block=options.layers,
         cross_attention_dim=width,
@@ -123,12 +133,20 @@ class Denoiser(nn.Module):
 
     means: Tensor
 
-    def __init__(self, unet: UNet2DConditionModel, policy: ConditionPolicy, means: Mapping[Source, Tensor] | None = None) -> None:
+    def __init__(
+        self,
+        unet: UNet2DConditionModel,
+        policy: ConditionPolicy,
+        means: Mapping[Source, Tensor] | None = None,
+    ) -> None:
         """With ``gap="mean-shift"``, ``means`` gives the training mean (d,) of each source that will be used."""
         super().__init__()
         self.unet, self.policy = unet, policy
         outputs, inputs = int(unet.config["out_channels"]), int(unet.config["in_channels"])
-        if inputs not in (outputs, 2 * outputs) or unet.config["cross_attention_dim"] != policy.width:
+        if (
+            inputs not in (outputs, 2 * outputs)
+            or unet.config["cross_attention_dim"] != policy.width
+        ):
             raise PalpateError(
                 f"The U-Net must take {outputs} or {2 * outputs} channels and tokens of width {policy.width}",
                 f"{inputs} channels and width {unet.config['cross_attention_dim']}",
@@ -137,9 +155,19 @@ class Denoiser(nn.Module):
         self.background = inputs == 2 * outputs
         # A source without a mean is marked by NaN, and refused when it is used.
         fill = 0.0 if policy.gap == "none" else float("nan")
-        rows = [means[s].float() if means is not None and s in means else torch.full((policy.width,), fill) for s in SOURCES]
-        self.register_buffer("means", torch.stack(rows) if policy.gap != "none" else torch.zeros(len(SOURCES), policy.width))
-        self.null = nn.Parameter(0.02 * torch.randn(policy.width)) if policy.null == "learned" else None
+        rows = [
+            means[s].float()
+            if means is not None and s in means
+            else torch.full((policy.width,), fill)
+            for s in SOURCES
+        ]
+        self.register_buffer(
+            "means",
+            torch.stack(rows) if policy.gap != "none" else torch.zeros(len(SOURCES), policy.width),
+        )
+        self.null = (
+            nn.Parameter(0.02 * torch.randn(policy.width)) if policy.null == "learned" else None
+        )
 
     @property
     def channels(self) -> int:
@@ -161,7 +189,7 @@ class Denoiser(nn.Module):
             raise PalpateError(
                 f"Conditions must be embeddings of shape (n, {self.policy.width})",
                 str(tuple(conditions.shape)),
-                "Use the pipeline's own towers",
+                "Use the pipeline's own encoders",
             )
         mean = self.means[SOURCES.index(source)]
         if not torch.isfinite(mean).all():
@@ -170,29 +198,43 @@ class Denoiser(nn.Module):
                 "a checkpoint without it",
                 f"Give training the {source} embeddings too",
             )
-        token = nn.functional.normalize(conditions.to(self.device, torch.float32) - mean, dim=1) * self.policy.width**0.5
+        token = (
+            nn.functional.normalize(conditions.to(self.device, torch.float32) - mean, dim=1)
+            * self.policy.width**0.5
+        )
         return token.unsqueeze(1).expand(-1, self.policy.tokens, -1)
 
     def null_tokens(self, n: int) -> Tensor:
         """The unconditional tokens (n, k, d)."""
         shape = (n, self.policy.tokens, self.policy.width)
-        return torch.zeros(shape, device=self.device) if self.null is None else self.null.expand(shape)
+        return (
+            torch.zeros(shape, device=self.device) if self.null is None else self.null.expand(shape)
+        )
 
-    def forward(self, x: Tensor, t: Tensor, tokens: Tensor, background: Tensor | None = None) -> Tensor:
+    def forward(
+        self, x: Tensor, t: Tensor, tokens: Tensor, background: Tensor | None = None
+    ) -> Tensor:
         """The network's output (n, c, h, w): noise, or v where the schedule says so.
 
         Args:
-            x: noisy normalised latents (n, c, h, w).
+            x: noisy normalized latents (n, c, h, w).
             t: steps, int64 (n,) in 0..T-1 (the paper's 1..T).
             tokens: (n, k, d).
-            background: normalised latents of the no-contact images (n, c, h, w).
+            background: normalized latents of the no-contact images (n, c, h, w).
         """
         if self.background:
             if background is None:
-                raise PalpateError("This generator needs a background image per sample", "none", "Fill the manifest's column background")
+                raise PalpateError(
+                    "This generator needs a background image per sample",
+                    "none",
+                    "Fill the manifest's column background",
+                )
             x = torch.cat([x, background], dim=1)
         first = tokens[:, 0] if self.unet.config["class_embed_type"] == "projection" else None
-        return cast("Tensor", self.unet(x, t, encoder_hidden_states=tokens, class_labels=first, return_dict=False)[0])
+        return cast(
+            "Tensor",
+            self.unet(x, t, encoder_hidden_states=tokens, class_labels=first, return_dict=False)[0],
+        )
 
     def halve(self) -> Rounding:
         """Rounds the U-Net's weights to 16 bits, here and now; see :func:`palpate.encoders.half.round_to_half`."""
@@ -206,7 +248,9 @@ class Denoiser(nn.Module):
         if half:
             self.halve()
         save_weights(self.unet, folder, half=half)
-        extra = {"means": self.means.cpu().contiguous()} | ({} if self.null is None else {"null": self.null.detach().cpu().contiguous()})
+        extra = {"means": self.means.cpu().contiguous()} | (
+            {} if self.null is None else {"null": self.null.detach().cpu().contiguous()}
+        )
         with atomic_path(Path(folder) / "condition.safetensors") as part:
             save_file(extra, part)
 
@@ -218,16 +262,24 @@ class Denoiser(nn.Module):
             PalpateError: if a file is missing, unreadable, incomplete, or of another policy.
         """
         try:
-            unet = UNet2DConditionModel.from_pretrained(str(folder), low_cpu_mem_usage=False, use_safetensors=True, local_files_only=True)
+            unet = UNet2DConditionModel.from_pretrained(
+                str(folder), low_cpu_mem_usage=False, use_safetensors=True, local_files_only=True
+            )
             extra = load_file(Path(folder) / "condition.safetensors")
             model = cls(unet.float(), policy)
-            wanted = {"means": model.means} | ({} if model.null is None else {"null": model.null.data})
+            wanted = {"means": model.means} | (
+                {} if model.null is None else {"null": model.null.data}
+            )
             for name, place in wanted.items():
                 if (shape := tuple(extra[name].shape) if name in extra else None) != place.shape:
-                    raise ValueError(f"condition.safetensors has {name} of shape {shape}, not {tuple(place.shape)}")
+                    raise ValueError(
+                        f"condition.safetensors has {name} of shape {shape}, not {tuple(place.shape)}"
+                    )
                 place.copy_(extra[name])
         except (*UNREADABLE, AttributeError) as error:
             got = (str(error).splitlines() or [type(error).__name__])[0]
             fix = "Copy the whole pipeline folder again"
-            raise PalpateError("The denoiser must be a folder written by palpate", f"{folder}: {got}", fix) from None
+            raise PalpateError(
+                "The denoiser must be a folder written by palpate", f"{folder}: {got}", fix
+            ) from None
         return model.eval().requires_grad_(requires_grad=False)

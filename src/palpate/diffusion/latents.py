@@ -1,7 +1,7 @@
-"""Latents, encoded once: a memory-mapped cache of what the frozen autoencoder gives before quantisation.
+"""Latents, encoded once: a memory-mapped cache of what the frozen autoencoder gives before quantization.
 
 A cache is ``latents.npy`` (float32, (n, c, h, w)) with ``latents.json`` beside it, which holds the ids in order
-and a key; it is used again only if both are the same. The statistics by which latents are normalised,
+and a key; it is used again only if both are the same. The statistics by which latents are normalized,
 
     z' = (z - mean_c) / std_c      (``scale="std"``)        z' = z      (``scale="one"``, the paper's preset)
 
@@ -19,7 +19,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, read_json, write_json
+from palpate.core import (
+    PalpateError,
+    Progress,
+    atomic_path,
+    digest_json,
+    quiet,
+    read_json,
+    write_json,
+)
 from palpate.diffusion.autoencoder import Autoencoder
 
 FORMAT = "palpate-latents/1"
@@ -54,18 +62,30 @@ class LatentStats:
             square = square + (part**2).sum(axis=(0, 2, 3))
             count += part.shape[0] * part.shape[2] * part.shape[3]
         if not count:
-            raise PalpateError("Latent statistics need at least one image", "none", "Check the split: is its train part empty?")
+            raise PalpateError(
+                "Latent statistics need at least one image",
+                "none",
+                "Check the split: is its train part empty?",
+            )
         mean = np.asarray(total) / count
         std = np.sqrt(np.maximum(np.asarray(square) / count - mean**2, 1e-12))
         return cls(tuple(float(v) for v in mean), tuple(float(v) for v in std), scale)
 
-    def normalise(self, latents: Tensor) -> Tensor:
+    def normalize(self, latents: Tensor) -> Tensor:
         """Latents of the autoencoder -> what the denoiser sees."""
-        return latents if self.scale == "one" else (latents - _column(self.mean, latents)) / _column(self.std, latents)
+        return (
+            latents
+            if self.scale == "one"
+            else (latents - _column(self.mean, latents)) / _column(self.std, latents)
+        )
 
     def restore(self, latents: Tensor) -> Tensor:
-        """The inverse of :meth:`normalise`."""
-        return latents if self.scale == "one" else latents * _column(self.std, latents) + _column(self.mean, latents)
+        """The inverse of :meth:`normalize`."""
+        return (
+            latents
+            if self.scale == "one"
+            else latents * _column(self.std, latents) + _column(self.mean, latents)
+        )
 
 
 def _column(values: tuple[float, ...], like: Tensor) -> Tensor:
@@ -107,7 +127,9 @@ def encode_latents(
         for start in range(0, len(ids), batch):
             z = autoencoder.encode(images[start : min(start + batch, len(ids))], batch).numpy()
             if store is None:
-                store = np.lib.format.open_memmap(part, mode="w+", dtype=np.float32, shape=(len(ids), *z.shape[1:]))
+                store = np.lib.format.open_memmap(
+                    part, mode="w+", dtype=np.float32, shape=(len(ids), *z.shape[1:])
+                )
             store[start : start + len(z)] = z
             progress("encoding touches", start + len(z), len(ids))
         if store is None:

@@ -4,13 +4,13 @@
 
     unet/          the denoiser, diffusers' format, and condition.safetensors (modality means, learned null)
     autoencoder/   the VQModel, diffusers' format, and its palpate.json
-    towers/        the vision tower (and text tower) whose embeddings the denoiser knows
+    encoders/      the vision encoder (and text encoder) whose embeddings the denoiser knows
     scheduler/     scheduler_config.json, diffusers' format: for programs that read only the parts
     palpate.json   preset, condition policy, schedule, sampler, latent statistics, background flag, training record, digest
     README.md      the card for people
 
-A pipeline that was trained on the towers and the autoencoder of a shipped model may refer to them instead of carrying copies: then
-``autoencoder/`` and ``towers/`` are absent, and ``"shared"`` in ``palpate.json`` names the model. Their digests stand there in either
+A pipeline that was trained on the encoders and the autoencoder of a shipped model may refer to them instead of carrying copies: then
+``autoencoder/`` and ``encoders/`` are absent, and ``"shared"`` in ``palpate.json`` names the model. Their digests stand there in either
 case and are checked on loading.
 
 The *digest* names weights, condition policy, schedule and latent statistics: what the pictures depend on beside
@@ -30,26 +30,34 @@ import torch
 from torch import Tensor
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, atomic_folder, digest_json, quiet, told_of, write_json
+from palpate.core import (
+    PalpateError,
+    Progress,
+    atomic_folder,
+    digest_json,
+    quiet,
+    told_of,
+    write_json,
+)
 from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_shipped
 from palpate.diffusion.autoencoder import Autoencoder
-from palpate.diffusion.card import FORMAT, SamplerOptions, read_card
+from palpate.diffusion.card import FORMAT, FORMAT_1, SamplerOptions, read_card
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Source
 from palpate.diffusion.latents import LatentStats
 from palpate.diffusion.pixels import architecture, digest_tensors, to_unit
 from palpate.diffusion.sampling import build_scheduler, require_sampling, sample_latents
 from palpate.diffusion.training import Schedule
+from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.hub import find_model
-from palpate.encoders.towers import Towers, load_clip
 
 SYNTHETIC = "Made by a generator that was trained on synthetic data alone (palpate's procedural world), not on a real sensor."
-#: Photos embedded at once, always: an embedding does not depend on its neighbours.
+#: Photos embedded at once, always: an embedding does not depend on its neighbors.
 EMBED = 32
 
 
 @dataclass(frozen=True)
-class Pipeline:
+class TactilePipeline:
     """A generator of touches.
 
     Attributes:
@@ -58,7 +66,7 @@ class Pipeline:
         schedule: that the denoiser was trained with.
         sampler: the default sampling settings.
         size: side of the touches in pixels.
-        towers: give the vision embeddings of photos; None for a pipeline driven by embeddings alone.
+        encoders: give the vision embeddings of photos; None for a pipeline driven by embeddings alone.
         preset: name of the preset.
         training: JSON record: digests of manifest, split and encoder, steps, seed, source of the conditions, versions.
     """
@@ -69,17 +77,28 @@ class Pipeline:
     schedule: Schedule
     sampler: SamplerOptions
     size: int
-    towers: Towers | None = None
+    encoders: EncoderSet | None = None
     preset: str = ""
     training: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 of all that the pictures depend on beside seed, sampler and input."""
-        parts = [asdict(self.stats), asdict(self.schedule), asdict(self.denoiser.policy), self.size, self.autoencoder.digest]
+        parts = [
+            asdict(self.stats),
+            asdict(self.schedule),
+            asdict(self.denoiser.policy),
+            self.size,
+            self.autoencoder.digest,
+        ]
         parts.append(architecture(self.denoiser.unet.config))
         return digest_json(
-            [FORMAT, *parts, digest_tensors(self.denoiser.state_dict()), self.towers.digest("vision") if self.towers else None]
+            [
+                FORMAT_1,
+                *parts,
+                digest_tensors(self.denoiser.state_dict()),
+                self.encoders.digest("vision") if self.encoders else None,
+            ]
         )
 
     @property
@@ -89,15 +108,21 @@ class Pipeline:
 
     @property
     def vision_size(self) -> int:
-        """Side in pixels at which photos are best given; they are resized to the tower's input anyway."""
-        return self._towers().preprocess("vision").resize
+        """Side in pixels at which photos are best given; they are resized to the encoder's input anyway."""
+        return self._encoders().preprocess("vision").resize
 
-    def _towers(self) -> Towers:
-        if self.towers is None:
-            raise PalpateError("Photos need the pipeline's vision tower", "a pipeline without towers", "Save it with its towers")
-        return self.towers
+    def _encoders(self) -> EncoderSet:
+        if self.encoders is None:
+            raise PalpateError(
+                "Photos need the pipeline's vision encoder",
+                "a pipeline without encoders",
+                "Save it with its encoders",
+            )
+        return self.encoders
 
-    def sampler_with(self, *, guidance: float | None = None, steps: int | None = None, batch: int | None = None) -> SamplerOptions:
+    def sampler_with(
+        self, *, guidance: float | None = None, steps: int | None = None, batch: int | None = None
+    ) -> SamplerOptions:
         """The default sampler with some settings replaced.
 
         Raises:
@@ -109,18 +134,20 @@ class Pipeline:
         return sampler
 
     def embed(self, vision: np.ndarray) -> Tensor:
-        """Photos, bytes (n, h, w, 3), -> L2-normalised vision embeddings (n, d), on the CPU."""
-        towers, parts = self._towers(), list[Tensor]()
-        transform = towers.preprocess("vision")
+        """Photos, bytes (n, h, w, 3), -> L2-normalized vision embeddings (n, d), on the CPU."""
+        encoders, parts = self._encoders(), list[Tensor]()
+        transform = encoders.preprocess("vision")
         with torch.no_grad():
             for start in range(0, len(vision), EMBED):
                 stop = min(start + EMBED, len(vision))
                 # The last batch repeats its last row: every batch runs the same kernels.
-                pixels = transform.fit(vision[[min(k, stop - 1) for k in range(start, start + EMBED)]])
-                unit = to_unit(pixels).add(1.0).div(2.0).to(towers.device)
-                embedded = towers.encode("vision", transform.normalise(transform.crop(unit)))
+                pixels = transform.fit(
+                    vision[[min(k, stop - 1) for k in range(start, start + EMBED)]]
+                )
+                unit = to_unit(pixels).add(1.0).div(2.0).to(encoders.device)
+                embedded = encoders.encode("vision", transform.normalize(transform.crop(unit)))
                 parts.append(embedded[: stop - start].cpu())
-        return torch.cat(parts) if parts else torch.empty(0, towers.dim)
+        return torch.cat(parts) if parts else torch.empty(0, encoders.dim)
 
     def touch(
         self,
@@ -151,7 +178,14 @@ class Pipeline:
             PalpateError: if lengths differ, a background is missing, or guidance is asked of a model without dropout.
         """
         sampler = self.sampler_with(guidance=guidance, steps=steps)
-        return self.touch_from_embeddings(self.embed(vision), ids, seed=seed, sampler=sampler, background=background, progress=progress)
+        return self.touch_from_embeddings(
+            self.embed(vision),
+            ids,
+            seed=seed,
+            sampler=sampler,
+            background=background,
+            progress=progress,
+        )
 
     def touch_from_embeddings(
         self,
@@ -170,8 +204,10 @@ class Pipeline:
         if background is not None:
             if background.shape[1:3] != (self.size, self.size):
                 got = f"{background.shape[1]} x {background.shape[2]}"
-                raise PalpateError(f"Background images must be {self.size} pixels square", got, "Resize them")
-            ground = self.stats.normalise(self.autoencoder.encode(background))
+                raise PalpateError(
+                    f"Background images must be {self.size} pixels square", got, "Resize them"
+                )
+            ground = self.stats.normalize(self.autoencoder.encode(background))
         tokens = self.denoiser.tokens(torch.as_tensor(conditions), source)
         latents = sample_latents(
             self.denoiser,
@@ -186,12 +222,12 @@ class Pipeline:
         )
         return self.autoencoder.decode(self.stats.restore(latents))
 
-    def to(self, device: str | torch.device) -> Pipeline:
+    def to(self, device: str | torch.device) -> TactilePipeline:
         """Moves all parts to a device, in place; returns the pipeline."""
         self.autoencoder.to(device)
         self.denoiser.to(device)
-        if self.towers is not None:
-            self.towers.to(str(device))
+        if self.encoders is not None:
+            self.encoders.to(str(device))
         return self
 
     @property
@@ -201,7 +237,11 @@ class Pipeline:
             return ""
         records = (self.training, self.training.get("start_record") or {})
         known = sorted({str(name) for record in records for name in record.get("materials", ())})
-        return f"{SYNTHETIC} It knows only these materials: {', '.join(known)}." if known else SYNTHETIC
+        return (
+            f"{SYNTHETIC} It knows only these materials: {', '.join(known)}."
+            if known
+            else SYNTHETIC
+        )
 
     def save(self, folder: Path, *, half: bool = False, shared: str | None = None) -> None:
         """Writes the pipeline; the folder appears whole or not at all.
@@ -209,7 +249,7 @@ class Pipeline:
         Args:
             folder: must be new or empty.
             half: round the weights to 16 bits first (of this object too: its digest changes), and write 16-bit weights.
-            shared: a shipped name whose towers and autoencoder this pipeline uses: they are then referred to, not written.
+            shared: a shipped name whose encoders and autoencoder this pipeline uses: they are then referred to, not written.
 
         Raises:
             PalpateError: if the folder exists and is not empty, a weight is too large for 16 bits, or the shared model differs.
@@ -220,19 +260,22 @@ class Pipeline:
             self.denoiser.save(part / "unet", half=half)
             if shared is None:
                 self.autoencoder.save(part / "autoencoder", half=half)
-                if self.towers is not None:
-                    self.towers.save(part / "towers", half=half)
+                if self.encoders is not None:
+                    self.encoders.save(part / "encoders", half=half)
             self.__dict__.pop("digest", None)  # of the weights before rounding
             build_scheduler(self.schedule, self.sampler.method).save_pretrained(part / "scheduler")
-            write_json(part / "palpate.json", self.to_json() | ({} if shared is None else {"shared": shared}))
+            write_json(
+                part / "palpate.json",
+                self.to_json() | ({} if shared is None else {"shared": shared}),
+            )
             write_model_cards(part)
 
     def _require_shared(self, name: str) -> None:
-        autoencoder, towers = _shared_parts(name)
-        here = (self.autoencoder.digest, self.towers.digest("vision") if self.towers else None)
-        if here != (autoencoder.digest, towers.digest("vision")):
+        autoencoder, encoders = _shared_parts(name)
+        here = (self.autoencoder.digest, self.encoders.digest("vision") if self.encoders else None)
+        if here != (autoencoder.digest, encoders.digest("vision")):
             raise PalpateError(
-                f"A pipeline that refers to {name} must use its autoencoder and vision tower",
+                f"A pipeline that refers to {name} must use its autoencoder and vision encoder",
                 "others",
                 "Leave out shared, or train on these",
             )
@@ -250,13 +293,13 @@ class Pipeline:
             "sampler": asdict(self.sampler),
             "latents": asdict(self.stats) | {"factor": self.autoencoder.factor},
             "autoencoder": self.autoencoder.digest,
-            "towers": self.towers.digest("vision") if self.towers else None,
+            "encoders": self.encoders.digest("vision") if self.encoders else None,
             "training": dict(self.training),
             "palpate": __version__,
         }
 
     @classmethod
-    def load(cls, source: str | Path) -> Pipeline:
+    def load(cls, source: str | Path) -> TactilePipeline:
         """Reads a saved pipeline and checks its digest.
 
         Args:
@@ -271,18 +314,36 @@ class Pipeline:
         about = read_card(folder)
         settings = _settings(note, about)
         if "shared" in about:
-            autoencoder, towers = _shared_parts(str(about["shared"]))
-            if (autoencoder.digest, towers.digest("vision")) != (about["autoencoder"], about["towers"]):
+            autoencoder, encoders = _shared_parts(str(about["shared"]))
+            if (autoencoder.digest, encoders.digest("vision")) != (
+                about["autoencoder"],
+                about["encoders"],
+            ):
                 must = f"{folder} must find the parts of {about['shared']} that it was trained on"
-                raise PalpateError(must, "those of another version of palpate", "Install the version that it names, or train again")
+                raise PalpateError(
+                    must,
+                    "those of another version of palpate",
+                    "Install the version that it names, or train again",
+                )
         else:
             autoencoder = Autoencoder.load(folder / "autoencoder")
-            towers = Towers.load(folder / "towers") if about["towers"] else None
+            place = folder / "encoders"
+            place = place if place.is_dir() else folder / "towers"  # format 1
+            encoders = EncoderSet.load(place) if about["encoders"] else None
         with told_of(note, "condition"):
             policy = ConditionPolicy(**about["condition"])
-        pipeline = cls(autoencoder=autoencoder, denoiser=Denoiser.load(folder / "unet", policy), towers=towers, **settings)
+        pipeline = cls(
+            autoencoder=autoencoder,
+            denoiser=Denoiser.load(folder / "unet", policy),
+            encoders=encoders,
+            **settings,
+        )
         if pipeline.digest != about["digest"]:
-            raise PalpateError(f"The weights in {folder} must match its palpate.json", "other weights", "Copy the whole folder again")
+            raise PalpateError(
+                f"The weights in {folder} must match its palpate.json",
+                "other weights",
+                "Copy the whole folder again",
+            )
         return pipeline
 
 
@@ -295,7 +356,9 @@ def _settings(note: Path, about: Mapping[str, Any]) -> dict[str, Any]:
     settings: dict[str, Any] = {}
     with told_of(note, "latents"):
         stats = about["latents"]
-        settings["stats"] = LatentStats(tuple(map(float, stats["mean"])), tuple(map(float, stats["std"])), stats["scale"])
+        settings["stats"] = LatentStats(
+            tuple(map(float, stats["mean"])), tuple(map(float, stats["std"])), stats["scale"]
+        )
     with told_of(note, "schedule"):
         settings["schedule"] = Schedule(**about["schedule"])
     with told_of(note, "sampler"):
@@ -308,12 +371,16 @@ def _settings(note: Path, about: Mapping[str, Any]) -> dict[str, Any]:
     return settings | {"preset": str(about["preset"])}
 
 
-def _shared_parts(name: str) -> tuple[Autoencoder, Towers]:
-    """Autoencoder and towers of a shipped model; a folder or hub id is refused, as it would mean another thing elsewhere.
+def _shared_parts(name: str) -> tuple[Autoencoder, EncoderSet]:
+    """Autoencoder and encoders of a shipped model; a folder or hub id is refused, as it would mean another thing elsewhere.
 
     Raises:
         PalpateError: if the name is none of the shipped ones.
     """
     if not is_shipped(name):
-        raise PalpateError(f"A pipeline may refer to {', '.join(SHIPPED)}", repr(name), "Save it with its own towers and autoencoder")
-    return Autoencoder.load(name), Towers(load_clip(name))
+        raise PalpateError(
+            f"A pipeline may refer to {', '.join(SHIPPED)}",
+            repr(name),
+            "Save it with its own encoders and autoencoder",
+        )
+    return Autoencoder.load(name), EncoderSet(load_clip(name))

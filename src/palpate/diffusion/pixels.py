@@ -22,10 +22,16 @@ def to_unit(images: np.ndarray | Tensor) -> Tensor:
     Raises:
         PalpateError: for another shape or type.
     """
-    tensor = images if isinstance(images, Tensor) else torch.from_numpy(np.require(images, requirements=["C", "W"]))
+    tensor = (
+        images
+        if isinstance(images, Tensor)
+        else torch.from_numpy(np.require(images, requirements=["C", "W"]))
+    )
     if tensor.dtype != torch.uint8 or tensor.ndim != 4 or tensor.shape[3] != 3:
         raise PalpateError(
-            "Images must be bytes of shape (n, height, width, 3)", f"{tensor.dtype} of shape {tuple(tensor.shape)}", "Decode them to RGB"
+            "Images must be bytes of shape (n, height, width, 3)",
+            f"{tensor.dtype} of shape {tuple(tensor.shape)}",
+            "Decode them to RGB",
         )
     return tensor.permute(0, 3, 1, 2).to(torch.float32).div(127.5).sub(1.0)
 
@@ -48,12 +54,38 @@ def digest_tensors(tensors: Mapping[str, Tensor]) -> str:
 
 #: The settings of a diffusers model that decide what it computes; others name files, versions, or what only other kinds of model read.
 ARCHITECTURE = (
-    "act_fn", "attention_head_dim", "block_out_channels", "class_embed_type", "cross_attention_dim", "down_block_types", "downsample_padding",
-    "flip_sin_to_cos", "freq_shift", "in_channels", "latent_channels", "layers_per_block", "lookup_from_codebook", "mid_block_add_attention",
-    "mid_block_scale_factor", "mid_block_type", "norm_eps", "norm_num_groups", "norm_type", "num_attention_heads", "num_vq_embeddings",
-    "only_cross_attention", "out_channels", "resnet_time_scale_shift", "scaling_factor", "time_embedding_type", "timestep_post_act",
-    "transformer_layers_per_block", "up_block_types", "use_linear_projection", "vq_embed_dim",
-)  # fmt: skip
+    "act_fn",
+    "attention_head_dim",
+    "block_out_channels",
+    "class_embed_type",
+    "cross_attention_dim",
+    "down_block_types",
+    "downsample_padding",
+    "flip_sin_to_cos",
+    "freq_shift",
+    "in_channels",
+    "latent_channels",
+    "layers_per_block",
+    "lookup_from_codebook",
+    "mid_block_add_attention",
+    "mid_block_scale_factor",
+    "mid_block_type",
+    "norm_eps",
+    "norm_num_groups",
+    "norm_type",
+    "num_attention_heads",
+    "num_vq_embeddings",
+    "only_cross_attention",
+    "out_channels",
+    "resnet_time_scale_shift",
+    "scaling_factor",
+    "time_embedding_type",
+    "timestep_post_act",
+    "transformer_layers_per_block",
+    "up_block_types",
+    "use_linear_projection",
+    "vq_embed_dim",
+)
 
 
 def architecture(config: Mapping[str, Any]) -> dict[str, Any]:

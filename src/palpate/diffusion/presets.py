@@ -13,7 +13,7 @@ prediction         eps                    v                                 eps 
 condition          one token, dropout 0.1, null zeros, in all three
 source             text                   text or photo, half each          text
 gap, noise         none, 0                mean-shift, 0.3                   none, 0
-optimiser          AdamW 1e-3, EMA 0.99   AdamW 1e-3, cosine, EMA 0.99      AdamW 6.4e-5 (2e-6 x batch 32), EMA 0.9999
+optimizer          AdamW 1e-3, EMA 0.99   AdamW 1e-3, cosine, EMA 0.99      AdamW 6.4e-5 (2e-6 x batch 32), EMA 0.9999
 length             20 steps of 8          800 steps of 8                    30 epochs of batch 32
 sampler            DPM-Solver++ 4         DPM-Solver++ 8                    DDIM 200, eta 0
 guidance           2                      4                                 7.5
@@ -33,7 +33,7 @@ from palpate.diffusion.autoencoder_training import AutoencoderOptions
 from palpate.diffusion.denoiser import ConditionPolicy, UNetOptions
 from palpate.diffusion.sampling import SamplerOptions
 from palpate.diffusion.training import Schedule
-from palpate.encoders.loop import LoopOptions
+from palpate.training.loop import LoopOptions
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class DiffusionPreset:
         autoencoder: how to train one, or None if a trained one is given (``paper``: a ``vq-f4`` folder).
         latent_scale: see :class:`~palpate.diffusion.latents.LatentStats`.
         unet, schedule, sampler: see there.
-        condition: the policy; its width is replaced by that of the towers at hand.
+        condition: the policy; its width is replaced by that of the encoders at hand.
         loop: training; ``steps`` is ignored if ``epochs`` is given.
         epochs: passes over the training part, or None.
     """
@@ -64,7 +64,11 @@ class DiffusionPreset:
 
     def loop_for(self, n: int, *, seed: int | None = None) -> LoopOptions:
         """The loop for ``n`` training samples: epochs become steps."""
-        steps = self.loop.steps if self.epochs is None else max(1, -(-self.epochs * n // self.loop.batch))
+        steps = (
+            self.loop.steps
+            if self.epochs is None
+            else max(1, -(-self.epochs * n // self.loop.batch))
+        )
         return replace(self.loop, steps=steps, seed=self.loop.seed if seed is None else seed)
 
     def condition_for(self, width: int) -> ConditionPolicy:
@@ -75,7 +79,16 @@ class DiffusionPreset:
 TINY = DiffusionPreset(
     name="tiny",
     size=32,
-    autoencoder=AutoencoderOptions(patch=4, widths=(16,), groups=4, codes=64, steps_free=20, steps_quantised=10, batch=8, crop=0),
+    autoencoder=AutoencoderOptions(
+        patch=4,
+        widths=(16,),
+        groups=4,
+        codes=64,
+        steps_free=20,
+        steps_quantized=10,
+        batch=8,
+        crop=0,
+    ),
     latent_scale="std",
     unet=UNetOptions(widths=(16, 32), attention=(False, True), layers=1, head_width=16, groups=8),
     condition=ConditionPolicy(width=32),
@@ -87,10 +100,14 @@ MINI = DiffusionPreset(
     name="mini",
     size=64,
     # f4 as in latent diffusion: pixel pairs become channels, then one halving. Straight four-pixel patches lose texture.
-    autoencoder=AutoencoderOptions(patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=2000, steps_quantised=300),
+    autoencoder=AutoencoderOptions(
+        patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=2000, steps_quantized=300
+    ),
     latent_scale="std",
-    unet=UNetOptions(widths=(64, 96), attention=(False, True), layers=1, head_width=32, groups=16, modulate=True),
-    # Gap and noise go beyond the paper: the text-image gap is wide in small towers.
+    unet=UNetOptions(
+        widths=(64, 96), attention=(False, True), layers=1, head_width=32, groups=16, modulate=True
+    ),
+    # Gap and noise go beyond the paper: the text-image gap is wide in small encoders.
     condition=ConditionPolicy(width=128, gap="mean-shift", noise=0.3, source="mixed"),
     loop=LoopOptions(steps=800, batch=8, lr=1e-3, warmup=50, ema=0.99),
     schedule=Schedule(prediction="v_prediction"),
@@ -103,9 +120,24 @@ PAPER = DiffusionPreset(
     size=256,
     autoencoder=None,
     latent_scale="one",
-    unet=UNetOptions(widths=(192, 384, 576, 960), attention=(False, True, True, True), layers=2, head_width=32, groups=32),
+    unet=UNetOptions(
+        widths=(192, 384, 576, 960),
+        attention=(False, True, True, True),
+        layers=2,
+        head_width=32,
+        groups=32,
+    ),
     condition=ConditionPolicy(width=768),
-    loop=LoopOptions(steps=0, batch=32, lr=2e-6 * 32, warmup=0, decay="constant", weight_decay=0.01, clip=None, ema=0.9999),
+    loop=LoopOptions(
+        steps=0,
+        batch=32,
+        lr=2e-6 * 32,
+        warmup=0,
+        decay="constant",
+        weight_decay=0.01,
+        clip=None,
+        ema=0.9999,
+    ),
     epochs=30,
     sampler=SamplerOptions("ddim", steps=200, guidance=7.5),
 )
@@ -120,5 +152,7 @@ def preset_named(name: str) -> DiffusionPreset:
         PalpateError: if there is none.
     """
     if name not in PRESETS:
-        raise PalpateError(f"The preset must be one of {', '.join(PRESETS)}", repr(name), "Choose one of them")
+        raise PalpateError(
+            f"The preset must be one of {', '.join(PRESETS)}", repr(name), "Choose one of them"
+        )
     return PRESETS[name]

@@ -29,16 +29,22 @@ from palpate.diffusion.training import Schedule
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
 
 
-def require_sampling(options: SamplerOptions, schedule: Schedule, denoiser: Denoiser | None = None) -> None:
+def require_sampling(
+    options: SamplerOptions, schedule: Schedule, denoiser: Denoiser | None = None
+) -> None:
     """Refuses settings that cannot be sampled with, before any work is done.
 
     Raises:
         PalpateError: on an unknown method, on steps, batch or guidance out of range, or guidance for a denoiser that never saw the unconditional token.
     """
-    require_settings(options, most=schedule.steps, dropout=None if denoiser is None else denoiser.policy.dropout)
+    require_settings(
+        options, most=schedule.steps, dropout=None if denoiser is None else denoiser.policy.dropout
+    )
 
 
-def build_scheduler(schedule: Schedule, method: Method) -> DDIMScheduler | DPMSolverMultistepScheduler:
+def build_scheduler(
+    schedule: Schedule, method: Method
+) -> DDIMScheduler | DPMSolverMultistepScheduler:
     """The diffusers scheduler for a trained model; latents are not clipped."""
     if method == "ddim":
         # Trailing steps start at t = T, where the starting noise belongs, for any number of steps.
@@ -71,7 +77,9 @@ def starting_noise(ids: Sequence[str], shape: tuple[int, int, int], seed: int) -
     """z^T of each sample: float32 (n, c, h, w), a function of (seed, id) alone."""
     if not ids:
         return torch.empty(0, *shape)
-    return torch.from_numpy(np.stack([rng_for(seed, "noise", i).standard_normal(shape, dtype=np.float32) for i in ids]))
+    return torch.from_numpy(
+        np.stack([rng_for(seed, "noise", i).standard_normal(shape, dtype=np.float32) for i in ids])
+    )
 
 
 @torch.no_grad()
@@ -88,7 +96,7 @@ def sample(
     background: Tensor | None = None,
     progress: Progress = quiet,
 ) -> Tensor:
-    """Normalised latents (n, c, h, w) of ``ids``, on the CPU.
+    """Normalized latents (n, c, h, w) of ``ids``, on the CPU.
 
     Args:
         predict: the network, or any function of its form.
@@ -99,14 +107,18 @@ def sample(
         schedule: the network's.
         options: see :class:`SamplerOptions`.
         seed: of the starting noise.
-        background: normalised background latents (n, c, h, w), or None.
+        background: normalized background latents (n, c, h, w), or None.
         progress: called with the number of samples done.
 
     Raises:
         PalpateError: if there is not one condition (and background) an id, or steps or batch are not positive.
     """
     if len(tokens) != len(ids) or (background is not None and len(background) != len(ids)):
-        raise PalpateError("Every id needs one condition", f"{len(ids)} ids, {len(tokens)} conditions", "Pass one row an id")
+        raise PalpateError(
+            "Every id needs one condition",
+            f"{len(ids)} ids, {len(tokens)} conditions",
+            "Pass one row an id",
+        )
     require_sampling(options, schedule)
     parts: list[Tensor] = []
     for start in range(0, len(ids), options.batch):
@@ -122,19 +134,33 @@ def sample(
 
 
 def _one_batch(
-    predict: Predictor, z: Tensor, tokens: Tensor, null: Tensor, background: Tensor | None, schedule: Schedule, options: SamplerOptions
+    predict: Predictor,
+    z: Tensor,
+    tokens: Tensor,
+    null: Tensor,
+    background: Tensor | None,
+    schedule: Schedule,
+    options: SamplerOptions,
 ) -> Tensor:
     scheduler = build_scheduler(schedule, options.method)
     scheduler.set_timesteps(options.steps, device=z.device)
     z = z * scheduler.init_noise_sigma
     for t in scheduler.timesteps:
-        guess = _guided(predict, z, t.expand(len(z)), tokens, null.expand(tokens.shape), background, options)
+        guess = _guided(
+            predict, z, t.expand(len(z)), tokens, null.expand(tokens.shape), background, options
+        )
         z = cast("Tensor", scheduler.step(guess, cast("int", t), z, return_dict=False)[0])
     return z
 
 
 def _guided(
-    predict: Predictor, z: Tensor, t: Tensor, tokens: Tensor, null: Tensor, background: Tensor | None, options: SamplerOptions
+    predict: Predictor,
+    z: Tensor,
+    t: Tensor,
+    tokens: Tensor,
+    null: Tensor,
+    background: Tensor | None,
+    options: SamplerOptions,
 ) -> Tensor:
     """The guided prediction; v is linear in eps for given z, so that the formula holds for it as well."""
     s = options.guidance
@@ -170,7 +196,11 @@ def sample_latents(
     require_sampling(options, schedule, denoiser)
     if denoiser.background != (background is not None):
         got = "no background" if denoiser.background else "a background for a generator without"
-        raise PalpateError("A generator w/ BG takes a background image a sample, others take none", got, "Use the matching pipeline")
+        raise PalpateError(
+            "A generator w/ BG takes a background image a sample, others take none",
+            got,
+            "Use the matching pipeline",
+        )
     return sample(
         denoiser,
         tokens,

@@ -1,1 +1,1 @@
-"""The towers (vision, text, touch): loading, contrastive training, embedding with a cache, probes. Imports torch."""
+"""The encoders (vision, text, touch): loading, contrastive training, embedding with a cache, probes. Imports torch."""

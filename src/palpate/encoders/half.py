@@ -43,16 +43,28 @@ def round_to_half(modules: Mapping[str, nn.Module]) -> Rounding:
     Raises:
         PalpateError: if a weight is not finite in 16 bits; nothing is changed then.
     """
-    before = {f"{part}.{name}": v for part, m in modules.items() for name, v in m.state_dict().items() if v.is_floating_point()}
+    before = {
+        f"{part}.{name}": v
+        for part, m in modules.items()
+        for name, v in m.state_dict().items()
+        if v.is_floating_point()
+    }
     after = {name: value.half().to(value.dtype) for name, value in before.items()}
     for name, value in after.items():
         if not bool(torch.isfinite(value).all()):
             got = f"{name} with values up to {float(before[name].abs().max()):.3g}"
-            raise PalpateError("Weights saved in 16 bits must be finite and below 65,520 in size", got, "Save them in 32 bits")
+            raise PalpateError(
+                "Weights saved in 16 bits must be finite and below 65,520 in size",
+                got,
+                "Save them in 32 bits",
+            )
     worst, lost = Rounding(), 0
     with torch.no_grad():
         for name, value in before.items():
-            change = float((after[name] - value).double().norm() / value.double().norm().clamp_min(torch.finfo(torch.float64).tiny))
+            change = float(
+                (after[name] - value).double().norm()
+                / value.double().norm().clamp_min(torch.finfo(torch.float64).tiny)
+            )
             lost += int(((value != 0) & (after[name] == 0)).sum())
             worst = Rounding(change, name) if change > worst.relative else worst
             value.copy_(after[name])  # the tensors of state_dict are the module's own

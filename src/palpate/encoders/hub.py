@@ -35,11 +35,15 @@ def find_model(source: str | Path, part: Part, what: str, fix: str) -> Path:
     """
     if (shipped := shipped_folder(source, part)) is not None:
         return shipped
-    if isinstance(source, Path) or (source and Path(source).is_dir()):  # an empty name is not the folder that one is in
+    if isinstance(source, Path) or (
+        source and Path(source).is_dir()
+    ):  # an empty name is not the folder that one is in
         return Path(source)
     if not is_hub_id(source):
         raise PalpateError(
-            f"The {what} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)", f"no folder {source or repr('')}", fix
+            f"The {what} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)",
+            f"no folder {source or repr('')}",
+            fix,
         )
     return fetch(source, PATTERNS, what, fix)
 

@@ -1,4 +1,4 @@
-"""Presets of the towers: size and training course, complete and typed, with what they cost on the row.
+"""Presets of the encoders: size and training course, complete and typed, with what they cost on the row.
 
 ``paper`` follows paper section 3 and, where that is silent, TVL's published recipe (recipes section 3): 200 epochs, batch 256, AdamW
 (0.9, 0.95), weight decay 0.05, 10 epochs of warm-up, half a cosine to zero, learning rate 1.5e-4 x batch / 256 = 1.5e-4.
@@ -13,8 +13,8 @@ from typing import Literal
 from transformers import CLIPConfig, CLIPVisionConfig
 
 from palpate.core import PalpateError
-from palpate.encoders.loop import LoopOptions
 from palpate.encoders.preprocess import Augment
+from palpate.training.loop import LoopOptions
 
 Targets = Literal["diagonal", "identical-text"]
 
@@ -59,18 +59,18 @@ class Course:
 
 @dataclass(frozen=True)
 class EncoderPreset:
-    """A complete set of towers.
+    """A complete set of encoders.
 
     Attributes:
         name: for ``--preset``.
         pretrained: hub id or folder of the frozen CLIP, or None: a fresh one is trained first.
-        image, patch: sides in pixels of what the touch tower (and a fresh vision tower) sees, and of its patches.
-        touch: size of the touch tower.
+        image, patch: sides in pixels of what the tactile encoder (and a fresh vision encoder) sees, and of its patches.
+        touch: size of the tactile encoder.
         vision, text, dim, vocabulary, context: of a fresh CLIP; ``dim`` is the width of the common space, ``context`` in tokens.
         touch_course, clip_course: how each is trained; None without a fresh CLIP.
         targets: ``diagonal`` is the paper's loss; ``identical-text`` counts rows with equal captions as positives of each other in
             the two text pairs (see :func:`palpate.encoders.contrastive.soft_targets`).
-        own_statistics: normalise pixels by the training side's mean and sd instead of CLIP's constants.
+        own_statistics: normalize pixels by the training side's mean and sd instead of CLIP's constants.
         cost: what it takes, and where that was measured.
     """
 
@@ -91,7 +91,7 @@ class EncoderPreset:
     own_statistics: bool = True
 
     def touch_config(self, dim: int) -> CLIPVisionConfig:
-        """The touch tower's configuration for a common space of width ``dim``."""
+        """The tactile encoder's configuration for a common space of width ``dim``."""
         return _vision(self.touch, self.image, self.patch, dim)
 
     def clip_config(self, vocabulary: int) -> CLIPConfig:
@@ -102,22 +102,36 @@ class EncoderPreset:
         """
         if self.vision is None or self.text is None:
             raise PalpateError(
-                f"The preset {self.name} must describe a fresh CLIP", f"it takes {self.pretrained}", "Load that one, or use the preset mini"
+                f"The preset {self.name} must describe a fresh CLIP",
+                f"it takes {self.pretrained}",
+                "Load that one, or use the preset mini",
             )
         vision = _vision(self.vision, self.image, self.patch, self.dim)
         text = {
-            "hidden_size": self.text.width, "intermediate_size": 4 * self.text.width, "num_hidden_layers": self.text.layers,
-            "num_attention_heads": self.text.heads, "projection_dim": self.dim, "vocab_size": vocabulary,
-            "max_position_embeddings": self.context, "pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 3,
-        }  # fmt: skip
+            "hidden_size": self.text.width,
+            "intermediate_size": 4 * self.text.width,
+            "num_hidden_layers": self.text.layers,
+            "num_attention_heads": self.text.heads,
+            "projection_dim": self.dim,
+            "vocab_size": vocabulary,
+            "max_position_embeddings": self.context,
+            "pad_token_id": 0,
+            "bos_token_id": 1,
+            "eos_token_id": 3,
+        }
         return CLIPConfig(text_config=text, vision_config=vision.to_dict(), projection_dim=self.dim)
 
 
 def _vision(size: Size, image: int, patch: int, dim: int) -> CLIPVisionConfig:
     return CLIPVisionConfig(
-        hidden_size=size.width, intermediate_size=4 * size.width, num_hidden_layers=size.layers, num_attention_heads=size.heads,
-        image_size=image, patch_size=patch, projection_dim=dim,
-    )  # fmt: skip
+        hidden_size=size.width,
+        intermediate_size=4 * size.width,
+        num_hidden_layers=size.layers,
+        num_attention_heads=size.heads,
+        image_size=image,
+        patch_size=patch,
+        projection_dim=dim,
+    )
 
 
 #: Photos of a surface have no up, and text does not care: turns and flips are free for the vision-text pair. For touch they stay off.
@@ -128,17 +142,55 @@ _TINY = Course(epochs=2, batch=8, lr=1e-3)
 _TVL = Course(epochs=200, batch=256, lr=1.5e-4, clip=None)
 _DATACOMP = "laion/CLIP-ViT-L-14-DataComp.XL-s13B-b90K"
 
-# fmt: off
-PRESETS: dict[str, EncoderPreset] = {p.name: p for p in (
-    #             name     pretrained  px  patch  touch tower        course        cost
-    EncoderPreset("tiny",  None,       16,  8, Size(16, 1, 2),    _TINY,       "seconds; for tests",
-                  vision=Size(16, 1, 2), text=Size(16, 1, 2), clip_course=_TINY, dim=8, vocabulary=300, context=16),
-    EncoderPreset("mini",  None,       64,  8, Size(96, 3, 3),    _MINI_TOUCH, "4,000 + 900 frames: about 65 + 33 CPU-s on one x86-64 core (AVX2)",
-                  vision=Size(96, 3, 3), text=Size(96, 2, 3), clip_course=_MINI_CLIP, dim=128, vocabulary=1024, context=32),
-    EncoderPreset("paper", _DATACOMP, 224, 14, Size(1024, 24, 16), _TVL,       "200 epochs on one A100 (the paper; hours not stated)",
-                  dim=768, targets="diagonal", own_statistics=False),
-)}
-# fmt: on
+
+PRESETS: dict[str, EncoderPreset] = {
+    p.name: p
+    for p in (
+        #             name     pretrained  px  patch  tactile encoder        course        cost
+        EncoderPreset(
+            "tiny",
+            None,
+            16,
+            8,
+            Size(16, 1, 2),
+            _TINY,
+            "seconds; for tests",
+            vision=Size(16, 1, 2),
+            text=Size(16, 1, 2),
+            clip_course=_TINY,
+            dim=8,
+            vocabulary=300,
+            context=16,
+        ),
+        EncoderPreset(
+            "mini",
+            None,
+            64,
+            8,
+            Size(96, 3, 3),
+            _MINI_TOUCH,
+            "4,000 + 900 frames: about 65 + 33 CPU-s on one x86-64 core (AVX2)",
+            vision=Size(96, 3, 3),
+            text=Size(96, 2, 3),
+            clip_course=_MINI_CLIP,
+            dim=128,
+            vocabulary=1024,
+            context=32,
+        ),
+        EncoderPreset(
+            "paper",
+            _DATACOMP,
+            224,
+            14,
+            Size(1024, 24, 16),
+            _TVL,
+            "200 epochs on one A100 (the paper; hours not stated)",
+            dim=768,
+            targets="diagonal",
+            own_statistics=False,
+        ),
+    )
+}
 
 
 def preset(name: str) -> EncoderPreset:
@@ -148,5 +200,9 @@ def preset(name: str) -> EncoderPreset:
         PalpateError: if there is none of that name.
     """
     if name not in PRESETS:
-        raise PalpateError(f"A preset of the towers must be one of {', '.join(PRESETS)}", repr(name), "Choose one of these")
+        raise PalpateError(
+            f"A preset of the encoders must be one of {', '.join(PRESETS)}",
+            repr(name),
+            "Choose one of these",
+        )
     return PRESETS[name]

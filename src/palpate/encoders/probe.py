@@ -1,7 +1,7 @@
 """What the embeddings know: material accuracy by a linear probe, and retrieval.
 
-Probe: multinomial logistic regression on standardised features, ``min_W -1/n sum_i log softmax(W x_i)_{y_i} + l2 ||W||^2``, solved by
-L-BFGS; l2 is chosen on the training side by leaving out whole groups (leaving out rows would let neighbours of one video pick it).
+Probe: multinomial logistic regression on standardized features, ``min_W -1/n sum_i log softmax(W x_i)_{y_i} + l2 ||W||^2``, solved by
+L-BFGS; l2 is chosen on the training side by leaving out whole groups (leaving out rows would let neighbors of one video pick it).
 
 Retrieval: rank of the right key among the pool by cosine. Ties are counted as a random order would, in expectation, so equal keys
 never look like hits. With R > 1 positives the first of them counts.
@@ -44,8 +44,15 @@ class Probe:
         return [self.classes[k] for k in logits.argmax(axis=1)]
 
 
-def fit_probe(train: FeatureSet, *, l2: float | None = None, balanced: bool = False, folds: int = 3, seed: int = 0) -> Probe:
-    """Fits a linear probe to labelled features.
+def fit_probe(
+    train: FeatureSet,
+    *,
+    l2: float | None = None,
+    balanced: bool = False,
+    folds: int = 3,
+    seed: int = 0,
+) -> Probe:
+    """Fits a linear probe to labeled features.
 
     Args:
         train: features with labels; rows without a label are left out. Groups are needed to choose ``l2``.
@@ -57,10 +64,14 @@ def fit_probe(train: FeatureSet, *, l2: float | None = None, balanced: bool = Fa
     Raises:
         PalpateError: without labels, or with fewer than two classes.
     """
-    x, labels, groups = _labelled(train, "train")
+    x, labels, groups = _labeled(train, "train")
     classes = tuple(sorted(set(labels)))
     if len(classes) < 2:
-        raise PalpateError("A probe needs at least two materials in train", f"{len(classes)}", "Use a split whose train part has more")
+        raise PalpateError(
+            "A probe needs at least two materials in train",
+            f"{len(classes)}",
+            "Use a split whose train part has more",
+        )
     number = {name: k for k, name in enumerate(classes)}
     y = np.array([number[label] for label in labels])
     mean, sd = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-8)
@@ -103,22 +114,41 @@ def material_accuracy(
         PalpateError: without labels on both sides, or on features of two encoders.
     """
     if train.encoder != test.encoder:
-        raise PalpateError("Both sides of a probe must come from one encoder", f"{train.encoder} and {test.encoder}", "Embed them again")
+        raise PalpateError(
+            "Both sides of a probe must come from one encoder",
+            f"{train.encoder} and {test.encoder}",
+            "Embed them again",
+        )
     probe = probe or fit_probe(train, l2=l2, balanced=balanced, seed=seed)
-    x, labels, groups = _labelled(test, "test")
+    x, labels, groups = _labeled(test, "test")
     hit = np.array([a == b for a, b in zip(probe.predict(x), labels, strict=True)], dtype=float)
     counts = Counter(labels)
     rows = np.array([1 / counts[label] for label in labels]) if balanced else np.ones(len(hit))
-    majority = Counter(_labelled(train, "train")[1]).most_common(1)[0][0]
+    majority = Counter(_labeled(train, "train")[1]).most_common(1)[0][0]
     share = 1 / len(counts) * (majority in counts) if balanced else counts[majority] / len(labels)
-    recall = {name: float(hit[[label == name for label in labels]].mean()) for name in sorted(counts)}
+    recall = {
+        name: float(hit[[label == name for label in labels]].mean()) for name in sorted(counts)
+    }
     return mean_over_groups(
-        "material accuracy (balanced)" if balanced else "material accuracy", hit, rows, groups, subject, split, test.encoder, seed,
+        "material accuracy (balanced)" if balanced else "material accuracy",
+        hit,
+        rows,
+        groups,
+        subject,
+        split,
+        test.encoder,
+        seed,
         {"probe": "logistic regression"},
-        {"chance": 1 / len(probe.classes), "majority": share, "recall": recall, "l2": probe.l2,
-         "train_samples": len(train.ids), "unseen_classes": sorted(set(labels) - set(probe.classes))},
+        {
+            "chance": 1 / len(probe.classes),
+            "majority": share,
+            "recall": recall,
+            "l2": probe.l2,
+            "train_samples": len(train.ids),
+            "unseen_classes": sorted(set(labels) - set(probe.classes)),
+        },
         "mean of class recalls" if balanced else "mean",
-    )  # fmt: skip
+    )
 
 
 def retrieval(
@@ -157,14 +187,28 @@ def retrieval(
     """
     n = len(queries.ids)
     if list(queries.ids) != list(keys.ids):
-        raise PalpateError("Queries and keys must have the same ids in the same order", "different ones", "Take the same ids from both")
+        raise PalpateError(
+            "Queries and keys must have the same ids in the same order",
+            "different ones",
+            "Take the same ids from both",
+        )
     if n < 2 or queries.features.shape[1] != keys.features.shape[1]:
         got = f"{n} samples, widths {queries.features.shape[1]} and {keys.features.shape[1]}"
-        raise PalpateError("Retrieval needs at least two samples in one common space", got, "Embed both with one set of towers")
+        raise PalpateError(
+            "Retrieval needs at least two samples in one common space",
+            got,
+            "Embed both with one set of encoders",
+        )
     if pool is not None and not 2 <= pool <= n:
-        raise PalpateError(f"The pool must hold 2 to {n} samples", f"{pool}", "Choose a smaller pool")
+        raise PalpateError(
+            f"The pool must hold 2 to {n} samples", f"{pool}", "Choose a smaller pool"
+        )
     right = np.eye(n, dtype=bool) if positives is None else positives | np.eye(n, dtype=bool)
-    draws = [np.arange(n)] if pool is None else [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(repeats)]
+    draws = (
+        [np.arange(n)]
+        if pool is None
+        else [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(repeats)]
+    )
     groups = list(queries.groups) if queries.groups is not None else list(queries.ids)
     out: list[Score] = []
     hits = {k: np.zeros(n) for k in top}
@@ -179,15 +223,28 @@ def retrieval(
             chance[k] += float(_hit_chance(np.zeros_like(similar), good, k).mean()) / len(draws)
     used = seen > 0
     for k in top:
-        settings = {"pool": pool, "repeats": repeats if pool else None, "positives": "diagonal" if positives is None else "given"}
+        settings = {
+            "pool": pool,
+            "repeats": repeats if pool else None,
+            "positives": "diagonal" if positives is None else "given",
+        }
         value = hits[k][used] / seen[used]
         names = [g for g, u in zip(groups, used, strict=True) if u]
         out.append(
             mean_over_groups(
-                f"{name} top-{k}", value, seen[used], names, subject, split, queries.encoder, seed if pool else None, settings,
-                {"chance": chance[k], "key_encoder": keys.encoder}, "mean over pools" if pool else "mean",
+                f"{name} top-{k}",
+                value,
+                seen[used],
+                names,
+                subject,
+                split,
+                queries.encoder,
+                seed if pool else None,
+                settings,
+                {"chance": chance[k], "key_encoder": keys.encoder},
+                "mean over pools" if pool else "mean",
             )
-        )  # fmt: skip
+        )
     return out
 
 
@@ -218,20 +275,30 @@ def _hit_chance(similar: Floats, good: NDArray[np.bool_], k: int) -> Floats:
     return 1 - miss
 
 
-def _labelled(features: FeatureSet, side: str) -> tuple[Floats, list[str], list[str]]:
+def _labeled(features: FeatureSet, side: str) -> tuple[Floats, list[str], list[str]]:
     """Rows that have a label: features as float64, labels, groups (the id where there is none)."""
     if features.labels is None:
-        raise PalpateError(f"The {side} features must have materials", "none", "Fill the manifest's column material")
+        raise PalpateError(
+            f"The {side} features must have materials",
+            "none",
+            "Fill the manifest's column material",
+        )
     keep = [k for k, label in enumerate(features.labels) if label]
     if not keep:
-        raise PalpateError(f"The {side} features must have rows with a material", "none", "Check the split and the column material")
+        raise PalpateError(
+            f"The {side} features must have rows with a material",
+            "none",
+            "Check the split and the column material",
+        )
     groups = features.groups if features.groups is not None else features.ids
     named = [groups[k] or features.ids[k] for k in keep]
     return features.features[keep].astype(np.float64), [features.labels[k] for k in keep], named
 
 
-def _logistic(x: Floats, y: NDArray[np.int64], rows: Floats, classes: int, l2: float) -> tuple[Floats, Floats]:
-    """Weight (d, classes) and bias (classes,) of the penalised logistic regression at the head of this file."""
+def _logistic(
+    x: Floats, y: NDArray[np.int64], rows: Floats, classes: int, l2: float
+) -> tuple[Floats, Floats]:
+    """Weight (d, classes) and bias (classes,) of the penalized logistic regression at the head of this file."""
     n, d = x.shape
     one = np.concatenate([x, np.ones((n, 1))], axis=1)
     rows = rows / rows.sum()
@@ -245,14 +312,30 @@ def _logistic(x: Floats, y: NDArray[np.int64], rows: Floats, classes: int, l2: f
         error[np.arange(n), y] -= 1
         gradient = one.T @ (error * rows[:, None])
         gradient[:d] += 2 * l2 * w[:d]
-        return float(-(rows * log_p[np.arange(n), y]).sum() + l2 * (w[:d] ** 2).sum()), gradient.ravel()
+        return float(
+            -(rows * log_p[np.arange(n), y]).sum() + l2 * (w[:d] ** 2).sum()
+        ), gradient.ravel()
 
-    found = minimize(objective, np.zeros((d + 1) * classes), jac=True, method="L-BFGS-B", options={"maxiter": 300})
+    found = minimize(
+        objective,
+        np.zeros((d + 1) * classes),
+        jac=True,
+        method="L-BFGS-B",
+        options={"maxiter": 300},
+    )
     w = found.x.reshape(d + 1, classes)
     return w[:d], w[d]
 
 
-def _choose(x: Floats, y: NDArray[np.int64], rows: Floats, groups: Sequence[str], classes: int, folds: int, seed: int) -> float:
+def _choose(
+    x: Floats,
+    y: NDArray[np.int64],
+    rows: Floats,
+    groups: Sequence[str],
+    classes: int,
+    folds: int,
+    seed: int,
+) -> float:
     """The penalty with the best accuracy on left-out groups; the stronger one on a tie; 1e-2 with too few groups."""
     names = sorted(set(groups))
     if len(names) < 2 * folds:
@@ -270,9 +353,18 @@ def _choose(x: Floats, y: NDArray[np.int64], rows: Floats, groups: Sequence[str]
 
 
 def mean_over_groups(
-    metric: str, value: Floats, rows: Floats, groups: Sequence[str], subject: str, split: str | None, encoder: str | None,
-    seed: int | None, settings: Mapping[str, object], details: Mapping[str, object], estimator: str = "mean",
-) -> Score:  # fmt: skip
+    metric: str,
+    value: Floats,
+    rows: Floats,
+    groups: Sequence[str],
+    subject: str,
+    split: str | None,
+    encoder: str | None,
+    seed: int | None,
+    settings: Mapping[str, object],
+    details: Mapping[str, object],
+    estimator: str = "mean",
+) -> Score:
     """The weighted mean of per-sample values, with a leave-one-group-out jackknife interval."""
     mean = float((rows @ value) / rows.sum())
     names = sorted(set(groups))
@@ -283,11 +375,25 @@ def mean_over_groups(
         bottom = np.bincount(at, weights=rows, minlength=len(names))
         left = (top.sum() - top) / (bottom.sum() - bottom)
         g = len(names)
-        half = float(student.ppf(0.975, g - 1) * np.sqrt((g - 1) / g * ((left - left.mean()) ** 2).sum()))
+        half = float(
+            student.ppf(0.975, g - 1) * np.sqrt((g - 1) / g * ((left - left.mean()) ** 2).sum())
+        )
         # Where leaving out any group changes nothing, the jackknife has nothing to say.
         interval = (max(0.0, mean - half), min(1.0, mean + half)) if half > 0 else None
     return Score(
-        metric, subject, mean, interval, interval_method=f"leave-one-group-out jackknife, t, {len(names) - 1} df" if interval else "",
-        estimator=estimator, n=len(value), seed=seed, encoder=encoder, split=split,
-        higher_is_better=True, settings=settings, details=details,
-    )  # fmt: skip
+        metric,
+        subject,
+        mean,
+        interval,
+        interval_method=f"leave-one-group-out jackknife, t, {len(names) - 1} df"
+        if interval
+        else "",
+        estimator=estimator,
+        n=len(value),
+        seed=seed,
+        encoder=encoder,
+        split=split,
+        higher_is_better=True,
+        settings=settings,
+        details=details,
+    )

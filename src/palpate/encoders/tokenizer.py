@@ -12,7 +12,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
+from tokenizers import (
+    Tokenizer,
+    decoders,
+    models,
+    normalizers,
+    pre_tokenizers,
+    processors,
+    trainers,
+)
 from transformers import PreTrainedTokenizerFast
 
 from palpate.core import PalpateError
@@ -20,7 +28,9 @@ from palpate.core import PalpateError
 PAD, START, UNKNOWN, END = SPECIAL = ("<pad>", "<|startoftext|>", "<unk>", "<|endoftext|>")
 
 
-def train_tokenizer(texts: Iterable[str], *, vocabulary: int = 1024, context: int = 32) -> PreTrainedTokenizerFast:
+def train_tokenizer(
+    texts: Iterable[str], *, vocabulary: int = 1024, context: int = 32
+) -> PreTrainedTokenizerFast:
     """Learns a tokenizer from texts; the same texts, in any order and number, give the same one.
 
     Args:
@@ -33,25 +43,40 @@ def train_tokenizer(texts: Iterable[str], *, vocabulary: int = 1024, context: in
     """
     distinct = sorted({text.strip() for text in texts} - {""})
     if not distinct:
-        raise PalpateError("A tokenizer needs at least one text", "none", "Fill the manifest's column text or material")
+        raise PalpateError(
+            "A tokenizer needs at least one text",
+            "none",
+            "Fill the manifest's column text or material",
+        )
     alphabet = pre_tokenizers.ByteLevel.alphabet()
     if vocabulary < len(alphabet) + len(SPECIAL):
         raise PalpateError(
-            f"The vocabulary must hold the bytes and special tokens, {len(alphabet) + len(SPECIAL)}", f"{vocabulary}", "Choose e.g. 1024"
+            f"The vocabulary must hold the bytes and special tokens, {len(alphabet) + len(SPECIAL)}",
+            f"{vocabulary}",
+            "Choose e.g. 1024",
         )
     tokenizer = Tokenizer(models.BPE())
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])  # pyright: ignore[reportAttributeAccessIssue]
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)  # pyright: ignore[reportAttributeAccessIssue]
     tokenizer.decoder = decoders.ByteLevel()  # pyright: ignore[reportAttributeAccessIssue]
     trainer = trainers.BpeTrainer(
-        vocab_size=vocabulary, special_tokens=list(SPECIAL), initial_alphabet=sorted(alphabet), show_progress=False
+        vocab_size=vocabulary,
+        special_tokens=list(SPECIAL),
+        initial_alphabet=sorted(alphabet),
+        show_progress=False,
     )
     tokenizer.train_from_iterator(distinct, trainer)
     tokenizer.post_processor = processors.TemplateProcessing(  # pyright: ignore[reportAttributeAccessIssue]
-        single=f"{START} $A {END}", special_tokens=[(START, SPECIAL.index(START)), (END, SPECIAL.index(END))]
+        single=f"{START} $A {END}",
+        special_tokens=[(START, SPECIAL.index(START)), (END, SPECIAL.index(END))],
     )
     return PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer, pad_token=PAD, bos_token=START, unk_token=UNKNOWN, eos_token=END, model_max_length=context
+        tokenizer_object=tokenizer,
+        pad_token=PAD,
+        bos_token=START,
+        unk_token=UNKNOWN,
+        eos_token=END,
+        model_max_length=context,
     )
 
 
@@ -60,13 +85,17 @@ def save_tokenizer(tokenizer: Any, folder: Path) -> None:
 
     How it was loaded, and how its last call cut and padded, is no part of it, and would make equal tokenizers differ.
     """
-    if (backend := getattr(tokenizer, "backend_tokenizer", None)) is not None:  # every call sets these anew
+    if (
+        backend := getattr(tokenizer, "backend_tokenizer", None)
+    ) is not None:  # every call sets these anew
         backend.no_truncation()
         backend.no_padding()
     tokenizer.save_pretrained(folder)
     path = Path(folder) / "tokenizer_config.json"
     config = json.loads(path.read_text(encoding="utf-8"))
-    if config.get("tokenizer_class") == "TokenizersBackend":  # transformers 5's name, unknown to 4, which 5 still accepts
+    if (
+        config.get("tokenizer_class") == "TokenizersBackend"
+    ):  # transformers 5's name, unknown to 4, which 5 still accepts
         config["tokenizer_class"] = "PreTrainedTokenizerFast"
     config = {k: v for k, v in config.items() if k not in ("is_local", "local_files_only")}
     path.write_text(json.dumps(config, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

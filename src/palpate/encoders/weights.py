@@ -20,12 +20,31 @@ from palpate.core.digest import canonical_json
 from palpate.encoders.half import half_copy
 
 #: What transformers and huggingface_hub raise for an unreachable hub, absent files, foreign formats and pickled objects.
-UNREADABLE = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError, pickle.UnpicklingError)
-#: The part of a configuration that decides what a tower computes; the rest varies between versions of transformers.
+UNREADABLE = (
+    OSError,
+    ValueError,
+    RuntimeError,
+    KeyError,
+    TypeError,
+    SafetensorError,
+    pickle.UnpicklingError,
+)
+#: The part of a configuration that decides what a encoder computes; the rest varies between versions of transformers.
 ARCHITECTURE = (
-    "hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads", "image_size", "patch_size", "num_channels",
-    "vocab_size", "max_position_embeddings", "eos_token_id", "projection_dim", "hidden_act", "layer_norm_eps",
-)  # fmt: skip
+    "hidden_size",
+    "intermediate_size",
+    "num_hidden_layers",
+    "num_attention_heads",
+    "image_size",
+    "patch_size",
+    "num_channels",
+    "vocab_size",
+    "max_position_embeddings",
+    "eos_token_id",
+    "projection_dim",
+    "hidden_act",
+    "layer_norm_eps",
+)
 
 
 def save_weights(model: Any, folder: Path, *, half: bool) -> None:
@@ -42,7 +61,10 @@ def save_weights(model: Any, folder: Path, *, half: bool) -> None:
     before = json.dumps(config)
     config.pop("_name_or_path", None)
     if "dtype" in config:  # diffusers has none
-        for part in (config, *(v for k, v in config.items() if k.endswith("_config") and isinstance(v, dict))):
+        for part in (
+            config,
+            *(v for k, v in config.items() if k.endswith("_config") and isinstance(v, dict)),
+        ):
             part["dtype"] = "float16" if half else str(model.dtype).removeprefix("torch.")
     if json.dumps(config) != before:
         place.write_text(json.dumps(config, indent=2, sort_keys=True) + "\n", encoding="utf-8")

@@ -12,19 +12,24 @@ import numpy as np
 
 from palpate.core import FeatureSet, PalpateError, Score
 from palpate.encoders.embed import embed_texts
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.probe import mean_over_groups
-from palpate.encoders.towers import Towers
 
 
 def zero_shot_accuracy(
-    images: FeatureSet, prompts: Mapping[str, Sequence[str]], towers: Towers, *, subject: str = "real", split: str | None = None
+    images: FeatureSet,
+    prompts: Mapping[str, Sequence[str]],
+    encoders: EncoderSet,
+    *,
+    subject: str = "real",
+    split: str | None = None,
 ) -> Score:
     """Accuracy of naming the class of images by text alone.
 
     Args:
-        images: embeddings of one tower (n, d) with labels, and groups for the interval.
+        images: embeddings of one encoder (n, d) with labels, and groups for the interval.
         prompts: class -> at least one text; every label must be a class.
-        towers: whose text tower embeds the prompts.
+        encoders: whose text encoder embeds the prompts.
         subject: what is scored, for the score.
         split: digest, for the score.
 
@@ -37,25 +42,51 @@ def zero_shot_accuracy(
     labels = list(images.labels or ())
     if not labels or "" in labels:
         raise PalpateError(
-            "Zero-shot classification needs a label for every image", f"{labels.count('') or 'all'} without", "Leave these out"
+            "Zero-shot classification needs a label for every image",
+            f"{labels.count('') or 'all'} without",
+            "Leave these out",
         )
     classes = sorted(prompts)
     if len(classes) < 2 or any(not prompts[name] for name in classes):
-        raise PalpateError("There must be at least two classes, each with a text", f"{len(classes)} classes", "Pass more prompts")
+        raise PalpateError(
+            "There must be at least two classes, each with a text",
+            f"{len(classes)} classes",
+            "Pass more prompts",
+        )
     if unknown := sorted({str(label) for label in labels} - set(classes)):
         raise PalpateError(
-            "Every label must be a class with prompts", f"{len(unknown)} that are not, first {unknown[0]!r}", "Add its texts"
+            "Every label must be a class with prompts",
+            f"{len(unknown)} that are not, first {unknown[0]!r}",
+            "Add its texts",
         )
-    prototypes = np.stack([_unit(embed_texts(prompts[name], towers).astype(np.float64).mean(axis=0)) for name in classes])
+    prototypes = np.stack(
+        [
+            _unit(embed_texts(prompts[name], encoders).astype(np.float64).mean(axis=0))
+            for name in classes
+        ]
+    )
     named = [classes[k] for k in (images.features.astype(np.float64) @ prototypes.T).argmax(axis=1)]
     hit = np.array([a == b for a, b in zip(named, labels, strict=True)], dtype=float)
     groups = list(images.groups) if images.groups is not None else list(images.ids)
-    recall = {name: float(hit[[label == name for label in labels]].mean()) for name in sorted({str(label) for label in labels})}
+    recall = {
+        name: float(hit[[label == name for label in labels]].mean())
+        for name in sorted({str(label) for label in labels})
+    }
     return mean_over_groups(
-        "zero-shot accuracy", hit, np.ones(len(hit)), groups, subject, split, images.encoder, None,
-        {"prompts": {name: list(prompts[name]) for name in classes}, "text": towers.digest("text")},
+        "zero-shot accuracy",
+        hit,
+        np.ones(len(hit)),
+        groups,
+        subject,
+        split,
+        images.encoder,
+        None,
+        {
+            "prompts": {name: list(prompts[name]) for name in classes},
+            "text": encoders.digest("text"),
+        },
         {"chance": 1 / len(classes), "recall": recall},
-    )  # fmt: skip
+    )
 
 
 def _unit(x: np.ndarray) -> np.ndarray:

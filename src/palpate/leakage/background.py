@@ -1,6 +1,6 @@
 """Touch without the sensor: what the contact adds to the picture of the passive gel.
 
-Untouched gel (its colours, its markers) makes all frames of one sensor look alike, so a tactile thumbnail t is compared by what is left after its background b:
+Untouched gel (its colors, its markers) makes all frames of one sensor look alike, so a tactile thumbnail t is compared by what is left after its background b:
 
 1. *Registration.* b is moved by the offset of at most 2 of 32 pixels at which the luminance of both, band-passed, correlates best (quarters, then the
    peak of a parabola, to a sixteenth): a picture that was cropped elsewhere than its background would keep every marker twice. Markers are about a pixel
@@ -29,14 +29,17 @@ GAIN = (0.85, 1.15)
 ROUNDS = 3
 #: Frames that a median needs, and how many it takes at most.
 FEWEST, MOST = 8, 200
-#: Grey levels squared: keeps the gain at 1 where the background is flat.
+#: Gray levels squared: keeps the gain at 1 where the background is flat.
 _RIDGE = 0.05
 
 
 def _moves() -> Floats:
     """(65, 32, 32): matrices that move a column of pixels by -2 ... 2 in sixteenths, cubic between pixels, edges repeated."""
     eye = np.eye(SIDE)
-    moved = [ndimage.shift(eye, (-d / FINEST, 0), order=3, mode="nearest") for d in range(-REACH * FINEST, REACH * FINEST + 1)]
+    moved = [
+        ndimage.shift(eye, (-d / FINEST, 0), order=3, mode="nearest")
+        for d in range(-REACH * FINEST, REACH * FINEST + 1)
+    ]
     return np.stack(moved).astype(np.float32)
 
 
@@ -57,9 +60,12 @@ def remove_background(touch: Floats, background: Floats) -> Floats:
         background: (n, 3, 32, 32), each the background of its touch.
 
     Returns:
-        (n, 3, 32, 32) signed grey levels, each channel's weighted mean near 0.
+        (n, 3, 32, 32) signed gray levels, each channel's weighted mean near 0.
     """
-    luma = [band_pass(np.concatenate([x[:, :1], np.zeros_like(x[:, 1:])], axis=1)) for x in (touch, background)]
+    luma = [
+        band_pass(np.concatenate([x[:, :1], np.zeros_like(x[:, 1:])], axis=1))
+        for x in (touch, background)
+    ]
     steps = np.round(best_offset(luma[0], luma[1], QUARTERS) * FINEST).astype(np.int64)
     down, right = _MOVES[steps[:, 0] + REACH * FINEST], _MOVES[steps[:, 1] + REACH * FINEST]
     moved = down[:, None] @ background @ right.transpose(0, 2, 1)[:, None]
@@ -72,11 +78,15 @@ def remove_background(touch: Floats, background: Floats) -> Floats:
         b = moved - (weight * moved).sum(axis=(2, 3), keepdims=True) / total
         weighted = weight * b
         across = (weighted * t).sum(axis=(2, 3), keepdims=True) + _RIDGE * total
-        gain = np.clip(across / ((weighted * b).sum(axis=(2, 3), keepdims=True) + _RIDGE * total), *GAIN)
+        gain = np.clip(
+            across / ((weighted * b).sum(axis=(2, 3), keepdims=True) + _RIDGE * total), *GAIN
+        )
         left = t - gain * b
         error = np.square(left).sum(axis=1, keepdims=True)
         weight = known / (1 + error / (4 * np.median(error, axis=(2, 3), keepdims=True) + 1e-3))
-    beside = (_BESIDE @ (known * left) @ _BESIDE.T) / (_BESIDE @ known @ _BESIDE.T + np.float32(1e-6))
+    beside = (_BESIDE @ (known * left) @ _BESIDE.T) / (
+        _BESIDE @ known @ _BESIDE.T + np.float32(1e-6)
+    )
     return np.where(known > 0, left, beside).astype(np.float32, copy=False)
 
 
@@ -104,7 +114,9 @@ class Backgrounds:
     medians: tuple[int, int, int]
 
 
-def backgrounds(touch: Ints, own: Ints, pixels: NDArray[np.uint8], videos: Ints, sensors: Ints) -> Backgrounds:
+def backgrounds(
+    touch: Ints, own: Ints, pixels: NDArray[np.uint8], videos: Ints, sensors: Ints
+) -> Backgrounds:
     """Gives each sample its own background or a median.
 
     Args:

@@ -2,7 +2,7 @@
 
 *Score.* Some pictures are like everything (the round print of a flat thing on a gel), others like nothing, so a similarity s says little alone. With
 z = artanh s (Fisher) and c the level of unrelated pictures for this query (the mean of its highest 1/32 of z against 128 random train pictures, those of
-its own video and of the match's left out; Auckenthaler et al. 2000 call this test normalisation), the score is
+its own video and of the match's left out; Auckenthaler et al. 2000 call this test normalization), the score is
 
     tanh(z - c),  0 where that is negative:
 
@@ -127,18 +127,26 @@ def other_videos(excess: Floats, rate: float) -> Calibration:
         kept = excess[excess <= place + scale * -np.log(-np.log1p(-1 / (ODDS * len(excess))))]
     shoulder = float(np.quantile(kept, 0.9))
     tail = kept[kept > shoulder]
-    mean = max(float((tail - shoulder).mean()) if len(tail) else scale, scale / 2)  # ties at the shoulder must not make it vanish
+    mean = max(
+        float((tail - shoulder).mean()) if len(tail) else scale, scale / 2
+    )  # ties at the shoulder must not make it vanish
     threshold = max(float(np.tanh(shoulder + mean * np.log(max(0.1 / rate, 1.0)))), LEAST_EXCESS)
     unrelated = score(excess, np.zeros_like(excess))
     over = float((unrelated >= threshold).mean())
-    lowest = " (the lowest that is allowed; the data alone would set it lower)" if threshold <= LEAST_EXCESS else ""
+    lowest = (
+        " (the lowest that is allowed; the data alone would set it lower)"
+        if threshold <= LEAST_EXCESS
+        else ""
+    )
     notes = [
         f"Threshold {threshold:.3f}{lowest} from the best matches of {len(excess)} samples in other videos, for {rate:.2%} of unrelated samples; {over:.2%}"
         " of those lie over it."
     ]
     if dropped := len(excess) - len(kept):
         share = f"{dropped} of them ({dropped / len(excess):.1%})"
-        notes.append(f"{share} are so alike that they are taken for copies across videos and do not set the threshold.")
+        notes.append(
+            f"{share} are so alike that they are taken for copies across videos and do not set the threshold."
+        )
     return Calibration(threshold, unrelated, notes)
 
 
@@ -170,7 +178,11 @@ def random_blocks(z: Floats, count: int, rate: float) -> Calibration:
     if best is None:
         return uncalibrated(rate)
     threshold = max(float(np.tanh(best[0])), LEAST)
-    lowest = " (the lowest that is allowed; the data alone would set it lower)" if threshold <= LEAST else ""
+    lowest = (
+        " (the lowest that is allowed; the data alone would set it lower)"
+        if threshold <= LEAST
+        else ""
+    )
     note = (
         f"Threshold {threshold:.3f}{lowest} from random pairs (in blocks of {best[1]}), carried over to the best of"
         f" {count} train pictures, for {rate:.2%} of unrelated samples."
@@ -187,5 +199,7 @@ def uncalibrated(rate: float) -> Calibration:
 def histograms(unrelated: Floats, found: Floats) -> tuple[list[float], list[int], list[int]]:
     """Counts of both over the same 50 bins of [0, 1]; NaN counts nowhere."""
     edges = np.linspace(0, 1, BINS + 1)
-    counts: list[NDArray[np.int64]] = [np.histogram(x[np.isfinite(x)], edges)[0] for x in (unrelated, found)]
+    counts: list[NDArray[np.int64]] = [
+        np.histogram(x[np.isfinite(x)], edges)[0] for x in (unrelated, found)
+    ]
     return edges.round(4).tolist(), counts[0].tolist(), counts[1].tolist()

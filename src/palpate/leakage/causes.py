@@ -11,20 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.leakage.background import planar, remove_background
-from palpate.leakage.pool import Pool, quantised, small_pictures
+from palpate.leakage.pool import Pool, quantized, small_pictures
 from palpate.leakage.search import nearest
 from palpate.leakage.verify import BLOCK, Floats, Ints, band_pass, similarities
 
-#: Root mean square difference of two blank thumbnails at which their score is 0, in grey levels.
+#: Root mean square difference of two blank thumbnails at which their score is 0, in gray levels.
 FAR = 32.0
-#: Root mean square difference up to which two backgrounds show one gel at two times, in grey levels.
+#: Root mean square difference up to which two backgrounds show one gel at two times, in gray levels.
 ONE_GEL = 12.0
 #: Backgrounds of a video that a touch is compared with.
 OTHERS = 16
 
 
 def blank_matches(
-    pool: Pool, queries: Ints, base: Ints, score: Floats, place: Ints, cause: NDArray[np.str_], threshold: float
+    pool: Pool,
+    queries: Ints,
+    base: Ints,
+    score: Floats,
+    place: Ints,
+    cause: NDArray[np.str_],
+    threshold: float,
 ) -> tuple[Floats, Ints, NDArray[np.str_]]:
     """Replaces the results of blank test pictures by their nearest blank train picture.
 
@@ -47,7 +53,11 @@ def blank_matches(
     score[blank], cause[blank] = np.where(np.isnan(score[blank]), np.nan, 0), ""
     if len(others):
         pixels = pool.thumbs.pixels
-        found = nearest(small_pictures(pixels, pool.thumb[queries[blank]]), small_pictures(pixels, pool.thumb[base[others]]), 1)
+        found = nearest(
+            small_pictures(pixels, pool.thumb[queries[blank]]),
+            small_pictures(pixels, pool.thumb[base[others]]),
+            1,
+        )
         alike = np.clip(1 - found.distance[:, 0] / FAR, 0, 1)
         score[blank], place[blank] = alike, others[found.index[:, 0]]
         cause[blank] = np.where(alike >= threshold, "nothing touched", "")
@@ -66,20 +76,29 @@ def gel_at_other_times(pool: Pool, items: Ints, videos: Ints) -> Floats:
     if pool.background is None:
         return out
     found, row = pool.background
-    known = np.unique(np.stack([pool.videos, found.row], axis=1)[(pool.videos >= 0) & found.own], axis=0)
+    known = np.unique(
+        np.stack([pool.videos, found.row], axis=1)[(pool.videos >= 0) & found.own], axis=0
+    )
     for start in range(0, len(items), BLOCK // OTHERS):
         block = items[start : start + BLOCK // OTHERS]
         at, other = _others(known, videos[start : start + len(block)], row[block])
         if not len(at):
             continue
         mine = row[block[at]]
-        near = np.linalg.norm(small_pictures(found.pixels, other) - small_pictures(found.pixels, mine), axis=1) <= ONE_GEL
+        near = (
+            np.linalg.norm(
+                small_pictures(found.pixels, other) - small_pictures(found.pixels, mine), axis=1
+            )
+            <= ONE_GEL
+        )
         at, other = at[near], other[near]
         if not len(at):  # the camera or the light changed: no other background shows this gel
             continue
         touches = band_pass(pool.planes(block))
-        gel = band_pass(remove_background(planar(found.pixels[other]), planar(found.pixels[row[block[at]]])))
-        both = quantised(np.concatenate([touches, gel]))
+        gel = band_pass(
+            remove_background(planar(found.pixels[other]), planar(found.pixels[row[block[at]]]))
+        )
+        both = quantized(np.concatenate([touches, gel]))
         values = similarities(both, at, len(block) + np.arange(len(at)))
         np.maximum.at(out, start + at, values)
     return out
@@ -97,4 +116,8 @@ def _others(known: Ints, videos: Ints, own: Ints) -> tuple[Ints, Ints]:
             rows = rows[np.linspace(0, len(rows) - 1, OTHERS).astype(np.int64)]
         at.append(np.full(len(rows), k, np.int64))
         other.append(rows.astype(np.int64))
-    return (np.concatenate(at), np.concatenate(other)) if at else (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    return (
+        (np.concatenate(at), np.concatenate(other))
+        if at
+        else (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    )

@@ -1,6 +1,6 @@
-"""What near-duplicate detection needs of a kind of features: candidates by nearest neighbours, and the similarity of a pair.
+"""What near-duplicate detection needs of a kind of features: candidates by nearest neighbors, and the similarity of a pair.
 
-:class:`Plates` compares pictures (``verify``), :class:`Embeddings` the vectors of a trained tower by their cosine. Both answer in [-1, 1] for row numbers of one pool
+:class:`Plates` compares pictures (``verify``), :class:`Embeddings` the vectors of a trained encoder by their cosine. Both answer in [-1, 1] for row numbers of one pool
 that holds every distinct picture of train and test once.
 """
 
@@ -35,7 +35,7 @@ class Comparer(Protocol):
     same: float
 
     def vectors(self) -> Floats:
-        """(n, d) rows whose nearest neighbours are candidates."""
+        """(n, d) rows whose nearest neighbors are candidates."""
         ...
 
     def pairs(self, i: Ints, j: Ints, progress: Progress = quiet) -> Floats:
@@ -88,7 +88,7 @@ class Embeddings:
 
     def __init__(self, vectors: Floats, name: str) -> None:
         self.name = name
-        self.same = 1 - 1e-6  # a weak tower puts different pictures very near
+        self.same = 1 - 1e-6  # a weak encoder puts different pictures very near
         length = np.linalg.norm(vectors, axis=1, keepdims=True)
         self._vectors = (vectors / np.maximum(length, np.float32(1e-12))).astype(np.float32)
 
@@ -138,7 +138,11 @@ def best_matches(
     if len(queries) * len(base) <= EXHAUSTIVE:
         found = comparer.grid(queries, base, progress)
         if query_groups is not None and base_groups is not None:
-            found = np.where((query_groups[:, None] == base_groups[None]) & (query_groups[:, None] >= 0), -np.inf, found)
+            found = np.where(
+                (query_groups[:, None] == base_groups[None]) & (query_groups[:, None] >= 0),
+                -np.inf,
+                found,
+            )
         best = found.argmax(axis=1)
         top = found[np.arange(len(best)), best]
         has = np.isfinite(top)
@@ -146,26 +150,37 @@ def best_matches(
         return place, value
     vectors = comparer.vectors()
     found = nearest(
-        vectors[queries], vectors[base], min(CANDIDATES, len(base)), query_groups=query_groups, base_groups=base_groups, progress=progress
+        vectors[queries],
+        vectors[base],
+        min(CANDIDATES, len(base)),
+        query_groups=query_groups,
+        base_groups=base_groups,
+        progress=progress,
     )
     rows, columns = np.nonzero(found.index >= 0)
     candidates = found.index[rows, columns]
     values = comparer.pairs(queries[rows], base[candidates], progress)
-    order = np.lexsort((candidates, -values, rows))  # the best candidate of each query first; ties to the lowest row
+    order = np.lexsort(
+        (candidates, -values, rows)
+    )  # the best candidate of each query first; ties to the lowest row
     first = np.unique(rows[order], return_index=True)
     place[first[0]] = candidates[order][first[1]]
     value[first[0]] = values[order][first[1]]
     return place, value
 
 
-def all_or_nearest(comparer: Comparer, items: Ints, count: int, progress: Progress = quiet) -> tuple[Ints, Ints, Floats]:
+def all_or_nearest(
+    comparer: Comparer, items: Ints, count: int, progress: Progress = quiet
+) -> tuple[Ints, Ints, Floats]:
     """Pairs of different pictures worth looking at: all if they are few, else each with its ``count`` nearest.
 
     Returns:
         (i, j, similarity): places in ``items``; a pair may stand in both orders.
     """
     if len(items) ** 2 <= EXHAUSTIVE:
-        found = comparer.grid(items, items, progress) if len(items) else np.zeros((0, 0), np.float32)
+        found = (
+            comparer.grid(items, items, progress) if len(items) else np.zeros((0, 0), np.float32)
+        )
         i, j = np.nonzero(items[:, None] != items[None])
         return i, j, found[i, j]
     vectors = comparer.vectors()[items]

@@ -11,7 +11,7 @@ The search vector of a band-passed thumbnail x (``verify.band_pass``) joins two 
 * the magnitudes of the windowed spectrum up to 4 cycles a side, |F(w x)|^(1/2): a shift changes only phases;
 * G_2 x at every fourth pixel: where things are, blurred by more than a shift moves them.
 
-Its neighbours are candidates; ``verify.similarities`` judges them.
+Its neighbors are candidates; ``verify.similarities`` judges them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ PLAIN = ("YCbCr", "RGB", "L")
 _HIGHEST = 4
 _HANN = np.hanning(SIDE + 2)[1:-1]
 _WINDOW = np.outer(_HANN, _HANN).astype(np.float32)
-_BLUR = ndimage.gaussian_filter1d(np.eye(SIDE), 2.0, axis=0, mode="nearest")[2::4].astype(np.float32)
+_BLUR = ndimage.gaussian_filter1d(np.eye(SIDE), 2.0, axis=0, mode="nearest")[2::4].astype(
+    np.float32
+)
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,9 @@ def thumbnail(path: Path) -> NDArray[np.uint8] | str:
                 upright = ImageOps.exif_transpose(image) if image.info.get("exif") else image
                 small = upright.resize((SIDE, SIDE), Image.Resampling.BILINEAR)
                 return np.asarray(small if small.mode == "YCbCr" else small.convert("YCbCr"))
-        return np.asarray(read_image(path).resize((SIDE, SIDE), Image.Resampling.BILINEAR).convert("YCbCr"))
+        return np.asarray(
+            read_image(path).resize((SIDE, SIDE), Image.Resampling.BILINEAR).convert("YCbCr")
+        )
     except PalpateError as error:
         return error.got
     except BROKEN as error:
@@ -86,7 +90,11 @@ def thumbnail(path: Path) -> NDArray[np.uint8] | str:
 
 
 def thumbnails(
-    paths: Sequence[Path | None], *, cache: Path | None = None, processes: int | None = None, progress: Progress = quiet
+    paths: Sequence[Path | None],
+    *,
+    cache: Path | None = None,
+    processes: int | None = None,
+    progress: Progress = quiet,
 ) -> Thumbnails:
     """Decodes every distinct path once.
 
@@ -102,7 +110,9 @@ def thumbnails(
     """
     files = sorted({path for path in paths if path is not None})
     place = {path: k for k, path in enumerate(files)}
-    pixels, found, reasons = _load(files, None if cache is None else Path(cache), processes, progress)
+    pixels, found, reasons = _load(
+        files, None if cache is None else Path(cache), processes, progress
+    )
     row = np.array([-1 if path is None else found[place[path]] for path in paths], np.int64)
     return Thumbnails(row, pixels, {str(files[k]): why for k, why in sorted(reasons.items())})
 
@@ -112,14 +122,24 @@ def _load(
 ) -> tuple[NDArray[np.uint8], Ints, dict[int, str]]:
     """Different thumbnails of files, the row of each file among them (-1 where it cannot be read), and why some cannot."""
     pieces = [files[start : start + PIECE] for start in range(0, len(files), PIECE)]
-    stored = [None if cache is None else cache / f"thumbnails-{_key(piece)}.npz" for piece in pieces]
-    ready = {k: path for k, path in enumerate(stored) if path is not None and _read(path, len(pieces[k])) is not None}
+    stored = [
+        None if cache is None else cache / f"thumbnails-{_key(piece)}.npz" for piece in pieces
+    ]
+    ready = {
+        k: path
+        for k, path in enumerate(stored)
+        if path is not None and _read(path, len(pieces[k])) is not None
+    }
     progress("decoding pictures", 0, len(files))
-    fresh = _decode([(k, piece) for k, piece in enumerate(pieces) if k not in ready], stored, processes)
+    fresh = _decode(
+        [(k, piece) for k, piece in enumerate(pieces) if k not in ready], stored, processes
+    )
     kept, row, reasons = _Different(len(files)), np.full(len(files), -1, np.int64), dict[int, str]()
     done = 0
     early: dict[int, Decoded] = {}
-    for k, piece in enumerate(pieces):  # in order, so that rows do not depend on what was cached or came first
+    for k, piece in enumerate(
+        pieces
+    ):  # in order, so that rows do not depend on what was cached or came first
         while k not in ready and k not in early:
             early.update([next(fresh)])
         decoded = early.pop(k) if k in early else _read(ready[k], len(piece))
@@ -175,13 +195,21 @@ def _read(path: Path, count: int) -> Decoded | None:
     return pixels, {int(k): str(text) for k, text in zip(bad, why, strict=True)}
 
 
-def _decode(pieces: list[tuple[int, list[Path]]], stored: list[Path | None], processes: int | None) -> Iterator[tuple[int, Decoded]]:
+def _decode(
+    pieces: list[tuple[int, list[Path]]], stored: list[Path | None], processes: int | None
+) -> Iterator[tuple[int, Decoded]]:
     """Decodes pieces, writing each to its place in the cache when it is whole; yields (piece, thumbnails and what cannot be read)."""
-    chunks = [((k, start), files[start : start + CHUNK]) for k, files in pieces for start in range(0, len(files), CHUNK)]
+    chunks = [
+        ((k, start), files[start : start + CHUNK])
+        for k, files in pieces
+        for start in range(0, len(files), CHUNK)
+    ]
     size = {k: len(files) for k, files in pieces}
     partial: dict[int, Decoded] = {}
     left = dict(size)
-    for (k, start), (pixels, bad) in _chunks(chunks, processes or os.cpu_count() or 1, sum(size.values())):
+    for (k, start), (pixels, bad) in _chunks(
+        chunks, processes or os.cpu_count() or 1, sum(size.values())
+    ):
         whole, reasons = partial.setdefault(k, (np.zeros((size[k], SIDE, SIDE, 3), np.uint8), {}))
         whole[start : start + len(pixels)] = pixels
         reasons.update({start + j: why for j, why in bad.items()})
@@ -191,7 +219,10 @@ def _decode(pieces: list[tuple[int, list[Path]]], stored: list[Path | None], pro
             if (path := stored[k]) is not None:
                 with atomic_path(path) as part, open(part, "wb") as file:
                     np.savez(
-                        file, pixels=decoded[0], bad=np.array(list(decoded[1]), np.int64), why=np.array(list(decoded[1].values()), str)
+                        file,
+                        pixels=decoded[0],
+                        bad=np.array(list(decoded[1]), np.int64),
+                        why=np.array(list(decoded[1].values()), str),
                     )
             yield k, decoded
 
@@ -205,11 +236,15 @@ def _chunks(chunks: list[Chunk], processes: int, count: int) -> Iterator[tuple[P
     """Decodes chunks in processes if they are many, else in threads (Pillow lets go of the interpreter while it decodes)."""
     left = dict(chunks)
     if processes > 1 and count >= FEW:
-        context = multiprocessing.get_context("spawn")  # a forked copy of a process with threads may hang
+        context = multiprocessing.get_context(
+            "spawn"
+        )  # a forked copy of a process with threads may hang
         try:
             with ProcessPoolExecutor(processes, context, initializer=follow_parent) as pool:
                 try:
-                    for (place, _), decoded in zip(chunks, _started(pool, [files for _, files in chunks]), strict=True):
+                    for (place, _), decoded in zip(
+                        chunks, _started(pool, [files for _, files in chunks]), strict=True
+                    ):
                         del left[place]
                         yield place, decoded
                 finally:
@@ -248,7 +283,7 @@ def _decode_chunk(files: list[Path]) -> Decoded:
 
 
 def search_vectors(plates: NDArray[np.int8]) -> Floats:
-    """Vectors whose nearest neighbours are candidates for near-duplicates.
+    """Vectors whose nearest neighbors are candidates for near-duplicates.
 
     Args:
         plates: (n, 3, 32, 32) band-passed pictures of any scale.
@@ -261,9 +296,22 @@ def search_vectors(plates: NDArray[np.int8]) -> Floats:
     for start in range(0, len(plates), BLOCK):
         x = plates[start : start + BLOCK].astype(np.float32)
         spectrum = np.asarray(fft.rfft2(x * _WINDOW), np.complex64)
-        near = np.concatenate([spectrum[:, :, :keep, :keep], spectrum[:, :, -_HIGHEST:, :keep]], axis=2)
-        out.append(np.hstack([_unit(np.sqrt(np.abs(near)).astype(np.float32)), _unit(np.asarray(_BLUR @ x @ _BLUR.T, np.float32))]))
-    return np.concatenate(out) if out else np.zeros((0, 3 * (2 * _HIGHEST + 1) * keep + 192), np.float32)
+        near = np.concatenate(
+            [spectrum[:, :, :keep, :keep], spectrum[:, :, -_HIGHEST:, :keep]], axis=2
+        )
+        out.append(
+            np.hstack(
+                [
+                    _unit(np.sqrt(np.abs(near)).astype(np.float32)),
+                    _unit(np.asarray(_BLUR @ x @ _BLUR.T, np.float32)),
+                ]
+            )
+        )
+    return (
+        np.concatenate(out)
+        if out
+        else np.zeros((0, 3 * (2 * _HIGHEST + 1) * keep + 192), np.float32)
+    )
 
 
 def _unit(x: Floats) -> Floats:

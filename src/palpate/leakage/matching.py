@@ -44,7 +44,12 @@ class Entries:
     def of(cls, item: Ints, videos: Ints) -> Entries:
         """Of samples with their pictures and videos; -1 stands for no picture and for an unknown video."""
         use = np.flatnonzero(item >= 0)
-        pairs, first, place = np.unique(np.stack([item[use], videos[use]], axis=1), axis=0, return_index=True, return_inverse=True)
+        pairs, first, place = np.unique(
+            np.stack([item[use], videos[use]], axis=1),
+            axis=0,
+            return_index=True,
+            return_inverse=True,
+        )
         back = np.full(len(item), -1, np.int64)
         back[use] = place.ravel()
         return cls(pairs[:, 0], pairs[:, 1], use[first], back)
@@ -69,11 +74,22 @@ class Found:
     by_videos: bool
 
 
-def match(comparer: Comparer, base: Entries, queries: Entries, rate: float, pictures: Pool | None, progress: Progress) -> Found:
+def match(
+    comparer: Comparer,
+    base: Entries,
+    queries: Entries,
+    rate: float,
+    pictures: Pool | None,
+    progress: Progress,
+) -> Found:
     """Best matches of all test entries, their scores and causes (but for drift)."""
     place, similarity = best_matches(comparer, queries.item, base.item, progress=progress)
     calibration, by_videos = calibrated(comparer, base, queries, rate, pictures, progress)
-    level = levels_of(comparer, base, queries, place, progress) if by_videos else np.zeros(len(queries), np.float32)
+    level = (
+        levels_of(comparer, base, queries, place, progress)
+        if by_videos
+        else np.zeros(len(queries), np.float32)
+    )
     score = calibrate.score(calibrate.fisher(similarity), level)
     equal = similarity >= comparer.same
     if len(base):
@@ -81,17 +97,29 @@ def match(comparer: Comparer, base: Entries, queries: Entries, rate: float, pict
     score[equal] = 1.0  # the same picture is the same picture, however many others are like it
     cause = np.where(score >= calibration.threshold, "content", "").astype("<U15")
     if pictures is not None:
-        score, place, cause = blank_matches(pictures, queries.item, base.item, score, place, cause, calibration.threshold)
+        score, place, cause = blank_matches(
+            pictures, queries.item, base.item, score, place, cause, calibration.threshold
+        )
     return Found(score, place, similarity, cause, calibration, by_videos)
 
 
 def calibrated(
-    comparer: Comparer, base: Entries, queries: Entries, rate: float, pictures: Pool | None, progress: Progress
+    comparer: Comparer,
+    base: Entries,
+    queries: Entries,
+    rate: float,
+    pictures: Pool | None,
+    progress: Progress,
 ) -> tuple[Calibration, bool]:
     """The threshold, and whether it comes from videos, so that scores are above the level of unrelated pictures."""
-    null, told = null_sample(base), "Train has too few samples of two known videos to tell unrelated pictures by."
+    null, told = (
+        null_sample(base),
+        "Train has too few samples of two known videos to tell unrelated pictures by.",
+    )
     if null is not None:
-        apart, alike = best_matches(comparer, null.item, base.item, null.videos, base.videos, progress)
+        apart, alike = best_matches(
+            comparer, null.item, base.item, null.videos, base.videos, progress
+        )
         # The same picture in two videos is a copy for certain and says nothing of unrelated ones.
         use = (apart >= 0) & (alike < comparer.same) & (null.item != base.item[apart])
         if pictures is not None:
@@ -118,12 +146,18 @@ def null_sample(base: Entries) -> Entries | None:
     if len(np.unique(base.videos[rows])) < 2 or len(rows) < calibrate.FEWEST:
         return None
     chosen = np.sort(rng_for(0, "near-duplicates", "null").permutation(rows)[:NULL_SAMPLES])
-    return Entries(base.item[chosen], base.videos[chosen], np.arange(len(chosen)), np.arange(len(chosen)))
+    return Entries(
+        base.item[chosen], base.videos[chosen], np.arange(len(chosen)), np.arange(len(chosen))
+    )
 
 
-def levels_of(comparer: Comparer, base: Entries, queries: Entries, match: Ints, progress: Progress) -> Floats:
+def levels_of(
+    comparer: Comparer, base: Entries, queries: Entries, match: Ints, progress: Progress
+) -> Floats:
     """How alike unrelated pictures are to each query; the cohort is the same random train entries for all. ``match``: (q,) places in base or -1."""
-    cohort = np.sort(rng_for(0, "near-duplicates", "cohort").permutation(len(base))[: calibrate.COHORT])
+    cohort = np.sort(
+        rng_for(0, "near-duplicates", "cohort").permutation(len(base))[: calibrate.COHORT]
+    )
     if not len(cohort) or not len(queries):
         return np.zeros(len(queries), np.float32)
     z = calibrate.fisher(comparer.grid(queries.item, base.item[cohort], progress))
@@ -134,7 +168,12 @@ def levels_of(comparer: Comparer, base: Entries, queries: Entries, match: Ints, 
 
 
 def from_random_pairs(
-    comparer: Comparer, base: Entries, queries: Entries, rate: float, pictures: Pool | None, progress: Progress
+    comparer: Comparer,
+    base: Entries,
+    queries: Entries,
+    rate: float,
+    pictures: Pool | None,
+    progress: Progress,
 ) -> Calibration:
     """The threshold where no videos are known."""
     if pictures is not None:
@@ -145,12 +184,16 @@ def from_random_pairs(
     rng = rng_for(0, "near-duplicates", "random pairs")
     asked = rng.permutation(len(queries))[:RANDOM_QUERIES]
     rows: list[Floats] = []
-    for part in np.array_split(asked, min(RANDOM_ROUNDS, len(asked))):  # each with other train pictures
+    for part in np.array_split(
+        asked, min(RANDOM_ROUNDS, len(asked))
+    ):  # each with other train pictures
         chosen = rng.permutation(count)[:RANDOM_WIDTH]
         other, theirs = base.item[chosen], base.videos[chosen]
         found = calibrate.fisher(comparer.grid(queries.item[part], other, progress))
         mine = queries.videos[part][:, None]
-        found[(queries.item[part][:, None] == other[None]) | ((mine == theirs[None]) & (mine >= 0))] = np.nan
+        found[
+            (queries.item[part][:, None] == other[None]) | ((mine == theirs[None]) & (mine >= 0))
+        ] = np.nan
         rows.append(rng.permuted(found, axis=1))
     z = np.concatenate(rows)
     return calibrate.random_blocks(z, count, rate)

@@ -12,8 +12,8 @@ sensor drift       touches alike only in what varies slowly over the picture, or
                    the threshold (0.8 of it as z) is content if what varies slowly finds the same train touch: then both speak for a copy
 =================  ========================================================================================================
 
-Steps: thumbnails and background (``descriptors``, ``background``), candidates by nearest neighbours (``search``), similarity (``verify``), score and threshold (``calibrate``).
-Between blank pictures the score is 1 - (root mean square difference of the thumbnails, the whole picture) / 32 grey levels.
+Steps: thumbnails and background (``descriptors``, ``background``), candidates by nearest neighbors (``search``), similarity (``verify``), score and threshold (``calibrate``).
+Between blank pictures the score is 1 - (root mean square difference of the thumbnails, the whole picture) / 32 gray levels.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def near_duplicates(
         test: the samples to judge.
         modality: ``vision`` or ``touch``.
         false_positives: share of unrelated samples that may be flagged, in (0, 0.1].
-        features: a trained tower's embeddings of train and test, (n_train, d) and (n_test, d), to compare instead of the pictures; causes are then all ``content``.
+        features: a trained encoder's embeddings of train and test, (n_train, d) and (n_test, d), to compare instead of the pictures; causes are then all ``content``.
         feature_name: names them, e.g. an encoder's digest.
         cache: folder for thumbnails, so that a rerun is quick; None keeps nothing.
         processes: that decode; None takes one a core.
@@ -107,15 +107,24 @@ def near_duplicates(
     """
     _check(modality, false_positives, features, (len(train), len(test)))
     if features is not None:
-        comparer: Comparer = Embeddings(np.concatenate([np.asarray(f, np.float32) for f in features]), feature_name or "embeddings given")
-        item, videos, pictures = np.arange(len(train) + len(test)), codes((train, test), "video"), None
+        comparer: Comparer = Embeddings(
+            np.concatenate([np.asarray(f, np.float32) for f in features]),
+            feature_name or "embeddings given",
+        )
+        item, videos, pictures = (
+            np.arange(len(train) + len(test)),
+            codes((train, test), "video"),
+            None,
+        )
     else:
-        pictures, fine = pool(train, test, modality, cache=cache, processes=processes, progress=progress)
+        pictures, fine = pool(
+            train, test, modality, cache=cache, processes=processes, progress=progress
+        )
         comparer, item, videos = Plates(fine), pictures.item, pictures.videos
     cut = len(train)
     base, queries = Entries.of(item[:cut], videos[:cut]), Entries.of(item[cut:], videos[cut:])
     found = match(comparer, base, queries, false_positives, pictures, progress)
-    if pictures is not None and modality == "touch":
+    if pictures is not None and modality == "tactile":
         found = _name_drift(found, pictures, comparer, base, queries, false_positives, progress)
     return _spread(found, modality, false_positives, comparer, base, queries, len(test), pictures)
 
@@ -157,26 +166,36 @@ def near_groups(
     both = None if features is None else (features, np.asarray(features)[:0])
     _check(modality, false_positives, both, (len(manifest), 0))
     if features is not None:
-        comparer: Comparer = Embeddings(np.asarray(features, np.float32), feature_name or "embeddings given")
+        comparer: Comparer = Embeddings(
+            np.asarray(features, np.float32), feature_name or "embeddings given"
+        )
         item, videos, pictures = np.arange(len(manifest)), codes((manifest,), "video"), None
     else:
-        pictures, fine = pool(manifest, none, modality, cache=cache, processes=processes, progress=progress)
+        pictures, fine = pool(
+            manifest, none, modality, cache=cache, processes=processes, progress=progress
+        )
         comparer, item, videos = Plates(fine), pictures.item, pictures.videos
     entries = Entries.of(item, videos)
     if pictures is not None:
         entries = entries.only(~pictures.blank[entries.item])
     i, j, similarity = all_or_nearest(comparer, entries.item, LINKS, progress)
-    calibration, by_videos = calibrated(comparer, entries, entries, false_positives, pictures, progress)
+    calibration, by_videos = calibrated(
+        comparer, entries, entries, false_positives, pictures, progress
+    )
     level = np.zeros(len(entries), np.float32)
     if by_videos:
-        level = levels_of(comparer, entries, entries, _best_elsewhere(entries, i, j, similarity), progress)
+        level = levels_of(
+            comparer, entries, entries, _best_elsewhere(entries, i, j, similarity), progress
+        )
     score = calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j]))
     linked = (score >= calibration.threshold) | (similarity >= comparer.same)
-    if by_videos and pictures is not None and modality == "touch":
+    if by_videos and pictures is not None and modality == "tactile":
         close = np.flatnonzero(~linked & (score >= _least(calibration.threshold)))
-        linked[close] = _slow_agrees(pictures, entries, i[close], j[close], false_positives, progress)
+        linked[close] = _slow_agrees(
+            pictures, entries, i[close], j[close], false_positives, progress
+        )
     i, j, similarity = i[linked], j[linked], similarity[linked]
-    if pictures is not None and modality == "touch" and len(i):
+    if pictures is not None and modality == "tactile" and len(i):
         some = np.unique(np.concatenate([i, j]))
         gel = np.zeros(len(entries), np.float32)
         gel[some] = gel_at_other_times(pictures, entries.item[some], entries.videos[some])
@@ -213,7 +232,13 @@ def _clusters(item: Ints, nodes: Ints, i: Ints, j: Ints) -> Ints:
 
 
 def _name_drift(
-    found: Found, pictures: Pool, comparer: Comparer, base: Entries, queries: Entries, rate: float, progress: Progress
+    found: Found,
+    pictures: Pool,
+    comparer: Comparer,
+    base: Entries,
+    queries: Entries,
+    rate: float,
+    progress: Progress,
 ) -> Found:
     """Tells touches that are alike through the state of the sensor from those alike in content."""
     cause, score = found.cause.copy(), found.score
@@ -228,7 +253,9 @@ def _name_drift(
     if len(content):
         gel = gel_at_other_times(pictures, queries.item[content], queries.videos[content])
         cause[content[gel >= found.similarity[content] * GEL_SHARE]] = "sensor drift"
-    score = np.where(only, np.maximum(slow.score, found.calibration.threshold), score).astype(np.float32)
+    score = np.where(only, np.maximum(slow.score, found.calibration.threshold), score).astype(
+        np.float32
+    )
     cause[only] = "sensor drift"
     return replace(found, cause=cause, score=score, place=np.where(only, slow.place, found.place))
 
@@ -238,22 +265,43 @@ def _least(threshold: float) -> float:
     return float(np.tanh(AGREED * np.arctanh(threshold)))
 
 
-def _slow_agrees(pictures: Pool, entries: Entries, i: Ints, j: Ints, rate: float, progress: Progress) -> NDArray[np.bool_]:
+def _slow_agrees(
+    pictures: Pool, entries: Entries, i: Ints, j: Ints, rate: float, progress: Progress
+) -> NDArray[np.bool_]:
     """Whether the pairs (i, j) of entries are alike in what varies slowly, by a threshold of its own."""
     if not len(i):
         return np.zeros(0, bool)
     comparer = Plates(plates(pictures, slow=True)[0])
     calibration, by_videos = calibrated(comparer, entries, entries, rate, None, progress)
-    similarity, level = comparer.pairs(entries.item[i], entries.item[j], progress), np.zeros(len(entries), np.float32)
+    similarity, level = (
+        comparer.pairs(entries.item[i], entries.item[j], progress),
+        np.zeros(len(entries), np.float32),
+    )
     if by_videos:
         some = np.zeros(len(entries), bool)
         some[i], some[j] = True, True
-        level[some] = levels_of(comparer, entries, entries.only(some), _best_elsewhere(entries, i, j, similarity)[some], progress)
-    return calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j])) >= calibration.threshold
+        level[some] = levels_of(
+            comparer,
+            entries,
+            entries.only(some),
+            _best_elsewhere(entries, i, j, similarity)[some],
+            progress,
+        )
+    return (
+        calibrate.score(calibrate.fisher(similarity), np.maximum(level[i], level[j]))
+        >= calibration.threshold
+    )
 
 
 def _spread(
-    found: Found, modality: str, rate: float, comparer: Comparer, base: Entries, queries: Entries, count: int, pictures: Pool | None
+    found: Found,
+    modality: str,
+    rate: float,
+    comparer: Comparer,
+    base: Entries,
+    queries: Entries,
+    count: int,
+    pictures: Pool | None,
 ) -> NearMatches:
     """From entries to the samples of test."""
     has = queries.back >= 0
@@ -262,30 +310,62 @@ def _spread(
     if len(queries) and len(base):
         at = queries.back[has]
         score[has], cause[has] = found.score[at], found.cause[at]
-        nearest[has] = np.where(found.place[at] >= 0, base.sample[np.maximum(found.place[at], 0)], -1)
+        nearest[has] = np.where(
+            found.place[at] >= 0, base.sample[np.maximum(found.place[at], 0)], -1
+        )
     edges, unrelated, histogram = calibrate.histograms(found.calibration.unrelated, score)
     notes = [*(pictures.notes if pictures is not None else []), *found.calibration.notes]
     settings = {
-        "features": comparer.name, "pictures": len(base) + len(queries), "false_positives": rate,
-        "unrelated": len(found.calibration.unrelated), "blank_limit": pictures.limit if pictures is not None else None,
-    }  # fmt: skip
+        "features": comparer.name,
+        "pictures": len(base) + len(queries),
+        "false_positives": rate,
+        "unrelated": len(found.calibration.unrelated),
+        "blank_limit": pictures.limit if pictures is not None else None,
+    }
     return NearMatches(
-        modality, score, nearest, cause == "content", cause, found.calibration.threshold, rate, edges, unrelated, histogram, notes, settings
+        modality,
+        score,
+        nearest,
+        cause == "content",
+        cause,
+        found.calibration.threshold,
+        rate,
+        edges,
+        unrelated,
+        histogram,
+        notes,
+        settings,
     )
 
 
-def _check(modality: str, rate: float, features: tuple[NDArray[np.float32], NDArray[np.float32]] | None, counts: tuple[int, int]) -> None:
+def _check(
+    modality: str,
+    rate: float,
+    features: tuple[NDArray[np.float32], NDArray[np.float32]] | None,
+    counts: tuple[int, int],
+) -> None:
     if modality not in MODALITIES:
-        raise PalpateError("The modality must be vision or touch", repr(modality), "Pass one of them")
+        raise PalpateError(
+            "The modality must be vision or touch", repr(modality), "Pass one of them"
+        )
     if not 0 < rate <= 0.1:
-        raise PalpateError("The false-positive rate must lie in (0, 0.1]", str(rate), "Pass e.g. 0.001")
+        raise PalpateError(
+            "The false-positive rate must lie in (0, 0.1]", str(rate), "Pass e.g. 0.001"
+        )
     if features is None:
         return
     shapes = [np.asarray(f).shape for f in features]
-    if any(len(s) != 2 for s in shapes) or tuple(s[0] for s in shapes) != counts or shapes[0][1] != shapes[1][1]:
+    if (
+        any(len(s) != 2 for s in shapes)
+        or tuple(s[0] for s in shapes) != counts
+        or shapes[0][1] != shapes[1][1]
+    ):
         raise PalpateError(
             f"The embeddings must be (n, d), a row a sample: {counts[0]} of train, {counts[1]} of test",
-            " and ".join(str(s) for s in shapes), "Embed the same manifests",
-        )  # fmt: skip
+            " and ".join(str(s) for s in shapes),
+            "Embed the same manifests",
+        )
     if not all(np.isfinite(f).all() for f in features):
-        raise PalpateError("The embeddings must be finite", "a number that is not", "Embed the pictures again")
+        raise PalpateError(
+            "The embeddings must be finite", "a number that is not", "Embed the pictures again"
+        )

@@ -72,45 +72,93 @@ class Flags:
 
     def columns(self, ids: NDArray[np.object_]) -> dict[str, pl.Series]:
         """Score, flag, nearest train id and, where there are several, the cause, as table columns."""
-        near = [str(ids[k]) if k >= 0 else None for k in self.nearest.tolist()] if (self.nearest >= 0).any() else [None] * len(self.flag)
+        near = (
+            [str(ids[k]) if k >= 0 else None for k in self.nearest.tolist()]
+            if (self.nearest >= 0).any()
+            else [None] * len(self.flag)
+        )
         out = {
             f"{self.key}_score": pl.Series(self.score, dtype=pl.Float32).fill_nan(None),
             f"{self.key}_flag": pl.Series(self.flag),
             f"{self.key}_nearest": pl.Series(near, dtype=pl.String),
         }
         if self.cause is not None:
-            out[f"{self.key}_cause"] = pl.Series(self.cause.tolist(), dtype=pl.String).replace("", None)
+            out[f"{self.key}_cause"] = pl.Series(self.cause.tolist(), dtype=pl.String).replace(
+                "", None
+            )
         return out
 
-    def summary(self, train: Manifest, test: Manifest, gaps: NDArray[np.int64], rows: NDArray[np.int64], worst: int) -> Signal:
+    def summary(
+        self,
+        train: Manifest,
+        test: Manifest,
+        gaps: NDArray[np.int64],
+        rows: NDArray[np.int64],
+        worst: int,
+    ) -> Signal:
         """The signal as a result; ``gaps`` and ``rows`` are the nearest frames in time, to tell a pair's own gap."""
         causes: dict[str, int] = {}
         if self.cause is not None:
             causes = {name: n for name in CAUSES if (n := int((self.cause == name).sum()))}
         return Signal(
-            self.kind, int(np.isfinite(self.score).sum()), int(self.flag.sum()), self.threshold, self.false_positives,
-            [float(e) for e in self.edges], [int(n) for n in self.unrelated], [int(n) for n in self.found], causes,
-            self._worst(train, test, gaps, rows, worst), list(self.notes), self.counts,
-        )  # fmt: skip
+            self.kind,
+            int(np.isfinite(self.score).sum()),
+            int(self.flag.sum()),
+            self.threshold,
+            self.false_positives,
+            [float(e) for e in self.edges],
+            [int(n) for n in self.unrelated],
+            [int(n) for n in self.found],
+            causes,
+            self._worst(train, test, gaps, rows, worst),
+            list(self.notes),
+            self.counts,
+        )
 
-    def _worst(self, train: Manifest, test: Manifest, gaps: NDArray[np.int64], rows: NDArray[np.int64], worst: int) -> list[LeakPair]:
+    def _worst(
+        self,
+        train: Manifest,
+        test: Manifest,
+        gaps: NDArray[np.int64],
+        rows: NDArray[np.int64],
+        worst: int,
+    ) -> list[LeakPair]:
         """The strongest pairs, one a group first; where pictures look alike for another cause, a few of those last."""
         strong = _varied(np.flatnonzero(self.flag & (self.nearest >= 0)), self.score, test, worst)
         if self.cause is not None:
             for name in CAUSES[1:]:
-                strong += _varied(np.flatnonzero((self.cause == name) & (self.nearest >= 0)), self.score, test, min(3, worst))
+                strong += _varied(
+                    np.flatnonzero((self.cause == name) & (self.nearest >= 0)),
+                    self.score,
+                    test,
+                    min(3, worst),
+                )
         pairs: list[LeakPair] = []
         for k in strong:
             j = int(self.nearest[k])
             a, b = test.table.row(k, named=True), train.table.row(j, named=True)
-            known = a["video"] is not None and a["video"] == b["video"] and None not in (a["frame"], b["frame"])
-            gap = abs(int(a["frame"]) - int(b["frame"])) if known else int(gaps[k]) if rows[k] == j and gaps[k] >= 0 else None
+            known = (
+                a["video"] is not None
+                and a["video"] == b["video"]
+                and None not in (a["frame"], b["frame"])
+            )
+            gap = (
+                abs(int(a["frame"]) - int(b["frame"]))
+                if known
+                else int(gaps[k])
+                if rows[k] == j and gaps[k] >= 0
+                else None
+            )
             cause = str(self.cause[k]) if self.cause is not None else ""
-            pairs.append(LeakPair(test.ref(a), train.ref(b), gap, round(float(self.score[k]), 4), cause))
+            pairs.append(
+                LeakPair(test.ref(a), train.ref(b), gap, round(float(self.score[k]), 4), cause)
+            )
         return pairs
 
 
-def identical_samples(train: Manifest, test: Manifest, gaps: NDArray[np.int64], rows: NDArray[np.int64]) -> Flags:
+def identical_samples(
+    train: Manifest, test: Manifest, gaps: NDArray[np.int64], rows: NDArray[np.int64]
+) -> Flags:
     """Test samples whose id, or whose video and frame, are in train.
 
     Args:
@@ -137,14 +185,28 @@ def shared_group(train: Manifest, test: Manifest, column: str, *, counts: bool) 
     known = b.is_not_null().to_numpy()
     shared = b.is_in(a.drop_nulls().unique().implode()).fill_null(False).to_numpy()
     score = np.where(known, shared, np.nan).astype(np.float32)
-    notes = [f"{n} test samples have no {column}: nothing is known of them." for n in [int((~known).sum())] if n]
-    notes += [f"{n} train samples have no {column}: what they share is not seen." for n in [a.null_count()] if n]
+    notes = [
+        f"{n} test samples have no {column}: nothing is known of them."
+        for n in [int((~known).sum())]
+        if n
+    ]
+    notes += [
+        f"{n} train samples have no {column}: what they share is not seen."
+        for n in [a.null_count()]
+        if n
+    ]
     if not counts and shared.any():
-        notes.append(f"Told, but not counted as a leak: the {column} is not what this audit was asked to keep apart.")
-    return Flags(f"shared {column}", score, shared, np.full(len(b), -1, np.int64), counts=counts, notes=notes)
+        notes.append(
+            f"Told, but not counted as a leak: the {column} is not what this audit was asked to keep apart."
+        )
+    return Flags(
+        f"shared {column}", score, shared, np.full(len(b), -1, np.int64), counts=counts, notes=notes
+    )
 
 
-def time_gap(gaps: NDArray[np.int64], rows: NDArray[np.int64], near: int = NEAR_FRAMES) -> Flags | None:
+def time_gap(
+    gaps: NDArray[np.int64], rows: NDArray[np.int64], near: int = NEAR_FRAMES
+) -> Flags | None:
     """Nearness in time to the nearest train frame of the same video; None where no test sample has one.
 
     Args:
@@ -161,7 +223,9 @@ def time_gap(gaps: NDArray[np.int64], rows: NDArray[np.int64], near: int = NEAR_
         (gaps >= 0) & (gaps <= near),
         rows,
         threshold=0.5 if near else 1.0,
-        notes=[f"Flagged up to {near} frames; the score is 2^(-gap/{near})."] if near else ["Flagged at a gap of 0 frames only."],
+        notes=[f"Flagged up to {near} frames; the score is 2^(-gap/{near})."]
+        if near
+        else ["Flagged at a gap of 0 frames only."],
     )
 
 
@@ -175,7 +239,12 @@ def identical_bytes(train: Manifest, test: Manifest, progress: Progress = quiet)
         for k, name in enumerate(train.column(column)):
             if name is not None:
                 first.setdefault(train.path(name), k)
-    used = [(k, test.path(name)) for column in PICTURES for k, name in enumerate(test.column(column)) if name is not None]
+    used = [
+        (k, test.path(name))
+        for column in PICTURES
+        for k, name in enumerate(test.column(column))
+        if name is not None
+    ]
     sizes = {path: _size(path) for path in {*first, *(path for _, path in used)}}
     if not first or not any(sizes[path] > 0 for _, path in used):
         return None
@@ -198,13 +267,23 @@ def identical_bytes(train: Manifest, test: Manifest, progress: Progress = quiet)
     flag = nearest >= 0
     empty = sum(sizes[p] == 0 for p in sizes)
     notes = [f"{empty} files are empty (0 bytes) and were not compared."] if empty else []
-    return Flags("identical bytes", np.where(seen, flag, np.nan).astype(np.float32), flag, nearest, notes=notes)
+    return Flags(
+        "identical bytes",
+        np.where(seen, flag, np.nan).astype(np.float32),
+        flag,
+        nearest,
+        notes=notes,
+    )
 
 
-def signal_table(test: Manifest, train: Manifest, found: Sequence[Flags], gaps: NDArray[np.int64]) -> pl.DataFrame:
+def signal_table(
+    test: Manifest, train: Manifest, found: Sequence[Flags], gaps: NDArray[np.int64]
+) -> pl.DataFrame:
     """Every signal of every test sample: ``id, video, frame, material, leaking, gap`` and the columns of each signal."""
     ids = np.array(train.ids, object)
-    columns: Mapping[str, pl.Series] = {name: series for flags in found for name, series in flags.columns(ids).items()}
+    columns: Mapping[str, pl.Series] = {
+        name: series for flags in found for name, series in flags.columns(ids).items()
+    }
     gap = pl.Series(gaps).replace(-1, None)
     return test.table.select("id", "video", "frame", "material").with_columns(
         leaking=pl.Series(leaking(found, len(test))), gap=gap, **columns
@@ -220,7 +299,9 @@ def leaking(found: Sequence[Flags], count: int) -> NDArray[np.bool_]:
     return out
 
 
-def _varied(rows: NDArray[np.int64], score: NDArray[np.float32], test: Manifest, most: int) -> list[int]:
+def _varied(
+    rows: NDArray[np.int64], score: NDArray[np.float32], test: Manifest, most: int
+) -> list[int]:
     """Up to ``most`` rows by falling score, the best of each video first."""
     order = rows[np.argsort(-score[rows], kind="stable")].tolist()
     videos = test.table["video"]

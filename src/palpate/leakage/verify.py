@@ -1,4 +1,4 @@
-"""Similarity of two pictures: the peak of their normalised cross-correlation over small shifts.
+"""Similarity of two pictures: the peak of their normalized cross-correlation over small shifts.
 
 A picture is a thumbnail of 32 x 32 pixels in YCbCr, band-passed: with G_s a Gaussian blur of s pixels (edges repeated),
 
@@ -60,7 +60,9 @@ class Shifts:
         """Offsets of -2 ... 2 pixels in steps of ``step``."""
         at = np.arange(-REACH, REACH + step / 2, step)
         half = np.arange(SIDE // 2 + 1)
-        twice = np.where((half == 0) | (half == SIDE // 2), 1.0, 2.0)  # a real picture's other half of the spectrum
+        twice = np.where(
+            (half == 0) | (half == SIDE // 2), 1.0, 2.0
+        )  # a real picture's other half of the spectrum
         rows = np.exp(2j * np.pi * np.outer(at, np.fft.fftfreq(SIDE)))
         columns = np.exp(2j * np.pi * np.outer(half / SIDE, at)) * (twice / SIDE**2)[:, None]
         return cls(at.astype(np.float32), rows.astype(np.complex64), columns.astype(np.complex64))
@@ -78,7 +80,9 @@ def band_pass(pictures: Floats) -> Floats:
     Returns:
         (n, 3, 32, 32), the filter of this file's head.
     """
-    out: Floats = np.asarray(_FINE @ pictures @ _FINE.T - _COARSE @ pictures @ _COARSE.T, np.float32)
+    out: Floats = np.asarray(
+        _FINE @ pictures @ _FINE.T - _COARSE @ pictures @ _COARSE.T, np.float32
+    )
     out[:, 1:] *= CHROMA
     return out
 
@@ -99,7 +103,9 @@ def smooth(pictures: Floats) -> Floats:
 
 def rms(pictures: Floats) -> Floats:
     """Root mean square over channels and pixels: (n,)."""
-    return np.sqrt(np.mean(np.square(pictures, dtype=np.float32), axis=(1, 2, 3))).astype(np.float32)
+    return np.sqrt(np.mean(np.square(pictures, dtype=np.float32), axis=(1, 2, 3))).astype(
+        np.float32
+    )
 
 
 def _spectrum(x: Floats) -> NDArray[np.complex64]:
@@ -116,7 +122,9 @@ def query_spectra(x: Floats) -> tuple[NDArray[np.complex64], Floats]:
 
 def base_spectra(x: Floats, shifts: Shifts = HALVES) -> tuple[NDArray[np.complex64], Floats]:
     """Spectra (n, 3, 32, 17), and the norms of the windows (n, k, k) at all offsets."""
-    energy = (_boxes(np.square(x, dtype=np.float64)) - _boxes(x.astype(np.float64)) ** 2 / _INNER**2).sum(axis=1)
+    energy = (
+        _boxes(np.square(x, dtype=np.float64)) - _boxes(x.astype(np.float64)) ** 2 / _INNER**2
+    ).sum(axis=1)
     at = shifts.offsets.astype(np.float64) + REACH
     low = np.minimum(at.astype(np.int64), 2 * REACH - 1)
     part = at - low
@@ -134,9 +142,11 @@ def _boxes(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def correlations(
-    query: tuple[NDArray[np.complex64], Floats], base: tuple[NDArray[np.complex64], Floats], shifts: Shifts = HALVES
+    query: tuple[NDArray[np.complex64], Floats],
+    base: tuple[NDArray[np.complex64], Floats],
+    shifts: Shifts = HALVES,
 ) -> Floats:
-    """Normalised cross-correlation at all offsets, (n, k, k), of spectra that stand pair by pair (or broadcast)."""
+    """Normalized cross-correlation at all offsets, (n, k, k), of spectra that stand pair by pair (or broadcast)."""
     cross = np.einsum("pcij,pcij->pij", query[0], base[0])
     peaks = (shifts.rows @ cross @ shifts.columns).real
     return peaks / (query[1][:, None, None] * base[1] + np.float32(1e-6))
@@ -145,7 +155,7 @@ def correlations(
 def best_offset(x: Floats, y: Floats, shifts: Shifts) -> Floats:
     """For each pair the offset (n, 2), down and right in pixels, at which they correlate best.
 
-    Between the offsets of ``shifts`` it is the peak of the parabola through the highest value and its two neighbours along each axis.
+    Between the offsets of ``shifts`` it is the peak of the parabola through the highest value and its two neighbors along each axis.
     """
     values = correlations(query_spectra(x), base_spectra(y, shifts), shifts)
     rows, last = np.arange(len(x)), len(shifts.offsets) - 1
@@ -157,11 +167,15 @@ def best_offset(x: Floats, y: Floats, shifts: Shifts) -> Floats:
         before, top, after = (lines[rows, np.clip(at + d, 0, last)] for d in (-1, 0, 1))
         bend = before - 2 * top + after
         curved = (at > 0) & (at < last) & (bend < -1e-6)
-        out[:, axis] += np.where(curved, (before - after) / np.where(curved, 2 * bend, 1), 0) * (shifts.offsets[1] - shifts.offsets[0])
+        out[:, axis] += np.where(curved, (before - after) / np.where(curved, 2 * bend, 1), 0) * (
+            shifts.offsets[1] - shifts.offsets[0]
+        )
     return out
 
 
-def similarities(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progress = quiet) -> Floats:
+def similarities(
+    plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progress = quiet
+) -> Floats:
     """S of pairs of pictures.
 
     Args:
@@ -186,7 +200,9 @@ def similarities(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progre
     return out
 
 
-def against_all(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progress = quiet) -> Iterator[tuple[slice, Floats]]:
+def against_all(
+    plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progress = quiet
+) -> Iterator[tuple[slice, Floats]]:
     """S of every query with every one of a few pictures, in blocks of queries.
 
     Args:
@@ -206,7 +222,9 @@ def against_all(plates: NDArray[np.int8], i: Ints, j: Ints, *, progress: Progres
         spectra, norms = query_spectra(plates[i[part]].astype(np.float32))
         values = np.empty((len(norms), len(j)), np.float32)
         for k in range(len(norms)):
-            values[k] = correlations((spectra[k : k + 1], norms[k : k + 1]), (others, windows)).max(axis=(1, 2))
+            values[k] = correlations((spectra[k : k + 1], norms[k : k + 1]), (others, windows)).max(
+                axis=(1, 2)
+            )
         yield part, np.clip(values, -1, 1)
     progress("comparing with unrelated pictures", len(i), len(i))
 

@@ -23,7 +23,12 @@ R = TypeVar("R")
 
 #: The series of expm1 serves up to here, and may leave out so much (in MMD^2 twice 1000 times that); (t + 1)! at place t; numbers of a block
 #: that fit a core's cache.
-SERIES, LEFT_OUT, FACTORIALS, CACHED = 0.13, 2e-11, tuple(float(f) for f in np.cumprod(np.arange(1, 13))), 1 << 15
+SERIES, LEFT_OUT, FACTORIALS, CACHED = (
+    0.13,
+    2e-11,
+    tuple(float(f) for f in np.cumprod(np.arange(1, 13))),
+    1 << 15,
+)
 
 
 class Ops:
@@ -64,7 +69,9 @@ class Ops:
         """
         if x.dtype != np.float32 or not x.size or not least >= -SERIES:
             return np.expm1(x if shift is None else self.add_outer_(x, *shift), out=x)
-        terms = next(t for t in range(3, len(FACTORIALS)) if (-least) ** (t + 1) <= LEFT_OUT * FACTORIALS[t])
+        terms = next(
+            t for t in range(3, len(FACTORIALS)) if (-least) ** (t + 1) <= LEFT_OUT * FACTORIALS[t]
+        )
         step = max(1, CACHED // x.shape[-1])
         room = np.empty((step, *x.shape[1:]), x.dtype)
         for k in range(0, len(x), step):
@@ -92,7 +99,12 @@ class Ops:
 
     def sum_rows(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
         """(R, m) sums over the runs of rows that begin at ``starts`` (R,), in float64: near-equal numbers in float32 are rounded in one direction."""
-        return np.stack([k[a:b].sum(axis=0, dtype=np.float64) for a, b in zip(starts, [*starts[1:], len(k)], strict=True)])
+        return np.stack(
+            [
+                k[a:b].sum(axis=0, dtype=np.float64)
+                for a, b in zip(starts, [*starts[1:], len(k)], strict=True)
+            ]
+        )
 
     def sum_columns(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
         """(n, R) sums over runs of columns, in float64."""
@@ -108,7 +120,9 @@ class Ops:
 
     def at_least_float32(self, x: Any) -> Any:
         """As float32 or float64."""
-        return x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)  # native byte order too
+        return x.astype(
+            np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False
+        )  # native byte order too
 
     def divide_rows(self, x: Any, norms: NDArray[np.float64]) -> Any:
         """Rows divided by (n,) numbers, in the type of ``x``."""
@@ -152,7 +166,9 @@ class ArrayApiOps(Ops):
 
     def columns(self, x: Any, *extra: Any) -> Any:
         """``x`` (n, d) with further columns (n,) behind."""
-        return self.xp.concat([x, *(self.xp.reshape(self.xp.astype(e, x.dtype), (-1, 1)) for e in extra)], axis=1)
+        return self.xp.concat(
+            [x, *(self.xp.reshape(self.xp.astype(e, x.dtype), (-1, 1)) for e in extra)], axis=1
+        )
 
     def squares(self, x: Any) -> Any:
         """(n,) squared norms, in float64 where the device has it."""
@@ -186,7 +202,9 @@ class ArrayApiOps(Ops):
     def sum_rows(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
         """(R, m) sums over runs of rows, in float64: one product."""
         number = np.repeat(np.arange(len(starts)), np.diff([*starts, k.shape[0]]))
-        marks = self.xp.asarray((number == np.arange(len(starts))[:, None]).astype(np.float64), device=self.device)
+        marks = self.xp.asarray(
+            (number == np.arange(len(starts))[:, None]).astype(np.float64), device=self.device
+        )
         return self.numpy(marks @ self.xp.astype(k, self.xp.float64))
 
     def sum_columns(self, k: Any, starts: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -230,7 +248,9 @@ def blas_threads() -> int:
     from threadpoolctl import threadpool_info
 
     allowed = [int(pool["num_threads"]) for pool in threadpool_info() if pool["user_api"] == "blas"]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     return max(1, min([cores, *allowed]))
 
 
@@ -252,13 +272,17 @@ def full_products() -> Generator[None]:
 def release(x: Any) -> None:
     """Lets the system forget the pages of an array on disk that were read: they would count as this process's memory."""
     held = getattr(x, "_mmap", None)
-    if isinstance(x, np.memmap) and held is not None and hasattr(held, "madvise") and x.mode != "c":  # own changes would be lost
+    if (
+        isinstance(x, np.memmap) and held is not None and hasattr(held, "madvise") and x.mode != "c"
+    ):  # own changes would be lost
         held.madvise(mmap.MADV_DONTNEED)
 
 
 def is_foreign(x: Any) -> bool:
     """Whether ``x`` is an array of a library other than NumPy: a torch tensor, say."""
-    return not isinstance(x, np.ndarray) and (hasattr(x, "__array_namespace__") or type(x).__module__.split(".")[0] == "torch")
+    return not isinstance(x, np.ndarray) and (
+        hasattr(x, "__array_namespace__") or type(x).__module__.split(".")[0] == "torch"
+    )
 
 
 def ops_of(x: Any) -> Ops:

@@ -44,20 +44,27 @@ def as_array(name: str, x: Any) -> Any:
         if getattr(getattr(x, "device", None), "type", "") != "cpu":
             return x
         if str(x.dtype).endswith("bfloat16"):  # NumPy has none
-            warnings.warn(f"{name}: bfloat16 features were widened to float32; their rounding stays", stacklevel=4)
+            warnings.warn(
+                f"{name}: bfloat16 features were widened to float32; their rounding stays",
+                stacklevel=4,
+            )
             x = x.float()
     if isinstance(x, np.memmap):  # np.asarray would forget where it comes from
         return x
     try:
         return np.asarray(x)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise PalpateError(f"{name} must turn into a NumPy array", str(error).splitlines()[0], "Pass an array of one width") from None
+        raise PalpateError(
+            f"{name} must turn into a NumPy array",
+            str(error).splitlines()[0],
+            "Pass an array of one width",
+        ) from None
 
 
 def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Any:
     """``x`` as a float32 or float64 array (n, d) that a kernel may be evaluated on.
 
-    Looked at in slabs, so that an array on disk (``np.memmap``) of float32 or float64 rows is read but not held; one that has to be normalised, or
+    Looked at in slabs, so that an array on disk (``np.memmap``) of float32 or float64 rows is read but not held; one that has to be normalized, or
     widened from half precision, is copied into memory.
 
     Args:
@@ -67,22 +74,38 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         least: the fewest rows that the estimator can use.
 
     Raises:
-        PalpateError: on integers, a wrong shape, too few rows, NaN or infinity, zero or un-normalised rows (their numbers are named).
+        PalpateError: on integers, a wrong shape, too few rows, NaN or infinity, zero or un-normalized rows (their numbers are named).
     """
     if normalize is not True and normalize is not False and normalize != "check":
-        raise PalpateError('normalize must be "check", True or False', repr(normalize), "Leave it out for the default")
+        raise PalpateError(
+            'normalize must be "check", True or False',
+            repr(normalize),
+            "Leave it out for the default",
+        )
     x = as_array(name, x)
     kind = x.dtype.name if isinstance(x, np.ndarray) else str(x.dtype).rsplit(".", maxsplit=1)[-1]
     if not kind.startswith(("float", "bfloat", "longdouble")):
         raise PalpateError(
-            f"{name} must be floating-point features", f"dtype {x.dtype}", "Pass the encoder's float output, not pixels or codes"
+            f"{name} must be floating-point features",
+            f"dtype {x.dtype}",
+            "Pass the encoder's float output, not pixels or codes",
         )
     if x.ndim != 2 or x.shape[1] == 0:
-        raise PalpateError(f"{name} must have shape (n, d), one row a sample", f"shape {tuple(x.shape)}", "Stack one feature vector a row")
+        raise PalpateError(
+            f"{name} must have shape (n, d), one row a sample",
+            f"shape {tuple(x.shape)}",
+            "Stack one feature vector a row",
+        )
     if len(x) < least:
-        raise PalpateError(f"{name} must have at least {least} rows for this estimator", f"{len(x)}", "Pass more samples")
+        raise PalpateError(
+            f"{name} must have at least {least} rows for this estimator",
+            f"{len(x)}",
+            "Pass more samples",
+        )
     if kind in ("float16", "bfloat16"):
-        warnings.warn(f"{name}: {kind} features were widened to float32; their rounding stays", stacklevel=3)
+        warnings.warn(
+            f"{name}: {kind} features were widened to float32; their rounding stays", stacklevel=3
+        )
     ops = ops_of(x)
     x = ops.at_least_float32(x)
     norms = np.empty(len(x))
@@ -90,18 +113,32 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         norms[k : k + SLAB] = np.sqrt(ops.numpy(ops.squares(x[k : k + SLAB])))
         release(x)
     if (bad := ~np.isfinite(norms)).any():
-        raise PalpateError(f"{name} must be finite", f"NaN or infinity in {rows_text(bad)}", "Check what those rows were made from")
+        raise PalpateError(
+            f"{name} must be finite",
+            f"NaN or infinity in {rows_text(bad)}",
+            "Check what those rows were made from",
+        )
     if normalize is not False and (bad := norms == 0).any():
-        raise PalpateError(f"{name} must have no zero vector", f"zeros in {rows_text(bad)}", "Check what those rows were made from")
+        raise PalpateError(
+            f"{name} must have no zero vector",
+            f"zeros in {rows_text(bad)}",
+            "Check what those rows were made from",
+        )
     if normalize is True:
         return ops.divide_rows(x, norms)
     if normalize == "check" and (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
         got = f"norm {norms[np.flatnonzero(bad)[0]]:.4g} in {rows_text(bad)}"
-        raise PalpateError(f"{name} must be L2-normalised", got, "Pass normalize=True to divide by the norm, or normalize=False to keep it")
+        raise PalpateError(
+            f"{name} must be L2-normalized",
+            got,
+            "Pass normalize=True to divide by the norm, or normalize=False to keep it",
+        )
     return x
 
 
-def checked_pair(x: Any, y: Any, *, normalize: Normalize, least: int, names: tuple[str, str] = ("x", "y")) -> tuple[Any, Any]:
+def checked_pair(
+    x: Any, y: Any, *, normalize: Normalize, least: int, names: tuple[str, str] = ("x", "y")
+) -> tuple[Any, Any]:
     """Both feature arrays, checked, of one width, one library and one dtype.
 
     Raises:
@@ -111,12 +148,24 @@ def checked_pair(x: Any, y: Any, *, normalize: Normalize, least: int, names: tup
     if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
         got = f"{x.shape[1]} and {y.shape[1]}"
         second = names[1][:1].lower() + names[1][1:] if names[1].startswith("The ") else names[1]
-        raise PalpateError(f"{names[0]} and {second} must have the same width", got, "Embed both with the same encoder")
-    homes = [f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}".strip() if is_foreign(v) else "numpy" for v in (x, y)]
+        raise PalpateError(
+            f"{names[0]} and {second} must have the same width",
+            got,
+            "Embed both with the same encoder",
+        )
+    homes = [
+        f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}".strip()
+        if is_foreign(v)
+        else "numpy"
+        for v in (x, y)
+    ]
     if homes[0] != homes[1]:
         must = f"{names[0]} and {names[1]} must be arrays of one library on one device"
         raise PalpateError(must, " and ".join(homes), "Move one of them")
-    a, b = (checked_features(name, v, normalize=normalize, least=least) for name, v in zip(names, (x, y), strict=True))
+    a, b = (
+        checked_features(name, v, normalize=normalize, least=least)
+        for name, v in zip(names, (x, y), strict=True)
+    )
     return ops_of(a).one_type(a, b)
 
 
@@ -148,10 +197,18 @@ def checked_names(name: str, values: Sequence[Any] | None, n: int) -> list[str] 
         return None
     names = list(values)
     if len(names) != n:
-        raise PalpateError(f"{name} must have one entry a row ({n})", f"{len(names)}", f"Pass {name} in the order of the rows")
+        raise PalpateError(
+            f"{name} must have one entry a row ({n})",
+            f"{len(names)}",
+            f"Pass {name} in the order of the rows",
+        )
     missing = np.array([is_missing(v) for v in names], dtype=bool)
     if missing.any():
-        raise PalpateError(f"{name} must be known for every row", f"none in {rows_text(missing)}", f"Fill {name}, or pass None for all")
+        raise PalpateError(
+            f"{name} must be known for every row",
+            f"none in {rows_text(missing)}",
+            f"Fill {name}, or pass None for all",
+        )
     return [str(v) for v in names]
 
 
@@ -164,8 +221,16 @@ def checked_level(level: Any) -> None:
 def checked_whole(least: int, **values: Any) -> None:
     """Refuses parameters that are not whole numbers from ``least`` on."""
     for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value < 2**63:
-            raise PalpateError(f"{name} must be a whole number of at least {least}", repr(value), "Leave it out for the default")
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | np.integer)
+            or not least <= value < 2**63
+        ):
+            raise PalpateError(
+                f"{name} must be a whole number of at least {least}",
+                repr(value),
+                "Leave it out for the default",
+            )
 
 
 def checked_positive(**values: float) -> None:
@@ -178,14 +243,24 @@ def checked_positive(**values: float) -> None:
 def checked_numbers(**values: Any) -> None:
     """Refuses parameters that are not finite numbers from 0 on."""
     for name, value in values.items():
-        if not isinstance(value, int | float | np.number) or isinstance(value, bool) or not (np.isfinite(value) and value >= 0):
-            raise PalpateError(f"{name} must be a finite number from 0 on", repr(value), "Leave it out for the default")
+        if (
+            not isinstance(value, int | float | np.number)
+            or isinstance(value, bool)
+            or not (np.isfinite(value) and value >= 0)
+        ):
+            raise PalpateError(
+                f"{name} must be a finite number from 0 on",
+                repr(value),
+                "Leave it out for the default",
+            )
 
 
 def checked_choice(name: str, value: Any, choices: Sequence[str]) -> None:
     """Refuses a word that is not among ``choices``."""
     if value not in choices:
-        raise PalpateError(f"{name} must be one of {', '.join(choices)}", repr(value), "Choose one of these")
+        raise PalpateError(
+            f"{name} must be one of {', '.join(choices)}", repr(value), "Choose one of these"
+        )
 
 
 def checked_images(generated: Any, reference: Any) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -194,20 +269,31 @@ def checked_images(generated: Any, reference: Any) -> tuple[NDArray[Any], NDArra
     Raises:
         PalpateError: on other shapes, dtypes or ranges; image numbers are named.
     """
-    pair = [np.asarray(as_array(f"The {name} images", v)) for name, v in (("generated", generated), ("reference", reference))]
+    pair = [
+        np.asarray(as_array(f"The {name} images", v))
+        for name, v in (("generated", generated), ("reference", reference))
+    ]
     for name, images in zip(("generated", "reference"), pair, strict=True):
         if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
             raise PalpateError(
-                f"The {name} images must have shape (n, h, w, 3), n >= 1", f"shape {images.shape}", "Stack them with channels last"
+                f"The {name} images must have shape (n, h, w, 3), n >= 1",
+                f"shape {images.shape}",
+                "Stack them with channels last",
             )
         if images.dtype != np.uint8 and images.dtype.kind != "f":
-            raise PalpateError(f"The {name} images must be uint8, or floats in [0, 1]", f"dtype {images.dtype}", "Convert them")
+            raise PalpateError(
+                f"The {name} images must be uint8, or floats in [0, 1]",
+                f"dtype {images.dtype}",
+                "Convert them",
+            )
         if images.dtype.kind == "f":
             for number, image in enumerate(images):
                 low, high = float(image.min()), float(image.max())
                 if not (low >= -1e-6 and high <= 1 + 1e-6):  # also false for NaN
                     raise PalpateError(
-                        f"The {name} images must lie in [0, 1]", f"[{low:.4g}, {high:.4g}] in image {number}", "Scale them to [0, 1]"
+                        f"The {name} images must lie in [0, 1]",
+                        f"[{low:.4g}, {high:.4g}] in image {number}",
+                        "Scale them to [0, 1]",
                     )
     if pair[0].shape != pair[1].shape:
         raise PalpateError(

@@ -131,7 +131,12 @@ class Pairs:
 
     def squared_errors(self) -> Array:
         """(n,) mean squared error of each pair, all channels together."""
-        return np.array([((self.unit(x) - self.unit(y)) ** 2).mean() for x, y in zip(self.a, self.b, strict=True)])
+        return np.array(
+            [
+                ((self.unit(x) - self.unit(y)) ** 2).mean()
+                for x, y in zip(self.a, self.b, strict=True)
+            ]
+        )
 
     @property
     def coding(self) -> dict[str, list[float]]:
@@ -154,11 +159,15 @@ def as_images(name: str, images: Any) -> NDArray[Any]:
         return np.asarray(images)
     except (TypeError, ValueError, RuntimeError) as error:
         raise PalpateError(
-            f"The {name} images must turn into a NumPy array", str(error).splitlines()[0], "Pass an array, or tensor.detach().cpu()"
+            f"The {name} images must turn into a NumPy array",
+            str(error).splitlines()[0],
+            "Pass an array, or tensor.detach().cpu()",
         ) from None
 
 
-def checked_pairs(generated: Any, reference: Any, data_range: Range | None = None, compat: str | None = None) -> Pairs:
+def checked_pairs(
+    generated: Any, reference: Any, data_range: Range | None = None, compat: str | None = None
+) -> Pairs:
     """The images, checked against the data range.
 
     Args:
@@ -177,19 +186,37 @@ def checked_pairs(generated: Any, reference: Any, data_range: Range | None = Non
         return Pairs(*checked_images(*pair), None, compat is None)
     low, high = _span(data_range)
     if compat == "piq" and low != 0:
-        raise PalpateError("piq knows only data ranges from 0", f"data_range=({low:g}, {high:g})", "Shift the images, or leave compat out")
+        raise PalpateError(
+            "piq knows only data ranges from 0",
+            f"data_range=({low:g}, {high:g})",
+            "Shift the images, or leave compat out",
+        )
     for name, images in zip(("generated", "reference"), pair, strict=True):
         if images.dtype.kind not in "uif":
-            raise PalpateError(f"The {name} images must be numbers", f"dtype {images.dtype}", "Convert them")
-        for number, image in enumerate(images) if images.ndim == 4 and 0 not in images.shape else ():
+            raise PalpateError(
+                f"The {name} images must be numbers", f"dtype {images.dtype}", "Convert them"
+            )
+        for number, image in (
+            enumerate(images) if images.ndim == 4 and 0 not in images.shape else ()
+        ):
             least, most = float(image.min()), float(image.max())
             reach = 1e-6 * (high - low)
             if not (least >= low - reach and most <= high + reach):  # also false for NaN
                 got = f"[{least:.4g}, {most:.4g}] in image {number}"
-                raise PalpateError(f"The {name} images must lie in the data range [{low:g}, {high:g}]", got, _HINT)
-        if images.dtype.kind == "f" and images.size and high - low >= 100 and 0 < float(images.max()) <= 1 and float(images.min()) >= 0:
+                raise PalpateError(
+                    f"The {name} images must lie in the data range [{low:g}, {high:g}]", got, _HINT
+                )
+        if (
+            images.dtype.kind == "f"
+            and images.size
+            and high - low >= 100
+            and 0 < float(images.max()) <= 1
+            and float(images.min()) >= 0
+        ):
             raise PalpateError(
-                f"The {name} images must fill the data range [{low:g}, {high:g}]", "floats in [0, 1]", "Leave data_range out, or scale them"
+                f"The {name} images must fill the data range [{low:g}, {high:g}]",
+                "floats in [0, 1]",
+                "Leave data_range out, or scale them",
             )
     # The shapes are checked as ever, on empty stand-ins: the ranges are already.
     checked_images(*(np.broadcast_to(np.uint8(0), v.shape) for v in pair))
@@ -201,15 +228,23 @@ _HINT = "Pass the range of the numbers, e.g. data_range=(-1, 1) for images in [-
 
 def _span(data_range: Any) -> tuple[float, float]:
     try:
-        low, high = (0.0, float(data_range)) if np.ndim(data_range) == 0 else (float(v) for v in data_range)
+        low, high = (
+            (0.0, float(data_range)) if np.ndim(data_range) == 0 else (float(v) for v in data_range)
+        )
     except (TypeError, ValueError):
         low, high = np.nan, np.nan
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise PalpateError("data_range must be a positive number, or (low, high) with low < high", repr(data_range), _HINT)
+        raise PalpateError(
+            "data_range must be a positive number, or (low, high) with low < high",
+            repr(data_range),
+            _HINT,
+        )
     return low, high
 
 
-def local_maps(x: Array, y: Array, convention: Convention, reach: float = 1.0) -> tuple[Array, Array]:
+def local_maps(
+    x: Array, y: Array, convention: Convention, reach: float = 1.0
+) -> tuple[Array, Array]:
     """SSIM and its contrast-structure factor at every window.
 
     Args:
@@ -248,7 +283,11 @@ def pooled(image: Array, factor: int) -> Array:
     if factor == 1:
         return image
     h, w = image.shape[1] // factor, image.shape[2] // factor
-    return image[:, : h * factor, : w * factor].reshape(len(image), h, factor, w, factor).mean(axis=(2, 4))
+    return (
+        image[:, : h * factor, : w * factor]
+        .reshape(len(image), h, factor, w, factor)
+        .mean(axis=(2, 4))
+    )
 
 
 def ssim_values(pairs: Pairs, compat: str | None) -> Array:
@@ -261,7 +300,9 @@ def ssim_values(pairs: Pairs, compat: str | None) -> Array:
     height, width = pairs.a.shape[1:3]
     if min(height, width) < convention.window:
         size = f"{convention.window} x {convention.window}"
-        raise PalpateError(f"Images must be at least {size} for SSIM", f"{height} x {width}", "Score larger images")
+        raise PalpateError(
+            f"Images must be at least {size} for SSIM", f"{height} x {width}", "Score larger images"
+        )
     factor, values = convention.factor(height, width), np.empty(len(pairs))
     for i in range(len(pairs)):
         x, y = (pooled(v, factor) for v in pairs.channels(i))

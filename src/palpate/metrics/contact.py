@@ -21,7 +21,7 @@ d = touch - background in [-1, 1] and compared where the real touch touches:
   there). A squared error prefers empty gel to a wrong touch, here as everywhere: read it beside ``details["empty"]``, what empty gel has.
 * *IoU*: of the generated touch's mask (made in the same way) and the real one. A contact everywhere has ``details["everywhere"]``.
 
-For a network that compares pictures, as LPIPS does, :func:`contact_pictures` gives the differences as pictures, neutral grey outside the mask,
+For a network that compares pictures, as LPIPS does, :func:`contact_pictures` gives the differences as pictures, neutral gray outside the mask,
 and the mask to average by.
 """
 
@@ -38,7 +38,15 @@ from palpate.core import PalpateError, Score
 from palpate.metrics.checks import checked_choice, checked_images, checked_names
 from palpate.metrics.compat import WINDOW, Convention
 from palpate.metrics.kernels import Array
-from palpate.metrics.masks import LEAST, Mask, checked_least, checked_touches, mask_of, pictures_digest, unit
+from palpate.metrics.masks import (
+    LEAST,
+    Mask,
+    checked_least,
+    checked_touches,
+    mask_of,
+    pictures_digest,
+    unit,
+)
 from palpate.metrics.multiscale import fitting_scales, signed_maps, weighted_ms_ssim
 from palpate.metrics.pairwise import mean_score
 
@@ -98,12 +106,27 @@ def contact_per_image(
     Raises:
         PalpateError: on other shapes, dtypes or ranges, images smaller than the window, or unknown options.
     """
-    names = ("psnr", "ssim", "ms_ssim", "residual", "iou", "per_real_energy", "empty_psnr", "empty_ssim", "empty_ms_ssim")
+    names = (
+        "psnr",
+        "ssim",
+        "ms_ssim",
+        "residual",
+        "iou",
+        "per_real_energy",
+        "empty_psnr",
+        "empty_ssim",
+        "empty_ms_ssim",
+    )
     pairs = _Pairs.of(generated, reference, background, generated_background, markers, least)
-    found = {name: np.full(len(pairs.real), np.nan) for name in names} | {"area": np.zeros(len(pairs.real))}
+    found = {name: np.full(len(pairs.real), np.nan) for name in names} | {
+        "area": np.zeros(len(pairs.real))
+    }
     for i, made, real, kept, mask in pairs:
         other = mask_of(unit(pairs.made[i]), unit(pairs.own[i]), least)[0]
-        row = _compared(made, real, kept) | {"iou": float((mask & other).sum() / (mask | other).sum()), "area": float(mask.mean())}
+        row = _compared(made, real, kept) | {
+            "iou": float((mask & other).sum() / (mask | other).sum()),
+            "area": float(mask.mean()),
+        }
         for name, value in row.items():
             found[name][i] = value
     return Contacts(**found)
@@ -156,16 +179,32 @@ class _Pairs:
     least: float
 
     @classmethod
-    def of(cls, generated: Any, reference: Any, background: Any, generated_background: Any, markers: Markers, least: float) -> _Pairs:
+    def of(
+        cls,
+        generated: Any,
+        reference: Any,
+        background: Any,
+        generated_background: Any,
+        markers: Markers,
+        least: float,
+    ) -> _Pairs:
         """Checks everything; errors as :func:`contact_per_image`."""
         checked_choice("markers", markers, ("skip", "keep"))
         checked_least(least)
         real, empty = checked_touches("reference", reference, background)
-        made, own = checked_touches("generated", generated, background if generated_background is None else generated_background)
+        made, own = checked_touches(
+            "generated",
+            generated,
+            background if generated_background is None else generated_background,
+        )
         made, real = checked_images(made, real)
         if min(real.shape[1:3]) < WINDOW:
             got = f"{real.shape[1]} x {real.shape[2]}"
-            raise PalpateError(f"Images must be at least {WINDOW} x {WINDOW} for contact metrics", got, "Score larger images")
+            raise PalpateError(
+                f"Images must be at least {WINDOW} x {WINDOW} for contact metrics",
+                got,
+                "Score larger images",
+            )
         return cls(made, own, real, empty, markers, least)
 
     def __iter__(self) -> Iterator[tuple[int, Array, Array, Mask, Mask]]:
@@ -201,7 +240,9 @@ class ContactOptions(TypedDict, total=False):
     level: float
 
 
-def contact_scores(generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]) -> list[Score]:
+def contact_scores(
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
+) -> list[Score]:
     """Mean residual, SSIM, PSNR, IoU and MS-SSIM of the contact over the touches that touch something, from one mask a touch.
 
     Args:
@@ -217,25 +258,48 @@ def contact_scores(generated: Any, reference: Any, background: Any, **options: U
     Raises:
         PalpateError: as :func:`contact_per_image`.
     """
-    given: dict[str, Any] = {k: v for k, v in options.items() if k in ("generated_background", "markers", "least")}
-    rest: dict[str, Any] = {"ids": None, "groups": None, "subject": "generated", "split": None, "level": 0.95}
+    given: dict[str, Any] = {
+        k: v for k, v in options.items() if k in ("generated_background", "markers", "least")
+    }
+    rest: dict[str, Any] = {
+        "ids": None,
+        "groups": None,
+        "subject": "generated",
+        "split": None,
+        "level": 0.95,
+    }
     if unknown := sorted(set(options) - set(given) - set(rest)):
-        raise PalpateError("Options of a contact score must be known", ", ".join(unknown), f"Choose from {', '.join(_OPTIONS)}")
+        raise PalpateError(
+            "Options of a contact score must be known",
+            ", ".join(unknown),
+            f"Choose from {', '.join(_OPTIONS)}",
+        )
     rest |= {k: v for k, v in options.items() if k in rest}
     found = contact_per_image(generated, reference, background, **given)
     bare = found.area == 0
     names = checked_names("ids", rest["ids"], len(bare)) or [str(i) for i in range(len(bare))]
     no_contact = {"count": int(bare.sum()), "ids": [names[i] for i in np.flatnonzero(bare)[:10]]}
-    note = f"{no_contact['count']} of {len(bare)} real touches show no contact, left out of the mean" if bare.any() else ""
+    note = (
+        f"{no_contact['count']} of {len(bare)} real touches show no contact, left out of the mean"
+        if bare.any()
+        else ""
+    )
     size = [int(v) for v in np.shape(reference)[1:3]]
-    settings = {"markers": given.get("markers", "skip"), "least": round(float(given.get("least", LEAST)), 6), "size": size}
+    settings = {
+        "markers": given.get("markers", "skip"),
+        "least": round(float(given.get("least", LEAST)), 6),
+        "size": size,
+    }
     settings |= {
         "generated_background": "real" if given.get("generated_background") is None else "own",
         "background": pictures_digest(background),
     }
     touched, scales = ~bare, fitting_scales(size)
     beside = {
-        "contact residual": {"empty": 1.0, "per_real_energy": _mean(found.per_real_energy[touched])},
+        "contact residual": {
+            "empty": 1.0,
+            "per_real_energy": _mean(found.per_real_energy[touched]),
+        },
         "contact SSIM": {"empty": _mean(found.empty_ssim[touched])},
         "contact PSNR": {"empty": _mean(found.empty_psnr[touched])},
         "contact IoU": {"empty": 0.0, "everywhere": _mean(found.area[touched])},
@@ -251,34 +315,50 @@ def contact_scores(generated: Any, reference: Any, background: Any, **options: U
     ]
     return [
         mean_score(
-            metric, values, bounds=bounds, better=metric != "contact residual", settings=settings | own, note=note,
-            details=beside[metric] | {"no_contact": no_contact, "area": _mean(found.area[touched])}, **rest,
+            metric,
+            values,
+            bounds=bounds,
+            better=metric != "contact residual",
+            settings=settings | own,
+            note=note,
+            details=beside[metric] | {"no_contact": no_contact, "area": _mean(found.area[touched])},
+            **rest,
         )
         for metric, values, bounds, own in kinds
-    ]  # fmt: skip
+    ]
 
 
-def contact_residual(generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]) -> Score:
+def contact_residual(
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
+) -> Score:
     """The residual alone; arguments, errors and details as :func:`contact_scores`. 0 is the touch, 1 empty gel; lower is better."""
     return contact_scores(generated, reference, background, **options)[0]
 
 
-def contact_ssim(generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]) -> Score:
+def contact_ssim(
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
+) -> Score:
     """The SSIM of the contact alone; arguments, errors and details as :func:`contact_scores`. 1 is the touch."""
     return contact_scores(generated, reference, background, **options)[1]
 
 
-def contact_psnr(generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]) -> Score:
+def contact_psnr(
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
+) -> Score:
     """The PSNR of the contact alone, in dB; arguments, errors and details as :func:`contact_scores`. Compare with ``details["empty"]``."""
     return contact_scores(generated, reference, background, **options)[2]
 
 
-def contact_iou(generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]) -> Score:
+def contact_iou(
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
+) -> Score:
     """The overlap of the contact masks alone; arguments, errors and details as :func:`contact_scores`. 1 is the same mask, 0 empty gel."""
     return contact_scores(generated, reference, background, **options)[3]
 
 
-def contact_ms_ssim(generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]) -> Score:
+def contact_ms_ssim(
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
+) -> Score:
     """The MS-SSIM of the contact alone; arguments, errors and details as :func:`contact_scores`. 1 is the touch."""
     return contact_scores(generated, reference, background, **options)[4]
 
@@ -292,15 +372,21 @@ def _compared(made: Array, real: Array, kept: Mask) -> dict[str, float]:
     x, y = (np.ascontiguousarray(np.moveaxis(v, 2, 0)) for v in (made, real))
     maps = [signed_maps(v, y, _SSIM, SSIM_RANGE)[0] for v in (x, np.zeros_like(y))]
     scales = fitting_scales(kept.shape)
-    several = [weighted_ms_ssim(v, y, kept, scales, _SSIM, SSIM_RANGE) for v in (x, np.zeros_like(y))]
+    several = [
+        weighted_ms_ssim(v, y, kept, scales, _SSIM, SSIM_RANGE) for v in (x, np.zeros_like(y))
+    ]
     with np.errstate(divide="ignore"):
         levels = -10 * np.log10([error, energy])
     return {
-        "psnr": float(levels[0]), "empty_psnr": float(levels[1]),
-        "ssim": float(maps[0][:, kept].mean()), "empty_ssim": float(maps[1][:, kept].mean()),
-        "ms_ssim": several[0], "empty_ms_ssim": several[1],
-        "residual": error / (energy + own) if energy + own else np.nan, "per_real_energy": error / energy if energy else np.nan,
-    }  # fmt: skip
+        "psnr": float(levels[0]),
+        "empty_psnr": float(levels[1]),
+        "ssim": float(maps[0][:, kept].mean()),
+        "empty_ssim": float(maps[1][:, kept].mean()),
+        "ms_ssim": several[0],
+        "empty_ms_ssim": several[1],
+        "residual": error / (energy + own) if energy + own else np.nan,
+        "per_real_energy": error / energy if energy else np.nan,
+    }
 
 
 def _mean(values: Array) -> float | None:

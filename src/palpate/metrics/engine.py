@@ -19,7 +19,7 @@ from palpate.core import PalpateError
 from palpate.metrics.arrays import ops_of, release
 from palpate.metrics.blocked import Sweep, blocked_sums
 from palpate.metrics.kernels import Gaussian, Index, Kernel
-from palpate.metrics.moments import Moments, centre_of
+from palpate.metrics.moments import Moments, center_of
 from palpate.metrics.sums import PairSums
 
 Backend = Literal["auto", "blocked", "moments"]
@@ -58,19 +58,30 @@ def kernel_sums(
         tolerance: largest ``bound`` that ``auto`` takes moments with.
         bound: what the rests of moments can change in the statistic that matters.
         block: most rows of a block.
-        spread: sets of segments whose centred squares are wanted.
+        spread: sets of segments whose centered squares are wanted.
 
     Raises:
         PalpateError: if moments are asked for where there are none.
     """
     width, rows = int(parts[0].shape[1]), len(segment)
     items, number = np.unique(np.stack([segment, unit]), axis=1, return_inverse=True)
-    why_not = _no_moments(kernel, items.shape[1], width, MOMENT_BYTES if rows <= LONG else 4 * MOMENT_BYTES)
+    why_not = _no_moments(
+        kernel, items.shape[1], width, MOMENT_BYTES if rows <= LONG else 4 * MOMENT_BYTES
+    )
     if backend == "moments" and why_not:
-        raise PalpateError("The moments back end needs one Gaussian bandwidth and few items", why_not, 'Pass backend="blocked"')
+        raise PalpateError(
+            "The moments back end needs one Gaussian bandwidth and few items",
+            why_not,
+            'Pass backend="blocked"',
+        )
     # Second moments that take more room than the features, and more than a little, are no saving.
     small = items.shape[1] * width**2 * 4 <= max(STATE_BYTES, rows * width * 4)
-    if backend == "moments" or (backend == "auto" and not why_not and small and rows >= max(LEAST_ROWS, ROWS_A_WIDTH * width)):
+    if backend == "moments" or (
+        backend == "auto"
+        and not why_not
+        and small
+        and rows >= max(LEAST_ROWS, ROWS_A_WIDTH * width)
+    ):
         found = _moments(parts, items, number.reshape(-1), segments, kernel, spread)
         rest = bound(found.sums)
         if backend == "moments" or rest <= tolerance:
@@ -78,9 +89,13 @@ def kernel_sums(
         why_not = f"they would leave {rest:.2g} open, more than the tolerance {tolerance:.2g}"
     if rows > LONG:
         reason = f" Moments were not taken: {why_not}." if backend == "auto" and why_not else ""
-        warnings.warn(f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{reason}", stacklevel=4)
+        warnings.warn(
+            f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{reason}", stacklevel=4
+        )
     x = ops_of(parts[0]).join(list(parts))
-    return blocked_sums(x, segment, unit, segments=segments, kernel=kernel, block=block, spread=spread)
+    return blocked_sums(
+        x, segment, unit, segments=segments, kernel=kernel, block=block, spread=spread
+    )
 
 
 def _no_moments(kernel: Kernel, items: int, width: int, room: int) -> str:
@@ -92,8 +107,18 @@ def _no_moments(kernel: Kernel, items: int, width: int, room: int) -> str:
     return ""
 
 
-def _moments(parts: Sequence[Any], items: Index, number: Index, segments: int, kernel: Kernel, spread: list[Index] | None) -> Sweep:
-    moments, first = Moments.empty(centre_of(parts), float(kernel.bandwidth or 0), items.shape[1]), 0  # type: ignore[attr-defined]
+def _moments(
+    parts: Sequence[Any],
+    items: Index,
+    number: Index,
+    segments: int,
+    kernel: Kernel,
+    spread: list[Index] | None,
+) -> Sweep:
+    moments, first = (
+        Moments.empty(center_of(parts), float(kernel.bandwidth or 0), items.shape[1]),
+        0,
+    )  # type: ignore[attr-defined]
     for part in parts:
         for k in range(0, len(part), STREAM):
             slab = part[k : k + STREAM]
@@ -101,4 +126,6 @@ def _moments(parts: Sequence[Any], items: Index, number: Index, segments: int, k
             release(part)
             first += len(slab)
     found = [moments.spread(np.flatnonzero(np.isin(items[0], s))) for s in spread or []]
-    return Sweep(moments.sums(items[0], items[1], segments), np.array(found, dtype=np.float64).reshape(-1, 3))
+    return Sweep(
+        moments.sums(items[0], items[1], segments), np.array(found, dtype=np.float64).reshape(-1, 3)
+    )

@@ -24,10 +24,16 @@ from numpy.typing import NDArray
 
 from palpate import __version__
 from palpate.core import FeatureSet, PalpateError, Score, rng_for
-from palpate.metrics.checks import Floats, checked_level, checked_names, checked_whole, copies_across
+from palpate.metrics.checks import (
+    Floats,
+    checked_level,
+    checked_names,
+    checked_whole,
+    copies_across,
+)
 from palpate.metrics.gaussians import Array, Moments, distance_of_features, distance_of_moments
 from palpate.metrics.intervals import jackknife_errors, t_interval
-from palpate.metrics.neighbours import checked_sets, copies_note
+from palpate.metrics.neighbors import checked_sets, copies_note
 from palpate.metrics.paired import Comparison, difference, holm, same_samples
 from palpate.metrics.scored import Scored
 
@@ -44,7 +50,9 @@ class FidOptions(TypedDict, total=False):
     level: float
 
 
-def compare_fid(generators: Mapping[str, FeatureSet], reference: FeatureSet, **options: Unpack[FidOptions]) -> Comparison:
+def compare_fid(
+    generators: Mapping[str, FeatureSet], reference: FeatureSet, **options: Unpack[FidOptions]
+) -> Comparison:
     """FID of several generators on the same samples, with paired differences.
 
     Args:
@@ -60,13 +68,22 @@ def compare_fid(generators: Mapping[str, FeatureSet], reference: FeatureSet, **o
         PalpateError: if generators differ in ids, labels, groups or encoder, or as :func:`fid`.
     """
     if unknown := sorted(set(options) - set(FidOptions.__annotations__)):
-        raise PalpateError(f"Options must be among {', '.join(FidOptions.__annotations__)}", ", ".join(unknown), "Check the spelling")
-    found = {name: _fid(one, reference, subject=name, **options) for name, one in same_samples(generators).items()}
+        raise PalpateError(
+            f"Options must be among {', '.join(FidOptions.__annotations__)}",
+            ", ".join(unknown),
+            "Check the spelling",
+        )
+    found = {
+        name: _fid(one, reference, subject=name, **options)
+        for name, one in same_samples(generators).items()
+    }
     differences: list[Score] = []
     for a, b in combinations(found.values(), 2):
         one, limits = difference(a, b), [v.score.details["infinity"] for v in (a, b)]
         limit = None if None in limits else limits[0] - limits[1]
-        differences.append(replace(one, note=one.note or _BIASED, details={**one.details, "infinity": limit}))
+        differences.append(
+            replace(one, note=one.note or _BIASED, details={**one.details, "infinity": limit})
+        )
     return Comparison([one.score for one in found.values()], holm(differences))
 
 
@@ -106,7 +123,13 @@ def fid(
     Raises:
         PalpateError: on features that are refused, unequal widths, fewer than two rows, or encoders of different digests.
     """
-    options: dict[str, Any] = {"normalize": normalize, "blocks": blocks, "seed": seed, "split": split, "level": level}
+    options: dict[str, Any] = {
+        "normalize": normalize,
+        "blocks": blocks,
+        "seed": seed,
+        "split": split,
+        "level": level,
+    }
     return _fid(generated, reference, subject=subject, interval=interval, **options).score
 
 
@@ -128,8 +151,16 @@ def _fid(
     checked_level(level)
     x, y = checked_sets(generated, reference, normalize=normalize, least=2)
     whole = Moments.of(x), Moments.of(y)
-    value = distance_of_moments(*whole) if min(len(x), len(y)) > x.shape[1] else distance_of_features(x, y)
-    details: dict[str, Any] = {"mean_term": float(((whole[0].mean - whole[1].mean) ** 2).sum()), "infinity": None, "version": __version__}
+    value = (
+        distance_of_moments(*whole)
+        if min(len(x), len(y)) > x.shape[1]
+        else distance_of_features(x, y)
+    )
+    details: dict[str, Any] = {
+        "mean_term": float(((whole[0].mean - whole[1].mean) ** 2).sum()),
+        "infinity": None,
+        "version": __version__,
+    }
     note, found, method = copies_note(copies_across(x, y), len(x)), None, ""
     replicates, units = np.zeros(0), []
     if interval:
@@ -140,13 +171,44 @@ def _fid(
         if error > 0:  # false for NaN as well
             low, high = t_interval(value, error, parts.count - 1, level)
             found, method = (max(0.0, low), high), parts.method
-        details |= {"infinity": parts.infinity(value, seed), "units": parts.units, "unit": parts.unit, "left_out": parts.left_out}
+        details |= {
+            "infinity": parts.infinity(value, seed),
+            "units": parts.units,
+            "unit": parts.unit,
+            "left_out": parts.left_out,
+        }
     score = Score(
-        "FID", subject, value, found, level=level, interval_method=method, estimator="plug-in", n=len(x), m=len(y),
-        seed=seed if interval else None, encoder=generated.encoder, reference=reference.digest, split=split, details=details,
+        "FID",
+        subject,
+        value,
+        found,
+        level=level,
+        interval_method=method,
+        estimator="plug-in",
+        n=len(x),
+        m=len(y),
+        seed=seed if interval else None,
+        encoder=generated.encoder,
+        reference=reference.digest,
+        split=split,
+        details=details,
         settings={"normalize": normalize, "covariance": "n - 1"},
-        note=". ".join(filter(None, [note, _note(min(len(x), len(y)), x.shape[1], value, details["infinity"], interval and found is None)])),
-    )  # fmt: skip
+        note=". ".join(
+            filter(
+                None,
+                [
+                    note,
+                    _note(
+                        min(len(x), len(y)),
+                        x.shape[1],
+                        value,
+                        details["infinity"],
+                        interval and found is None,
+                    ),
+                ],
+            )
+        ),
+    )
     return Scored(score, replicates, units)
 
 
@@ -203,13 +265,27 @@ class _Parts:
         """The distance (count,) without one block at a time; empty where what is left is no set."""
         values: list[float] = []
         for b in range(self.count):
-            kept = [len(x) - int((block == b).sum()) for x, block in zip(self.sets, self.block, strict=True)]
+            kept = [
+                len(x) - int((block == b).sum())
+                for x, block in zip(self.sets, self.block, strict=True)
+            ]
             if min(kept) < 2:
                 return np.zeros(0)
             if min(kept) > self.sets[0].shape[1]:
-                values.append(distance_of_moments(*(w.without(Moments.of(rows)) for w, rows in zip(whole, self.rows(b), strict=True))))
+                values.append(
+                    distance_of_moments(
+                        *(
+                            w.without(Moments.of(rows))
+                            for w, rows in zip(whole, self.rows(b), strict=True)
+                        )
+                    )
+                )
             else:
-                values.append(distance_of_features(*(x[block != b] for x, block in zip(self.sets, self.block, strict=True))))
+                values.append(
+                    distance_of_features(
+                        *(x[block != b] for x, block in zip(self.sets, self.block, strict=True))
+                    )
+                )
         return np.array(values)
 
     def infinity(self, value: float, seed: int) -> float | None:
@@ -235,26 +311,42 @@ class _Parts:
         return float(np.polynomial.polynomial.polyfit(at, values, 1)[0])
 
 
-def _draw_parts(generated: FeatureSet, reference: FeatureSet, sets: tuple[Floats, Floats], most: int, seed: int) -> _Parts:
+def _draw_parts(
+    generated: FeatureSet, reference: FeatureSet, sets: tuple[Floats, Floats], most: int, seed: int
+) -> _Parts:
     n, m = len(sets[0]), len(sets[1])
     rng = rng_for(seed, "fid blocks")
-    names = [checked_names("groups", s.groups, len(x)) for s, x in zip((generated, reference), sets, strict=True)]
+    names = [
+        checked_names("groups", s.groups, len(x))
+        for s, x in zip((generated, reference), sets, strict=True)
+    ]
     if names[0] is None or names[1] is None:
         count = min(most, n, m)
-        return _Parts(sets, (rng.permutation(n) % count, rng.permutation(m) % count), count, "row", n + m, _numbered(count))
+        return _Parts(
+            sets,
+            (rng.permutation(n) % count, rng.permutation(m) % count),
+            count,
+            "row",
+            n + m,
+            _numbered(count),
+        )
     called, unit = np.unique(np.array(names[0] + names[1], dtype=str), return_inverse=True)
     units = len(called)
     block = np.arange(units)
     if units > most:
         # The largest group first into the block that holds least, ties at random: blocks of nearly equal size.
-        size = np.bincount(unit[:n], minlength=units) / n + np.bincount(unit[n:], minlength=units) / m
+        size = (
+            np.bincount(unit[:n], minlength=units) / n + np.bincount(unit[n:], minlength=units) / m
+        )
         load = np.zeros(most)
         order = rng.permutation(units)
         for u in order[np.argsort(-size[order], kind="stable")]:
             block[u] = int(load.argmin())
             load[block[u]] += size[u]
     blocks = [str(name) for name in called] if units <= most else _numbered(most)
-    return _Parts(sets, (block[unit[:n]], block[unit[n:]]), min(units, most), "group", units, blocks)
+    return _Parts(
+        sets, (block[unit[:n]], block[unit[n:]]), min(units, most), "group", units, blocks
+    )
 
 
 def _numbered(count: int) -> list[str]:

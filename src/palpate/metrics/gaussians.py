@@ -32,7 +32,7 @@ SYMMETRY = 1e-6
 class Moments:
     """Mean and scatter of rows that arrive in parts; mergeable over files and processes.
 
-    The state is centred at its own mean and updated by the formula of Chan, Golub and LeVeque, ``M = M_a + M_b + delta delta' n_a n_b / n``,
+    The state is centered at its own mean and updated by the formula of Chan, Golub and LeVeque, ``M = M_a + M_b + delta delta' n_a n_b / n``,
     so that features far from the origin lose no digits.
 
     Attributes:
@@ -86,7 +86,9 @@ class Moments:
             return self
         _same_width(self.mean, other.mean)
         n, delta = self.n + other.n, other.mean - self.mean
-        self.scatter = self.scatter + other.scatter + np.outer(delta, delta * (self.n * other.n / n))
+        self.scatter = (
+            self.scatter + other.scatter + np.outer(delta, delta * (self.n * other.n / n))
+        )
         self.mean = self.mean + delta * (other.n / n)
         self.n = n
         return self
@@ -99,7 +101,11 @@ class Moments:
         """
         n = self.n - part.n
         if n < 0:
-            raise PalpateError("A part must have at most as many rows as the whole", f"{part.n} of {self.n}", "Take away what was added")
+            raise PalpateError(
+                "A part must have at most as many rows as the whole",
+                f"{part.n} of {self.n}",
+                "Take away what was added",
+            )
         if not part.n:
             return Moments(self.n, self.mean, self.scatter)
         if not n:
@@ -107,7 +113,9 @@ class Moments:
         _same_width(self.mean, part.mean)
         mean = self.mean + (self.mean - part.mean) * (part.n / n)
         delta = part.mean - mean
-        return Moments(n, mean, self.scatter - part.scatter - np.outer(delta, delta * (n * part.n / self.n)))
+        return Moments(
+            n, mean, self.scatter - part.scatter - np.outer(delta, delta * (n * part.n / self.n))
+        )
 
     @property
     def covariance(self) -> Array:
@@ -117,7 +125,9 @@ class Moments:
             PalpateError: with fewer than two rows.
         """
         if self.n < 2:
-            raise PalpateError("A covariance must come from at least 2 rows", f"{self.n}", "Add more samples")
+            raise PalpateError(
+                "A covariance must come from at least 2 rows", f"{self.n}", "Add more samples"
+            )
         return self.scatter / (self.n - 1)
 
 
@@ -130,7 +140,11 @@ def _on_host(x: Any) -> Any:
 
 def _same_width(a: Array, b: Array) -> None:
     if a.shape != b.shape:
-        raise PalpateError("All features must have the same width", f"{len(a)} and {len(b)}", "Embed all with the same encoder")
+        raise PalpateError(
+            "All features must have the same width",
+            f"{len(a)} and {len(b)}",
+            "Embed all with the same encoder",
+        )
 
 
 def frechet_distance(mean1: Any, cov1: Any, mean2: Any, cov2: Any) -> float:
@@ -151,14 +165,23 @@ def frechet_distance(mean1: Any, cov1: Any, mean2: Any, cov2: Any) -> float:
     """
     means = [_checked_mean(f"mean{i}", mean) for i, mean in enumerate((mean1, mean2), 1)]
     _same_width(means[0], means[1])
-    covs = [_checked_covariance(f"cov{i}", cov, len(means[0])) for i, cov in enumerate((cov1, cov2), 1)]
-    return _distance(means[0], means[1], float(np.trace(covs[0]) + np.trace(covs[1])), _root_trace(covs[0], covs[1]))
+    covs = [
+        _checked_covariance(f"cov{i}", cov, len(means[0])) for i, cov in enumerate((cov1, cov2), 1)
+    ]
+    return _distance(
+        means[0],
+        means[1],
+        float(np.trace(covs[0]) + np.trace(covs[1])),
+        _root_trace(covs[0], covs[1]),
+    )
 
 
 def _checked_mean(name: str, value: Any) -> Array:
     mean = np.asarray(value, dtype=np.float64)
     if mean.ndim != 1 or not mean.size or not np.isfinite(mean).all():
-        raise PalpateError(f"{name} must be a finite vector (d,)", f"shape {mean.shape}", "Pass the mean over rows")
+        raise PalpateError(
+            f"{name} must be a finite vector (d,)", f"shape {mean.shape}", "Pass the mean over rows"
+        )
     return mean
 
 
@@ -166,10 +189,18 @@ def _checked_covariance(name: str, value: Any, d: int) -> Array:
     cov = np.asarray(value, dtype=np.float64)
     if cov.shape != (d, d) or not np.isfinite(cov).all():
         got = f"shape {cov.shape}" if cov.shape != (d, d) else "NaN or infinity"
-        raise PalpateError(f"{name} must be a finite matrix ({d}, {d})", got, "Pass the covariance of the same features as the mean")
+        raise PalpateError(
+            f"{name} must be a finite matrix ({d}, {d})",
+            got,
+            "Pass the covariance of the same features as the mean",
+        )
     off = float(np.abs(cov - cov.T).max())
     if off > SYMMETRY * float(np.abs(cov).max()):
-        raise PalpateError(f"{name} must be symmetric", f"entries that differ from their mirror by {off:.3g}", "Pass a covariance matrix")
+        raise PalpateError(
+            f"{name} must be symmetric",
+            f"entries that differ from their mirror by {off:.3g}",
+            "Pass a covariance matrix",
+        )
     return (cov + cov.T) / 2
 
 

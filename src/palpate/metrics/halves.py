@@ -60,7 +60,11 @@ def sample_units(ids: Sequence[str], seed: int) -> tuple[Index, str, list[str]]:
     blocks = BLOCKS if len(names) <= MANY else BLOCKS_OF_MANY
     names.sort(key=lambda name: (seed_for(seed, "block", name), name))
     number = {name: k * blocks // len(names) for k, name in enumerate(names)}
-    return np.array([number[i] for i in ids], dtype=np.intp), "random-block", [f"block {k}" for k in range(blocks)]
+    return (
+        np.array([number[i] for i in ids], dtype=np.intp),
+        "random-block",
+        [f"block {k}" for k in range(blocks)],
+    )
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,9 @@ def design_of(t: Totals, plan: Plan) -> Design:
     t = whole_sets(t)
     inner, m, biased = np.diagonal(t.pairs) - t.n, t.n / 2, plan.estimator == "biased"
     with np.errstate(divide="ignore", invalid="ignore"):
-        return Design(inner / (m**2 if biased else m * (m - 1)), t.n / m**2 if biased else np.zeros(len(t.n)))
+        return Design(
+            inner / (m**2 if biased else m * (m - 1)), t.n / m**2 if biased else np.zeros(len(t.n))
+        )
 
 
 def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple[Array, Array]:
@@ -99,7 +105,11 @@ def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple
         (K,) dist^2 and (K,) E, NaN where undefined: a set of one group, no group with two samples, or fewer than 4 samples.
     """
     whole, sets = whole_sets(t), len(t.n) // 2
-    total, inside, pairs = np.diagonal(whole.sums), np.diagonal(whole.same), np.diagonal(whole.pairs)
+    total, inside, pairs = (
+        np.diagonal(whole.sums),
+        np.diagonal(whole.same),
+        np.diagonal(whole.pairs),
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         between = (total - inside) / (whole.n**2 - pairs)
         excess = inside / (pairs - whole.n) - between  # E = w - b
@@ -125,7 +135,11 @@ def halves_bound(rest: Totals, plan: Plan) -> Array:
     m = t.n / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         between = (total - inside) / (t.n**2 - pairs)
-        return plan.scale * (inside + pairs * between) / (m**2 if plan.estimator == "biased" else m * (m - 1))
+        return (
+            plan.scale
+            * (inside + pairs * between)
+            / (m**2 if plan.estimator == "biased" else m * (m - 1))
+        )
 
 
 def whole_sets(t: Totals) -> Totals:

@@ -38,13 +38,19 @@ def leave_one_out(totals: Iterable[Totals], statistic: Callable[[Totals], Array]
     return np.array([statistic(t) for t in totals], dtype=np.float64)
 
 
-def mean_interval(values: Array, groups: Sequence[str] | None, level: float) -> tuple[Interval | None, str]:
+def mean_interval(
+    values: Array, groups: Sequence[str] | None, level: float
+) -> tuple[Interval | None, str]:
     """Interval of the mean of ``values``, robust to whole groups deviating together.
 
     ``SE^2 = G/(G-1) * sum_g (sum_{i in g} (v_i - mean))^2 / n^2``; groups of equal size make it the t interval over group means,
     and groups of one the usual interval. Returns (interval or None, method).
     """
-    names = np.arange(len(values)) if groups is None else np.unique(np.asarray(groups, dtype=str), return_inverse=True)[1]
+    names = (
+        np.arange(len(values))
+        if groups is None
+        else np.unique(np.asarray(groups, dtype=str), return_inverse=True)[1]
+    )
     what, g = ("group" if groups is not None else "image"), int(names.max(initial=-1)) + 1
     if g < 2:
         return None, ""
@@ -52,8 +58,12 @@ def mean_interval(values: Array, groups: Sequence[str] | None, level: float) -> 
     error = float(np.sqrt(g / (g - 1) * (drift**2).sum())) / len(values)
     if error == 0:  # no variation between groups is no evidence of certainty
         return None, ""
-    method = "cluster-robust over groups" if groups is not None else "per image, taken as independent"
-    return t_interval(float(values.mean()), error, g - 1, level), f"{method}, t, {g - 1} df ({g} {what}s)"
+    method = (
+        "cluster-robust over groups" if groups is not None else "per image, taken as independent"
+    )
+    return t_interval(
+        float(values.mean()), error, g - 1, level
+    ), f"{method}, t, {g - 1} df ({g} {what}s)"
 
 
 def halves_of(n: Array) -> Array:
@@ -64,7 +74,7 @@ def halves_of(n: Array) -> Array:
 def random_halves_sd(spread: Array, sizes: Array, estimator: str, scale: float) -> Array:
     """Standard deviation (K,) of dist^2 between two random halves of each of K sets, by closed form.
 
-    Let s = +-1 mark halves of m and m' samples, n = m + m', D = m - m', and Kc be the doubly centred kernel matrix, whose rows add up to 0. With
+    Let s = +-1 mark halves of m and m' samples, n = m + m', D = m - m', and Kc be the doubly centered kernel matrix, whose rows add up to 0. With
     ``W = sum_{i != j} Kc_ij s_i s_j`` and ``L = sum_i Kc_ii s_i``
 
     biased = const + W (1/m + 1/m')^2 / 4,   unbiased = const + c W - 2 b L,
@@ -83,9 +93,18 @@ def random_halves_sd(spread: Array, sizes: Array, estimator: str, scale: float) 
     (off, trace, squares), (x, y) = spread.T, sizes.T
     n, d = x + y, x - y
     with np.errstate(divide="ignore", invalid="ignore"):
-        p1, p2, p3 = d / n, (d**2 - n) / (n * (n - 1)), (d**3 - (3 * n - 2) * d) / (n * (n - 1) * (n - 2))
+        p1, p2, p3 = (
+            d / n,
+            (d**2 - n) / (n * (n - 1)),
+            (d**3 - (3 * n - 2) * d) / (n * (n - 1) * (n - 2)),
+        )
         p4 = (d**4 - (6 * n - 8) * d**2 + 3 * n**2 - 6 * n) / (n * (n - 1) * (n - 2) * (n - 3))
-        var_w = 2 * off + 4 * p2 * (squares - off) + p4 * (trace**2 - 2 * off - 4 * (squares - off)) - (p2 * trace) ** 2
+        var_w = (
+            2 * off
+            + 4 * p2 * (squares - off)
+            + p4 * (trace**2 - 2 * off - 4 * (squares - off))
+            - (p2 * trace) ** 2
+        )
         var_l = squares * (1 - p1**2) + (trace**2 - squares) * (p2 - p1**2)
         both = -2 * p1 * squares + p3 * (2 * squares - trace**2) + p1 * p2 * trace**2
         if estimator == "biased":

@@ -42,7 +42,7 @@ class Kernel(Protocol):
 
     @property
     def stationary(self) -> bool:
-        """Whether it depends on differences of rows alone: they are then centred before they are given to the rest."""
+        """Whether it depends on differences of rows alone: they are then centered before they are given to the rest."""
         ...
 
     @property
@@ -57,7 +57,7 @@ class Kernel(Protocol):
 
     @property
     def radius_limit(self) -> float:
-        """Largest ``max ||x - centre||^2`` for which float32 keeps 1e-6 (x1000); 2^31 times that is too much for float64."""
+        """Largest ``max ||x - center||^2`` for which float32 keeps 1e-6 (x1000); 2^31 times that is too much for float64."""
         ...
 
     def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
@@ -90,10 +90,25 @@ class Kernel(Protocol):
 
 def checked_kernel(kernel: Any) -> None:
     """Refuses what is no kernel, the class of one too; None stands for the Gaussian of ``sigma``."""
-    needs = ("bandwidth", "stationary", "unit", "single", "radius_limit", "factors", "shift", "values", "diagonal", "settings")
-    if kernel is not None and (isinstance(kernel, type) or not all(hasattr(kernel, name) for name in needs)):
+    needs = (
+        "bandwidth",
+        "stationary",
+        "unit",
+        "single",
+        "radius_limit",
+        "factors",
+        "shift",
+        "values",
+        "diagonal",
+        "settings",
+    )
+    if kernel is not None and (
+        isinstance(kernel, type) or not all(hasattr(kernel, name) for name in needs)
+    ):
         raise PalpateError(
-            "kernel must be a kernel, e.g. Gaussian(), Polynomial() or Linear()", repr(kernel), "Import it from palpate.metrics"
+            "kernel must be a kernel, e.g. Gaussian(), Polynomial() or Linear()",
+            repr(kernel),
+            "Import it from palpate.metrics",
         )
 
 
@@ -115,11 +130,19 @@ class Gaussian:
     def __post_init__(self) -> None:
         given: Any = self.sigmas if np.iterable(self.sigmas) else (self.sigmas,)
         try:  # the characters of a word are no bandwidths, nor is True
-            several = () if isinstance(self.sigmas, str | bytes | bool) else tuple(float(sigma) for sigma in given)
+            several = (
+                ()
+                if isinstance(self.sigmas, str | bytes | bool)
+                else tuple(float(sigma) for sigma in given)
+            )
         except (TypeError, ValueError, OverflowError, RuntimeError):
             several = ()
         if not several or not all(np.isfinite(s) and 1e-100 < s < 1e100 for s in several):
-            raise PalpateError("sigma must be positive", repr(self.sigmas), "Pass e.g. sigma=10, or Gaussian((5.0, 10.0))")
+            raise PalpateError(
+                "sigma must be positive",
+                repr(self.sigmas),
+                "Pass e.g. sigma=10, or Gaussian((5.0, 10.0))",
+            )
         object.__setattr__(self, "sigmas", several)
 
     @property
@@ -166,7 +189,9 @@ class Gaussian:
 
     def settings(self) -> dict[str, Any]:
         """The name; one bandwidth stands in ``Score.bandwidth``, several here."""
-        return {"kernel": self.name} | ({"sigmas": list(self.sigmas)} if len(self.sigmas) > 1 else {})
+        return {"kernel": self.name} | (
+            {"sigmas": list(self.sigmas)} if len(self.sigmas) > 1 else {}
+        )
 
     @property
     def bandwidth(self) -> float | None:
@@ -187,12 +212,26 @@ class Polynomial:
     stationary, unit, single, radius_limit = False, 1.0, False, float("inf")
 
     def __post_init__(self) -> None:
-        if isinstance(self.degree, bool) or not isinstance(self.degree, int | np.integer) or self.degree < 1:
-            raise PalpateError("The degree of a polynomial kernel must be a whole number from 1 on", repr(self.degree), "KID's is 3")
+        if (
+            isinstance(self.degree, bool)
+            or not isinstance(self.degree, int | np.integer)
+            or self.degree < 1
+        ):
+            raise PalpateError(
+                "The degree of a polynomial kernel must be a whole number from 1 on",
+                repr(self.degree),
+                "KID's is 3",
+            )
         for name in ("gamma", "coef0"):
             value = getattr(self, name)
-            if not (name == "gamma" and value is None) and not (isinstance(value, int | float | np.number) and np.isfinite(value)):
-                raise PalpateError(f"{name} of a polynomial kernel must be a finite number", repr(value), "Leave it out for KID's")
+            if not (name == "gamma" and value is None) and not (
+                isinstance(value, int | float | np.number) and np.isfinite(value)
+            ):
+                raise PalpateError(
+                    f"{name} of a polynomial kernel must be a finite number",
+                    repr(value),
+                    "Leave it out for KID's",
+                )
 
     def factors(self, x: Any, ops: Ops) -> tuple[Any, Any]:
         """``[gamma x, coef0] . [y, 1]``."""
@@ -218,7 +257,12 @@ class Polynomial:
 
     def settings(self) -> dict[str, Any]:
         """All parameters."""
-        return {"kernel": "polynomial", "degree": self.degree, "gamma": self.gamma or "1/d", "coef0": self.coef0}
+        return {
+            "kernel": "polynomial",
+            "degree": self.degree,
+            "gamma": self.gamma or "1/d",
+            "coef0": self.coef0,
+        }
 
 
 @dataclass(frozen=True)
@@ -267,13 +311,22 @@ def gaussian(sigma: Sigma, x: Any, groups: Sequence[str] | Index | None = None) 
     """
     if isinstance(sigma, str):
         if sigma not in ("median", "multi"):
-            raise PalpateError('sigma must be positive, several of that, "median" or "multi"', repr(sigma), "Pass e.g. sigma=10")
+            raise PalpateError(
+                'sigma must be positive, several of that, "median" or "multi"',
+                repr(sigma),
+                "Pass e.g. sigma=10",
+            )
         middle = median_distance(x, groups)
-        return Gaussian(tuple(f * middle for f in (FACTORS if sigma == "multi" else (1.0,))), f"gaussian, {sigma}")
+        return Gaussian(
+            tuple(f * middle for f in (FACTORS if sigma == "multi" else (1.0,))),
+            f"gaussian, {sigma}",
+        )
     return Gaussian(sigma)  # type: ignore[arg-type]
 
 
-def median_distance(x: Any, groups: Sequence[str] | Index | None = None, rows: int = MEDIAN_ROWS) -> float:
+def median_distance(
+    x: Any, groups: Sequence[str] | Index | None = None, rows: int = MEDIAN_ROWS
+) -> float:
     """The median Euclidean distance between rows of different groups (of any rows where there is one group), over ``rows`` rows.
 
     Raises:
@@ -282,7 +335,9 @@ def median_distance(x: Any, groups: Sequence[str] | Index | None = None, rows: i
     n = len(x)
     at = np.sort(rng_for(0, "median distance").permutation(n)[:rows])
     ops, picked = ops_of(x), [np.zeros((0, x.shape[1]))]
-    for k in range(0, len(at), 32):  # an array on disk is mapped by large pages: a few rows of it at a time
+    for k in range(
+        0, len(at), 32
+    ):  # an array on disk is mapped by large pages: a few rows of it at a time
         picked.append(ops.numpy(x[at[k : k + 32].tolist()]))
         release(x)
     some = np.concatenate(picked)
@@ -296,5 +351,7 @@ def median_distance(x: Any, groups: Sequence[str] | Index | None = None, rows: i
     middle = float(np.median(distance[wanted])) if wanted.any() else 0.0
     if not middle > 1e-12:
         got = f"{n} row{'s' * (n != 1)}, {'all equal' if n > 1 else 'no pair'}"
-        raise PalpateError("The median distance needs rows that differ", got, "Pass a bandwidth, e.g. sigma=10")
+        raise PalpateError(
+            "The median distance needs rows that differ", got, "Pass a bandwidth, e.g. sigma=10"
+        )
     return middle

@@ -1,7 +1,7 @@
 """Where a touch touches: the contact mask, from the touch and the empty gel alone.
 
 Root mean square over the channels of touch - background, markers filled from around them, blurred by a Gaussian of 1/48 of the shorter side,
-above a threshold: 4 grey levels, or three times what the noise of that background leaves after the blur if that is more; then dilated by
+above a threshold: 4 gray levels, or three times what the noise of that background leaves after the blur if that is more; then dilated by
 1/64 of the side. Markers are pixels darker than 0.82 of the median luma around, of the touch or the background, and (from 48 px on) a pixel
 around them. A mask under 1 % of the pixels is empty.
 """
@@ -49,13 +49,19 @@ def contact_mask(touch: Any, background: Any, *, least: float = LEAST) -> Mask:
     """
     checked_least(least)
     touch, background = checked_touches("touch", touch, background)
-    return np.stack([mask_of(unit(t), unit(b), least)[0] for t, b in zip(touch, background, strict=True)])
+    return np.stack(
+        [mask_of(unit(t), unit(b), least)[0] for t, b in zip(touch, background, strict=True)]
+    )
 
 
 def checked_least(least: Any) -> None:
     """Refuses a least change that is not inside (0, 1)."""
     if not isinstance(least, int | float | np.number) or not 0 < least < 1:
-        raise PalpateError("least must lie in (0, 1), the scale of the images", repr(least), "Leave it out for 4 / 255")
+        raise PalpateError(
+            "least must lie in (0, 1), the scale of the images",
+            repr(least),
+            "Leave it out for 4 / 255",
+        )
 
 
 def mask_of(touch: Array, background: Array, least: float) -> tuple[Mask, Mask]:
@@ -66,7 +72,9 @@ def mask_of(touch: Array, background: Array, least: float) -> tuple[Mask, Mask]:
         near = np.asarray(ndimage.binary_dilation(near, iterations=max(1, side // 96)), bool)
     sigma = side / 48
     d = ndimage.gaussian_filter(_filled(touch - background, ~near, side / 32), (sigma, sigma, 0))
-    left = np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))  # of white noise of two images, after the blur
+    left = (
+        np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))
+    )  # of white noise of two images, after the blur
     mask = np.sqrt((d * d).mean(axis=2)) > max(least, TIMES_NOISE * left)
     if mask.mean() < SMALLEST:
         return np.zeros_like(mask), near
@@ -74,17 +82,21 @@ def mask_of(touch: Array, background: Array, least: float) -> tuple[Mask, Mask]:
 
 
 def _markers(image: Array) -> Mask:
-    grey = image @ (np.array([0.299, 0.587, 0.114]) if image.shape[2] == 3 else np.ones(1))
-    step = max(1, min(grey.shape) // 64)  # a median over a sixth of the side changes slowly, and costs the fourth power of the side
-    small = grey[::step, ::step]
+    gray = image @ (np.array([0.299, 0.587, 0.114]) if image.shape[2] == 3 else np.ones(1))
+    step = max(
+        1, min(gray.shape) // 64
+    )  # a median over a sixth of the side changes slowly, and costs the fourth power of the side
+    small = gray[::step, ::step]
     around = ndimage.median_filter(small, min(small.shape) // 6 | 1, mode="reflect")
-    return grey < MARKER * around.repeat(step, 0).repeat(step, 1)[: grey.shape[0], : grey.shape[1]]
+    return gray < MARKER * around.repeat(step, 0).repeat(step, 1)[: gray.shape[0], : gray.shape[1]]
 
 
 def _filled(d: Array, keep: Mask, sigma: float) -> Array:
     """``d`` (h, w, c) with the pixels not kept replaced by a blur of the kept ones around."""
     weight = ndimage.gaussian_filter(keep.astype(np.float64), sigma)[..., None]
-    around = ndimage.gaussian_filter(d * keep[..., None], (sigma, sigma, 0)) / np.maximum(weight, 1e-6)
+    around = ndimage.gaussian_filter(d * keep[..., None], (sigma, sigma, 0)) / np.maximum(
+        weight, 1e-6
+    )
     return np.where(keep[..., None], d, around)
 
 
@@ -97,7 +109,11 @@ def _noise(background: Array, keep: Mask) -> float:
     away = np.asarray(ndimage.binary_erosion(keep, np.ones((3, 3)), border_value=1), bool)
     if away.mean() < 1 / 16:
         return 0.0
-    return 1.4826 * float(np.median(np.abs(ndimage.convolve(background, kernel, mode="mirror"))[away])) / 6
+    return (
+        1.4826
+        * float(np.median(np.abs(ndimage.convolve(background, kernel, mode="mirror"))[away]))
+        / 6
+    )
 
 
 def unit(image: NDArray[Any]) -> Array:
@@ -112,7 +128,9 @@ def pictures_digest(images: Any) -> str:
     """
     images = as_images("background", images)
     rows = (np.rint(unit(image) * 65535).astype("<u2").tobytes() for image in images)
-    return hashlib.sha256(b"".join(sorted({hashlib.sha256(row).digest() for row in rows}))).hexdigest()[:16]
+    return hashlib.sha256(
+        b"".join(sorted({hashlib.sha256(row).digest() for row in rows}))
+    ).hexdigest()[:16]
 
 
 def checked_touches(name: str, touch: Any, background: Any) -> tuple[NDArray[Any], NDArray[Any]]:

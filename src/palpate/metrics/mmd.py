@@ -75,14 +75,19 @@ def largest_bound(sums: PairSums, estimator: Estimator, scale: float) -> float:
     if sums.bound is None:
         return 0.0
     # Where there are no pairs there is nothing to bound; elsewhere a bound that overflowed is no bound.
-    known = np.isfinite(mmd_matrix(sums.totals, estimator, scale)) & ~np.eye(sums.segments, dtype=bool)
+    known = np.isfinite(mmd_matrix(sums.totals, estimator, scale)) & ~np.eye(
+        sums.segments, dtype=bool
+    )
     off = mmd_bound(sums.bound.totals, estimator, scale)[known]
     return float(np.where(np.isfinite(off), off, np.inf).max(initial=0.0))
 
 
 def unit_index(*columns: Sequence[str]) -> list[Index]:
     """Integers for names, the same integer for the same name in every column."""
-    _, inverse = np.unique(np.concatenate([np.asarray(c, dtype=object).astype(str) for c in columns]), return_inverse=True)
+    _, inverse = np.unique(
+        np.concatenate([np.asarray(c, dtype=object).astype(str) for c in columns]),
+        return_inverse=True,
+    )
     return list(np.split(inverse.astype(np.intp), np.cumsum([len(c) for c in columns])[:-1]))
 
 
@@ -145,7 +150,7 @@ def distance(
         estimator: ``"unbiased"``, ``"biased"`` or ``"grouped"``, see the module.
         groups_x: m group names, for ``"grouped"``; the same name in both sets is the same group.
         groups_y: n group names.
-        normalize: ``"check"`` refuses rows not of unit length (1e-3), ``True`` normalises, ``False`` takes them as they are.
+        normalize: ``"check"`` refuses rows not of unit length (1e-3), ``True`` normalizes, ``False`` takes them as they are.
         backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
         tolerance: largest bound that ``auto`` accepts, at scale 1000.
         block: rows of a kernel block; memory is about ``block^2`` numbers a thread.
@@ -166,32 +171,73 @@ def distance(
     checked_numbers(tolerance=tolerance)
     checked_whole(1, block=block)
     checked_kernel(kernel)
-    x, y = checked_pair(x, y, normalize=normalize, least=1 if estimator == "biased" else 2, names=names)
+    x, y = checked_pair(
+        x, y, normalize=normalize, least=1 if estimator == "biased" else 2, names=names
+    )
     if copies := copies_across(x, y):
-        warnings.warn(f"{copies} rows of {names[0]} are bit for bit rows of {names[1]}: a copy is not a generator", stacklevel=2)
+        warnings.warn(
+            f"{copies} rows of {names[0]} are bit for bit rows of {names[1]}: a copy is not a generator",
+            stacklevel=2,
+        )
     sets = np.repeat(np.arange(2), [len(x), len(y)])
     units = sets  # no pair is left out: a set is one item
-    gx, gy = checked_names("groups_x", groups_x, len(x)), checked_names("groups_y", groups_y, len(y))
+    gx, gy = (
+        checked_names("groups_x", groups_x, len(x)),
+        checked_names("groups_y", groups_y, len(y)),
+    )
     if estimator == "grouped":
         if gx is None or gy is None:
-            raise PalpateError('estimator="grouped" must know the groups of both sets', "none", "Pass groups_x and groups_y")
+            raise PalpateError(
+                'estimator="grouped" must know the groups of both sets',
+                "none",
+                "Pass groups_x and groups_y",
+            )
         units = np.concatenate(unit_index(gx, gy))
     kernel = gaussian(sigma, y, gy) if kernel is None else kernel
     found = kernel_sums(
-        [x, y], sets, units, segments=2, kernel=kernel, backend=backend, tolerance=tolerance * scale / 1000, block=block,
+        [x, y],
+        sets,
+        units,
+        segments=2,
+        kernel=kernel,
+        backend=backend,
+        tolerance=tolerance * scale / 1000,
+        block=block,
         bound=lambda sums: largest_bound(sums, estimator, scale),
-    ).sums  # fmt: skip
+    ).sums
     value = float(mmd_matrix(found.totals, estimator, scale)[0, 1])
     if not np.isfinite(found.totals.sums).all():
-        raise PalpateError("Kernel values must be finite", "infinity or NaN", "Normalise the rows, or scale them down")
+        raise PalpateError(
+            "Kernel values must be finite",
+            "infinity or NaN",
+            "Normalize the rows, or scale them down",
+        )
     if not np.isfinite(value):
         got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
-        raise PalpateError("Each set must have at least two groups, not all shared", got, 'Use estimator="unbiased", or more groups')
+        raise PalpateError(
+            "Each set must have at least two groups, not all shared",
+            got,
+            'Use estimator="unbiased", or more groups',
+        )
     bound = largest_bound(found, estimator, scale)
     if bound > 2 * scale:  # more than the metric can be
         got = f"a bound of {bound:.2g}"
-        raise PalpateError("The moments back end needs a bandwidth that is wide against the features", got, 'Pass backend="blocked"')
-    return Distance(value, bound, found.backend, estimator, kernel.settings(), kernel.bandwidth, scale, len(x), len(y))
+        raise PalpateError(
+            "The moments back end needs a bandwidth that is wide against the features",
+            got,
+            'Pass backend="blocked"',
+        )
+    return Distance(
+        value,
+        bound,
+        found.backend,
+        estimator,
+        kernel.settings(),
+        kernel.bandwidth,
+        scale,
+        len(x),
+        len(y),
+    )
 
 
 def mmd2(x: Any, y: Any, **options: Any) -> float:

@@ -10,9 +10,9 @@ moments ``E = sum e``, ``F = sum u z``, ``G = sum u z z'``. The rest is certifie
 ``|rest| <= h(rho) <G_a, G_b>``, ``h(rho) = (exp(rho) - 1 - rho - rho^2 / 2) / rho^2 = rho / 6 + O(rho^2)``,
 
 as ``|exp(t) - 1 - t - t^2/2| <= t^2 h(|t|)`` with h increasing, and sums of squares are positive. Unit-norm features with sigma = 10 have
-rho <= 0.01 about their centre: the rest of TMMD is some 1e-5 where it is 10, and far less near 0.
+rho <= 0.01 about their center: the rest of TMMD is some 1e-5 where it is 10, and far less near 0.
 
-States add up: over batches, processes and machines, if they share the centre.
+States add up: over batches, processes and machines, if they share the center.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ CHUNK = 2048
 
 @dataclass
 class Moments:
-    """Weighted moments of the samples of P items about a fixed centre.
+    """Weighted moments of the samples of P items about a fixed center.
 
     Attributes:
-        centre: (d,) subtracted from every row.
+        center: (d,) subtracted from every row.
         sigma: bandwidth.
         n: (P,) samples.
         zeroth: (P,) E.
@@ -49,7 +49,7 @@ class Moments:
         rho: largest ``||z||^2`` so far.
     """
 
-    centre: Array
+    center: Array
     sigma: float
     n: Array
     zeroth: Array
@@ -60,13 +60,20 @@ class Moments:
     rho: float = 0.0
 
     @classmethod
-    def empty(cls, centre: Any, sigma: float, items: int) -> Moments:
+    def empty(cls, center: Any, sigma: float, items: int) -> Moments:
         """Nothing added yet."""
-        centre, d = np.asarray(centre, dtype=np.float64), len(centre)
+        center, d = np.asarray(center, dtype=np.float64), len(center)
         wide = np.float64 if items * d * d * 8 <= WIDE else np.float32
         zeros = np.zeros(items)
         return cls(
-            centre, float(sigma), zeros, zeros.copy(), np.zeros((items, d)), np.zeros((items, d, d), wide), zeros.copy(), zeros.copy()
+            center,
+            float(sigma),
+            zeros,
+            zeros.copy(),
+            np.zeros((items, d)),
+            np.zeros((items, d, d), wide),
+            zeros.copy(),
+            zeros.copy(),
         )
 
     def add(self, x: Any, item: Index | int = 0) -> None:
@@ -79,9 +86,16 @@ class Moments:
         items = np.full(len(x), item) if np.ndim(item) == 0 else np.asarray(item)
         order = np.argsort(items, kind="stable")
         cuts = np.r_[0, np.flatnonzero(np.diff(items[order])) + 1, len(x)]
-        jobs = [(int(items[order[a]]), order[i : min(i + CHUNK, b)]) for a, b in pairwise(cuts) for i in range(a, b, CHUNK) if a < b]
+        jobs = [
+            (int(items[order[a]]), order[i : min(i + CHUNK, b)])
+            for a, b in pairwise(cuts)
+            for i in range(a, b, CHUNK)
+            if a < b
+        ]
         ops = ops_of(x)
-        for (p, at), (e, f, g, fourth, diagonal, rho) in zip(jobs, ops.each(lambda job: self._part(x, job[1], ops), jobs), strict=True):
+        for (p, at), (e, f, g, fourth, diagonal, rho) in zip(
+            jobs, ops.each(lambda job: self._part(x, job[1], ops), jobs), strict=True
+        ):
             self.n[p] += len(at)
             self.zeroth[p] += e
             self.first[p] += f
@@ -92,9 +106,11 @@ class Moments:
 
     def _part(self, x: Any, at: Index, ops: Ops) -> tuple[float, Array, Any, float, float, float]:
         """(E, F, G, fourth, diagonal, rho) of a few rows of one item."""
-        run = slice(int(at[0]), int(at[-1]) + 1) if len(at) and at[-1] - at[0] == len(at) - 1 else at
+        run = (
+            slice(int(at[0]), int(at[-1]) + 1) if len(at) and at[-1] - at[0] == len(at) - 1 else at
+        )
         if type(ops) is Ops:
-            z = np.subtract(x[run], self.centre.astype(x.dtype), dtype=x.dtype)
+            z = np.subtract(x[run], self.center.astype(x.dtype), dtype=x.dtype)
             z *= x.dtype.type(1 / self.sigma)
             squares = ops.squares(z)
             u = np.exp(-0.5 * squares)
@@ -103,8 +119,12 @@ class Moments:
             second = z.T @ z
         else:
             xp = ops.xp  # type: ignore[attr-defined]
-            rows = x[run] if isinstance(run, slice) else xp.take(x, xp.asarray(run, device=ops.device), axis=0)  # type: ignore[attr-defined]
-            z = (rows - xp.asarray(self.centre, dtype=x.dtype, device=ops.device)) / self.sigma  # type: ignore[attr-defined]
+            rows = (
+                x[run]
+                if isinstance(run, slice)
+                else xp.take(x, xp.asarray(run, device=ops.device), axis=0)
+            )  # type: ignore[attr-defined]
+            z = (rows - xp.asarray(self.center, dtype=x.dtype, device=ops.device)) / self.sigma  # type: ignore[attr-defined]
             wide = ops.squares(z)
             u, squares = ops.numpy(xp.exp(-0.5 * wide)), ops.numpy(wide)
             weights = xp.astype(xp.exp(-0.25 * wide), x.dtype)
@@ -114,23 +134,43 @@ class Moments:
         e = np.expm1(-0.5 * squares)
         # What the expansion says of k(x, x) - 1 = 0: it is taken out of sums over i != j.
         at_self = 2 * e + e**2 + u**2 * squares + u**2 * squares**2 / 2
-        return float(e.sum()), first, second, float((u * squares) @ (u * squares)), float(at_self.sum()), float(squares.max(initial=0.0))
+        return (
+            float(e.sum()),
+            first,
+            second,
+            float((u * squares) @ (u * squares)),
+            float(at_self.sum()),
+            float(squares.max(initial=0.0)),
+        )
 
     def merge(self, others: Iterable[Moments]) -> Moments:
         """The moments of all samples of this and others, item by item.
 
         Raises:
-            PalpateError: if centres, bandwidths or shapes differ.
+            PalpateError: if centers, bandwidths or shapes differ.
         """
         out = Moments(
-            self.centre, self.sigma, self.n.copy(), self.zeroth.copy(), self.first.copy(), self.second.copy(), self.fourth.copy(),
-            self.diagonal.copy(), self.rho,
-        )  # fmt: skip
+            self.center,
+            self.sigma,
+            self.n.copy(),
+            self.zeroth.copy(),
+            self.first.copy(),
+            self.second.copy(),
+            self.fourth.copy(),
+            self.diagonal.copy(),
+            self.rho,
+        )
         for other in others:
-            if not (np.array_equal(out.centre, other.centre) and out.sigma == other.sigma and out.first.shape == other.first.shape):
+            if not (
+                np.array_equal(out.center, other.center)
+                and out.sigma == other.sigma
+                and out.first.shape == other.first.shape
+            ):
                 got = f"sigma {out.sigma:g} and {other.sigma:g}, items and widths {out.first.shape} and {other.first.shape}"
                 raise PalpateError(
-                    "Moments that are merged must share centre, bandwidth and items", got, "Begin all from one Moments.empty"
+                    "Moments that are merged must share center, bandwidth and items",
+                    got,
+                    "Begin all from one Moments.empty",
                 )
             for name in ("n", "zeroth", "first", "second", "fourth", "diagonal"):
                 getattr(out, name)[...] += getattr(other, name)
@@ -142,7 +182,13 @@ class Moments:
         flat = self.second.reshape(len(self.n), -1)
         second = (flat @ flat.T).astype(np.float64)
         e = self.zeroth
-        sums = np.outer(self.n, e) + np.outer(e, self.n) + np.outer(e, e) + self.first @ self.first.T + second / 2
+        sums = (
+            np.outer(self.n, e)
+            + np.outer(e, self.n)
+            + np.outer(e, e)
+            + self.first @ self.first.T
+            + second / 2
+        )
         sums[np.diag_indices_from(sums)] -= self.diagonal
         rest = second.copy()
         rest[np.diag_indices_from(rest)] -= self.fourth  # i = j is known: it is 0
@@ -158,13 +204,17 @@ class Moments:
         """As :func:`palpate.metrics.blocked.blocked_sums` gives them, with ``bound``; item p lies in one segment and one unit."""
         block, rest = self.products()
         n = self.n.copy()
-        bound = PairSums.from_block(rest, n, np.zeros_like(n), segment, unit, segments, backend="moments")
-        return PairSums.from_block(block, n, np.zeros_like(n), segment, unit, segments, backend="moments", bound=bound)
+        bound = PairSums.from_block(
+            rest, n, np.zeros_like(n), segment, unit, segments, backend="moments"
+        )
+        return PairSums.from_block(
+            block, n, np.zeros_like(n), segment, unit, segments, backend="moments", bound=bound
+        )
 
     def spread(self, items: Index) -> tuple[float, float, float]:
-        """As :func:`palpate.metrics.blocked.centred_squares`, of the samples of some items, to leading order in 1 / sigma^2.
+        """As :func:`palpate.metrics.blocked.centered_squares`, of the samples of some items, to leading order in 1 / sigma^2.
 
-        ``Kc_ij = z_i . z_j`` with z centred on the mean of these samples: within ``rho`` of its size of the exact value.
+        ``Kc_ij = z_i . z_j`` with z centered on the mean of these samples: within ``rho`` of its size of the exact value.
         """
         n, first = self.n[items].sum(), self.first[items].sum(axis=0)
         if n < 2:
@@ -191,15 +241,19 @@ def rest_factor(rho: float) -> float:
     """``h(rho) = (exp(rho) - 1 - rho - rho^2 / 2) / rho^2``, accurate for small rho too."""
     if rho <= 0:
         return 0.0
-    # sum_{p >= 3} rho^p / p! = exp(rho) * P(3, rho), with P the regularised lower incomplete gamma function.
+    # sum_{p >= 3} rho^p / p! = exp(rho) * P(3, rho), with P the regularized lower incomplete gamma function.
     with np.errstate(over="ignore"):
-        return float(np.exp(rho + np.log(special.gammainc(3, rho)) - 2 * np.log(rho))) if rho > 1e-80 else rho / 6
+        return (
+            float(np.exp(rho + np.log(special.gammainc(3, rho)) - 2 * np.log(rho)))
+            if rho > 1e-80
+            else rho / 6
+        )
 
 
-def centre_of(parts: Iterable[Any], rows: int = 4096, run: int = 64) -> Array:
+def center_of(parts: Iterable[Any], rows: int = 4096, run: int = 64) -> Array:
     """The mean of about ``rows`` rows in short runs spread evenly over the arrays.
 
-    Any fixed centre is right; one in the middle gives the least rest. Runs, since an array on disk is read by pages.
+    Any fixed center is right; one in the middle gives the least rest. Runs, since an array on disk is read by pages.
     """
     parts = [p for p in parts if len(p)]
     total, picked = sum(len(p) for p in parts), []

@@ -6,7 +6,7 @@ image and each further one has the 2 x 2 block means of the one before (a last o
     MS-SSIM = l_M^w_M  prod_j cs_j^w_j,      w = 0.0448, 0.2856, 0.3001, 0.2363, 0.1333
 
 with cs_j averaged over the windows of scale j, at the last scale the average of l cs; a negative average counts as 0, for it has no real
-power. Each scale is on the convention of our SSIM (``pairwise``): Gaussian 11 / 1.5, windows inside the image, each colour channel on its
+power. Each scale is on the convention of our SSIM (``pairwise``): Gaussian 11 / 1.5, windows inside the image, each color channel on its
 own; the mean over channels is taken of the products.
 
 The coarsest scale must hold a window of 11 pixels: five scales need 176 pixels a side, an image of 64 holds three. ``scales="auto"``
@@ -23,7 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Score
-from palpate.metrics.compat import OWN, WINDOW, Convention, Pairs, Range, checked_pairs, local_maps, pooled
+from palpate.metrics.compat import (
+    OWN,
+    WINDOW,
+    Convention,
+    Pairs,
+    Range,
+    checked_pairs,
+    local_maps,
+    pooled,
+)
 from palpate.metrics.kernels import Array
 from palpate.metrics.pairwise import mean_score
 
@@ -43,7 +52,9 @@ def scale_weights(scales: int) -> Array:
     return weights if scales == len(WEIGHTS) else weights / weights.sum()
 
 
-def ms_ssim_per_image(generated: Any, reference: Any, *, scales: Scales = "auto", data_range: Range | None = None) -> Array:
+def ms_ssim_per_image(
+    generated: Any, reference: Any, *, scales: Scales = "auto", data_range: Range | None = None
+) -> Array:
     """MS-SSIM of each pair of images.
 
     Args:
@@ -94,17 +105,34 @@ def ms_ssim(
     number = _number(scales, pairs)
     size = [int(v) for v in pairs.a.shape[1:3]]
     settings = OWN.settings | {
-        "data_range": pairs.data_range, "border": OWN.border, "size": size, "scales": number, "downsampling": "2 x 2 mean",
+        "data_range": pairs.data_range,
+        "border": OWN.border,
+        "size": size,
+        "scales": number,
+        "downsampling": "2 x 2 mean",
         "weights": [round(float(v), 6) for v in scale_weights(number)],
-    }  # fmt: skip
+    }
     note = ""
     if number < len(WEIGHTS):
-        why = f"five need {least_side(len(WEIGHTS))} pixels a side" if scales == "auto" else "as asked"
+        why = (
+            f"five need {least_side(len(WEIGHTS))} pixels a side"
+            if scales == "auto"
+            else "as asked"
+        )
         note = f"{number} of the 5 scales ({why}), weights divided by their sum: not comparable with MS-SSIM of 5"
     return mean_score(
-        "MS-SSIM", _values(pairs, number), ids, groups, bounds=(0.0, 1.0), subject=subject, split=split, level=level, settings=settings,
-        note=note, details=pairs.coding,
-    )  # fmt: skip
+        "MS-SSIM",
+        _values(pairs, number),
+        ids,
+        groups,
+        bounds=(0.0, 1.0),
+        subject=subject,
+        split=split,
+        level=level,
+        settings=settings,
+        note=note,
+        details=pairs.coding,
+    )
 
 
 def fitting_scales(size: Sequence[int]) -> int:
@@ -112,7 +140,9 @@ def fitting_scales(size: Sequence[int]) -> int:
     return max((m for m in range(1, len(WEIGHTS) + 1) if min(size) >= least_side(m)), default=0)
 
 
-def weighted_ms_ssim(x: Array, y: Array, kept: NDArray[np.bool_], scales: int, convention: Convention, reach: float) -> float:
+def weighted_ms_ssim(
+    x: Array, y: Array, kept: NDArray[np.bool_], scales: int, convention: Convention, reach: float
+) -> float:
     """MS-SSIM of two images over some of their pixels.
 
     The factors of each scale are averaged with the share of a cell that is kept as weight; a last odd row or column is repeated instead of
@@ -132,9 +162,17 @@ def weighted_ms_ssim(x: Array, y: Array, kept: NDArray[np.bool_], scales: int, c
     weight, means = kept.astype(np.float64)[None], np.empty((scales, len(x)))
     for j in range(scales):
         if j:
-            x, y, weight = pooled(_even(x, "edge"), 2), pooled(_even(y, "edge"), 2), pooled(_even(weight, "constant"), 2)
+            x, y, weight = (
+                pooled(_even(x, "edge"), 2),
+                pooled(_even(y, "edge"), 2),
+                pooled(_even(weight, "constant"), 2),
+            )
         similarity, structure = signed_maps(x, y, convention, reach)
-        means[j] = np.average((similarity if j == scales - 1 else structure).reshape(len(x), -1), axis=1, weights=weight.ravel())
+        means[j] = np.average(
+            (similarity if j == scales - 1 else structure).reshape(len(x), -1),
+            axis=1,
+            weights=weight.ravel(),
+        )
     return float(np.prod(np.maximum(means, 0) ** scale_weights(scales)[:, None], axis=0).mean())
 
 
@@ -156,15 +194,27 @@ def _number(scales: Any, pairs: Pairs) -> int:
     size = f"{pairs.a.shape[1]} x {pairs.a.shape[2]}"
     if scales == "auto":
         if side < WINDOW:
-            raise PalpateError(f"Images must be at least {WINDOW} x {WINDOW} for MS-SSIM", size, "Score larger images")
+            raise PalpateError(
+                f"Images must be at least {WINDOW} x {WINDOW} for MS-SSIM",
+                size,
+                "Score larger images",
+            )
         return fitting_scales(pairs.a.shape[1:3])
-    if isinstance(scales, bool) or not isinstance(scales, int | np.integer) or not 1 <= scales <= len(WEIGHTS):
+    if (
+        isinstance(scales, bool)
+        or not isinstance(scales, int | np.integer)
+        or not 1 <= scales <= len(WEIGHTS)
+    ):
         raise PalpateError(
-            f'scales must be "auto" or a whole number from 1 to {len(WEIGHTS)}', repr(scales), "Leave it out for the default"
+            f'scales must be "auto" or a whole number from 1 to {len(WEIGHTS)}',
+            repr(scales),
+            "Leave it out for the default",
         )
     if side < (need := least_side(int(scales))):
         fix = f'Score images of at least {need} pixels a side, or pass scales="auto"'
-        raise PalpateError(f"Images must be at least {need} x {need} for MS-SSIM of {scales} scales", size, fix)
+        raise PalpateError(
+            f"Images must be at least {need} x {need} for MS-SSIM of {scales} scales", size, fix
+        )
     return int(scales)
 
 

@@ -2,7 +2,7 @@
 
 * SSIM (Wang et al. 2004): local means, variances and covariance under an 11 x 11 Gaussian of sigma 1.5,
   ``(2 mx my + C1)(2 cov + C2) / ((mx^2 + my^2 + C1)(vx + vy + C2))`` with C1 = (0.01 L)^2, C2 = (0.03 L)^2, data range L = 1, on each
-  colour channel, no downsampling, weighted population variances; averaged over the windows that lie wholly inside the image (as the
+  color channel, no downsampling, weighted population variances; averaged over the windows that lie wholly inside the image (as the
   original; no padding).
 * PSNR: ``-10 log10(mean squared error)`` of an image, data range 1, all channels together. Two identical images have no PSNR
   (infinite): they are left out of the mean and counted in ``details["identical"]``, and the note says so.
@@ -24,12 +24,22 @@ from numpy.typing import NDArray
 from palpate import __version__
 from palpate.core import PalpateError, Score
 from palpate.metrics.checks import checked_level, checked_names
-from palpate.metrics.compat import SSIM_CONVENTIONS, Compat, Pairs, Range, checked_pairs, psnr_values, ssim_values
+from palpate.metrics.compat import (
+    SSIM_CONVENTIONS,
+    Compat,
+    Pairs,
+    Range,
+    checked_pairs,
+    psnr_values,
+    ssim_values,
+)
 from palpate.metrics.intervals import mean_interval
 from palpate.metrics.kernels import Array
 
 
-def paired_by_id(generated_ids: Sequence[str], reference_ids: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def paired_by_id(
+    generated_ids: Sequence[str], reference_ids: Sequence[str]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Where the two images of each id stand; the order of the lists may differ, their ids may not.
 
     Args:
@@ -42,28 +52,45 @@ def paired_by_id(generated_ids: Sequence[str], reference_ids: Sequence[str]) -> 
     Raises:
         PalpateError: if an id stands twice in a list, or in one list only; the first are named.
     """
-    lists = {"generated": [str(v) for v in generated_ids], "reference": [str(v) for v in reference_ids]}
+    lists = {
+        "generated": [str(v) for v in generated_ids],
+        "reference": [str(v) for v in reference_ids],
+    }
     for name, ids in lists.items():
         if not ids:
-            raise PalpateError(f"There must be {name} ids", "none", f"Pass the ids of the {name} images")
+            raise PalpateError(
+                f"There must be {name} ids", "none", f"Pass the ids of the {name} images"
+            )
         if twice := [i for i, count in Counter(ids).items() if count > 1]:
-            got = f"{len(twice)} that stand{'s' * (len(twice) == 1)} more than once: {_first(twice)}"
+            got = (
+                f"{len(twice)} that stand{'s' * (len(twice) == 1)} more than once: {_first(twice)}"
+            )
             raise PalpateError(f"Every {name} id must stand once", got, "Keep one image an id")
     made, wanted = (dict.fromkeys(v) for v in lists.values())
     missing, surplus = [i for i in wanted if i not in made], [i for i in made if i not in wanted]
     if missing or surplus:
-        parts = [f"{len(ids)} {what}: {_first(ids)}" for what, ids in (("not generated", missing), ("without reference", surplus)) if ids]
+        parts = [
+            f"{len(ids)} {what}: {_first(ids)}"
+            for what, ids in (("not generated", missing), ("without reference", surplus))
+            if ids
+        ]
         fix = "Score the same samples on both sides: take() the common ids if that is what you mean"
-        raise PalpateError("Generated and reference ids must be the same set", "; ".join(parts), fix)
+        raise PalpateError(
+            "Generated and reference ids must be the same set", "; ".join(parts), fix
+        )
     at = {i: k for k, i in enumerate(lists["generated"])}
-    return np.array([at[i] for i in lists["reference"]], dtype=np.int64), np.arange(len(wanted), dtype=np.int64)
+    return np.array([at[i] for i in lists["reference"]], dtype=np.int64), np.arange(
+        len(wanted), dtype=np.int64
+    )
 
 
 def _first(ids: Sequence[str]) -> str:
     return ", ".join(repr(i) for i in ids[:3]) + f" and {len(ids) - 3} more" * (len(ids) > 3)
 
 
-def ssim_per_image(generated: Any, reference: Any, *, data_range: Range | None = None, compat: Compat | None = None) -> Array:
+def ssim_per_image(
+    generated: Any, reference: Any, *, data_range: Range | None = None, compat: Compat | None = None
+) -> Array:
     """SSIM of each pair of images.
 
     Args:
@@ -81,7 +108,9 @@ def ssim_per_image(generated: Any, reference: Any, *, data_range: Range | None =
     return ssim_values(checked_pairs(generated, reference, data_range, compat), compat)
 
 
-def psnr_per_image(generated: Any, reference: Any, *, data_range: Range | None = None, compat: Compat | None = None) -> Array:
+def psnr_per_image(
+    generated: Any, reference: Any, *, data_range: Range | None = None, compat: Compat | None = None
+) -> Array:
     """PSNR in dB of each pair of images, infinity where they are identical (80 dB for piq).
 
     Args:
@@ -129,31 +158,61 @@ def mean_score(
     finite = np.isfinite(values)
     kept = values[finite]
     identical = int(np.isinf(values).sum())
-    interval, method = mean_interval(kept, None if groups is None else [g for g, k in zip(groups, finite, strict=True) if k], level)
+    interval, method = mean_interval(
+        kept,
+        None if groups is None else [g for g, k in zip(groups, finite, strict=True) if k],
+        level,
+    )
     if interval is not None and bounds is not None:
         interval = (max(bounds[0], interval[0]), min(bounds[1], interval[1]))
-    worst = np.argsort(np.where(np.isnan(values), np.inf, values if better else -values), kind="stable")[:5]
+    worst = np.argsort(
+        np.where(np.isnan(values), np.inf, values if better else -values), kind="stable"
+    )[:5]
     details: dict[str, Any] = {
         "sd": float(kept.std(ddof=1)) if len(kept) > 1 else None,
         "median": float(np.median(kept)) if len(kept) else None,
         "identical": identical,
-        "lowest" if better else "highest": [{"id": names[i] if names else str(i), "value": float(values[i])} for i in worst if finite[i]],
+        "lowest" if better else "highest": [
+            {"id": names[i] if names else str(i), "value": float(values[i])}
+            for i in worst
+            if finite[i]
+        ],
         "groups": len(set(groups)) if groups else None,
         "version": __version__,
     }
-    note = f"{identical} of {len(values)} pairs are identical (infinite), left out of the mean" if identical else ""
+    note = (
+        f"{identical} of {len(values)} pairs are identical (infinite), left out of the mean"
+        if identical
+        else ""
+    )
     if not len(kept):
         note = (
-            f"Undefined: all {len(values)} pairs are identical, so the value is infinite" if identical else "Undefined: no pair has a value"
+            f"Undefined: all {len(values)} pairs are identical, so the value is infinite"
+            if identical
+            else "Undefined: no pair has a value"
         )
     elif interval is None:
-        note = ". ".join(filter(None, [note, "No interval: one image or one group, or no variation between them"]))
+        note = ". ".join(
+            filter(
+                None, [note, "No interval: one image or one group, or no variation between them"]
+            )
+        )
     note = ". ".join(filter(None, [note, rest.pop("note", "")]))
     value = float(kept.mean()) if len(kept) else None
     return Score(
-        metric, value=value, interval=interval, level=level, interval_method=method, estimator="per-image mean", n=len(values),
-        m=len(values), higher_is_better=better, details=details | rest.pop("details", {}), note=note, **rest,
-    )  # fmt: skip
+        metric,
+        value=value,
+        interval=interval,
+        level=level,
+        interval_method=method,
+        estimator="per-image mean",
+        n=len(values),
+        m=len(values),
+        higher_is_better=better,
+        details=details | rest.pop("details", {}),
+        note=note,
+        **rest,
+    )
 
 
 def ssim(
@@ -191,14 +250,26 @@ def ssim(
     """
     pairs = checked_pairs(generated, reference, data_range, compat)
     convention = SSIM_CONVENTIONS[compat]
-    settings = convention.settings | {"data_range": pairs.data_range, "border": convention.border, "size": _size(pairs)}
+    settings = convention.settings | {
+        "data_range": pairs.data_range,
+        "border": convention.border,
+        "size": _size(pairs),
+    }
     if compat == "piq":
         settings["pooling"] = convention.factor(*_size(pairs))
     values = ssim_values(pairs, compat)
     return mean_score(
-        "SSIM", values, ids, groups, bounds=(-1.0, 1.0), subject=subject, split=split, level=level, settings=settings | _named(compat),
+        "SSIM",
+        values,
+        ids,
+        groups,
+        bounds=(-1.0, 1.0),
+        subject=subject,
+        split=split,
+        level=level,
+        settings=settings | _named(compat),
         details=pairs.coding,
-    )  # fmt: skip
+    )
 
 
 def psnr(
@@ -232,16 +303,26 @@ def psnr(
         PalpateError: as :func:`psnr_per_image`.
     """
     pairs = checked_pairs(generated, reference, data_range, compat)
-    rest: dict[str, Any] = {"subject": subject, "split": split, "level": level, "details": pairs.coding}
+    rest: dict[str, Any] = {
+        "subject": subject,
+        "split": split,
+        "level": level,
+        "details": pairs.coding,
+    }
     rest["settings"] = {"data_range": pairs.data_range, "size": _size(pairs)} | _named(compat)
     if compat == "torchmetrics":
         return _pooled_psnr(pairs.squared_errors(), ids, groups, rest)
     return mean_score("PSNR", psnr_values(pairs, compat), ids, groups, **rest)
 
 
-def _pooled_psnr(errors: Array, ids: Sequence[str] | None, groups: Sequence[str] | None, rest: dict[str, Any]) -> Score:
+def _pooled_psnr(
+    errors: Array, ids: Sequence[str] | None, groups: Sequence[str] | None, rest: dict[str, Any]
+) -> Score:
     """``-10 log10`` of the mean of all squared errors; its interval has the reach ``10 / ln 10 * reach(mean) / mean``."""
-    names, groups = checked_names("ids", ids, len(errors)), checked_names("groups", groups, len(errors))
+    names, groups = (
+        checked_names("ids", ids, len(errors)),
+        checked_names("groups", groups, len(errors)),
+    )
     mean, level = float(errors.mean()), rest["level"]
     checked_level(level)
     value, interval = (-10 * float(np.log10(mean)) if mean > 0 else None), None
@@ -251,14 +332,31 @@ def _pooled_psnr(errors: Array, ids: Sequence[str] | None, groups: Sequence[str]
         interval, method = (float(value - reach), float(value + reach)), f"{method}, delta method"
     note = "" if interval else "No interval: one image or one group, or no variation between them"
     worst = np.argsort(-errors, kind="stable")[:5]
-    lowest = [{"id": names[i] if names else str(i), "value": -10 * float(np.log10(errors[i]))} for i in worst if errors[i] > 0]
-    details = {"identical": int((errors == 0).sum()), "lowest": lowest, "groups": len(set(groups)) if groups else None}
+    lowest = [
+        {"id": names[i] if names else str(i), "value": -10 * float(np.log10(errors[i]))}
+        for i in worst
+        if errors[i] > 0
+    ]
+    details = {
+        "identical": int((errors == 0).sum()),
+        "lowest": lowest,
+        "groups": len(set(groups)) if groups else None,
+    }
     rest = rest | {"details": details | {"version": __version__} | rest["details"]}
     return Score(
-        "PSNR", value=value, interval=interval, interval_method=method if interval else "", estimator="pooled squared error", n=len(errors),
-        m=len(errors), higher_is_better=True,
-        note=note if value is not None else f"Undefined: all {len(errors)} pairs are identical, so the value is infinite", **rest,
-    )  # fmt: skip
+        "PSNR",
+        value=value,
+        interval=interval,
+        interval_method=method if interval else "",
+        estimator="pooled squared error",
+        n=len(errors),
+        m=len(errors),
+        higher_is_better=True,
+        note=note
+        if value is not None
+        else f"Undefined: all {len(errors)} pairs are identical, so the value is infinite",
+        **rest,
+    )
 
 
 def _named(compat: str | None) -> dict[str, str]:

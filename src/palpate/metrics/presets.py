@@ -16,7 +16,14 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypedDict
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import Normalize, checked_choice, checked_level, checked_numbers, checked_positive, checked_whole
+from palpate.metrics.checks import (
+    Normalize,
+    checked_choice,
+    checked_level,
+    checked_numbers,
+    checked_positive,
+    checked_whole,
+)
 from palpate.metrics.engine import BACKENDS, Backend
 from palpate.metrics.kernels import Kernel, Sigma, checked_kernel
 from palpate.metrics.mmd import ESTIMATORS, Estimator
@@ -43,7 +50,7 @@ class Options(TypedDict, total=False):
         backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
         tolerance: largest bound with which ``auto`` takes moments, default 1e-4 at scale 1000.
         block: rows of a kernel block, default 1024.
-        permutations: relabellings of the permutation test of TMMD, default 999; 0 for none.
+        permutations: relabelings of the permutation test of TMMD, default 999; 0 for none.
         level: coverage of intervals, default 0.95.
         min_samples: a class with fewer is excluded, at least 4, default 4.
         seed: seed of random halves, default 0.
@@ -97,7 +104,9 @@ class Plan:
 
 PRESETS: dict[str, Plan] = {
     "paper": Plan("paper", "unbiased", "random", "sum", "mean_of_ratios"),
-    "paper-tables": Plan("paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"),
+    "paper-tables": Plan(
+        "paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"
+    ),
     "cmmd": Plan("cmmd", "biased", "random", "sum", "mean_of_ratios"),
     "grouped": Plan("grouped", "grouped", "group", "sum", "ratio_of_means"),
 }
@@ -133,7 +142,15 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     checked_level(plan.level)
     checked_kernel(plan.kernel)
     if not grouped and "grouped" in (plan.preset, plan.estimator):
-        raise PalpateError("The grouped estimator must know the group of every sample", "none", 'Give groups, or preset="paper"')
+        raise PalpateError(
+            "The grouped estimator must know the group of every sample",
+            "none",
+            'Give groups, or preset="paper"',
+        )
     if not grouped and plan.halves == "group":
-        raise PalpateError('halves="group" must know the group of every sample', "none", 'Give groups, or halves="random"')
+        raise PalpateError(
+            'halves="group" must know the group of every sample',
+            "none",
+            'Give groups, or halves="random"',
+        )
     return plan

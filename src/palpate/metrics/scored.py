@@ -20,9 +20,7 @@ from palpate.metrics.presets import Plan
 from palpate.metrics.sums import PairSums
 from palpate.metrics.tables import Estimate, Table
 
-RANDOM_NOTE = (
-    "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; halves of whole videos do (preset grouped)"
-)
+RANDOM_NOTE = "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; halves of whole videos do (preset grouped)"
 
 
 #: A bound at scale 1000 from which it is told.
@@ -99,16 +97,35 @@ def scored(
         details = {**details, **{name: None for name in ("p_value", "z") if name in details}}
         note = note or "Undefined: an average over no pairs"
     elif interval is None:
-        note = ". ".join(filter(None, [note, "No interval: too few groups or samples to leave one out"]))
+        note = ". ".join(
+            filter(None, [note, "No interval: too few groups or samples to leave one out"])
+        )
     details = plain(details) | {
-        "unit": table.unit, "backend": table.sums.backend, "bound": plain(bound) if value is not None else None, "version": __version__,
-    }  # fmt: skip
+        "unit": table.unit,
+        "backend": table.sums.backend,
+        "bound": plain(bound) if value is not None else None,
+        "version": __version__,
+    }
     score = Score(
-        metric, plan.subject, value, interval, plan.level, method, bandwidth=table.kernel.bandwidth, scale=plan.scale,
-        n=len(generated.ids), encoder=generated.encoder, split=plan.split, details=details, note=note,
-        settings={**table.kernel.settings(), **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)}},
+        metric,
+        plan.subject,
+        value,
+        interval,
+        plan.level,
+        method,
+        bandwidth=table.kernel.bandwidth,
+        scale=plan.scale,
+        n=len(generated.ids),
+        encoder=generated.encoder,
+        split=plan.split,
+        details=details,
+        note=note,
+        settings={
+            **table.kernel.settings(),
+            **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)},
+        },
         **{k: plain(v) for k, v in rest.items()},
-    )  # fmt: skip
+    )
     design = np.zeros(0) if design is None else design
     if found is None or not len(found.units):
         return Scored(score, design=design)
@@ -128,7 +145,11 @@ def over_classes(one: Scored) -> Scored:
     details = {**one.score.details, "left_out": "class"}
     excess = one.without_class[:, 1] if "E" in details else np.zeros(0)
     return replace(
-        one, score=replace(one.score, details=details), replicates=one.without_class[:, 0], units=details["classes"], excess=excess
+        one,
+        score=replace(one.score, details=details),
+        replicates=one.without_class[:, 0],
+        units=details["classes"],
+        excess=excess,
     )
 
 
@@ -155,13 +176,31 @@ def excess_of(one: Scored) -> Scored | None:
     interval, note = (interval if known else None), "" if known else UNBOUNDED
     if known and bound > TOLD * score.scale / 1000:
         note = within(bound)
-    kept = {name: d[name] for name in ("unit", "left_out", "units", "backend", "version", "classes", "excluded") if name in d}
+    kept = {
+        name: d[name]
+        for name in ("unit", "left_out", "units", "backend", "version", "classes", "excluded")
+        if name in d
+    }
     found = replace(
-        score, metric=f"{score.metric} E", value=d["E"] if known else None, interval=None if interval is None else (interval[0], interval[1]),
-        null=None, interval_method=score.interval_method if interval else "", floor=d.get("E_floor"), estimator="unbiased", seed=None,
-        note=note, details=kept | {"bound": bound if known else None},
-    )  # fmt: skip
-    return Scored(found, one.excess, one.units if len(one.excess) else (), groups=one.groups, without_class=one.without_class[:, 1:])
+        score,
+        metric=f"{score.metric} E",
+        value=d["E"] if known else None,
+        interval=None if interval is None else (interval[0], interval[1]),
+        null=None,
+        interval_method=score.interval_method if interval else "",
+        floor=d.get("E_floor"),
+        estimator="unbiased",
+        seed=None,
+        note=note,
+        details=kept | {"bound": bound if known else None},
+    )
+    return Scored(
+        found,
+        one.excess,
+        one.units if len(one.excess) else (),
+        groups=one.groups,
+        without_class=one.without_class[:, 1:],
+    )
 
 
 def within(bound: float) -> str:
@@ -181,7 +220,9 @@ def not_comparable(one: Scored, floor: Scored) -> str:
     by_group = mine.settings.get("halves") == "group"
     if by_group and list(one.groups) != list(floor.groups):
         return "other groups"
-    if one.design.shape != floor.design.shape or not np.allclose(one.design, floor.design, rtol=ALIKE, atol=0):
+    if one.design.shape != floor.design.shape or not np.allclose(
+        one.design, floor.design, rtol=ALIKE, atol=0
+    ):
         return "other numbers of samples" + (" a group" if by_group else "")
     return ""
 
@@ -197,12 +238,28 @@ def with_floor(one: Scored, floor: Scored, why: str = "") -> Scored:
     alike = mine.details.get("classes") == theirs.details.get("classes")
     details: dict[str, Any] = {}
     if "E" in mine.details:
-        details["E_floor"] = theirs.details.get("E") if alike else _mean_excess(theirs, mine.details.get("classes") or [])
+        details["E_floor"] = (
+            theirs.details.get("E")
+            if alike
+            else _mean_excess(theirs, mine.details.get("classes") or [])
+        )
     if "E_ratio" in mine.details:
         details["E_ratio_floor"] = theirs.details.get("E_ratio") if alike else None
-    said = "" if not why or mine.value is None else f"No floor: real touches of {why} have another value"
+    said = (
+        ""
+        if not why or mine.value is None
+        else f"No floor: real touches of {why} have another value"
+    )
     note = ". ".join(filter(None, [mine.note, said]))
-    return replace(one, score=replace(mine, floor=None if why else theirs.value, details={**mine.details, **details}, note=note))
+    return replace(
+        one,
+        score=replace(
+            mine,
+            floor=None if why else theirs.value,
+            details={**mine.details, **details},
+            note=note,
+        ),
+    )
 
 
 def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:
@@ -253,19 +310,29 @@ def halves_note(plan: Plan, sums: PairSums, *, grouped: bool) -> str:
         return "All features are equal: complete collapse, which this metric calls perfect"
     found = [RANDOM_NOTE] if plan.halves == "random" and plan.estimator != "biased" else []
     if not grouped:
-        found.append("The interval takes samples as independent; frames of one video are not: give groups")
+        found.append(
+            "The interval takes samples as independent; frames of one video are not: give groups"
+        )
     return ". ".join(found)
 
 
-def null_band(centre: float, sd: float) -> Interval | None:
+def null_band(center: float, sd: float) -> Interval | None:
     """95 % of random halves, by a normal approximation: the true distribution leans to the right where a few directions dominate."""
-    return (centre - 1.96 * sd, centre + 1.96 * sd) if np.isfinite(sd) and np.isfinite(centre) else None
+    return (
+        (center - 1.96 * sd, center + 1.96 * sd)
+        if np.isfinite(sd) and np.isfinite(center)
+        else None
+    )
 
 
 def unfit(sums: PairSums, c: int, plan: Plan) -> str:
     """Why segment c cannot be cut into halves; '' if it can."""
     own = sums.segment == c
-    sizes = np.bincount(np.unique(sums.unit[own], return_inverse=True)[1], weights=sums.n[own]) if own.any() else np.zeros(0)
+    sizes = (
+        np.bincount(np.unique(sums.unit[own], return_inverse=True)[1], weights=sums.n[own])
+        if own.any()
+        else np.zeros(0)
+    )
     if sizes.sum() < plan.min_samples:
         return f"fewer than {plan.min_samples} samples"
     if plan.halves == "group" and len(sizes) < 2:

@@ -47,7 +47,7 @@ class StreamingMetric:
     Args:
         keep: ``"features"`` or ``"sums"``, see the module.
         classes: for ``"sums"`` of CI- and D-TMMD: the labels there can be.
-        centre: for ``"sums"``: (d,) any fixed vector near the features, the same in all processes that will be merged, e.g. the mean of the
+        center: for ``"sums"``: (d,) any fixed vector near the features, the same in all processes that will be merged, e.g. the mean of the
             real embeddings; the nearer, the smaller the bound. None: the mean of the first batch, for one process.
         floor: for ``"sums"`` without reference: whether real touches are summed too, for ``Score.floor``.
         encoder: digest of the encoder, kept with the score.
@@ -70,35 +70,62 @@ class StreamingMetric:
         *,
         keep: Keep = "features",
         classes: Sequence[str] | None = None,
-        centre: Any = None,
+        center: Any = None,
         floor: bool = False,
         encoder: str | None = None,
         reset_real_features: bool = True,
         **options: Unpack[Options],
     ) -> None:
         checked_choice("keep", keep, ("features", "sums"))
-        self.keep, self.encoder, self.reset_real_features, self.options = keep, encoder, reset_real_features, options
+        self.keep, self.encoder, self.reset_real_features, self.options = (
+            keep,
+            encoder,
+            reset_real_features,
+            options,
+        )
         if keep == "features":
-            self.plan = plan_for(options, grouped=True)  # for its checks: whether groups are known is seen later
-            self.layout, self.centre = None, None
+            self.plan = plan_for(
+                options, grouped=True
+            )  # for its checks: whether groups are known is seen later
+            self.layout, self.center = None, None
         else:
             self.plan = plan_of_sums(options, halves=self.of_halves)
             names = ("",) if not self.by_class else checked_classes(classes)
-            self.layout = Layout(float(cast(float, self.plan.sigma)), names, self.of_halves, 2 if floor else 1, self.plan.seed)
-            self.centre = None if centre is None else checked_centre(centre)
+            self.layout = Layout(
+                float(cast(float, self.plan.sigma)),
+                names,
+                self.of_halves,
+                2 if floor else 1,
+                self.plan.seed,
+            )
+            self.center = None if center is None else checked_center(center)
         self.state = self.fresh()
 
     def fresh(self) -> State:
         """A state with nothing in it."""
-        return FeatureState() if self.layout is None else SumState(self.layout, self.centre)
+        return FeatureState() if self.layout is None else SumState(self.layout, self.center)
 
     @property
     def digest(self) -> str:
         """SHA-256 of the settings that states depend on: metrics of one digest can share a state, whatever they compute from it."""
-        layout = None if self.layout is None else [self.layout.__dict__, None if self.centre is None else self.centre.tolist()]
-        return digest_json([self.keep, self.encoder, self.reset_real_features, self.plan.normalize, layout])
+        layout = (
+            None
+            if self.layout is None
+            else [self.layout.__dict__, None if self.center is None else self.center.tolist()]
+        )
+        return digest_json(
+            [self.keep, self.encoder, self.reset_real_features, self.plan.normalize, layout]
+        )
 
-    def update(self, features: Any, *, real: bool = False, ids: Any = None, labels: Any = None, groups: Any = None) -> None:
+    def update(
+        self,
+        features: Any,
+        *,
+        real: bool = False,
+        ids: Any = None,
+        labels: Any = None,
+        groups: Any = None,
+    ) -> None:
         """Adds a batch; a batch that is refused changes nothing.
 
         Args:
@@ -113,7 +140,11 @@ class StreamingMetric:
             PalpateError: at once for rows that are NaN, infinite, zero or (``normalize="check"``) not of unit length, with their numbers in the
                 batch; another width than before; columns of another length.
         """
-        self.state.update(features, self.plan.normalize, **Columns(real=real, ids=ids, labels=labels, groups=groups))
+        self.state.update(
+            features,
+            self.plan.normalize,
+            **Columns(real=real, ids=ids, labels=labels, groups=groups),
+        )
 
     def compute(self) -> Score:
         """The score of all batches since the last reset.
@@ -133,9 +164,17 @@ class StreamingMetric:
             must = f"{self.name} must have seen {'generated touches' if self.of_halves else 'generated and real touches'} before compute()"
             got = f"{state.rows(real=False)} generated and {state.rows(real=True)} real"
             raise PalpateError(
-                must, got, "Call update(features)" + ("" if self.of_halves else " and update(features, real=True)") + " first"
+                must,
+                got,
+                "Call update(features)"
+                + ("" if self.of_halves else " and update(features, real=True)")
+                + " first",
             )
-        return self._from_features(state) if isinstance(state, FeatureState) else self._from_sums(state)
+        return (
+            self._from_features(state)
+            if isinstance(state, FeatureState)
+            else self._from_sums(state)
+        )
 
     def reset(self) -> None:
         """Forgets all batches; with ``reset_real_features=False`` those of generated touches only."""
@@ -145,13 +184,27 @@ class StreamingMetric:
         """Adds what another metric of the same settings has seen, e.g. one that came back from a process as a pickle.
 
         Raises:
-            PalpateError: if class, settings, width or centre differ.
+            PalpateError: if class, settings, width or center differ.
         """
         if other is self:
-            raise PalpateError("A metric must be merged with another one", "itself", "Merge what other processes have seen")
-        if type(other) is not type(self) or other.digest != self.digest or not same_options(other.options, self.options):
-            got = f"{type(self).__name__} and {type(other).__name__}" + (" of different settings" if type(other) is type(self) else "")
-            raise PalpateError("Metrics that are merged must be of one class with the same settings", got, "Construct all alike")
+            raise PalpateError(
+                "A metric must be merged with another one",
+                "itself",
+                "Merge what other processes have seen",
+            )
+        if (
+            type(other) is not type(self)
+            or other.digest != self.digest
+            or not same_options(other.options, self.options)
+        ):
+            got = f"{type(self).__name__} and {type(other).__name__}" + (
+                " of different settings" if type(other) is type(self) else ""
+            )
+            raise PalpateError(
+                "Metrics that are merged must be of one class with the same settings",
+                got,
+                "Construct all alike",
+            )
         self.state = cast(Any, self.state).merge(other.state)
 
     def merge(self, *others: Self) -> Self:
@@ -176,32 +229,62 @@ class StreamingMetric:
         return score
 
     def _function(self, generated: FeatureSet, real: FeatureSet | None) -> Score:
-        plan, grouped = plan_for(self.options, grouped=generated.groups is not None), generated.groups is not None
-        one = self._of(build_table(generated, None, plan, grouped=grouped, median_of=real), generated, plan)
+        plan, grouped = (
+            plan_for(self.options, grouped=generated.groups is not None),
+            generated.groups is not None,
+        )
+        one = self._of(
+            build_table(generated, None, plan, grouped=grouped, median_of=real), generated, plan
+        )
         if real is None:
             return one.score
         if (real.groups is None) == grouped:
             must = "The floor must be scored like the generated touches"
             raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
-        return with_floor(one, self._of(build_table(real, None, plan, grouped=grouped, median_of=real), real, plan)).score
+        return with_floor(
+            one,
+            self._of(build_table(real, None, plan, grouped=grouped, median_of=real), real, plan),
+        ).score
 
     def _from_sums(self, state: SumState) -> Score:
         one, by = self._one_set(state, real=False), state.checked_hash(state.hashed)
         score = one.score
-        note = score.note if score.value is None else ". ".join(filter(None, [SUMS_NOTE, HALVES_NOTE[by]]))
-        one = replace(one, score=replace(score, note=note, settings={**score.settings, "halves": f"hashed by {by}"}))
+        note = (
+            score.note
+            if score.value is None
+            else ". ".join(filter(None, [SUMS_NOTE, HALVES_NOTE[by]]))
+        )
+        one = replace(
+            one,
+            score=replace(
+                score, note=note, settings={**score.settings, "halves": f"hashed by {by}"}
+            ),
+        )
         if state.rows(real=True):
-            why = "" if state.same_groups else "other groups, or of other numbers of samples a group,"
+            why = (
+                "" if state.same_groups else "other groups, or of other numbers of samples a group,"
+            )
             one = with_floor(one, self._one_set(state, real=True), why)
         score = one.score
         if self.plan.estimator != "biased":
             return score
-        return replace(score, null=None, details={k: v for k, v in score.details.items() if k != "z"})  # its centre is that of equal halves
+        return replace(
+            score, null=None, details={k: v for k, v in score.details.items() if k != "z"}
+        )  # its center is that of equal halves
 
     def _one_set(self, state: SumState, *, real: bool) -> Scored:
         table, small, sizes = state.table(real=real)
-        one = self._of(table, sized(state.rows(real=real), labelled=self.by_class, encoder=self.encoder), self.plan)
-        return replace(one, score=without_units(one.score, {"halves": dict(zip(table.classes, sizes, strict=True))}, small))
+        one = self._of(
+            table,
+            sized(state.rows(real=real), labeled=self.by_class, encoder=self.encoder),
+            self.plan,
+        )
+        return replace(
+            one,
+            score=without_units(
+                one.score, {"halves": dict(zip(table.classes, sizes, strict=True))}, small
+            ),
+        )
 
 
 class TMMD(StreamingMetric):
@@ -216,8 +299,12 @@ class TMMD(StreamingMetric):
 
     def _from_sums(self, state: SumState) -> Score:
         table, _, _ = state.table()
-        generated, real = (sized(state.rows(real=real), encoder=self.encoder) for real in (False, True))
-        score = without_units(tmmd_of(table, generated, real, self.plan).score, {"copies": None}, [])
+        generated, real = (
+            sized(state.rows(real=real), encoder=self.encoder) for real in (False, True)
+        )
+        score = without_units(
+            tmmd_of(table, generated, real, self.plan).score, {"copies": None}, []
+        )
         return replace(score, note=SUMS_NOTE if score.value is not None else score.note)
 
 
@@ -261,12 +348,20 @@ def plan_of_sums(options: Options, *, halves: bool) -> Plan:
     """
     fix = 'Use keep="features", or preset="paper" or "cmmd" and one number as sigma'
     if "grouped" in (options.get("preset"), options.get("estimator")):
-        raise PalpateError('keep="sums" cannot leave out pairs of one group', "the grouped estimator", fix)
+        raise PalpateError(
+            'keep="sums" cannot leave out pairs of one group', "the grouped estimator", fix
+        )
     sigma = options.get("sigma", 10.0)
     if (kernel := options.get("kernel")) is not None:
-        raise PalpateError('keep="sums" has the Gaussian kernel', f"kernel={kernel!r}", 'Pass sigma, or keep="features"')
+        raise PalpateError(
+            'keep="sums" has the Gaussian kernel',
+            f"kernel={kernel!r}",
+            'Pass sigma, or keep="features"',
+        )
     if isinstance(sigma, str) or np.ndim(sigma) > 0:
-        raise PalpateError('keep="sums" must know its one bandwidth beforehand', f"sigma={sigma!r}", fix)
+        raise PalpateError(
+            'keep="sums" must know its one bandwidth beforehand', f"sigma={sigma!r}", fix
+        )
     bare: Options = {**options, "permutations": 0, "backend": "moments"}
     plan = plan_for(bare, grouped=False)
     if halves and plan.halves != "random":
@@ -276,7 +371,9 @@ def plan_of_sums(options: Options, *, halves: bool) -> Plan:
 
 def same_options(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether two metrics were given the same; bandwidths may stand in an array."""
-    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) if k == "sigma" else a[k] == b[k] for k in a)
+    return a.keys() == b.keys() and all(
+        np.array_equal(a[k], b[k]) if k == "sigma" else a[k] == b[k] for k in a
+    )
 
 
 def checked_classes(classes: Sequence[str] | None) -> tuple[str, ...]:
@@ -287,33 +384,52 @@ def checked_classes(classes: Sequence[str] | None) -> tuple[str, ...]:
     """
     names = tuple(str(c) for c in classes or ())
     if not names or len(set(names)) < len(names) or "" in names:
-        raise PalpateError('keep="sums" must know the classes', f"{list(names)}", "Pass classes=, each name once")
+        raise PalpateError(
+            'keep="sums" must know the classes', f"{list(names)}", "Pass classes=, each name once"
+        )
     return names
 
 
-def checked_centre(centre: Any) -> np.ndarray:
+def checked_center(center: Any) -> np.ndarray:
     """(d,) float64.
 
     Raises:
         PalpateError: if it is no finite vector.
     """
-    found = np.asarray(to_host(centre), dtype=np.float64)
+    found = np.asarray(to_host(center), dtype=np.float64)
     if found.ndim != 1 or not found.size or not np.isfinite(found).all():
-        raise PalpateError("centre must be a finite vector (d,)", f"shape {found.shape}", "Pass e.g. the mean of the real embeddings")
+        raise PalpateError(
+            "center must be a finite vector (d,)",
+            f"shape {found.shape}",
+            "Pass e.g. the mean of the real embeddings",
+        )
     return found
 
 
 def without_units(score: Score, details: Mapping[str, Any], small: Sequence[str]) -> Score:
     """A score of sums: without what leaves out units, and with the true reason why classes are excluded."""
-    found: dict[str, Any] = {k: v for k, v in score.details.items() if k != "left_out"} | {"unit": None, "units": None, **details}
+    found: dict[str, Any] = {k: v for k, v in score.details.items() if k != "left_out"} | {
+        "unit": None,
+        "units": None,
+        **details,
+    }
     for name, value in found.items():
         if name.endswith("_interval"):
             found[name] = None
         elif isinstance(value, dict) and "interval" in value:
             found[name] = {**value, "interval": None}
-    note = UNBOUNDED.replace('backend="blocked"', 'keep="features"') if score.note == UNBOUNDED else score.note
+    note = (
+        UNBOUNDED.replace('backend="blocked"', 'keep="features"')
+        if score.note == UNBOUNDED
+        else score.note
+    )
     if "excluded" in found:
-        found["excluded"] = {**found["excluded"], **dict.fromkeys(small, "fewer than two samples in a half")}
+        found["excluded"] = {
+            **found["excluded"],
+            **dict.fromkeys(small, "fewer than two samples in a half"),
+        }
     if "per_class" in found:
-        found["per_class"] = {name: {**of, "units": None} for name, of in found["per_class"].items()}
+        found["per_class"] = {
+            name: {**of, "units": None} for name, of in found["per_class"].items()
+        }
     return replace(score, interval=None, interval_method="", details=found, note=note)

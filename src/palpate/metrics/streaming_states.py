@@ -25,7 +25,7 @@ from palpate.core.score import is_missing
 from palpate.metrics.arrays import is_foreign
 from palpate.metrics.checks import Normalize, checked_features, checked_names
 from palpate.metrics.kernels import Array, Gaussian, Index
-from palpate.metrics.moments import Moments, centre_of
+from palpate.metrics.moments import Moments, center_of
 from palpate.metrics.tables import Table
 
 HEAD = 8
@@ -56,7 +56,9 @@ class Batch:
 
     def given(self) -> tuple[str, ...]:
         """Which of ids, labels and groups there are."""
-        return tuple(name for name in ("ids", "labels", "groups") if getattr(self, name) is not None)
+        return tuple(
+            name for name in ("ids", "labels", "groups") if getattr(self, name) is not None
+        )
 
     def to_bytes(self) -> NDArray[np.uint8]:
         """The record, see the module."""
@@ -64,7 +66,13 @@ class Batch:
         rows = np.ascontiguousarray(self.features, dtype=self.features.dtype.newbyteorder("<"))
         filled = 8 * HEAD + rows.nbytes + len(names)
         out = np.zeros(-(-filled // 8) * 8, dtype=np.uint8)
-        out[: 8 * HEAD].view("<i8")[:6] = out.size, *rows.shape, rows.itemsize, self.real, len(names)
+        out[: 8 * HEAD].view("<i8")[:6] = (
+            out.size,
+            *rows.shape,
+            rows.itemsize,
+            self.real,
+            len(names),
+        )
         out[8 * HEAD : 8 * HEAD + rows.nbytes] = rows.reshape(-1).view(np.uint8)
         out[8 * HEAD + rows.nbytes : filled] = np.frombuffer(names, dtype=np.uint8)
         return out
@@ -94,7 +102,10 @@ def names_of(name: str, values: Any, n: int, *, gaps: bool = False) -> list[str]
     if values is None:
         return None
     plain = values.tolist() if hasattr(values, "tolist") else list(values)
-    plain = [v.item() if hasattr(v, "item") else v for v in (plain if isinstance(plain, list) else [plain])]
+    plain = [
+        v.item() if hasattr(v, "item") else v
+        for v in (plain if isinstance(plain, list) else [plain])
+    ]
     if not gaps or len(plain) != n:
         return checked_names(name, plain, n)
     return ["" if is_missing(v) else str(v) for v in plain]
@@ -119,7 +130,13 @@ def batch_of(features: Any, normalize: Normalize, **columns: Unpack[Columns]) ->
         checked_features(set_name(real), x, normalize=normalize, least=0)
     n = len(x)
     ids, groups = (names_of(name, columns.get(name), n) for name in ("ids", "groups"))
-    return Batch(np.array(x, order="C"), real, ids, names_of("labels", columns.get("labels"), n, gaps=True), groups)
+    return Batch(
+        np.array(x, order="C"),
+        real,
+        ids,
+        names_of("labels", columns.get("labels"), n, gaps=True),
+        groups,
+    )
 
 
 def alike(a: Batch, b: Batch) -> None:
@@ -130,10 +147,18 @@ def alike(a: Batch, b: Batch) -> None:
     """
     if a.features.shape[1] != b.features.shape[1]:
         got = f"{a.features.shape[1]} and {b.features.shape[1]}"
-        raise PalpateError("The features of all updates must have the same width", got, "Embed all with the same encoder")
+        raise PalpateError(
+            "The features of all updates must have the same width",
+            got,
+            "Embed all with the same encoder",
+        )
     if a.real == b.real and len(a.features) and len(b.features) and a.given() != b.given():
         got = " and ".join(", ".join(batch.given()) or "none" for batch in (a, b))
-        raise PalpateError("All updates of one set must give the same of ids, labels and groups", got, "Give each always, or never")
+        raise PalpateError(
+            "All updates of one set must give the same of ids, labels and groups",
+            got,
+            "Give each always, or never",
+        )
 
 
 @dataclass
@@ -151,7 +176,10 @@ class FeatureState:
 
     def check(self, batch: Batch) -> None:
         """Refuses a batch that does not fit the last one, or the last one of its set."""
-        for last in (next(reversed(self.batches), None), next((b for b in reversed(self.batches) if b.real == batch.real), None)):
+        for last in (
+            next(reversed(self.batches), None),
+            next((b for b in reversed(self.batches) if b.real == batch.real), None),
+        ):
             if last is not None:
                 alike(last, batch)
 
@@ -177,10 +205,18 @@ class FeatureState:
         if not batches:
             return None, 0
         features = np.concatenate([b.features for b in batches])
-        column = lambda name: [v for b in batches for v in getattr(b, name)] if name in batches[0].given() else None  # noqa: E731
+        column = lambda name: (
+            [v for b in batches for v in getattr(b, name)] if name in batches[0].given() else None
+        )
         ids = column("ids")
         repeated = 0 if ids is None else len(ids) - len(set(ids))
-        return FeatureSet(row_ids(features) if ids is None else ids, features, column("labels"), column("groups"), encoder), repeated
+        return FeatureSet(
+            row_ids(features) if ids is None else ids,
+            features,
+            column("labels"),
+            column("groups"),
+            encoder,
+        ), repeated
 
 
 def row_ids(features: NDArray[Any]) -> list[str]:
@@ -232,26 +268,41 @@ class Layout:
         if not self.halves:
             return np.full(n, int(real), dtype=np.intp), np.zeros(4)
         if real and self.sets == 1:
-            raise PalpateError('A metric with keep="sums" must be told of real touches', "real=True", "Pass floor=True to the constructor")
+            raise PalpateError(
+                'A metric with keep="sums" must be told of real touches',
+                "real=True",
+                "Pass floor=True to the constructor",
+            )
         label = np.zeros(n, dtype=np.intp)
         if self.classes != ("",):
-            names = checked_names("labels", names_of("labels", columns.get("labels"), n), n) or ([""] * n)
+            names = checked_names("labels", names_of("labels", columns.get("labels"), n), n) or (
+                [""] * n
+            )
             number = {name: c for c, name in enumerate(self.classes)}
             if strange := sorted(set(names) - set(number)):
                 got = ", ".join(repr(s) for s in strange[:5]) if strange != [""] else "no labels"
                 raise PalpateError(
-                    f"labels must be among the {len(number)} classes", got, "Pass all of them as classes=, and a label a row"
+                    f"labels must be among the {len(number)} classes",
+                    got,
+                    "Pass all of them as classes=, and a label a row",
                 )
             label = np.array([number[name] for name in names], dtype=np.intp)
         ids, groups = (names_of(name, columns.get(name), n) for name in ("ids", "groups"))
         keys = groups if groups is not None else ids
         if keys is None:
-            raise PalpateError('keep="sums" must know the id or the group of every sample', "neither", "Pass ids=, or groups= (videos)")
+            raise PalpateError(
+                'keep="sums" must know the id or the group of every sample',
+                "neither",
+                "Pass ids=, or groups= (videos)",
+            )
         half = {key: seed_for(self.seed, "half", key) & 1 for key in set(keys)}
         side = np.array([half[key] for key in keys], dtype=np.intp)
         mark = {key: seed_for(0, "mark", key) % MARKS for key in half} if groups is not None else {}
         marks = float(sum(mark[key] for key in keys)) if mark else 0.0
-        grows = np.array([n * (groups is not None), n * (groups is None), marks * (not real), marks * real], dtype=np.float64)
+        grows = np.array(
+            [n * (groups is not None), n * (groups is None), marks * (not real), marks * real],
+            dtype=np.float64,
+        )
         return self.part(real).start + 2 * label + side, grows
 
 
@@ -261,34 +312,40 @@ class SumState:
 
     Attributes:
         layout: what the items are.
-        centre: (d,) subtracted from every row; None: the mean of the first batch, from then on.
-        moments: the sums; None before the first row where the centre is not given.
+        center: (d,) subtracted from every row; None: the mean of the first batch, from then on.
+        moments: the sums; None before the first row where the center is not given.
         hashed: (4,) rows dealt to halves by their group, and by their id; and of each set the sum over rows of a number made of the group, which
             is equal for the same groups with as many rows each. It is added up as all sums are, and exact for half a billion rows.
     """
 
     layout: Layout
-    centre: Array | None = None
+    center: Array | None = None
     moments: Moments | None = None
     hashed: Array = field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
-        if self.moments is None and self.centre is not None:
-            self.moments = Moments.empty(self.centre, self.layout.sigma, self.layout.count)
+        if self.moments is None and self.center is not None:
+            self.moments = Moments.empty(self.center, self.layout.sigma, self.layout.count)
 
     def update(self, features: Any, normalize: Normalize, **columns: Unpack[Columns]) -> None:
         """Adds rows; none is kept."""
-        x = checked_features(set_name(bool(columns.get("real", False))), features, normalize=normalize, least=0)
-        if self.moments is not None and x.shape[1] != len(self.moments.centre):
-            got = f"{len(self.moments.centre)} and {x.shape[1]}"
-            raise PalpateError("The features of all updates must have the same width", got, "Embed all with the same encoder")
+        x = checked_features(
+            set_name(bool(columns.get("real", False))), features, normalize=normalize, least=0
+        )
+        if self.moments is not None and x.shape[1] != len(self.moments.center):
+            got = f"{len(self.moments.center)} and {x.shape[1]}"
+            raise PalpateError(
+                "The features of all updates must have the same width",
+                got,
+                "Embed all with the same encoder",
+            )
         if not len(x):
             return
         item, grows = self.layout.items(len(x), **columns)
         hashed = self.hashed + grows
         self.checked_hash(hashed)
         if self.moments is None:
-            self.moments = Moments.empty(centre_of([x]), self.layout.sigma, self.layout.count)
+            self.moments = Moments.empty(center_of([x]), self.layout.sigma, self.layout.count)
         self.moments.add(x, item)
         self.hashed[...] = hashed
 
@@ -301,7 +358,11 @@ class SumState:
         """
         if (hashed[:2] > 0).all():
             got = f"{hashed[0]:.0f} rows by group and {hashed[1]:.0f} by id"
-            raise PalpateError("Halves must be dealt by group always, or by id always", got, "Give groups with every update, or with none")
+            raise PalpateError(
+                "Halves must be dealt by group always, or by id always",
+                got,
+                "Give groups with every update, or with none",
+            )
         return "group" if hashed[0] else "sample" if hashed[1] else ""
 
     def reset(self, *, keep_real: bool) -> None:
@@ -321,7 +382,9 @@ class SumState:
         found = [s.moments for s in (self, other) if s.moments is not None]
         hashed = self.hashed + other.hashed
         self.checked_hash(hashed)
-        return SumState(self.layout, self.centre, found[0].merge(found[1:]) if found else None, hashed)
+        return SumState(
+            self.layout, self.center, found[0].merge(found[1:]) if found else None, hashed
+        )
 
     @property
     def same_groups(self) -> bool:
@@ -340,7 +403,11 @@ class SumState:
             the sizes of the halves of each class.
         """
         classes = self.layout.classes
-        moments = self.moments if self.moments is not None else Moments.empty(np.zeros(1), self.layout.sigma, self.layout.count)
+        moments = (
+            self.moments
+            if self.moments is not None
+            else Moments.empty(np.zeros(1), self.layout.sigma, self.layout.count)
+        )
         last = 4 * len(classes)
         if self.layout.halves:
             own = self.layout.part(real)
@@ -350,19 +417,27 @@ class SumState:
             segment = np.array([0, last])
         sums = moments.sums(segment, np.zeros(len(segment), dtype=np.intp), last + 1)
         sizes = moments.n.reshape(-1, 2)
-        small = np.flatnonzero(sizes.min(axis=1) < 2) if classes != ("",) else np.zeros(0, dtype=np.intp)
+        small = (
+            np.flatnonzero(sizes.min(axis=1) < 2)
+            if classes != ("",)
+            else np.zeros(0, dtype=np.intp)
+        )
         if len(small):
             to = np.arange(last + 1)
             to[:-1].reshape(-1, 4)[small] = -1
             sums = sums.merge(to, last + 1)
-        pairs: Iterable[Index] = np.arange(len(segment)).reshape(-1, 2) if self.layout.halves else []
+        pairs: Iterable[Index] = (
+            np.arange(len(segment)).reshape(-1, 2) if self.layout.halves else []
+        )
         spread = np.array([moments.spread(at) for at in [np.arange(len(segment)), *pairs]])
         halves = np.concatenate([sizes.sum(axis=0)[None], sizes]) if self.layout.halves else None
-        table = Table(sums, classes, "sample", ["all"], Gaussian((self.layout.sigma,)), spread, sizes=halves)
+        table = Table(
+            sums, classes, "sample", ["all"], Gaussian((self.layout.sigma,)), spread, sizes=halves
+        )
         return table, [classes[c] for c in small], sizes.astype(int).tolist()
 
 
-def sized(n: int, *, labelled: bool = False, encoder: str | None = None) -> FeatureSet:
+def sized(n: int, *, labeled: bool = False, encoder: str | None = None) -> FeatureSet:
     """A set that only has a size: what a score asks of features that were never kept."""
     blank = [""] * n
-    return FeatureSet(blank, np.zeros((n, 0)), blank if labelled else None, None, encoder)
+    return FeatureSet(blank, np.zeros((n, 0)), blank if labeled else None, None, encoder)

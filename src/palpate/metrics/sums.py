@@ -41,7 +41,9 @@ class Totals:
     def merge(self, to: Index, segments: int) -> Totals:
         """Segments joined: segment s becomes ``to[s]``; -1 drops it."""
         m = one_hot(to, segments)
-        return Totals(self.n @ m, m.T @ self.sums @ m, m.T @ self.same @ m, m.T @ self.pairs @ m, self.own @ m)
+        return Totals(
+            self.n @ m, m.T @ self.sums @ m, m.T @ self.same @ m, m.T @ self.pairs @ m, self.own @ m
+        )
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,16 @@ class PairSums:
     bound: PairSums | None = field(default=None, repr=False)
 
     @classmethod
-    def from_block(cls, block: Array, n: Array, own: Array, segment: Index, unit: Index, segments: int, **rest: Any) -> PairSums:
+    def from_block(
+        cls,
+        block: Array,
+        n: Array,
+        own: Array,
+        segment: Index,
+        unit: Index,
+        segments: int,
+        **rest: Any,
+    ) -> PairSums:
         """From sums of items with items."""
         m = one_hot(segment, segments)
         same = np.where(unit[:, None] == unit[None], block, 0.0)
@@ -91,10 +102,16 @@ class PairSums:
         """Segments joined: segment s becomes ``to[s]``; -1 drops it and its items."""
         m, keep = one_hot(to, segments), to[self.segment] >= 0
         return PairSums(
-            self.n[keep], self.rows[keep] @ m, self.same[keep] @ m, self.own[keep], to[self.segment][keep], self.unit[keep],
-            None if self.block is None else self.block[np.ix_(keep, keep)], self.backend,
+            self.n[keep],
+            self.rows[keep] @ m,
+            self.same[keep] @ m,
+            self.own[keep],
+            to[self.segment][keep],
+            self.unit[keep],
+            None if self.block is None else self.block[np.ix_(keep, keep)],
+            self.backend,
             None if self.bound is None else self.bound.merge(to, segments),
-        )  # fmt: skip
+        )
 
     def _part(self, at: Index | slice) -> tuple[Array, Array, Array, Array]:
         """(n, sums, same, own) of some items against all segments, by segment of the item."""
@@ -115,7 +132,11 @@ class PairSums:
         """Sums over all items."""
         n, sums, same, own = self._part(slice(None))
         units, number = np.unique(self.unit, return_inverse=True)
-        count = np.bincount(number * self.segments + self.segment, weights=self.n, minlength=len(units) * self.segments)
+        count = np.bincount(
+            number * self.segments + self.segment,
+            weights=self.n,
+            minlength=len(units) * self.segments,
+        )
         count = count.reshape(len(units), self.segments).astype(np.float64)
         return Totals(n, sums, same, count.T @ count, own)
 
@@ -125,7 +146,9 @@ class PairSums:
         for at in self._by_unit:
             n, against_all, inside, own = self._part(at)
             sums = full.sums - against_all - against_all.T + inside
-            yield Totals(full.n - n, sums, full.same - inside, full.pairs - np.outer(n, n), full.own - own)
+            yield Totals(
+                full.n - n, sums, full.same - inside, full.pairs - np.outer(n, n), full.own - own
+            )
 
 
 def split_by(key: Index) -> list[Index]:

@@ -34,7 +34,7 @@ class Table:
         unit: what the jackknife leaves out: ``"group"``, ``"sample"`` or ``"random-block"``.
         names: the name of each unit number.
         kernel: what was summed.
-        spread: (1 + C, 3) centred squares (:mod:`palpate.metrics.blocked`) of the generated set and of each class.
+        spread: (1 + C, 3) centered squares (:mod:`palpate.metrics.blocked`) of the generated set and of each class.
         copies: generated rows that are bit for bit rows of the reference; None where they were not looked for.
         sizes: (1 + C, 2) sizes of the halves of the set and of each class, where they are not as equal as they can be.
     """
@@ -70,7 +70,9 @@ class Table:
 
     def whole_classes(self) -> PairSums:
         """Segment c: class number c, whole."""
-        return self.sums.merge(np.append(np.repeat(np.arange(len(self.classes)), 4), -1), len(self.classes))
+        return self.sums.merge(
+            np.append(np.repeat(np.arange(len(self.classes)), 4), -1), len(self.classes)
+        )
 
 
 def build_table(
@@ -87,7 +89,7 @@ def build_table(
     Args:
         generated: the set that is halved and divided into classes.
         reference: real touches, or None where no metric needs them.
-        plan: halves, seed, bandwidth, back end, normalisation.
+        plan: halves, seed, bandwidth, back end, normalization.
         grouped: whether the groups of the sets are the jackknife's units; else samples are.
         further: the bound of a statistic without scale, which moments must keep within the tolerance as well: D-TMMD is a ratio.
         median_of: the set whose median distance ``sigma="median"`` takes; else the reference, or the generated set without one.
@@ -95,14 +97,26 @@ def build_table(
     Raises:
         PalpateError: on features or groups that are refused.
     """
-    own = "The generated features" if plan.subject == "generated" else f"The features of {plan.subject!r}"
+    own = (
+        "The generated features"
+        if plan.subject == "generated"
+        else f"The features of {plan.subject!r}"
+    )
     copies: int | None = 0
     if reference is None:
         parts = [checked_features(own, generated.features, normalize=plan.normalize)]
         sets = [generated]
     else:
         names = (own, "The reference features")
-        parts = list(checked_pair(generated.features, reference.features, normalize=plan.normalize, least=1, names=names))
+        parts = list(
+            checked_pair(
+                generated.features,
+                reference.features,
+                normalize=plan.normalize,
+                least=1,
+                names=names,
+            )
+        )
         sets, copies = [generated, reference], copies_across(*parts)
     if grouped:
         groups = [checked_names("groups", s.groups, len(s.ids)) or [] for s in sets]
@@ -110,30 +124,53 @@ def build_table(
         names = sorted({name for column in groups for name in column})
     else:
         units, unit, names = sample_units([str(i) for s in sets for i in s.ids], plan.seed)
-    labels = ["" if is_missing(v) else str(v) for v in (generated.labels if generated.labels is not None else [None] * len(generated.ids))]
+    labels = [
+        "" if is_missing(v) else str(v)
+        for v in (generated.labels if generated.labels is not None else [None] * len(generated.ids))
+    ]
     classes = sorted(set(labels))
     number = {name: k for k, name in enumerate(classes)}
     label = np.array([number[v] for v in labels], dtype=np.intp)
     ids = [str(i) for i in generated.ids]
     halves = 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
-    segment = np.concatenate([halves, np.full(len(units) - len(halves), 4 * len(classes), dtype=np.intp)])
+    segment = np.concatenate(
+        [halves, np.full(len(units) - len(halves), 4 * len(classes), dtype=np.intp)]
+    )
     if plan.kernel is not None:
         kernel = plan.kernel
     elif median_of is None or not isinstance(plan.sigma, str):
         kernel = gaussian(plan.sigma, parts[-1], sets[-1].groups)
     else:
-        rows = checked_features("The features that the median distance is taken over", median_of.features, normalize=plan.normalize)
+        rows = checked_features(
+            "The features that the median distance is taken over",
+            median_of.features,
+            normalize=plan.normalize,
+        )
         kernel = gaussian(plan.sigma, rows, median_of.groups)
 
     def bound(sums: PairSums) -> float:
         table = Table(sums, classes, unit, names, kernel, np.zeros((0, 3)))
-        return max(_bound(table, plan), further(table, plan) * plan.scale / 1000 if further is not None else 0.0)
+        return max(
+            _bound(table, plan),
+            further(table, plan) * plan.scale / 1000 if further is not None else 0.0,
+        )
 
-    rest = [np.arange(4 * len(classes)), *(np.arange(4 * c, 4 * c + 4) for c in range(len(classes)))]
+    rest = [
+        np.arange(4 * len(classes)),
+        *(np.arange(4 * c, 4 * c + 4) for c in range(len(classes))),
+    ]
     found = kernel_sums(
-        parts, segment, units, segments=4 * len(classes) + 1, kernel=kernel, backend=plan.backend, tolerance=plan.tolerance * plan.scale / 1000,
-        bound=bound, block=plan.block, spread=rest,
-    )  # fmt: skip
+        parts,
+        segment,
+        units,
+        segments=4 * len(classes) + 1,
+        kernel=kernel,
+        backend=plan.backend,
+        tolerance=plan.tolerance * plan.scale / 1000,
+        bound=bound,
+        block=plan.block,
+        spread=rest,
+    )
     return Table(found.sums, classes, unit, names, kernel, found.spread, copies)
 
 
@@ -149,7 +186,11 @@ def _bound(table: Table, plan: Plan) -> float:
     known = np.isfinite(self_distances(whole.totals, plan)[0])
     halves = halves_bound(own.totals, plan)[known] if own is not None else np.zeros(1)
     halves = np.where(np.isfinite(halves), halves, np.inf)
-    return max(joint, largest_bound(table.whole_classes(), plan.estimator, plan.scale), float(halves.max(initial=0.0)))
+    return max(
+        joint,
+        largest_bound(table.whole_classes(), plan.estimator, plan.scale),
+        float(halves.max(initial=0.0)),
+    )
 
 
 @dataclass(frozen=True)
@@ -182,7 +223,14 @@ def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) ->
     df = sums.units - 1
     tail = "" if unit == "group" else ", samples taken as independent"
     method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
-    return Estimate(statistic(sums.totals), jackknife_errors(replicates), df, method, replicates, sums.unit_order)
+    return Estimate(
+        statistic(sums.totals),
+        jackknife_errors(replicates),
+        df,
+        method,
+        replicates,
+        sums.unit_order,
+    )
 
 
 def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
@@ -195,10 +243,19 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     if classes < 3:
         return over_units
     rest = np.arange(classes)
-    found = leave_one_out((take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:4])
+    found = leave_one_out(
+        (take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:4]
+    )
     if np.isfinite(over_units.errors[0]):
         return replace(over_units, without_class=found)
     first = jackknife_errors(found)
     errors = np.concatenate([first, np.full(len(over_units.values) - len(first), np.nan)])
     method = f"leave-one-class-out jackknife, t, {classes - 1} df (a class has too few {unit}s to leave one out)"
-    return replace(over_units, errors=errors, df=classes - 1, method=method, without_class=found, of_classes=True)
+    return replace(
+        over_units,
+        errors=errors,
+        df=classes - 1,
+        method=method,
+        without_class=found,
+        of_classes=True,
+    )

@@ -59,7 +59,9 @@ def tmmd(generated: FeatureSet, reference: FeatureSet, **options: Unpack[Options
     require_one_encoder(generated, reference, "reference")
     grouped = generated.groups is not None and reference.groups is not None
     plan = plan_for(options, grouped=grouped)
-    return tmmd_of(build_table(generated, reference, plan, grouped=grouped), generated, reference, plan).score
+    return tmmd_of(
+        build_table(generated, reference, plan, grouped=grouped), generated, reference, plan
+    ).score
 
 
 def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Plan) -> Scored:
@@ -68,7 +70,11 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
     found = estimate(sums, lambda t: mmd_matrix(t, plan.estimator, plan.scale)[:1, 1], table.unit)
     notes = []
     if not np.isfinite(found.values[0]):
-        needs = "two groups, not all shared, for the grouped estimator" if plan.estimator == "grouped" else "two samples"
+        needs = (
+            "two groups, not all shared, for the grouped estimator"
+            if plan.estimator == "grouped"
+            else "two samples"
+        )
         notes.append(f"Undefined: each set needs {needs}")
     if table.copies is None:
         notes.append("Copies of reference rows were not looked for on the device")
@@ -77,21 +83,45 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
             f"{table.copies} of {len(generated.ids)} generated rows are bit for bit rows of the reference: a copy is not a generator"
         )
     if not table.grouped:
-        notes.append("The interval takes samples as independent; frames of one video are not: give groups")
-    test = permutation_test(sums, plan.estimator, plan.scale, count=plan.permutations, seed=plan.seed)
+        notes.append(
+            "The interval takes samples as independent; frames of one video are not: give groups"
+        )
+    test = permutation_test(
+        sums, plan.estimator, plan.scale, count=plan.permutations, seed=plan.seed
+    )
     details = {
         "units": sums.units,
         "copies": table.copies,
         "p_value": test.p if test else None,
         "permutations": None
         if test is None
-        else {"count": len(test.null), "swapped": test.swapped, "dealt": test.dealt, "seed": plan.seed},
+        else {
+            "count": len(test.null),
+            "swapped": test.swapped,
+            "dealt": test.dealt,
+            "seed": plan.seed,
+        },
     }
-    null = None if test is None else (float(np.quantile(test.null, 0.025)), float(np.quantile(test.null, 0.975)))
+    null = (
+        None
+        if test is None
+        else (float(np.quantile(test.null, 0.025)), float(np.quantile(test.null, 0.975)))
+    )
     return scored(
-        "TMMD", table, generated, plan, (), found=found, bound=largest_bound(sums, plan.estimator, plan.scale), estimator=plan.estimator,
-        m=len(reference.ids), reference=reference.digest if reference.features.shape[1] else None, details=details, note=". ".join(notes), null=null,
-    )  # fmt: skip
+        "TMMD",
+        table,
+        generated,
+        plan,
+        (),
+        found=found,
+        bound=largest_bound(sums, plan.estimator, plan.scale),
+        estimator=plan.estimator,
+        m=len(reference.ids),
+        reference=reference.digest if reference.features.shape[1] else None,
+        details=details,
+        note=". ".join(notes),
+        null=null,
+    )
 
 
 def i_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
@@ -107,7 +137,9 @@ def i_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
     plan = plan_for(options, grouped=generated.groups is not None)
-    return i_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan).score
+    return i_tmmd_of(
+        build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan
+    ).score
 
 
 def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
@@ -116,25 +148,41 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     design = design_of(sums.totals, plan)
     found = estimate(sums, lambda t: np.concatenate(self_distances(t, plan, design)), table.unit)
     whole = sums.merge(np.zeros(2, dtype=np.intp), 1)
-    sizes, n = (halves_of(whole.totals.n) if table.sizes is None else table.sizes[:1]), len(generated.ids)
+    sizes, n = (
+        (halves_of(whole.totals.n) if table.sizes is None else table.sizes[:1]),
+        len(generated.ids),
+    )
     sd = float(random_halves_sd(table.spread[:1], sizes, plan.estimator, plan.scale)[0])
     dispersion = _dispersion(whole.totals, sizes, plan)[0]
-    centre = dispersion if plan.estimator == "biased" else 0.0
+    center = dispersion if plan.estimator == "biased" else 0.0
     reason = unfit(whole, 0, plan)
     details = {
         "E": found.values[1] if table.grouped else None,
         "E_interval": found.interval(1, plan.level) if table.grouped else None,
         "E_bound": _excess_bound(sums, design, plan) if table.grouped else None,
-        "z": (found.values[0] - centre) / sd if sd > 0 else None,
+        "z": (found.values[0] - center) / sd if sd > 0 else None,
         "dispersion": dispersion,
         "units": sums.units,
     }
-    note = f"Undefined: {reason} (n = {n})" if reason else halves_note(plan, sums, grouped=table.grouped)
+    note = (
+        f"Undefined: {reason} (n = {n})"
+        if reason
+        else halves_note(plan, sums, grouped=table.grouped)
+    )
     return scored(
-        "I-TMMD", table, generated, plan, ("halves",), found=None if reason else found, design=_design(design, sizes, plan),
+        "I-TMMD",
+        table,
+        generated,
+        plan,
+        ("halves",),
+        found=None if reason else found,
+        design=_design(design, sizes, plan),
         bound=_halves_bound(sums, plan)[0],
-        null=null_band(centre, sd), details=details, note=note, **halves_fields(plan),
-    )  # fmt: skip
+        null=null_band(center, sd),
+        details=details,
+        note=note,
+        **halves_fields(plan),
+    )
 
 
 def _design(design: Design, sizes: Array, plan: Plan) -> Array:
@@ -147,26 +195,39 @@ def _design(design: Design, sizes: Array, plan: Plan) -> Array:
 
 def _halves_bound(sums: PairSums, plan: Plan) -> Array:
     """(K,) bounds of the distances between halves; zeros where sums are exact."""
-    return np.zeros(sums.segments // 2) if sums.bound is None else halves_bound(sums.bound.totals, plan)
+    return (
+        np.zeros(sums.segments // 2)
+        if sums.bound is None
+        else halves_bound(sums.bound.totals, plan)
+    )
 
 
 def _excess_bound(sums: PairSums, design: Design, plan: Plan) -> float | None:
     """What the mean E may be off by: dist^2 of halves of whole groups is E times a number of the design."""
     if sums.bound is None:
         return 0.0
-    return float((_halves_bound(sums, plan) / design.own).mean()) if (design.own > 0).all() else None
+    return (
+        float((_halves_bound(sums, plan) / design.own).mean()) if (design.own > 0).all() else None
+    )
 
 
 def _dispersion(t: Totals, sizes: Array, plan: Plan) -> Array:
     """What biased dist^2 averages over random halves: (1/m + 1/m') scale (mean diagonal k - mean off-diagonal k), for each segment."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return (1 / sizes).sum(axis=1) * plan.scale * (t.own / t.n - np.diagonal(t.sums) / (t.n * (t.n - 1)))
+        return (
+            (1 / sizes).sum(axis=1)
+            * plan.scale
+            * (t.own / t.n - np.diagonal(t.sums) / (t.n * (t.n - 1)))
+        )
 
 
 def _usable(table: Table, plan: Plan) -> tuple[Index, dict[str, str]]:
     """Class numbers that can be cut into halves, and why the others cannot."""
     whole = table.whole_classes()
-    reasons = {name or "(no label)": unfit(whole, c, plan) if name else "no label" for c, name in enumerate(table.classes)}
+    reasons = {
+        name or "(no label)": unfit(whole, c, plan) if name else "no label"
+        for c, name in enumerate(table.classes)
+    }
     kept = np.array([c for c, reason in enumerate(reasons.values()) if not reason], dtype=np.intp)
     return kept, {name: reason for name, reason in reasons.items() if reason}
 
@@ -183,7 +244,9 @@ def ci_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
     plan = plan_for(options, grouped=generated.groups is not None)
-    return ci_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan).score
+    return ci_tmmd_of(
+        build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan
+    ).score
 
 
 def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
@@ -191,35 +254,62 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     kept, excluded = _usable(table, plan)
     details: dict[str, Any] = {"classes": [table.classes[c] for c in kept], "excluded": excluded}
     if not len(kept):
-        note = "Undefined: no class can be cut into halves" + ("" if generated.labels is not None else " (the samples have no labels)")
-        return scored("CI-TMMD", table, generated, plan, ("halves",), details=details, note=note, **halves_fields(plan))
+        note = "Undefined: no class can be cut into halves" + (
+            "" if generated.labels is not None else " (the samples have no labels)"
+        )
+        return scored(
+            "CI-TMMD",
+            table,
+            generated,
+            plan,
+            ("halves",),
+            details=details,
+            note=note,
+            **halves_fields(plan),
+        )
     sums = table.class_halves(kept)
     design = design_of(sums.totals, plan)
-    found = class_estimate(sums, lambda t: np.array([v.mean() for v in self_distances(t, plan, design)]), table.unit)  # Eq. 4
+    found = class_estimate(
+        sums, lambda t: np.array([v.mean() for v in self_distances(t, plan, design)]), table.unit
+    )  # Eq. 4
     each, excess = self_distances(sums.totals, plan)
     whole = sums.merge(np.repeat(np.arange(len(kept)), 2), len(kept))
     sizes = halves_of(whole.totals.n) if table.sizes is None else table.sizes[1 + kept]
     spread = random_halves_sd(table.spread[1 + kept], sizes, plan.estimator, plan.scale)
     sd = float(np.sqrt((spread**2).sum())) / len(kept)
     dispersion = float(_dispersion(whole.totals, sizes, plan).mean())
-    centre = dispersion if plan.estimator == "biased" else 0.0
+    center = dispersion if plan.estimator == "biased" else 0.0
     details |= {
         "E": found.values[1] if table.grouped else None,
         "E_interval": found.interval(1, plan.level) if table.grouped else None,
         "E_bound": _excess_bound(sums, design, plan) if table.grouped else None,
-        "z": (found.values[0] - centre) / sd if sd > 0 else None,
+        "z": (found.values[0] - center) / sd if sd > 0 else None,
         "dispersion": dispersion,
         "per_class": {
-            name: {"value": each[k], "E": excess[k] if table.grouped else None, "n": int(whole.totals.n[k]), "units": units_of(whole, k)}
+            name: {
+                "value": each[k],
+                "E": excess[k] if table.grouped else None,
+                "n": int(whole.totals.n[k]),
+                "units": units_of(whole, k),
+            }
             for k, name in enumerate(details["classes"])
         },
         "units": sums.units,
     }
     return scored(
-        "CI-TMMD", table, generated, plan, ("halves",), found=found, design=_design(design, sizes, plan),
+        "CI-TMMD",
+        table,
+        generated,
+        plan,
+        ("halves",),
+        found=found,
+        design=_design(design, sizes, plan),
         bound=float(_halves_bound(sums, plan).mean()),
-        null=null_band(centre, sd), details=details, note=halves_note(plan, sums, grouped=table.grouped), **halves_fields(plan),
-    )  # fmt: skip
+        null=null_band(center, sd),
+        details=details,
+        note=halves_note(plan, sums, grouped=table.grouped),
+        **halves_fields(plan),
+    )
 
 
 def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
@@ -237,7 +327,13 @@ def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
     plan = plan_for(options, grouped=generated.groups is not None)
-    return d_tmmd_of(build_table(generated, None, plan, grouped=generated.groups is not None, further=ratio_bound), generated, plan).score
+    return d_tmmd_of(
+        build_table(
+            generated, None, plan, grouped=generated.groups is not None, further=ratio_bound
+        ),
+        generated,
+        plan,
+    ).score
 
 
 def d_matrix(t: Totals, plan: Plan, design: Design | None = None) -> Array:
@@ -274,7 +370,9 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     if len(kept) < 2:
         note = f"Undefined: needs two classes that can be cut into halves, has {len(kept)}"
         note += "" if generated.labels is not None else " (the samples have no labels)"
-        return scored("D-TMMD", table, generated, plan, settings, details=details, note=note, **fields)
+        return scored(
+            "D-TMMD", table, generated, plan, settings, details=details, note=note, **fields
+        )
     sums = table.class_halves(kept)
 
     design = design_of(sums.totals, plan)
@@ -285,12 +383,24 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         inter = float(denominators(matrix, "mean_off_diagonal").mean())
         excess = float(self_distances(t, plan)[1].mean()) / (inter or np.nan)
         pooled = d_ratio(matrix, plan.denominator, "ratio_of_means")
-        return np.array([d_ratio(matrix, plan.denominator, plan.aggregate), excess, pooled, inter, *denominators(matrix, plan.denominator)])
+        return np.array(
+            [
+                d_ratio(matrix, plan.denominator, plan.aggregate),
+                excess,
+                pooled,
+                inter,
+                *denominators(matrix, plan.denominator),
+            ]
+        )
 
     found = class_estimate(sums, statistic, table.unit)
     matrix, below, errors = d_matrix(sums.totals, plan), found.values[4:], found.errors[4:]
     apart = found.values[3] > (2 * found.errors[3] if np.isfinite(found.errors[3]) else 0.0)
-    unstable = [name for k, name in enumerate(details["classes"]) if not below[k] > (2 * errors[k] if np.isfinite(errors[k]) else np.inf)]
+    unstable = [
+        name
+        for k, name in enumerate(details["classes"])
+        if not below[k] > (2 * errors[k] if np.isfinite(errors[k]) else np.inf)
+    ]
     details |= {
         "matrix": matrix,
         "variants": {f"{d}/{a}": d_ratio(matrix, d, a) for d in DENOMINATORS for a in AGGREGATES},
@@ -304,15 +414,36 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     }
     bound, note = _d_bound(sums, matrix, plan), ""
     if not np.isfinite(found.values[0]):
-        unknown = not bound <= 1 and largest_bound(sums, plan.estimator, plan.scale) > plan.tolerance * plan.scale / 1000
-        note = UNBOUNDED if unknown else "Undefined: the classes do not separate (a denominator is not positive)"
+        unknown = (
+            not bound <= 1
+            and largest_bound(sums, plan.estimator, plan.scale) > plan.tolerance * plan.scale / 1000
+        )
+        note = (
+            UNBOUNDED
+            if unknown
+            else "Undefined: the classes do not separate (a denominator is not positive)"
+        )
     if not note and unstable:
-        why = "within two standard errors of 0" if np.isfinite(errors).all() else "of unknown error (too few groups)"
+        why = (
+            "within two standard errors of 0"
+            if np.isfinite(errors).all()
+            else "of unknown error (too few groups)"
+        )
         note = f"Denominators {why}, so the ratio is unreliable: {', '.join(unstable)}"
     return scored(
-        "D-TMMD", table, generated, plan, settings, found=found, design=_design(design, sizes, plan), bound=bound, limit=1.0,
-        details=details, note=note, **fields,
-    )  # fmt: skip
+        "D-TMMD",
+        table,
+        generated,
+        plan,
+        settings,
+        found=found,
+        design=_design(design, sizes, plan),
+        bound=bound,
+        limit=1.0,
+        details=details,
+        note=note,
+        **fields,
+    )
 
 
 def ratio_bound(table: Table, plan: Plan) -> float:
@@ -335,7 +466,11 @@ def _d_bound(sums: PairSums, matrix: Array, plan: Plan) -> float:
     if plan.aggregate == "ratio_of_means":
         own, off, wide, low = (np.array([v.mean()]) for v in (own, off, wide, low))
     own, off = np.abs(own), np.abs(off)
-    return float(((own + wide) / (off - low) - own / off).mean()) if (off > low).all() else float("inf")
+    return (
+        float(((own + wide) / (off - low) - own / off).mean())
+        if (off > low).all()
+        else float("inf")
+    )
 
 
 def four_scores(
@@ -365,7 +500,9 @@ def four_scores(
     return [one.score for one in (first, *(map(with_floor, rest, floors) if floors else rest))]
 
 
-def floors_of(floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Options) -> list[Scored]:
+def floors_of(
+    floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Options
+) -> list[Scored]:
     """I-, CI- and D-TMMD of real touches, made like those of ``like``.
 
     Raises:
@@ -376,7 +513,14 @@ def floors_of(floor: FeatureSet, reference: FeatureSet, like: FeatureSet, option
         must = "The floor must be scored like the generated touches"
         raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
     plan = plan_for(options, grouped=floor.groups is not None)
-    table = build_table(floor, None, plan, grouped=floor.groups is not None, median_of=reference, further=ratio_bound)
+    table = build_table(
+        floor,
+        None,
+        plan,
+        grouped=floor.groups is not None,
+        median_of=reference,
+        further=ratio_bound,
+    )
     return [f(table, floor, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
 
 
@@ -386,5 +530,14 @@ def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> l
     both = own and reference.groups is not None
     plan, joint = plan_for(options, grouped=own), plan_for(options, grouped=both)
     table = build_table(generated, reference, joint, grouped=both, further=ratio_bound)
-    alone = table if own == both else build_table(generated, None, plan, grouped=own, median_of=reference, further=ratio_bound)
-    return [tmmd_of(table, generated, reference, joint), *(f(alone, generated, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of))]
+    alone = (
+        table
+        if own == both
+        else build_table(
+            generated, None, plan, grouped=own, median_of=reference, further=ratio_bound
+        )
+    )
+    return [
+        tmmd_of(table, generated, reference, joint),
+        *(f(alone, generated, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)),
+    ]

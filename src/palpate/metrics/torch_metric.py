@@ -1,4 +1,4 @@
-"""The four streaming metrics as true ``torchmetrics.Metric``: in a MetricCollection, on a LightningModule, synchronised by torchmetrics.
+"""The four streaming metrics as true ``torchmetrics.Metric``: in a MetricCollection, on a LightningModule, synchronized by torchmetrics.
 
 ``from palpate.metrics.torch_metric import TMMD, ITMMD, CITMMD, DTMMD`` takes the arguments of the class of the same name in
 :mod:`palpate.metrics.streaming`, and those of ``torchmetrics.Metric``. ``compute()`` returns the value as a tensor (NaN where it is undefined),
@@ -9,9 +9,9 @@ States, all registered with ``add_state`` and a ``dist_reduce_fx``:
 * ``keep="features"``: ``records`` ("cat"), a list of byte strings that describe themselves (:mod:`palpate.metrics.streaming_states`). Features,
   names and counts travel in one gather; processes may have seen unequal numbers of rows, or none. Metrics of one collection whose
   settings agree hold one list together (torchmetrics' compute groups): features are stored once for all four.
-* ``keep="sums"``: moments ("sum"), their radius ("max"), how halves were dealt ("sum"). ``centre`` must be given: states of fixed size need its
+* ``keep="sums"``: moments ("sum"), their radius ("max"), how halves were dealt ("sum"). ``center`` must be given: states of fixed size need its
   width, and processes that share nothing else must share it.
-* ``settings`` ("max"): digest of the settings that states depend on (mode, normalisation, encoder; for sums classes, centre, bandwidth), which
+* ``settings`` ("max"): digest of the settings that states depend on (mode, normalization, encoder; for sums classes, center, bandwidth), which
   must be the same in all processes and within a compute group. What is computed from a state is each process's own affair: construct the
   metric alike everywhere.
 
@@ -44,8 +44,14 @@ except ImportError as error:
 
 #: Arguments of ``torchmetrics.Metric``.
 THEIRS = (
-    "compute_on_cpu", "dist_sync_on_step", "process_group", "dist_sync_fn", "distributed_available_fn", "sync_on_compute", "compute_with_cache",
-)  # fmt: skip
+    "compute_on_cpu",
+    "dist_sync_on_step",
+    "process_group",
+    "dist_sync_fn",
+    "distributed_available_fn",
+    "sync_on_compute",
+    "compute_with_cache",
+)
 
 
 class TorchMetric(Metric):
@@ -69,22 +75,38 @@ class TorchMetric(Metric):
         if self.plain.layout is None:
             self.add_state("records", [], dist_reduce_fx="cat")
             return
-        if self.plain.centre is None:
-            must = f'{type(self).__name__}(keep="sums") must be given a centre'
-            raise PalpateError(must, "none", "Pass e.g. centre=the mean of the real embeddings, the same in all processes")
+        if self.plain.center is None:
+            must = f'{type(self).__name__}(keep="sums") must be given a center'
+            raise PalpateError(
+                must,
+                "none",
+                "Pass e.g. center=the mean of the real embeddings, the same in all processes",
+            )
         empty = self._plain_state()
         for name in SUMS:
-            self.add_state(name, torch.from_numpy(getattr(empty.moments, name)), dist_reduce_fx="sum")
+            self.add_state(
+                name, torch.from_numpy(getattr(empty.moments, name)), dist_reduce_fx="sum"
+            )
         self.add_state("hashed", torch.from_numpy(empty.hashed), dist_reduce_fx="sum")
         self.add_state("rho", torch.zeros((), dtype=torch.float64), dist_reduce_fx="max")
 
-    def update(self, features: Any, *, real: bool = False, ids: Any = None, labels: Any = None, groups: Any = None) -> None:
+    def update(
+        self,
+        features: Any,
+        *,
+        real: bool = False,
+        ids: Any = None,
+        labels: Any = None,
+        groups: Any = None,
+    ) -> None:
         """Adds a batch, as :meth:`palpate.metrics.streaming.StreamingMetric.update`."""
         columns: Any = {"real": real, "ids": ids, "labels": labels, "groups": groups}
         self._score = None
         if self.plain.layout is None:
             batch = batch_of(features, self.plain.plan.normalize, **columns)
-            own = next((r for r in reversed(self.records) if len(r) and is_real(r) == batch.real), None)
+            own = next(
+                (r for r in reversed(self.records) if len(r) and is_real(r) == batch.real), None
+            )
             self._read([*self.records[-1:], *([] if own is None else [own])]).check(batch)
             if len(batch.features):
                 self.records.append(torch.from_numpy(batch.to_bytes()).to(self.device))
@@ -102,7 +124,9 @@ class TorchMetric(Metric):
             seen = np.flatnonzero(state.moments.n)
             at = torch.from_numpy(seen).to(self.n.device)
             for name in SUMS:
-                getattr(self, name).index_add_(0, at, torch.from_numpy(getattr(state.moments, name)[seen]).to(self.n.device))
+                getattr(self, name).index_add_(
+                    0, at, torch.from_numpy(getattr(state.moments, name)[seen]).to(self.n.device)
+                )
             self.rho.clamp_(min=state.moments.rho)
 
     def compute(self) -> Any:
@@ -123,7 +147,12 @@ class TorchMetric(Metric):
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """Adds a batch and returns the value of the batch alone, see the class."""
-        for name, state in self.metric_state.items():  # a compute group shares its states, and each member is called
+        for (
+            name,
+            state,
+        ) in (
+            self.metric_state.items()
+        ):  # a compute group shares its states, and each member is called
             setattr(self, name, list(state) if isinstance(state, list) else state.clone())
         self.update(*args, **kwargs)
         one = self.plain.fresh()
@@ -133,7 +162,9 @@ class TorchMetric(Metric):
         features = args[0] if args else columns.pop("features")
         if not columns.get("real"):
             one.update(features, self.plain.plan.normalize, **columns)
-        self._forward_cache = self._tensor(None if self.plain.missing(one) else self.plain.score_of(one))
+        self._forward_cache = self._tensor(
+            None if self.plain.missing(one) else self.plain.score_of(one)
+        )
         return self._forward_cache
 
     def reset(self) -> None:
@@ -142,9 +173,14 @@ class TorchMetric(Metric):
         super().reset()
         self._score = None
         if isinstance(kept, FeatureState):
-            self.records.extend(torch.from_numpy(b.to_bytes()).to(self.device) for b in kept.batches)
+            self.records.extend(
+                torch.from_numpy(b.to_bytes()).to(self.device) for b in kept.batches
+            )
         elif kept is not None and kept.moments is not None:
-            for name, value in [*((name, getattr(kept.moments, name)) for name in SUMS), ("hashed", kept.hashed)]:
+            for name, value in [
+                *((name, getattr(kept.moments, name)) for name in SUMS),
+                ("hashed", kept.hashed),
+            ]:
                 getattr(self, name).copy_(torch.from_numpy(value))
             self.rho.fill_(kept.moments.rho)
 
@@ -156,12 +192,22 @@ class TorchMetric(Metric):
         """
         if isinstance(incoming_state, TorchMetric):
             if incoming_state is self:
-                raise PalpateError("A metric must be merged with another one", "itself", "Merge what other processes have seen")
-            if type(incoming_state) is not type(self) or not streaming.same_options(incoming_state.plain.options, self.plain.options):
                 raise PalpateError(
-                    "Metrics that are merged must be of one class with the same settings", "different ones", "Construct all alike"
+                    "A metric must be merged with another one",
+                    "itself",
+                    "Merge what other processes have seen",
                 )
-        states = incoming_state.metric_state if isinstance(incoming_state, Metric) else incoming_state
+            if type(incoming_state) is not type(self) or not streaming.same_options(
+                incoming_state.plain.options, self.plain.options
+            ):
+                raise PalpateError(
+                    "Metrics that are merged must be of one class with the same settings",
+                    "different ones",
+                    "Construct all alike",
+                )
+        states = (
+            incoming_state.metric_state if isinstance(incoming_state, Metric) else incoming_state
+        )
         self._same_settings(states["settings"])
         self._computed = self._score = None
         super().merge_state(incoming_state)
@@ -175,7 +221,7 @@ class TorchMetric(Metric):
         return out
 
     def sync(self, *args: Any, **kwargs: Any) -> None:
-        """The synchronisation of torchmetrics; a process without data then gathers an empty record of the right type."""
+        """The synchronization of torchmetrics; a process without data then gathers an empty record of the right type."""
         if self.plain.layout is None and isinstance(self.records, list) and not self.records:
             self.records.append(torch.zeros(0, dtype=torch.uint8, device=self.device))
         super().sync(*args, **kwargs)
@@ -190,12 +236,22 @@ class TorchMetric(Metric):
 
     def _same_settings(self, settings: Any) -> None:
         if bytes(settings.cpu().tolist()).hex() != self.plain.digest:
-            must = f"All states of a {type(self).__name__} that are merged must have the same settings"
-            raise PalpateError(must, "different classes, centre, bandwidth, encoder or mode", "Construct the metric alike in all processes")
+            must = (
+                f"All states of a {type(self).__name__} that are merged must have the same settings"
+            )
+            raise PalpateError(
+                must,
+                "different classes, center, bandwidth, encoder or mode",
+                "Construct the metric alike in all processes",
+            )
 
     def _tensor(self, score: Score | None) -> Any:
         value = float("nan") if score is None or score.value is None else score.value
-        return torch.tensor(value, dtype=torch.float32 if self.device.type == "mps" else torch.float64, device=self.device)
+        return torch.tensor(
+            value,
+            dtype=torch.float32 if self.device.type == "mps" else torch.float64,
+            device=self.device,
+        )
 
     def _plain_state(self) -> SumState:
         state = self.plain.fresh()
@@ -208,10 +264,19 @@ class TorchMetric(Metric):
 
     def _sums(self) -> SumState:
         """The sums: on the same memory where states are on the CPU, else a copy."""
-        found, layout, centre = {name: host(getattr(self, name)) for name in SUMS}, self.plain.layout, self.plain.centre
+        found, layout, center = (
+            {name: host(getattr(self, name)) for name in SUMS},
+            self.plain.layout,
+            self.plain.center,
+        )
         assert layout is not None
-        assert centre is not None
-        return SumState(layout, centre, Moments(centre, layout.sigma, **found, rho=float(self.rho)), host(self.hashed))
+        assert center is not None
+        return SumState(
+            layout,
+            center,
+            Moments(center, layout.sigma, **found, rho=float(self.rho)),
+            host(self.hashed),
+        )
 
     def _state(self) -> streaming.State:
         return self._sums() if self.plain.layout is not None else self._read(self.records)

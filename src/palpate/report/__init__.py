@@ -14,7 +14,15 @@ from palpate.report.paths import with_paths
 from palpate.report.sentences import summary_lines
 from palpate.report.text import plain
 
-__all__ = ["ReportFiles", "check_results", "render_markdown", "render_page", "summary_lines", "with_paths", "write_report"]
+__all__ = [
+    "ReportFiles",
+    "check_results",
+    "render_markdown",
+    "render_page",
+    "summary_lines",
+    "with_paths",
+    "write_report",
+]
 
 
 @dataclass(frozen=True)
@@ -29,11 +37,18 @@ class ReportFiles:
 def _moved(results: Results, base: Path, folder: Path) -> Results:
     """The results with all picture paths counted from ``folder``: they stay right when the run folder moves, and name nobody's disk."""
     start, end = base.resolve(), folder.resolve()
-    return with_paths(results, lambda name: Path(os.path.relpath(start / name, end)).as_posix())  # an absolute name replaces the base
+    return with_paths(
+        results, lambda name: Path(os.path.relpath(start / name, end)).as_posix()
+    )  # an absolute name replaces the base
 
 
 def write_report(
-    results: Results, page: Path, *, base: Path | None = None, max_bytes: int = 10_000_000, progress: Progress = quiet
+    results: Results,
+    page: Path,
+    *,
+    base: Path | None = None,
+    max_bytes: int = 10_000_000,
+    progress: Progress = quiet,
 ) -> ReportFiles:
     """Writes ``page`` (HTML) and, beside it, the same results as ``.json`` and ``.md``; each file whole or not at all.
 
@@ -54,12 +69,23 @@ def write_report(
     """
     page = Path(page)
     if page.suffix != ".html":
-        raise PalpateError("The page's file name must end in .html", f"{page.name!r}", "Name it e.g. report.html")
+        raise PalpateError(
+            "The page's file name must end in .html", f"{page.name!r}", "Name it e.g. report.html"
+        )
     here = page.parent
     results = _moved(results, base if base is not None else here, here)
     files = ReportFiles(page, page.with_suffix(".json"), page.with_suffix(".md"))
     text = render_markdown(results)
     write_json(files.json, plain(results.to_json()))
     write_text(files.markdown, text)
-    write_text(page, render_page(results, here, max_bytes=max_bytes, names=(files.json.name, files.markdown.name), progress=progress))
+    write_text(
+        page,
+        render_page(
+            results,
+            here,
+            max_bytes=max_bytes,
+            names=(files.json.name, files.markdown.name),
+            progress=progress,
+        ),
+    )
     return files

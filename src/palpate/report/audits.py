@@ -12,7 +12,17 @@ from markupsafe import Markup
 from palpate.core import MATRIX_ROWS, Audit, Impact, ImpactRow, LeakPair, Signal
 from palpate.report import plots
 from palpate.report.pictures import Picture, Wanted
-from palpate.report.sentences import HARMLESS, cause_notes, cause_texts, leak_line, line_text, meaning_of, there, threshold_text, where
+from palpate.report.sentences import (
+    HARMLESS,
+    cause_notes,
+    cause_texts,
+    leak_line,
+    line_text,
+    meaning_of,
+    there,
+    threshold_text,
+    where,
+)
 from palpate.report.text import count, number, percent, plural, score_text
 
 #: Pairs of one signal that show at once, and that the page holds at all; the JSON beside the page names every one.
@@ -45,7 +55,9 @@ class PairList:
     @property
     def drawn(self) -> bool:
         """Whether there is a place for pictures: always without a signal, else if any pair has one."""
-        return not self.kind or any((s.vision or s.tactile) for p in self.pairs for s in (p.test, p.train))
+        return not self.kind or any(
+            (s.vision or s.tactile) for p in self.pairs for s in (p.test, p.train)
+        )
 
 
 @dataclass(frozen=True)
@@ -190,7 +202,9 @@ def _middles(bins: plots.Bins) -> str:
     for name, counts in (("unrelated samples", bins.unrelated), ("test samples", bins.found)):
         if sum(counts):
             low, high = (_quantile(bins.edges, counts, share) for share in (0.25, 0.75))
-            said += f" The middle half of the {name} scores {score_text(low)} to {score_text(high)}."
+            said += (
+                f" The middle half of the {name} scores {score_text(low)} to {score_text(high)}."
+            )
     return said
 
 
@@ -221,17 +235,30 @@ def matrix_view(audit: Audit) -> MatrixView | None:
     shown: list[MatrixRow] = []
     for row in rows:
         total = sum(int(row.get(p) or 0) for p in parts) or 1
-        cells = [(count(int(row.get(p) or 0)), round(int(row.get(p) or 0) / total, 3)) for p in parts]
-        shown.append(MatrixRow(str(row.get("group") or "not given"), cells, int(row.get("leaking") or 0)))
+        cells = [
+            (count(int(row.get(p) or 0)), round(int(row.get(p) or 0) / total, 3)) for p in parts
+        ]
+        shown.append(
+            MatrixRow(str(row.get("group") or "not given"), cells, int(row.get("leaking") or 0))
+        )
     return MatrixView(parts, shown, max(0, audit.groups_in_all - len(rows)))
 
 
 def interval_percent(interval: tuple[float, float] | None) -> str:
     """``"[65.0, 77.1]"``, in per cent; '' for None."""
-    return "" if interval is None else f"[{number(100 * interval[0], 1)}, {number(100 * interval[1], 1)}]"
+    return (
+        ""
+        if interval is None
+        else f"[{number(100 * interval[0], 1)}, {number(100 * interval[1], 1)}]"
+    )
 
 
-def _cell(value: float, interval: tuple[float, float] | None, axis: plots.Axis | None, chance: float | None) -> ImpactCell:
+def _cell(
+    value: float,
+    interval: tuple[float, float] | None,
+    axis: plots.Axis | None,
+    chance: float | None,
+) -> ImpactCell:
     bar = Markup("")
     if axis is not None:
         wide = None if interval is None else (100 * interval[0], 100 * interval[1])
@@ -248,7 +275,9 @@ def impact_view(impact: Impact | None) -> ImpactView | None:
     for r in impact.rows:
         scores += [r.given, r.clean, r.chance, *(r.given_interval or ()), *(r.clean_interval or ())]
         costs += [r.cost, *(r.cost_interval or ())]
-    score_axis, cost_axis = (plots.axis_over([100 * v for v in values]) for values in (scores, costs))
+    score_axis, cost_axis = (
+        plots.axis_over([100 * v for v in values]) for values in (scores, costs)
+    )
     rows = [
         (
             r,
@@ -259,7 +288,10 @@ def impact_view(impact: Impact | None) -> ImpactView | None:
         )
         for r in impact.rows
     ]
-    axes = [plots.axis_row(a) if a is not None else Markup("") for a in (score_axis, score_axis, cost_axis)]
+    axes = [
+        plots.axis_row(a) if a is not None else Markup("")
+        for a in (score_axis, score_axis, cost_axis)
+    ]
     return ImpactView(impact, rows, axes)
 
 
@@ -272,7 +304,14 @@ def audit_view(audit: Audit, pairs: Sequence[Sequence[PairRow]]) -> AuditView:
     """
     by_any = audit.leaking_samples / audit.test_samples if audit.test_samples else 0.0
     views = [
-        PairView(found.kind, found.title, found.drawn, rows[:OPEN_PAIRS], rows[OPEN_PAIRS:], len(found.pairs))
+        PairView(
+            found.kind,
+            found.title,
+            found.drawn,
+            rows[:OPEN_PAIRS],
+            rows[OPEN_PAIRS:],
+            len(found.pairs),
+        )
         for found, rows in zip(pair_lists(audit), pairs, strict=True)
     ]
     return AuditView(
@@ -295,7 +334,11 @@ def pair_facts(pair: LeakPair, kind: str) -> list[str]:
     facts: list[str] = []
     if pair.gap is not None:
         facts.append(f"{count(pair.gap)} {'frame' if pair.gap == 1 else 'frames'} apart")
-    elif kind and None not in (pair.test.video, pair.train.video) and pair.test.video != pair.train.video:
+    elif (
+        kind
+        and None not in (pair.test.video, pair.train.video)
+        and pair.test.video != pair.train.video
+    ):
         facts.append("another video")
     else:
         facts.append("gap unknown")
@@ -309,6 +352,11 @@ def signal_row(view: SignalView) -> Mapping[str, Any]:
     """A signal as one row of text for the Markdown table."""
     s = view.signal
     return {
-        "signal": s.kind, "looked at": count(s.checked), "flagged": count(s.flagged), "share": view.share, "threshold": view.threshold,
-        "false positives": view.false_positives, "alike because of": "; ".join(view.causes) or "–",
-    }  # fmt: skip
+        "signal": s.kind,
+        "looked at": count(s.checked),
+        "flagged": count(s.flagged),
+        "share": view.share,
+        "threshold": view.threshold,
+        "false positives": view.false_positives,
+        "alike because of": "; ".join(view.causes) or "–",
+    }

@@ -10,7 +10,13 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from palpate.core import Results
 
-_WORDS: Mapping[Any, str] = {str: "text", int: "a whole number", float: "a number", bool: "true or false", type(None): "null"}
+_WORDS: Mapping[Any, str] = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    type(None): "null",
+}
 
 
 @cache
@@ -26,7 +32,10 @@ def _wrong(value: Any, hint: Any, place: str) -> str:
         if not isinstance(value, hint):
             return f"{place} must be an object, is {value!r:.40}"
         hints = _hints(hint)
-        found = (_wrong(getattr(value, f.name), hints[f.name], f"{place}.{f.name}") for f in dataclasses.fields(value))
+        found = (
+            _wrong(getattr(value, f.name), hints[f.name], f"{place}.{f.name}")
+            for f in dataclasses.fields(value)
+        )
         return next(filter(None, found), "")
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
@@ -36,7 +45,16 @@ def _wrong(value: Any, hint: Any, place: str) -> str:
     if origin is tuple:
         if not isinstance(value, tuple) or len(value) != len(inner):
             return f"{place} must be a list of {len(inner)}, is {value!r:.40}"
-        return next(filter(None, (_wrong(v, h, f"{place}[{k}]") for k, (v, h) in enumerate(zip(value, inner, strict=True)))), "")
+        return next(
+            filter(
+                None,
+                (
+                    _wrong(v, h, f"{place}[{k}]")
+                    for k, (v, h) in enumerate(zip(value, inner, strict=True))
+                ),
+            ),
+            "",
+        )
     if origin in (Sequence, Mapping):
         if not isinstance(value, origin) or isinstance(value, str):
             return f"{place} must be {'a list' if origin is Sequence else 'an object'}, is {value!r:.40}"
@@ -53,7 +71,11 @@ def check_results(results: Results) -> None:
     Raises:
         ValueError: naming the first such field, e.g. ``audits[0].signals[2].threshold must be a number, is 'high'``.
     """
-    for name, values in (("audits", results.audits), ("scores", results.scores), ("gallery", results.gallery)):
+    for name, values in (
+        ("audits", results.audits),
+        ("scores", results.scores),
+        ("gallery", results.gallery),
+    ):
         for k, value in enumerate(values):
             if said := _wrong(value, type(value), f"{name}[{k}]"):
                 raise ValueError(said)

@@ -30,11 +30,33 @@ ARROWS = {True: r"$\uparrow$", False: r"$\downarrow$", None: r"$\rightarrow$"}
 _EXCESS = re.compile(r"(?<=-TMMD) E\b")
 #: Each compiles with the fonts that LaTeX starts with (OT1), in T1 and in LuaLaTeX; ``\textquotedbl`` would not.
 _SPECIAL = {
-    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\char34{}", "`": r"\`{}",
-    "σ": r"$\sigma$", "×": r"$\times$", "±": r"$\pm$", "·": r"$\cdot$", "²": "$^2$", "→": r"$\rightarrow$", "−": "$-$", "–": "--", "\u00a0": "~",
-    "[": "{[}", "]": "{]}",
-}  # fmt: skip
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "&": r"\&",
+    "#": r"\#",
+    "%": r"\%",
+    "_": r"\_",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\char34{}",
+    "`": r"\`{}",
+    "σ": r"$\sigma$",
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "·": r"$\cdot$",
+    "²": "$^2$",
+    "→": r"$\rightarrow$",
+    "−": "$-$",
+    "–": "--",
+    "\u00a0": "~",
+    "[": "{[}",
+    "]": "{]}",
+}
 #: Letters and signs that pdfLaTeX has in T1 fonts only, and all that it does not have.
 _T1 = re.compile("[«»ÐÞðþĄąĐđĘęĮįŊŋŲų‚„‹›]")
 _FOREIGN = re.compile("[^\x00-\x7f\xa1-ſȘșȚț‐-‖‘-‚“-„†‡•…‰‹›€™]|[ĦħĸĿŀŉŦŧſ]")
@@ -63,29 +85,58 @@ def latex_tables(results: Results) -> str:
     Raises:
         PalpateError: if two scores that would share a column were not made alike.
     """
-    differences = [(s, side) for s, side in zip(results.scores, sides(results.scores).of, strict=True) if s.metric.endswith(TAIL)]
+    differences = [
+        (s, side)
+        for s, side in zip(results.scores, sides(results.scores).of, strict=True)
+        if s.metric.endswith(TAIL)
+    ]
     lines: list[str] = []
     for table in score_tables(results.scores):
         if table.columns[0].metric.endswith(TAIL):
             continue
         beside = [d for d, side in differences if side in table.sides]
-        members = [cell.score for row in table.cells.values() for cells in row.values() for cell in cells]
+        members = [
+            cell.score for row in table.cells.values() for cells in row.values() for cell in cells
+        ]
         for tag in dict.fromkeys(_tag(c.metric) for c in table.columns):
             metrics = [c.metric for c in table.columns if _tag(c.metric) == tag]
-            lines += _scores(table.title, tag, metrics, [s for s in members if s.metric in metrics], beside, results)
+            lines += _scores(
+                table.title,
+                tag,
+                metrics,
+                [s for s in members if s.metric in metrics],
+                beside,
+                results,
+            )
     for part in parts(results.scores):
         lines += _differences(part.title, part.scores, results) if part.differences else []
-    needs = r"{booktabs,longtable}; longtable needs text of one column" if r"\begin{longtable}" in "\n".join(lines) else "{booktabs}"
-    head = [MARK, *(f"% {_comment(c)}" for c in results.commands), rf"% Needs \usepackage{needs}.", *_fonts("".join(lines)), ""]
+    needs = (
+        r"{booktabs,longtable}; longtable needs text of one column"
+        if r"\begin{longtable}" in "\n".join(lines)
+        else "{booktabs}"
+    )
+    head = [
+        MARK,
+        *(f"% {_comment(c)}" for c in results.commands),
+        rf"% Needs \usepackage{needs}.",
+        *_fonts("".join(lines)),
+        "",
+    ]
     return "\n".join([*head, *lines]).rstrip() + "\n"
 
 
 def _fonts(text: str) -> list[str]:
     """What the letters of a text need besides, as a comment."""
     if found := sorted(set(_FOREIGN.findall(text))):
-        return [f"% pdfLaTeX does not have {few(found)}: needs LuaLaTeX or XeLaTeX, and a font that has them."]
+        return [
+            f"% pdfLaTeX does not have {few(found)}: needs LuaLaTeX or XeLaTeX, and a font that has them."
+        ]
     found = sorted(set(_T1.findall(text)))
-    return [rf"% Needs \usepackage[T1]{{fontenc}} for {few(found)}, or LuaLaTeX or XeLaTeX."] if found else []
+    return (
+        [rf"% Needs \usepackage[T1]{{fontenc}} for {few(found)}, or LuaLaTeX or XeLaTeX."]
+        if found
+        else []
+    )
 
 
 def _comment(text: str) -> str:
@@ -94,7 +145,12 @@ def _comment(text: str) -> str:
 
 
 def _scores(
-    title: str, tag: str, metrics: Sequence[str], members: Sequence[Score], differences: Sequence[Score], results: Results
+    title: str,
+    tag: str,
+    metrics: Sequence[str],
+    members: Sequence[Score],
+    differences: Sequence[Score],
+    results: Results,
 ) -> list[str]:
     """One table: the metrics of a family whose names end in the same ``tag``, which goes to the caption."""
     subjects = list(dict.fromkeys(s.subject for s in members))
@@ -102,25 +158,51 @@ def _scores(
     for s in members:  # where seeds differ the first stands
         found.setdefault((s.subject, s.metric), s)
     digits = {
-        m: decimals([v for s in members if s.metric == m for v in (s.value, s.floor, *(s.interval or ())) if v is not None])
+        m: decimals(
+            [
+                v
+                for s in members
+                if s.metric == m
+                for v in (s.value, s.floor, *(s.interval or ()))
+                if v is not None
+            ]
+        )
         for m in metrics
     }
-    floors = {m: next((s.floor for s in members if s.metric == m and s.floor is not None), None) for m in metrics}
+    floors = {
+        m: next((s.floor for s in members if s.metric == m and s.floor is not None), None)
+        for m in metrics
+    }
     better = {m: next(s.higher_is_better for s in members if s.metric == m) for m in metrics}
     best = {m: best_of([found[key] for key in found if key[1] == m], differences) for m in metrics}
     title += f", {tag[2:-1]}" if tag else ""
-    gels = {m: next((gel for s in members if s.metric == m and (gel := gel_of(s)) is not None), None) for m in metrics}
+    gels = {
+        m: next((gel for s in members if s.metric == m and (gel := gel_of(s)) is not None), None)
+        for m in metrics
+    }
     said = {key: [*filter(None, [reason(s)]), *remarks(s)] for key, s in found.items()}
-    common = [text for text in next(iter(said.values())) if all(text in own for own in said.values())]
+    common = [
+        text for text in next(iter(said.values())) if all(text in own for own in said.values())
+    ]
     notes = Footnotes()
-    marks = {key: notes.numbers(text for text in own if text not in common) for key, own in said.items()}
-    rows = [_row(["", *(f"{escape(m.removesuffix(tag))} {ARROWS[better[m]]}" for m in metrics)]), r"\midrule"]
+    marks = {
+        key: notes.numbers(text for text in own if text not in common) for key, own in said.items()
+    }
+    rows = [
+        _row(["", *(f"{escape(m.removesuffix(tag))} {ARROWS[better[m]]}" for m in metrics)]),
+        r"\midrule",
+    ]
     for subject in subjects:
         cells = [found.get((subject, m)) for m in metrics]
-        values = [_value(s, digits[m], marks.get((subject, m), []), bold=best[m] == subject) for m, s in zip(metrics, cells, strict=True)]
+        values = [
+            _value(s, digits[m], marks.get((subject, m), []), bold=best[m] == subject)
+            for m, s in zip(metrics, cells, strict=True)
+        ]
         rows.append(_row([escape(subject), *values]))
         if any(s is not None and s.interval for s in cells):
-            rows.append(_row(["", *(_interval(s, digits[m]) for m, s in zip(metrics, cells, strict=True))]))
+            rows.append(
+                _row(["", *(_interval(s, digits[m]) for m, s in zip(metrics, cells, strict=True))])
+            )
         if any(s is not None and s.details.get("p_value") is not None for s in cells):
             rows.append(_row(["", *map(_tested, cells)]))
     last = [
@@ -129,8 +211,19 @@ def _scores(
         if any(v is not None for v in values.values())
     ]
     rows += [r"\midrule", *last] if last else []
-    below = [*(f"{_raised([k])}~{escape(text)}" for k, text in enumerate(notes.texts, 1)), *map(escape, common)]
-    return _environment(title, f"l{'r' * len(metrics)}", rows, members, results, differences=bool(differences), below=below)
+    below = [
+        *(f"{_raised([k])}~{escape(text)}" for k, text in enumerate(notes.texts, 1)),
+        *map(escape, common),
+    ]
+    return _environment(
+        title,
+        f"l{'r' * len(metrics)}",
+        rows,
+        members,
+        results,
+        differences=bool(differences),
+        below=below,
+    )
 
 
 def _tag(metric: str) -> str:
@@ -175,7 +268,11 @@ def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None
         differences: paired differences of any metrics; subjects without one (controls, real touches) take no part. E without differences of
             its own goes by those of its metric, where they say the same.
     """
-    alike = [d for d in differences if column and (d.reference, *setting_of(d)) == (column[0].reference, *setting_of(column[0]))]
+    alike = [
+        d
+        for d in differences
+        if column and (d.reference, *setting_of(d)) == (column[0].reference, *setting_of(column[0]))
+    ]
     own = [d for d in alike if d.metric == column[0].metric + TAIL]
     if not own and alike and _EXCESS.search(column[0].metric):
         own = [d for d in alike if d.metric == _EXCESS.sub("", column[0].metric) + TAIL]
@@ -183,7 +280,11 @@ def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None
     wins: dict[str, bool] = {}
     for d in own:
         for name in (d.details["a"], d.details["b"]):
-            wins[name] = wins.get(name, True) and bool(d.details.get("decided")) and d.details["better"] == name
+            wins[name] = (
+                wins.get(name, True)
+                and bool(d.details.get("decided"))
+                and d.details["better"] == name
+            )
     return next((name for name, won in wins.items() if won), None)
 
 
@@ -196,7 +297,15 @@ def _same_verdict(difference: Score, column: Sequence[Score]) -> bool:
     found = {s.subject: s for s in column}
     a, b = (found.get(difference.details[k]) for k in ("a", "b"))
     gap = difference.details.get("gap")
-    if a is None or b is None or a.value is None or b.value is None or a.floor is None or gap is None or not difference.value:
+    if (
+        a is None
+        or b is None
+        or a.value is None
+        or b.value is None
+        or a.floor is None
+        or gap is None
+        or not difference.value
+    ):
         return False
     delta, own = a.value - b.value, abs(a.value - a.floor) - abs(b.value - a.floor)
     factor = difference.value / delta if delta else 0.0
@@ -204,7 +313,10 @@ def _same_verdict(difference: Score, column: Sequence[Score]) -> bool:
 
 
 def _differences(title: str, differences: Sequence[Score], results: Results) -> list[str]:
-    head = [_row(["metric", "$a$", "$b$", "$a - b$", "interval", "$a$ better", "Holm $p$"]), r"\midrule"]
+    head = [
+        _row(["metric", "$a$", "$b$", "$a - b$", "interval", "$a$ better", "Holm $p$"]),
+        r"\midrule",
+    ]
     rows: list[str] = []
     mark = _raised([1])
     for d in differences:
@@ -226,15 +338,35 @@ def _differences(title: str, differences: Sequence[Score], results: Results) -> 
         )
     below = [f"{mark}~{escape(NEARER)}"] if any(map(by_gap, differences)) else []
     if len(rows) < LONG:
-        return _environment(title, "lllrrrr", [*head, *rows], differences, results, differences=False, below=below)
+        return _environment(
+            title, "lllrrrr", [*head, *rows], differences, results, differences=False, below=below
+        )
     return [
-        r"\begin{longtable}{lllrrrr}", rf"{_caption(title, differences, results, differences=False)} \\", r"\toprule", *head, r"\endfirsthead",
-        r"\toprule", *head, r"\endhead", r"\bottomrule", r"\endfoot", *rows, r"\end{longtable}", *_below(below), "",
-    ]  # fmt: skip
+        r"\begin{longtable}{lllrrrr}",
+        rf"{_caption(title, differences, results, differences=False)} \\",
+        r"\toprule",
+        *head,
+        r"\endfirsthead",
+        r"\toprule",
+        *head,
+        r"\endhead",
+        r"\bottomrule",
+        r"\endfoot",
+        *rows,
+        r"\end{longtable}",
+        *_below(below),
+        "",
+    ]
 
 
 def _percent(share: float) -> str:
-    return r"$> 99.9\,\%$" if share > 0.999 else r"$< 0.1\,\%$" if share < 0.001 else rf"${100 * share:.1f}\,\%$"
+    return (
+        r"$> 99.9\,\%$"
+        if share > 0.999
+        else r"$< 0.1\,\%$"
+        if share < 0.001
+        else rf"${100 * share:.1f}\,\%$"
+    )
 
 
 def _p(p: float) -> str:
@@ -253,13 +385,26 @@ def _environment(
 ) -> list[str]:
     caption = _caption(title, members, results, differences=differences)
     return [
-        r"\begin{table}", r"\centering", caption, rf"\begin{{tabular}}{{{columns}}}", r"\toprule", *rows, r"\bottomrule",
-        r"\end{tabular}", *_below(below), r"\end{table}", "",
-    ]  # fmt: skip
+        r"\begin{table}",
+        r"\centering",
+        caption,
+        rf"\begin{{tabular}}{{{columns}}}",
+        r"\toprule",
+        *rows,
+        r"\bottomrule",
+        r"\end{tabular}",
+        *_below(below),
+        r"\end{table}",
+        "",
+    ]
 
 
 def _caption(title: str, members: Sequence[Score], results: Results, *, differences: bool) -> str:
-    said = [escape(title), *_made(members, differences), *(rf"Command: \texttt{{{escape(c)}}}" for c in results.commands[:1])]
+    said = [
+        escape(title),
+        *_made(members, differences),
+        *(rf"Command: \texttt{{{escape(c)}}}" for c in results.commands[:1]),
+    ]
     return rf"\caption{{{'. '.join(said)}.}}"
 
 
@@ -278,16 +423,28 @@ def _made(members: Sequence[Score], differences: bool) -> list[str]:
         "estimator": [escape(s.estimator) for s in members if s.estimator],
         r"$\sigma$": [f"{s.bandwidth:.4g}" for s in members if s.bandwidth is not None],
         "values times": [f"{s.scale:g}" for s in members if s.scale != 1 and one_scale],
-        "scaled:": [f"{escape(s.metric)} times {s.scale:g}" for s in members if s.scale != 1 and not one_scale],
-        "intervals": [f"{100 * s.level:g}\\,\\% ({escape(s.interval_method)})" for s in members if s.interval],
+        "scaled:": [
+            f"{escape(s.metric)} times {s.scale:g}"
+            for s in members
+            if s.scale != 1 and not one_scale
+        ],
+        "intervals": [
+            f"{100 * s.level:g}\\,\\% ({escape(s.interval_method)})" for s in members if s.interval
+        ],
         "encoder": [rf"\texttt{{{short(s.encoder)}}}" for s in members if s.encoder],
         "reference": [rf"\texttt{{{short(s.reference)}}}" for s in members if s.reference],
         "split": [rf"\texttt{{{short(s.split)}}}" for s in members if s.split],
-        "$p$ by relabellings:": [f"{d['count']:,}" for s in members if isinstance(d := s.details.get("permutations"), Mapping)],
+        "$p$ by relabelings:": [
+            f"{d['count']:,}"
+            for s in members
+            if isinstance(d := s.details.get("permutations"), Mapping)
+        ],
         "seed": [str(s.seed) for s in members if s.seed is not None],
         "palpate": [escape(str(s.details["version"])) for s in members if s.details.get("version")],
     }
-    facts = [f"{name} {', '.join(dict.fromkeys(values))}" for name, values in each.items() if values]
+    facts = [
+        f"{name} {', '.join(dict.fromkeys(values))}" for name, values in each.items() if values
+    ]
     rule = (
         [
             "Bold: better than every other generator (for metrics without reference: closer to the floor) by a paired difference whose interval leaves out 0"

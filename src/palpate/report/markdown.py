@@ -10,7 +10,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from palpate.core import Audit, Impact, LeakPair, Results, SampleRef
-from palpate.report.audits import interval_percent, matrix_view, pair_facts, pair_lists, signal_row, signal_view
+from palpate.report.audits import (
+    interval_percent,
+    matrix_view,
+    pair_facts,
+    pair_lists,
+    signal_row,
+    signal_view,
+)
 from palpate.report.page import in_turns, material_of
 from palpate.report.sentences import leak_line, purpose, summary_lines, there, where
 from palpate.report.tables import Cell, Heat, Table, heat_tables, score_tables, settings_of
@@ -67,13 +74,32 @@ def _cell(cell: Cell) -> str:
 
 
 def _scores(table: Table) -> list[str]:
-    head = ["", *(f"{esc(c.metric)} {c.arrow}{', ' + c.size if c.size else ''}" for c in table.columns)]
-    rows = [
-        [esc(s), *("; ".join(_cell(c) for c in table.cells[s].get(col.metric, ())) or "–" for col in table.columns)] for s in table.subjects
+    head = [
+        "",
+        *(f"{esc(c.metric)} {c.arrow}{', ' + c.size if c.size else ''}" for c in table.columns),
     ]
-    lines = [f"### {table.title}", "", *([table.question, ""] if table.question else []), *pipe_table(head, rows)]
+    rows = [
+        [
+            esc(s),
+            *(
+                "; ".join(_cell(c) for c in table.cells[s].get(col.metric, ())) or "–"
+                for col in table.columns
+            ),
+        ]
+        for s in table.subjects
+    ]
+    lines = [
+        f"### {table.title}",
+        "",
+        *([table.question, ""] if table.question else []),
+        *pipe_table(head, rows),
+    ]
     made = [("All of these", table.shared), *((c.metric, c.made) for c in table.columns)]
-    lines += [f"- {esc(title)}: " + "; ".join(f"{esc(k)} {esc(v)}" for k, v in rows) for title, rows in made if rows]
+    lines += [
+        f"- {esc(title)}: " + "; ".join(f"{esc(k)} {esc(v)}" for k, v in rows)
+        for title, rows in made
+        if rows
+    ]
     lines += [f"- ({k}) {esc(note)}" for k, note in enumerate(table.notes, 1)]
     return [*lines, ""]
 
@@ -92,7 +118,9 @@ def _pair(pair: LeakPair, kind: str, other: str) -> str:
     facts = pair_facts(pair, kind)
     if not kind:
         facts[0] = f"gap {count(pair.gap)} frames" if pair.gap is not None else "gap unknown"
-    return f"- {'; '.join(map(esc, facts))}; test {_sample(pair.test)}; {other} {_sample(pair.train)}"
+    return (
+        f"- {'; '.join(map(esc, facts))}; test {_sample(pair.test)}; {other} {_sample(pair.train)}"
+    )
 
 
 def _signals(audit: Audit) -> list[str]:
@@ -126,8 +154,15 @@ def _impact(impact: Impact) -> list[str]:
     ]
     head = ["accuracy of material, %", "given split", "leak-free", "cost, points", "chance"]
     lines = ["#### What the leak costs", "", esc(impact.headline), "", *pipe_table(head, rows)]
-    lines += [f"- 95 % intervals by leaving out whole groups ({esc(impact.group)})", *(f"- {esc(note)}" for note in impact.notes)]
-    lines += [f"- leak-free splits: {', '.join(map(code, impact.clean_splits))}"] if impact.clean_splits else []
+    lines += [
+        f"- 95 % intervals by leaving out whole groups ({esc(impact.group)})",
+        *(f"- {esc(note)}" for note in impact.notes),
+    ]
+    lines += (
+        [f"- leak-free splits: {', '.join(map(code, impact.clean_splits))}"]
+        if impact.clean_splits
+        else []
+    )
     return [*lines, *_tree(plain(impact.settings)), ""]
 
 
@@ -147,10 +182,22 @@ def _finding(audit: Audit) -> list[str]:
     """Heading, counts and notes."""
     group, other = esc(audit.group), esc(audit.against)
     rows = [["samples", count(audit.train_samples), count(audit.test_samples)]]
-    rows += [[f"groups ({group})", count(audit.groups_train), count(audit.groups_test)]] if audit.group != "none" else []
+    rows += (
+        [[f"groups ({group})", count(audit.groups_train), count(audit.groups_test)]]
+        if audit.group != "none"
+        else []
+    )
     against = "" if audit.against == "train" else f"Test against {there(audit)}: "
-    share = audit.leaking_samples / audit.test_samples if audit.signals and audit.test_samples else audit.leaked_fraction
-    lines = [f"### {esc(against + audit.name)}: {esc(percent(share))} leaked", "", *pipe_table(["", other, "test"], rows)]
+    share = (
+        audit.leaking_samples / audit.test_samples
+        if audit.signals and audit.test_samples
+        else audit.leaked_fraction
+    )
+    lines = [
+        f"### {esc(against + audit.name)}: {esc(percent(share))} leaked",
+        "",
+        *pipe_table(["", other, "test"], rows),
+    ]
     lines += [f"- {esc(leak_line(audit))}"] if audit.signals and audit.test_samples else []
     if audit.group != "none":
         lines += [
@@ -171,7 +218,10 @@ def _audit(audit: Audit) -> list[str]:
     lines = _finding(audit)
     if audit.gap_counts:
         bins = zip(audit.gap_edges, audit.gap_edges[1:], audit.gap_counts, strict=False)
-        lines += pipe_table(["gap (frames)", "test samples"], [[f"{count(a)} to {count(b)}", count(n)] for a, b, n in bins])
+        lines += pipe_table(
+            ["gap (frames)", "test samples"],
+            [[f"{count(a)} to {count(b)}", count(n)] for a, b, n in bins],
+        )
     lines += _signals(audit) if audit.signals else []
     lines += _impact(audit.impact) if audit.impact is not None and audit.impact.rows else []
     for found in pair_lists(audit):
@@ -180,10 +230,18 @@ def _audit(audit: Audit) -> list[str]:
     lines += _matrix(audit)
     if audit.materials:
         keys = ("material", "train", "test", "groups_train", "groups_test")
-        cells = [[esc(str(m.get("material") or "–")), *(count(m.get(k)) for k in keys[1:])] for m in audit.materials]
+        cells = [
+            [esc(str(m.get("material") or "–")), *(count(m.get(k)) for k in keys[1:])]
+            for m in audit.materials
+        ]
         parts = (esc(audit.against), "test")
-        lines += pipe_table(["material", *parts, *(f"{esc(audit.group)}s in {part}" for part in parts)], cells)
-    return [*lines, *(["What to do next:", "", *_commands(audit.commands)] if audit.commands else [])]
+        lines += pipe_table(
+            ["material", *parts, *(f"{esc(audit.group)}s in {part}" for part in parts)], cells
+        )
+    return [
+        *lines,
+        *(["What to do next:", "", *_commands(audit.commands)] if audit.commands else []),
+    ]
 
 
 def _commands(commands: Sequence[str]) -> list[str]:
@@ -209,17 +267,32 @@ def render_markdown(results: Results) -> str:
         PalpateError: if scores may not stand in one table.
     """
     facts = list(results.facts) or summary_lines(results)
-    lines = [f"# {esc(results.title)}", "", esc(purpose(results)), "", *(f"- {esc(f)}" for f in facts), ""]
+    lines = [
+        f"# {esc(results.title)}",
+        "",
+        esc(purpose(results)),
+        "",
+        *(f"- {esc(f)}" for f in facts),
+        "",
+    ]
     if results.notes:
         lines += ["## Read this first", "", *(f"- {esc(n)}" for n in results.notes), ""]
     lines += ["## Gallery", ""]
     items = in_turns(results.gallery)[:LISTED]
     if items:
         rows = [
-            [esc(material_of(i.sample)), esc(where(i.sample)), _picture(i.sample.vision), _picture(i.sample.tactile), _picture(i.generated)]
+            [
+                esc(material_of(i.sample)),
+                esc(where(i.sample)),
+                _picture(i.sample.vision),
+                _picture(i.sample.tactile),
+                _picture(i.generated),
+            ]
             for i in sorted(items, key=lambda i: material_of(i.sample).casefold())
         ]
-        lines += pipe_table(["material", "sample", "photo", "real touch", "generated touch"], rows, right=False)
+        lines += pipe_table(
+            ["material", "sample", "photo", "real touch", "generated touch"], rows, right=False
+        )
         lines += [f"{count(len(items))} of {count(len(results.gallery))} rows.", ""]
     else:
         lines += _hint("gallery")
@@ -236,7 +309,12 @@ def render_markdown(results: Results) -> str:
     for audit in results.audits:
         lines += _audit(audit)
     lines += [] if results.audits else _hint("audits")
-    lines += ["## Settings and digests", "", *(_tree(settings_of(results)) or _hint("settings")), ""]
+    lines += [
+        "## Settings and digests",
+        "",
+        *(_tree(settings_of(results)) or _hint("settings")),
+        "",
+    ]
     lines += ["## Commands", ""]
     if results.commands:
         lines += _commands(results.commands)

@@ -22,7 +22,17 @@ from markupsafe import Markup, escape
 from palpate import __version__
 from palpate.core import GalleryItem, LeakPair, PalpateError, Progress, Results, SampleRef, quiet
 from palpate.report import plots
-from palpate.report.audits import MAX_PAIRS, OPEN_PAIRS, AuditView, PairRow, audit_view, pair_facts, pair_lists, pair_pictures, side_of
+from palpate.report.audits import (
+    MAX_PAIRS,
+    OPEN_PAIRS,
+    AuditView,
+    PairRow,
+    audit_view,
+    pair_facts,
+    pair_lists,
+    pair_pictures,
+    side_of,
+)
 from palpate.report.pictures import Album, Darkroom, Picture, Wanted
 from palpate.report.sentences import purpose, summary_lines, where
 from palpate.report.tables import heat_tables, score_tables, settings_of
@@ -70,7 +80,10 @@ def in_turns(items: Sequence[GalleryItem]) -> list[GalleryItem]:
 def _gallery_pictures(item: GalleryItem) -> list[Wanted]:
     s = item.sample
     said = f"{s.material or 'sample'}, {where(s)}"
-    wanted = [Wanted(s.vision, f"Photo: {said}", "Photo"), Wanted(s.tactile, f"Real touch: {said}", "Real touch")]
+    wanted = [
+        Wanted(s.vision, f"Photo: {said}", "Photo"),
+        Wanted(s.tactile, f"Real touch: {said}", "Real touch"),
+    ]
     wanted.append(Wanted(item.generated, f"Generated touch: {said}", "Generated"))
     if item.background is not None:
         wanted.append(Wanted(item.background, f"Sensor without contact: {said}", "No contact"))
@@ -92,18 +105,29 @@ class _Plan:
     @classmethod
     def of(cls, results: Results) -> _Plan:
         gallery = [(None, item) for item in in_turns(results.gallery)[:MAX_ROWS]]
-        lists = [((k, j), found.pairs) for k, a in enumerate(results.audits) for j, found in enumerate(pair_lists(a))]
-        turn = lambda ranks: [(place, pairs[r]) for r in ranks for place, pairs in lists if r < len(pairs)]  # noqa: E731
+        lists = [
+            ((k, j), found.pairs)
+            for k, a in enumerate(results.audits)
+            for j, found in enumerate(pair_lists(a))
+        ]
+        turn = lambda ranks: [
+            (place, pairs[r]) for r in ranks for place, pairs in lists if r < len(pairs)
+        ]
         pairs, more = turn(range(OPEN_PAIRS)), turn(range(OPEN_PAIRS, MAX_PAIRS))
         rows = [*pairs, *gallery[:OPEN_ROWS], *more, *gallery[OPEN_ROWS:]]
-        return cls(rows, len(pairs) + len(gallery[:OPEN_ROWS]), [side_of(a) for a in results.audits])
+        return cls(
+            rows, len(pairs) + len(gallery[:OPEN_ROWS]), [side_of(a) for a in results.audits]
+        )
 
     def wanted(self) -> list[list[Wanted]]:
         return [
-            pair_pictures(item, self.sides[place[0]]) if place is not None and isinstance(item, LeakPair)
-            else _gallery_pictures(item) if isinstance(item, GalleryItem) else []
+            pair_pictures(item, self.sides[place[0]])
+            if place is not None and isinstance(item, LeakPair)
+            else _gallery_pictures(item)
+            if isinstance(item, GalleryItem)
+            else []
             for place, item in self.rows
-        ]  # fmt: skip
+        ]
 
     def views(self, results: Results, album: Album) -> tuple[Folds, list[AuditView]]:
         """What the album holds, put back into its sections."""
@@ -114,8 +138,16 @@ class _Plan:
                 gallery.append(Row(item, pictures))
             elif place is not None:
                 pairs[place].append(PairRow(item, pictures))
-        folds = Folds(_by_material(gallery[:OPEN_ROWS]), _by_material(gallery[OPEN_ROWS:]), len(gallery), len(results.gallery))
-        audits = [audit_view(a, [pairs[k, j] for j in range(len(pair_lists(a)))]) for k, a in enumerate(results.audits)]
+        folds = Folds(
+            _by_material(gallery[:OPEN_ROWS]),
+            _by_material(gallery[OPEN_ROWS:]),
+            len(gallery),
+            len(results.gallery),
+        )
+        audits = [
+            audit_view(a, [pairs[k, j] for j in range(len(pair_lists(a)))])
+            for k, a in enumerate(results.audits)
+        ]
         return folds, audits
 
 
@@ -141,7 +173,9 @@ def _emphasise(sentence: str) -> Markup:
     found = _NUMBER.search(sentence)
     if found is None:
         return escape(sentence)
-    return Markup("{}<b>{}</b>{}").format(sentence[: found.start()], found.group(), sentence[found.end() :])
+    return Markup("{}<b>{}</b>{}").format(
+        sentence[: found.start()], found.group(), sentence[found.end() :]
+    )
 
 
 def _leaf(value: Any) -> Markup:
@@ -167,9 +201,15 @@ def _short_list(value: Sequence[Any]) -> tuple[Sequence[Any], int]:
 def _like_rows(value: Mapping[str, Any]) -> list[str]:
     """The keys that all of at least two entries share, if each entry is a flat mapping of just those; else nothing."""
     rows = list(value.values())
-    if len(rows) < 2 or not all(isinstance(r, Mapping) and r and list(r) == list(rows[0]) for r in rows):
+    if len(rows) < 2 or not all(
+        isinstance(r, Mapping) and r and list(r) == list(rows[0]) for r in rows
+    ):
         return []
-    return [] if any(isinstance(v, Mapping | list) for r in rows for v in r.values()) else list(rows[0])
+    return (
+        []
+        if any(isinstance(v, Mapping | list) for r in rows for v in r.values())
+        else list(rows[0])
+    )
 
 
 @cache
@@ -191,8 +231,15 @@ def environment() -> Environment:
         "pair_facts": pair_facts,
     }
     filters: dict[str, Any] = {
-        "count": count, "number": number, "percent": percent, "plural": plural, "emphasise": _emphasise, "leaf": _leaf, "plain": plain, "unbroken": _unbroken,
-    }  # fmt: skip
+        "count": count,
+        "number": number,
+        "percent": percent,
+        "plural": plural,
+        "emphasise": _emphasise,
+        "leaf": _leaf,
+        "plain": plain,
+        "unbroken": _unbroken,
+    }
     env.globals.update(functions)
     env.filters.update(filters)
     env.tests["tree"] = lambda value: isinstance(value, Mapping)
@@ -204,16 +251,27 @@ def _told(album: Album, wanted: int) -> list[str]:
     """What the page must say about its pictures."""
     notes: list[str] = []
     if album.broken:
-        notes.append(f"{plural(album.broken, 'picture')} could not be read; a placeholder names the file.")
+        notes.append(
+            f"{plural(album.broken, 'picture')} could not be read; a placeholder names the file."
+        )
     if len(album.rows) < wanted:
         left = plural(wanted - len(album.rows), "row")
-        notes.append(f"{left} of pictures were left out and the others made at most {album.side} px to keep the page within its size.")
+        notes.append(
+            f"{left} of pictures were left out and the others made at most {album.side} px to keep the page within its size."
+        )
     elif album.side < 128:
         notes.append(f"Pictures were shrunk to {album.side} px to keep the page within its size.")
     return notes
 
 
-def render_page(results: Results, base: Path, *, max_bytes: int, names: Sequence[str] = (), progress: Progress = quiet) -> str:
+def render_page(
+    results: Results,
+    base: Path,
+    *,
+    max_bytes: int,
+    names: Sequence[str] = (),
+    progress: Progress = quiet,
+) -> str:
     """The whole page.
 
     Args:
@@ -238,7 +296,15 @@ def render_page(results: Results, base: Path, *, max_bytes: int, names: Sequence
         "tables": score_tables(results.scores),
         "heats": heat_tables(results.scores),
         "undefined": sum(not defined(s) for s in results.scores),
-        "details": [(s, plain({k: v for k, v in s.details.items() if k not in ("matrix", "labels", "classes")})) for s in results.scores],
+        "details": [
+            (
+                s,
+                plain(
+                    {k: v for k, v in s.details.items() if k not in ("matrix", "labels", "classes")}
+                ),
+            )
+            for s in results.scores
+        ],
         "settings": settings_of(results),
         "hints": HINTS,
         "how_to_read": HOW_TO_READ,
@@ -250,13 +316,19 @@ def render_page(results: Results, base: Path, *, max_bytes: int, names: Sequence
     def draw(album: Album) -> str:
         folds, audits = plan.views(results, album)
         notes = [*results.notes, *_told(album, len(rows))]
-        return environment().get_template("page.html.j2").render(**fixed, notes=notes, gallery=folds, audits=audits)
+        return (
+            environment()
+            .get_template("page.html.j2")
+            .render(**fixed, notes=notes, gallery=folds, audits=audits)
+        )
 
     size = lambda text: len(text.encode())  # noqa: E731
     bare = size(draw(Album((), 0, 0)))
     if bare > max_bytes:
         raise PalpateError(
-            "The page's largest size must hold at least its text", f"{max_bytes:,} bytes for {bare:,} of text", f"Allow {2 * bare:,}"
+            "The page's largest size must hold at least its text",
+            f"{max_bytes:,} bytes for {bare:,} of text",
+            f"Allow {2 * bare:,}",
         )
     budget = max_bytes - bare
     while True:

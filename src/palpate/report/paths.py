@@ -24,5 +24,13 @@ def with_paths(results: Results, change: Callable[[str], str]) -> Results:
         signals = [replace(s, worst=[pair(p) for p in s.worst]) for s in a.signals]
         return replace(a, worst=[pair(p) for p in a.worst], signals=signals)
 
-    gallery = [replace(g, sample=sample(g.sample), generated=change(g.generated), background=maybe(g.background)) for g in results.gallery]
+    gallery = [
+        replace(
+            g,
+            sample=sample(g.sample),
+            generated=change(g.generated),
+            background=maybe(g.background),
+        )
+        for g in results.gallery
+    ]
     return replace(results, audits=[audit(a) for a in results.audits], gallery=gallery)

@@ -20,7 +20,16 @@ from palpate.core import Progress, quiet, track
 
 TINY = 96
 #: (longest side in pixels, JPEG quality), best first.
-LADDER: tuple[tuple[int, int], ...] = ((256, 88), (192, 86), (160, 84), (128, 82), (96, 78), (64, 72), (48, 64), (32, 60))
+LADDER: tuple[tuple[int, int], ...] = (
+    (256, 88),
+    (192, 86),
+    (160, 84),
+    (128, 82),
+    (96, 78),
+    (64, 72),
+    (48, 64),
+    (32, 60),
+)
 #: Above this side everything is shown; from here on, rows that are folded anyway are given up before pictures shrink further.
 KEEP_ALL = 128
 #: Markup around the pictures of one row, in bytes: an estimate that the writer corrects after rendering.
@@ -65,7 +74,7 @@ class Album:
 
 
 def to_rgb(image: Image.Image) -> Image.Image:
-    """An upright 8-bit RGB copy; 16-bit and float greys are stretched from their own range, transparency becomes white."""
+    """An upright 8-bit RGB copy; 16-bit and float grays are stretched from their own range, transparency becomes white."""
     image = ImageOps.exif_transpose(image)
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image, dtype=np.float64)
@@ -105,7 +114,12 @@ def thumbnail(path: Path, side: int, quality: int) -> tuple[str, int, int, bool]
         # Not optimize=True: libjpeg then needs one buffer for the whole picture, and Pillow's is too small for noisy ones.
         image.save(data, "JPEG", quality=quality, subsampling=0 if quality >= 86 else 2)
         kind = "jpeg"
-    return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}", image.width, image.height, tiny
+    return (
+        f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}",
+        image.width,
+        image.height,
+        tiny,
+    )
 
 
 class Darkroom:
@@ -141,7 +155,13 @@ class Darkroom:
         except Exception:  # a damaged file makes PIL raise almost anything, and one bad picture must not cost the page
             return "file unreadable"
 
-    def develop(self, rows: Sequence[Sequence[Wanted]], budget: int, essential: int, progress: Progress = quiet) -> Album:
+    def develop(
+        self,
+        rows: Sequence[Sequence[Wanted]],
+        budget: int,
+        essential: int,
+        progress: Progress = quiet,
+    ) -> Album:
         """The largest pictures with which the rows fit.
 
         Args:

@@ -1,6 +1,6 @@
 """Inline SVG: interval bars on one axis a column, the histogram of gaps, and the two histograms of a calibrated signal.
 
-Every drawing takes its colours from the page's CSS (classes, no inline colour), so light, dark and print agree.
+Every drawing takes its colors from the page's CSS (classes, no inline color), so light, dark and print agree.
 The interval bar maps x to ``pad + (x - low) / (high - low) * (width - 2 pad)`` pixels. The histograms have no
 ``viewBox``: their lengths are percentages, so text keeps its size on a phone and on a desk.
 """
@@ -48,7 +48,9 @@ def axis_of(scores: Sequence[Score]) -> Axis | None:
     """The axis that holds values, intervals, nulls and floors of one column; None if nothing is defined."""
     seen: list[float] = []
     for s in scores:
-        seen += [v for v in (s.value, s.floor, *(s.interval or ()), *(s.null or ())) if v is not None]
+        seen += [
+            v for v in (s.value, s.floor, *(s.interval or ()), *(s.null or ())) if v is not None
+        ]
     return axis_over(seen)
 
 
@@ -66,7 +68,10 @@ def axis_over(values: Sequence[float]) -> Axis | None:
         margin = abs(high) * 0.1 or 1.0
         low, high = low - margin, high + margin
     step = nice_step(high - low, 3)
-    ticks = [round(k * step, 12) for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+    ticks = [
+        round(k * step, 12)
+        for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    ]
     margin = 0.02 * (high - low)
     return Axis(low - margin, high + margin, ticks, max(0, -math.floor(math.log10(step) + 1e-9)))
 
@@ -92,7 +97,9 @@ def bar(
     parts = [f'<line class="rail" x1="{PAD}" x2="{WIDTH - PAD}" y1="{mid}" y2="{mid}"/>']
     if null and all(math.isfinite(v) for v in null):
         a, b = (axis.x(v) for v in null)
-        parts.append(f'<rect class="null" x="{min(a, b) - 0.75:.2f}" y="3" width="{abs(b - a) + 1.5:.2f}" height="{HEIGHT - 6}" rx="1.5"/>')
+        parts.append(
+            f'<rect class="null" x="{min(a, b) - 0.75:.2f}" y="3" width="{abs(b - a) + 1.5:.2f}" height="{HEIGHT - 6}" rx="1.5"/>'
+        )
     if floor is not None and math.isfinite(floor):
         x = axis.x(floor)
         parts.append(f'<line class="floor" x1="{x}" x2="{x}" y1="1" y2="{HEIGHT - 1}"/>')
@@ -101,11 +108,13 @@ def bar(
         parts.append(f'<path class="interval" d="M{a} {mid}H{b}M{a} {mid - 4}v8M{b} {mid - 4}v8"/>')
     if value is not None and math.isfinite(value):
         parts.append(f'<circle class="value" cx="{axis.x(value)}" cy="{mid}" r="4"/>')
-    return Markup(f'<svg class="bar" width="{WIDTH}" height="{HEIGHT}" aria-hidden="true" focusable="false">{"".join(parts)}</svg>')
+    return Markup(
+        f'<svg class="bar" width="{WIDTH}" height="{HEIGHT}" aria-hidden="true" focusable="false">{"".join(parts)}</svg>'
+    )
 
 
 def axis_row(axis: Axis) -> Markup:
-    """The labelled axis below a column of interval bars."""
+    """The labeled axis below a column of interval bars."""
     parts = [f'<line class="rail" x1="{PAD}" x2="{WIDTH - PAD}" y1="1" y2="1"/>']
     for tick in axis.ticks:
         x = axis.x(tick)
@@ -114,7 +123,9 @@ def axis_row(axis: Axis) -> Markup:
         at = min(max(x, half), WIDTH - half)
         parts.append(f'<line class="tick" x1="{x}" x2="{x}" y1="1" y2="5"/>')
         parts.append(f'<text x="{at:.2f}" y="17" text-anchor="middle">{text}</text>')
-    return Markup(f'<svg class="bar axis" width="{WIDTH}" height="20" aria-hidden="true" focusable="false">{"".join(parts)}</svg>')
+    return Markup(
+        f'<svg class="bar axis" width="{WIDTH}" height="20" aria-hidden="true" focusable="false">{"".join(parts)}</svg>'
+    )
 
 
 def _edge_position(edges: Sequence[int], value: float) -> float | None:
@@ -149,14 +160,16 @@ def _reach(edges: Sequence[int], least: float | None, middle: float, most: float
     if len(places) < 3 or None in places:
         return ""
     a, m, b = places
-    ends = "".join(f'<line class="reach" x1="{x:.3f}%" x2="{x:.3f}%" y1="20" y2="28"/>' for x in (a, b))
+    ends = "".join(
+        f'<line class="reach" x1="{x:.3f}%" x2="{x:.3f}%" y1="20" y2="28"/>' for x in (a, b)
+    )
     return f'<line class="reach" x1="{a:.3f}%" x2="{b:.3f}%" y1="24" y2="24"/>{ends}<circle class="value" cx="{m:.3f}%" cy="24" r="3.5"/>'
 
 
 def gap_histogram(audit: Audit) -> Markup:
     """Bars of the gaps between test frames and their nearest train frame; '' if the audit has none.
 
-    One bar a bin, all equally wide, with the edges labelled below; the median is a dashed line, and a line above the bars
+    One bar a bin, all equally wide, with the edges labeled below; the median is a dashed line, and a line above the bars
     reaches from the least gap to the most.
 
     Args:
@@ -172,7 +185,9 @@ def gap_histogram(audit: Audit) -> Markup:
     y = lambda v: bottom - (bottom - top) * v / ceiling  # noqa: E731
     parts: list[str] = []
     for k in range(int(ceiling / step) + 1):
-        parts.append(f'<line class="grid" x1="{_LEFT}%" x2="{_RIGHT}%" y1="{y(k * step):.1f}" y2="{y(k * step):.1f}"/>')
+        parts.append(
+            f'<line class="grid" x1="{_LEFT}%" x2="{_RIGHT}%" y1="{y(k * step):.1f}" y2="{y(k * step):.1f}"/>'
+        )
         parts.append(
             f'<text class="ylabel" x="{_LEFT - 1.5}%" y="{y(k * step) + 4:.1f}" text-anchor="end">{_tick(int(k * step), int(step))}</text>'
         )
@@ -186,25 +201,39 @@ def gap_histogram(audit: Audit) -> Markup:
     for k in _marks(edges):
         x = _LEFT + k * wide
         anchor = "end" if k == len(counts) else "middle"
-        parts.append(f'<line class="tick" x1="{x:.3f}%" x2="{x:.3f}%" y1="{bottom}" y2="{bottom + 4}"/>')
-        parts.append(f'<text x="{x:.3f}%" y="{bottom + 18}" text-anchor="{anchor}">{count(edges[k])}</text>')
+        parts.append(
+            f'<line class="tick" x1="{x:.3f}%" x2="{x:.3f}%" y1="{bottom}" y2="{bottom + 4}"/>'
+        )
+        parts.append(
+            f'<text x="{x:.3f}%" y="{bottom + 18}" text-anchor="{anchor}">{count(edges[k])}</text>'
+        )
     middle = audit.gap_median
     if middle is not None and (x := _edge_position(edges, middle)) is not None:
         anchor, shift = ("end", -1) if x > 60 else ("start", 1)
         parts.append(f'<line class="median" x1="{x:.3f}%" x2="{x:.3f}%" y1="8" y2="{bottom}"/>')
-        parts.append(f'<text class="median-label" x="{x + shift:.3f}%" y="14" text-anchor="{anchor}">median {number(middle, 0)}</text>')
+        parts.append(
+            f'<text class="median-label" x="{x + shift:.3f}%" y="14" text-anchor="{anchor}">median {number(middle, 0)}</text>'
+        )
         parts.append(_reach(edges, audit.gap_min, middle, audit.gap_max))
-    parts.append(f'<text class="xlabel" x="{_RIGHT}%" y="{bottom + 36}" text-anchor="end">frames to the nearest train frame</text>')
+    parts.append(
+        f'<text class="xlabel" x="{_RIGHT}%" y="{bottom + 36}" text-anchor="end">frames to the nearest train frame</text>'
+    )
     label = escape(
         f"Histogram of gaps for {audit.name}: {count(sum(counts))} test samples, {count(edges[0])} to {count(edges[-1])} frames"
         + (f", median {number(middle, 0)}" if middle is not None else "")
     )
-    return Markup(f'<svg class="histogram" width="100%" height="214" role="img" aria-label="{label}">{"".join(parts)}</svg>')
+    return Markup(
+        f'<svg class="histogram" width="100%" height="214" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+    )
 
 
 #: Most bars in a histogram of scores; finer bins are joined.
 BARS = 48
-_PANEL, _TOP, _BETWEEN = 70.0, 44.0, 30.0  # pixels: height of a panel, above the first, between the two
+_PANEL, _TOP, _BETWEEN = (
+    70.0,
+    44.0,
+    30.0,
+)  # pixels: height of a panel, above the first, between the two
 
 
 @dataclass(frozen=True)
@@ -230,11 +259,20 @@ class Bins:
 def bins_of(signal: Signal) -> Bins | None:
     """The signal's histograms as they are drawn: at most :data:`BARS` bins, none empty at the ends; None if there are none.
 
-    Neighbouring bins are joined where there are too many; the bin of the threshold is always kept.
+    Neighboring bins are joined where there are too many; the bin of the threshold is always kept.
     """
     edges, unrelated, found = list(signal.edges), list(signal.unrelated), list(signal.found)
-    fits = len(edges) == len(found) + 1 and len(unrelated) in (0, len(found)) and all(a < b for a, b in pairwise(edges))
-    if not fits or not found or not all(map(math.isfinite, (*edges, signal.threshold))) or sum(found) + sum(unrelated) <= 0:
+    fits = (
+        len(edges) == len(found) + 1
+        and len(unrelated) in (0, len(found))
+        and all(a < b for a, b in pairwise(edges))
+    )
+    if (
+        not fits
+        or not found
+        or not all(map(math.isfinite, (*edges, signal.threshold)))
+        or sum(found) + sum(unrelated) <= 0
+    ):
         return None
     size = len(found)
     full = [k for k in range(size) if found[k] or (unrelated and unrelated[k])]
@@ -251,7 +289,10 @@ def bins_of(signal: Signal) -> Bins | None:
 def _heights(counts: Sequence[int], bins: Bins) -> list[float]:
     """The share of all counts in each bin; in bins of unequal width, per width."""
     total = sum(counts) or 1
-    return [n / total / (1.0 if bins.even else b - a) for n, (a, b) in zip(counts, pairwise(bins.edges), strict=True)]
+    return [
+        n / total / (1.0 if bins.even else b - a)
+        for n, (a, b) in zip(counts, pairwise(bins.edges), strict=True)
+    ]
 
 
 def score_histogram(signal: Signal, said: str, other: str = "train") -> Markup:
@@ -276,19 +317,29 @@ def score_histogram(signal: Signal, said: str, other: str = "train") -> Markup:
     bottom = _TOP
     for k, (name, kind, counts) in enumerate(panels):
         bottom = _TOP + _PANEL + k * (_PANEL + _BETWEEN)
-        parts += _panel(f"{name} ({count(sum(counts))})", kind, counts, bins, bottom, at, signal.threshold)
+        parts += _panel(
+            f"{name} ({count(sum(counts))})", kind, counts, bins, bottom, at, signal.threshold
+        )
     digits = _digits(step := nice_step(high - low, 6))
     for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
         x = at(k * step)
         anchor = "end" if x > 95 else "middle"
-        parts.append(f'<line class="tick" x1="{x:.3f}%" x2="{x:.3f}%" y1="{bottom}" y2="{bottom + 4}"/>')
-        parts.append(f'<text x="{x:.3f}%" y="{bottom + 18}" text-anchor="{anchor}">{number(k * step, digits)}</text>')
-    parts.append(f'<text class="xlabel" x="{_RIGHT}%" y="{bottom + 36}" text-anchor="end">score of the best match; 1 = the same</text>')
+        parts.append(
+            f'<line class="tick" x1="{x:.3f}%" x2="{x:.3f}%" y1="{bottom}" y2="{bottom + 4}"/>'
+        )
+        parts.append(
+            f'<text x="{x:.3f}%" y="{bottom + 18}" text-anchor="{anchor}">{number(k * step, digits)}</text>'
+        )
+    parts.append(
+        f'<text class="xlabel" x="{_RIGHT}%" y="{bottom + 36}" text-anchor="end">score of the best match; 1 = the same</text>'
+    )
     x = at(signal.threshold)
     anchor, shift = ("end", -1) if x > 60 else ("start", 1)
     label = f"flagged from {score_text(signal.threshold)}"
     parts.append(f'<line class="median" x1="{x:.3f}%" x2="{x:.3f}%" y1="4" y2="{bottom}"/>')
-    parts.append(f'<text class="median-label" x="{x + shift:.3f}%" y="14" text-anchor="{anchor}">{label}</text>')
+    parts.append(
+        f'<text class="median-label" x="{x + shift:.3f}%" y="14" text-anchor="{anchor}">{label}</text>'
+    )
     height = bottom + 42
     return Markup(
         f'<svg class="histogram" width="100%" height="{height:.0f}" role="img" aria-label="{escape(said)}">{"".join(parts)}</svg>'
@@ -300,19 +351,30 @@ def _digits(step: float) -> int:
 
 
 def _panel(
-    name: str, kind: str, counts: Sequence[int], bins: Bins, bottom: float, at: Callable[[float], float], threshold: float
+    name: str,
+    kind: str,
+    counts: Sequence[int],
+    bins: Bins,
+    bottom: float,
+    at: Callable[[float], float],
+    threshold: float,
 ) -> list[str]:
     """One histogram of scores: its name, its scale and its bars; a bin that is not empty is at least a pixel high."""
     heights = _heights(counts, bins)
     step = nice_step(max(heights) or 1.0, 4)
     ceiling = step * math.ceil(max(heights) / step - 1e-9) or 1.0
     top = bottom - _PANEL
-    parts = [f'<line class="grid" x1="{_LEFT}%" x2="{_RIGHT}%" y1="{y}" y2="{y}"/>' for y in (top, bottom)]
+    parts = [
+        f'<line class="grid" x1="{_LEFT}%" x2="{_RIGHT}%" y1="{y}" y2="{y}"/>'
+        for y in (top, bottom)
+    ]
     if bins.even:
         parts.append(
             f'<text class="ylabel" x="{_LEFT - 1.5}%" y="{top + 4}" text-anchor="end">{number(100 * ceiling, _digits(100 * step))}\u00a0%</text>'
         )
-        parts.append(f'<text class="ylabel" x="{_LEFT - 1.5}%" y="{bottom + 4}" text-anchor="end">0</text>')
+        parts.append(
+            f'<text class="ylabel" x="{_LEFT - 1.5}%" y="{bottom + 4}" text-anchor="end">0</text>'
+        )
     for n, share, (a, b) in zip(counts, heights, pairwise(bins.edges), strict=True):
         if not n:
             continue
@@ -324,7 +386,10 @@ def _panel(
         for start, end, name_of in pieces:
             if end > start:
                 edge = 0.06 * (at(b) - at(a))
-                x, wide = at(start) + edge * (start == a), at(end) - at(start) - edge * ((start == a) + (end == b))
+                x, wide = (
+                    at(start) + edge * (start == a),
+                    at(end) - at(start) - edge * ((start == a) + (end == b)),
+                )
                 parts.append(
                     f'<rect class="{name_of}" x="{x:.3f}%" width="{max(wide, 0.05):.3f}%" y="{bottom - tall:.1f}" height="{tall:.1f}">'
                     f"<title>{score_text(a)} to {score_text(b)}: {count(n)}</title></rect>"

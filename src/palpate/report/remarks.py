@@ -15,12 +15,14 @@ NEARER = "Which is nearer to the floor: confidence and p are of |a - floor| - |b
 #: Names in a sentence; the others are counted.
 NAMES = 5
 #: How classes of samples without a label are called in ``details["excluded"]``.
-_UNLABELLED = "(no label)"
+_UNLABELED = "(no label)"
 
 
 def few(names: Sequence[str]) -> str:
     """``"a, b, c, d, e and 3 more"``."""
-    return ", ".join(names[:NAMES]) + (f" and {len(names) - NAMES} more" if len(names) > NAMES else "")
+    return ", ".join(names[:NAMES]) + (
+        f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+    )
 
 
 def sentences(score: Score) -> list[str]:
@@ -37,7 +39,10 @@ def reason(score: Score) -> str:
     if defined(score):
         return ""
     said = sentences(score)
-    return next((text for text in said if text.startswith("Undefined")), next(iter(said), "Undefined: no reason recorded"))
+    return next(
+        (text for text in said if text.startswith("Undefined")),
+        next(iter(said), "Undefined: no reason recorded"),
+    )
 
 
 def remarks(score: Score) -> list[str]:
@@ -58,12 +63,16 @@ def by_gap(score: Score) -> bool:
 def left_out(score: Score) -> str:
     """``"Left out: v0c (all samples are of one group)"``: the classes that do not count, by reason; '' where all do."""
     excluded: Any = score.details.get("excluded")
-    if not isinstance(excluded, Mapping) or not excluded or (not defined(score) and set(excluded) == {_UNLABELLED}):
+    if (
+        not isinstance(excluded, Mapping)
+        or not excluded
+        or (not defined(score) and set(excluded) == {_UNLABELED})
+    ):
         return ""
     reasons: dict[str, list[str]] = {}
     for name, why in excluded.items():
-        reasons.setdefault("" if name == _UNLABELLED else str(why), []).append(
-            "samples without a label" if name == _UNLABELLED else str(name)
+        reasons.setdefault("" if name == _UNLABELED else str(why), []).append(
+            "samples without a label" if name == _UNLABELED else str(name)
         )
     room, parts = NAMES, list[str]()
     for why, names in reasons.items():
@@ -76,11 +85,19 @@ def left_out(score: Score) -> str:
 def no_floor(score: Score) -> str:
     """Why a score of the TMMD family has no floor; '' where it has one or its note says why, and for metrics that never do."""
     name = score.metric.split(" (")[0]
-    if score.floor is not None or not defined(score) or any(text.startswith("No floor") for text in sentences(score)):
+    if (
+        score.floor is not None
+        or not defined(score)
+        or any(text.startswith("No floor") for text in sentences(score))
+    ):
         return ""
     if name == "TMMD":
         return "No floor: that of TMMD is made of further real touches, the train part of a split"
-    return "No floor: no such value of real touches is known" if name.removesuffix(" E") in ("I-TMMD", "CI-TMMD", "D-TMMD") else ""
+    return (
+        "No floor: no such value of real touches is known"
+        if name.removesuffix(" E") in ("I-TMMD", "CI-TMMD", "D-TMMD")
+        else ""
+    )
 
 
 class Footnotes:

@@ -7,18 +7,52 @@ from collections.abc import Sequence
 from palpate.core import Audit, Results, SampleRef, Score, Signal, columns
 from palpate.core.score import BETTER
 from palpate.report.sides import sides
-from palpate.report.text import count, decimals, defined, interval_text, number, percent, plural, score_text, setting_of
+from palpate.report.text import (
+    count,
+    decimals,
+    defined,
+    interval_text,
+    number,
+    percent,
+    plural,
+    score_text,
+    setting_of,
+)
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {there} the other part), and how a share of the test
 #: samples is told. The first match wins.
 KINDS: tuple[tuple[str, str, str], ...] = (
-    ("identical sample", "The very same sample, by its id or by its video and frame, is in {there}.", "are samples of {there} themselves"),
-    ("identical bytes", "A picture file of the sample is, byte for byte, a picture file of {there}.", "have a picture that {there} holds byte for byte"),
-    ("shared ", "Its {thing} is also in {there}: what is learned of that {thing} helps on the sample.", "share {a} {thing} with {there}"),
-    ("time gap", "A frame of the same video, a moment before or after, is in {there}.", "lie a moment from a frame of {there}"),
-    ("near-duplicate vision", "Its photo can hardly be told from a photo of {there}.", "have a near-duplicate photo in {there}"),
-    ("near-duplicate touch", "Its touch, without the sensor's own look, can hardly be told from one of {there}.", "have a near-duplicate touch in {there}"),
-)  # fmt: skip
+    (
+        "identical sample",
+        "The very same sample, by its id or by its video and frame, is in {there}.",
+        "are samples of {there} themselves",
+    ),
+    (
+        "identical bytes",
+        "A picture file of the sample is, byte for byte, a picture file of {there}.",
+        "have a picture that {there} holds byte for byte",
+    ),
+    (
+        "shared ",
+        "Its {thing} is also in {there}: what is learned of that {thing} helps on the sample.",
+        "share {a} {thing} with {there}",
+    ),
+    (
+        "time gap",
+        "A frame of the same video, a moment before or after, is in {there}.",
+        "lie a moment from a frame of {there}",
+    ),
+    (
+        "near-duplicate vision",
+        "Its photo can hardly be told from a photo of {there}.",
+        "have a near-duplicate photo in {there}",
+    ),
+    (
+        "near-duplicate touch",
+        "Its touch, without the sensor's own look, can hardly be told from one of {there}.",
+        "have a near-duplicate touch in {there}",
+    ),
+)
 #: Causes of pictures that look alike without being a leak, and what to make of them.
 HARMLESS = {
     "nothing touched": "the gel was untouched in both, and untouched gel looks alike everywhere",
@@ -54,12 +88,19 @@ def meaning_of(signal: Signal, audit: Audit) -> str:
 
 def threshold_text(signal: Signal) -> str:
     """The score from which samples are flagged; ``exact`` where nothing but a score of 1 is."""
-    return "exact" if signal.threshold >= 1 and signal.false_positives is None else f"score {score_text(signal.threshold)}"
+    return (
+        "exact"
+        if signal.threshold >= 1 and signal.false_positives is None
+        else f"score {score_text(signal.threshold)}"
+    )
 
 
 def cause_texts(signal: Signal) -> list[str]:
     """How many test samples look alike for which cause, and which causes are no leak."""
-    return [f"{cause} {count(n)}{' (no leak)' if cause in HARMLESS else ''}" for cause, n in signal.causes.items()]
+    return [
+        f"{cause} {count(n)}{' (no leak)' if cause in HARMLESS else ''}"
+        for cause, n in signal.causes.items()
+    ]
 
 
 def cause_notes(signal: Signal) -> list[str]:
@@ -98,7 +139,11 @@ def purpose(results: Results) -> str:
         parts.append("how close touch generated from photos comes to real touch")
     if results.audits:
         parts.append("whether the split behind the numbers leaks from train into test")
-    return f"What this page shows: {', and '.join(parts)}." if parts else "Results of palpate; nothing has been measured yet."
+    return (
+        f"What this page shows: {', and '.join(parts)}."
+        if parts
+        else "Results of palpate; nothing has been measured yet."
+    )
 
 
 def _said(signal: Signal, audit: Audit, first: bool) -> str:
@@ -116,7 +161,9 @@ def audit_line(audit: Audit) -> str:
     if not audit.test_samples:
         return f"{name}: the test part is empty, so nothing can leak."
     if audit.signals:
-        found = sorted((s for s in audit.signals if s.flagged and s.counts), key=lambda s: -s.fraction)[:3]
+        found = sorted(
+            (s for s in audit.signals if s.flagged and s.counts), key=lambda s: -s.fraction
+        )[:3]
         if not found:
             line = leak_line(audit)
             return f"{name}: {line[0].lower()}{line[1:]}"
@@ -135,11 +182,16 @@ def score_line(scores: Sequence[Score]) -> str:
     """The first column with a value, in one sentence; '' if there is none."""
     places = [(*setting_of(s), side) for s, side in zip(scores, sides(scores).of, strict=True)]
     first = next((place for s, place in zip(scores, places, strict=True) if defined(s)), None)
-    for metric, column in columns(s for s, place in zip(scores, places, strict=True) if place == first).items():
+    for metric, column in columns(
+        s for s, place in zip(scores, places, strict=True) if place == first
+    ).items():
         shown = [s for s in column if defined(s)]
         if shown:
             digits = decimals([s.value for s in shown if s.value is not None])
-            said = ", ".join(f"{s.subject} {number(s.value, digits)}{interval_text(s, digits, before=' ')}" for s in shown[:3])
+            said = ", ".join(
+                f"{s.subject} {number(s.value, digits)}{interval_text(s, digits, before=' ')}"
+                for s in shown[:3]
+            )
             floors = [s.floor for s in shown if s.floor is not None]
             floor = f"; floor {number(floors[0], digits)}" if floors else ""
             return f"{metric} ({BETTER[shown[0].higher_is_better]}): {said}{floor}."
@@ -156,9 +208,15 @@ def summary_lines(results: Results) -> list[str]:
         PalpateError: if the scores may not stand in one table.
     """
     lines = list(results.facts[:3])
-    ends = [results.audits[0], results.audits[-1]] if len(results.audits) > 1 else list(results.audits)
+    ends = (
+        [results.audits[0], results.audits[-1]] if len(results.audits) > 1 else list(results.audits)
+    )
     cost = next((a.impact.headline for a in results.audits if a.impact), "")
     candidates = [*(audit_line(a) for a in ends), cost, score_line(results.scores)]
     if len(results.gallery):
-        candidates.append(f"{plural(len(results.gallery), 'generated touch', 'generated touches')} in the gallery.")
-    return (lines + [c for c in candidates if c and c not in lines])[:3] if len(lines) < 3 else lines
+        candidates.append(
+            f"{plural(len(results.gallery), 'generated touch', 'generated touches')} in the gallery."
+        )
+    return (
+        (lines + [c for c in candidates if c and c not in lines])[:3] if len(lines) < 3 else lines
+    )

@@ -1,6 +1,6 @@
 """Which real touches each score was compared with, so that scores of different references stand in tables of their own.
 
-A *side* is a set of real touches: one digest of features an encoder, since an Inception network and a touch tower make different features of
+A *side* is a set of real touches: one digest of features an encoder, since an Inception network and a tactile encoder make different features of
 the same pictures. Results of several files follow each other, so a new side begins where an encoder's reference becomes another one.
 """
 
@@ -54,7 +54,9 @@ def sides(scores: Sequence[Score]) -> Sides:
             current = len(known) - 1
         known[current][encoder] = reference
         found.append(current)
-    return Sides(_with_free(scores, found), bound, [list(dict.fromkeys(side.values())) for side in known])
+    return Sides(
+        _with_free(scores, found), bound, [list(dict.fromkeys(side.values())) for side in known]
+    )
 
 
 def _with_free(scores: Sequence[Score], found: Sequence[int | None]) -> list[int]:

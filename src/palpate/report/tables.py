@@ -34,8 +34,12 @@ FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         "Does each generated touch match its own real touch, pixel by pixel or patch by patch?",
         ("contact ", "ssim", "psnr", "lpips", "l1", "mse"),
     ),
-    ("Recognition", "What can be read from the touch: its material, or the text and photo that belong to it?", ("acc", "top", "retriev", "probe", "@")),
-)  # fmt: skip
+    (
+        "Recognition",
+        "What can be read from the touch: its material, or the text and photo that belong to it?",
+        ("acc", "top", "retriev", "probe", "@"),
+    ),
+)
 OTHER = ("Other metrics", "")
 #: Stands with the question where a table has contact scores.
 GEL = "Gel: what the empty gel, without any touch, has in the place of a contact score; squared errors such as PSNR prefer it to a wrong touch."
@@ -129,7 +133,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Heat:
-    """A square matrix of divergences, e.g. D-TMMD's between classes. ``shares`` are the colours' strengths in [0, 1]."""
+    """A square matrix of divergences, e.g. D-TMMD's between classes. ``shares`` are the colors' strengths in [0, 1]."""
 
     title: str
     labels: Sequence[str]
@@ -142,7 +146,14 @@ def family_of(metric: str) -> tuple[str, str]:
     name = metric.lower()
     if name.endswith(TAIL):
         return DIFFERENCES
-    return next(((title, question) for title, question, pieces in FAMILIES if any(p in f"{name} (" for p in pieces)), OTHER)
+    return next(
+        (
+            (title, question)
+            for title, question, pieces in FAMILIES
+            if any(p in f"{name} (" for p in pieces)
+        ),
+        OTHER,
+    )
 
 
 def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
@@ -153,24 +164,39 @@ def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
         rows.append(("bandwidth σ", f"{first.bandwidth:g}"))
     if first.scale != 1:
         rows.append(("scale", f"× {first.scale:g}"))
-    levels = [(f"{100 * s.level:g}\u00a0%", s.interval_method) for s in column if s.interval is not None]
+    levels = [
+        (f"{100 * s.level:g}\u00a0%", s.interval_method) for s in column if s.interval is not None
+    ]
     methods = dict.fromkeys(f"{level}, {method}" if method else level for level, method in levels)
     rows.append(("interval", "; ".join(methods)))
     seeds = dict.fromkeys(str(s.seed) for s in column if s.seed is not None)
     rows.append(("seed", ", ".join(seeds)))
-    rows += [(str(k).replace("_", " "), v if isinstance(v, str) else str(plain(v))) for k, v in first.settings.items()]
-    rows += [("encoder", first.encoder or ""), ("reference", first.reference or ""), ("split", first.split or "")]
+    rows += [
+        (str(k).replace("_", " "), v if isinstance(v, str) else str(plain(v)))
+        for k, v in first.settings.items()
+    ]
+    rows += [
+        ("encoder", first.encoder or ""),
+        ("reference", first.reference or ""),
+        ("split", first.split or ""),
+    ]
     return [(what, how) for what, how in rows if how]
 
 
 def _size(score: Score) -> str:
-    return ", ".join(f"{k} = {v:,}" for k, v in (("n", score.n or None), ("m", score.m)) if v is not None)
+    return ", ".join(
+        f"{k} = {v:,}" for k, v in (("n", score.n or None), ("m", score.m)) if v is not None
+    )
 
 
 def gel_of(score: Score) -> float | None:
     """What the empty gel, without any touch, scores in the place of a contact score; None for other scores."""
     empty = score.details.get("empty")
-    return empty if isinstance(empty, int | float) and not isinstance(empty, bool) and math.isfinite(empty) else None
+    return (
+        empty
+        if isinstance(empty, int | float) and not isinstance(empty, bool) and math.isfinite(empty)
+        else None
+    )
 
 
 def _cell(score: Score, digits: int, notes: Footnotes, size: str) -> Cell:
@@ -180,7 +206,9 @@ def _cell(score: Score, digits: int, notes: Footnotes, size: str) -> Cell:
         value=number(score.value, digits),
         interval=interval_text(score, digits),
         floor=number(score.floor, digits) if score.floor is not None else "",
-        null=f"{number(score.null[0], digits)} to {number(score.null[1], digits)}" if score.null else "",
+        null=f"{number(score.null[0], digits)} to {number(score.null[1], digits)}"
+        if score.null
+        else "",
         gel=number(gel, digits) if gel is not None else "",
         size=size,
         footnotes=notes.numbers(remarks(score)),
@@ -206,7 +234,9 @@ def parts(scores: Sequence[Score]) -> list[Part]:
     order = [title for title, _, _ in FAMILIES] + [OTHER[0], DIFFERENCES[0]]
     found: dict[tuple[int, str, str], list[int]] = {}
     for k, score in enumerate(scores):
-        found.setdefault((order.index(family_of(score.metric)[0]), *setting_of(score)), []).append(k)
+        found.setdefault((order.index(family_of(score.metric)[0]), *setting_of(score)), []).append(
+            k
+        )
     several, at, out = len({split for _, _, split in found}) > 1, sides(scores), list[Part]()
     for (place, preset, split), members in sorted(found.items(), key=lambda item: item[0][0]):
         title, question = family_of(scores[members[0]].metric)
@@ -216,19 +246,35 @@ def parts(scores: Sequence[Score]) -> list[Part]:
         for side, some in _by_side(members, scores, at):
             first = not any(p.question == question for p in out)
             asked = question if first or place == len(FAMILIES) else ""
-            out.append(Part(title + cut + side, cut + side, asked, [scores[k] for k in some], frozenset(at.of[k] for k in some)))
+            out.append(
+                Part(
+                    title + cut + side,
+                    cut + side,
+                    asked,
+                    [scores[k] for k in some],
+                    frozenset(at.of[k] for k in some),
+                )
+            )
     return out
 
 
-def _by_side(members: Sequence[int], scores: Sequence[Score], at: Sides) -> list[tuple[str, list[int]]]:
+def _by_side(
+    members: Sequence[int], scores: Sequence[Score], at: Sides
+) -> list[tuple[str, list[int]]]:
     """The members by side, with what their title ends in, where those with a reference are of more than one; else all of them."""
     if len({at.of[k] for k in members if at.bound[k]}) < 2:
         return [("", list(members))]
     apart: dict[int, list[int]] = {}
     for k in members:
         apart.setdefault(at.of[k], []).append(k)
-    digests = {side: dict.fromkeys(scores[k].reference or "" for k in some if at.bound[k]) for side, some in apart.items()}
-    said = {side: " and ".join(d[:8] or "not recorded" for d in digests[side] or at.references[side]) for side in apart}
+    digests = {
+        side: dict.fromkeys(scores[k].reference or "" for k in some if at.bound[k])
+        for side, some in apart.items()
+    }
+    said = {
+        side: " and ".join(d[:8] or "not recorded" for d in digests[side] or at.references[side])
+        for side in apart
+    }
     return [(f", reference {said[side]}", some) for side, some in apart.items()]
 
 
@@ -246,16 +292,26 @@ def _table(part: Part) -> Table:
     cells: dict[str, dict[str, list[Cell]]] = {}
     heads: list[Column] = []
     for metric, column in columns(part.scores).items():
-        near = [v for s in column for v in (s.value, s.floor, *(s.interval or ())) if v is not None and math.isfinite(v)]
+        near = [
+            v
+            for s in column
+            for v in (s.value, s.floor, *(s.interval or ()))
+            if v is not None and math.isfinite(v)
+        ]
         common = _size(column[0]) if len({_size(s) for s in column}) == 1 else ""
         for score in column:
             cell = _cell(score, decimals(near), notes, "" if common else _size(score))
             cells.setdefault(score.subject, {}).setdefault(metric, []).append(cell)
-        heads.append(Column(metric, column[0].higher_is_better, axis_of(column), common, _made(column)))
+        heads.append(
+            Column(metric, column[0].higher_is_better, axis_of(column), common, _made(column))
+        )
     subjects = list(dict.fromkeys(score.subject for score in part.scores))
     shared = [row for row in heads[0].made if len(heads) > 1 and all(row in h.made for h in heads)]
     heads = [replace(h, made=[row for row in h.made if row not in shared]) for h in heads]
-    said = [NEARER if any(map(by_gap, part.scores)) else "", GEL if any(gel_of(s) is not None for s in part.scores) else ""]
+    said = [
+        NEARER if any(map(by_gap, part.scores)) else "",
+        GEL if any(gel_of(s) is not None for s in part.scores) else "",
+    ]
     question = " ".join(filter(None, [part.question, *said]))
     return Table(part.title, question, heads, subjects, cells, shared, notes.texts, part.sides)
 
@@ -272,7 +328,8 @@ def settings_of(results: Results) -> dict[str, Any]:
     shown = plain(results.settings)
     if joined:
         shown["real touches compared with"] = {
-            ", ".join(subjects): digests[0] if len(digests) == 1 else list(digests) for digests, subjects in joined.items()
+            ", ".join(subjects): digests[0] if len(digests) == 1 else list(digests)
+            for digests, subjects in joined.items()
         }
     return shown
 
@@ -280,9 +337,17 @@ def settings_of(results: Results) -> dict[str, Any]:
 def _square(matrix: Any) -> list[list[float | None]] | None:
     """``matrix`` as rows of numbers (None = undefined), or None if it is not a square of them."""
     rows = plain(matrix)
-    if not isinstance(rows, list) or not rows or any(not isinstance(r, list) or len(r) != len(rows) for r in rows):
+    if (
+        not isinstance(rows, list)
+        or not rows
+        or any(not isinstance(r, list) or len(r) != len(rows) for r in rows)
+    ):
         return None
-    if any(v is not None and (isinstance(v, bool) or not isinstance(v, int | float)) for r in rows for v in r):
+    if any(
+        v is not None and (isinstance(v, bool) or not isinstance(v, int | float))
+        for r in rows
+        for v in r
+    ):
         return None
     return rows
 
@@ -300,13 +365,20 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
             continue
         names = plain(score.details.get("classes", score.details.get("labels")))
         labels = (
-            [str(n) for n in names] if isinstance(names, list) and len(names) == len(matrix) else [f"{k + 1}" for k in range(len(matrix))]
+            [str(n) for n in names]
+            if isinstance(names, list) and len(names) == len(matrix)
+            else [f"{k + 1}" for k in range(len(matrix))]
         )
         seen = [abs(v) for row in matrix for v in row if v is not None]
         digits, top = min(3, decimals(seen)), max(seen, default=0.0) or 1.0
         tables.append(
             Heat(
-                ", ".join(filter(None, [score.metric, score.subject, str(score.settings.get("preset", ""))])) + tails[id(score)],
+                ", ".join(
+                    filter(
+                        None, [score.metric, score.subject, str(score.settings.get("preset", ""))]
+                    )
+                )
+                + tails[id(score)],
                 labels,
                 [[number(v, digits) for v in row] for row in matrix],
                 [[round(max(0.0, v or 0.0) / top, 3) for v in row] for row in matrix],

@@ -56,7 +56,15 @@ def decimals(values: Iterable[float]) -> int:
     largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
     if largest == 0:
         return 1
-    return max(0, min(8, 3 - max(0, math.floor(math.log10(largest))) if largest >= 0.1 else 2 - math.floor(math.log10(largest))))
+    return max(
+        0,
+        min(
+            8,
+            3 - max(0, math.floor(math.log10(largest)))
+            if largest >= 0.1
+            else 2 - math.floor(math.log10(largest)),
+        ),
+    )
 
 
 def number(value: float | None, digits: int | None = None) -> str:

@@ -30,25 +30,27 @@ def smoothstep(x: Array, start: float, end: float) -> Array:
 
 
 def blend(a: Array, b: Array, weight: Array) -> Array:
-    """Colours ``a`` (weight 0) to ``b`` (weight 1); ``weight`` has shape (h, w), the colours (3,) or (h, w, 3)."""
+    """Colors ``a`` (weight 0) to ``b`` (weight 1); ``weight`` has shape (h, w), the colors (3,) or (h, w, 3)."""
     return a + (b - a) * np.clip(weight, 0.0, 1.0)[..., None]
 
 
-def over(image: Array, colour: Array, weight: Array) -> Array:
-    """A planar image (3, h, w) covered by ``colour``, (3,) or (3, h, w), to the degree ``weight`` in [0, 1], shape (h, w)."""
-    if colour.ndim == 1:
-        colour = colour[:, None, None]
-    return image + (colour - image) * weight
+def over(image: Array, color: Array, weight: Array) -> Array:
+    """A planar image (3, h, w) covered by ``color``, (3,) or (3, h, w), to the degree ``weight`` in [0, 1], shape (h, w)."""
+    if color.ndim == 1:
+        color = color[:, None, None]
+    return image + (color - image) * weight
 
 
 def hsv(hue: float, saturation: float, value: float) -> Array:
-    """An RGB colour of shape (3,) in [0, 1]; the hue wraps, the others are clipped."""
-    return f32(colorsys.hsv_to_rgb(hue % 1.0, min(1.0, max(0.0, saturation)), min(1.0, max(0.0, value))))
+    """An RGB color of shape (3,) in [0, 1]; the hue wraps, the others are clipped."""
+    return f32(
+        colorsys.hsv_to_rgb(hue % 1.0, min(1.0, max(0.0, saturation)), min(1.0, max(0.0, value)))
+    )
 
 
-def tint(colour: Array, factor: Array) -> Array:
-    """``colour`` of shape (3,) or (h, w, 3) times a field of shape (h, w)."""
-    return colour * factor[..., None]
+def tint(color: Array, factor: Array) -> Array:
+    """``color`` of shape (3,) or (h, w, 3) times a field of shape (h, w)."""
+    return color * factor[..., None]
 
 
 def to_bytes(image: Array) -> np.ndarray:
@@ -125,7 +127,9 @@ def resample(field: Array, size: int) -> Array:
         if n == size:
             continue
         moved = np.moveaxis(field, axis, 0)
-        integral = np.concatenate([np.zeros_like(moved[:1], np.float64), np.cumsum(moved, axis=0, dtype=np.float64)])
+        integral = np.concatenate(
+            [np.zeros_like(moved[:1], np.float64), np.cumsum(moved, axis=0, dtype=np.float64)]
+        )
         at = np.linspace(0.0, n, size + 1)
         low = np.minimum(at.astype(np.intp), n - 1)
         part = (at - low).reshape(-1, *[1] * (field.ndim - 1))
@@ -136,7 +140,7 @@ def resample(field: Array, size: int) -> Array:
 
 @lru_cache(maxsize=16)
 def grid(size: int) -> tuple[Array, Array]:
-    """Pixel centres of a square image in [-1, 1]: ``y`` of shape (size, 1) and ``x`` of shape (1, size)."""
+    """Pixel centers of a square image in [-1, 1]: ``y`` of shape (size, 1) and ``x`` of shape (1, size)."""
     at = f32((np.arange(size) + 0.5) / size * 2.0 - 1.0)
     at.flags.writeable = False
     return at[:, None], at[None]
@@ -150,5 +154,8 @@ def slopes(field: Array, step: float) -> tuple[Array, Array]:
     down[1:-1] /= 2.0 * step
     right[:, 1:-1] /= 2.0 * step
     down[0], down[-1] = (field[1] - field[0]) / step, (field[-1] - field[-2]) / step
-    right[:, 0], right[:, -1] = (field[:, 1] - field[:, 0]) / step, (field[:, -1] - field[:, -2]) / step
+    right[:, 0], right[:, -1] = (
+        (field[:, 1] - field[:, 0]) / step,
+        (field[:, -1] - field[:, -2]) / step,
+    )
     return down, right

@@ -12,10 +12,27 @@ from palpate.sim.options import WorldOptions
 
 #: Frames of each class in both official lists together. Natural fabric has none there.
 TOUCH_AND_GO_FRAMES = {
-    "Concrete": 18_047, "Plastic": 6_001, "Glass": 1_458, "Wood": 21_846, "Metal": 10_633, "Brick": 7_337, "Tile": 3_068, "Leather": 2_730,
-    "Synthetic Fabric": 28_010, "Natural Fabric": 0, "Rubber": 330, "Paper": 2_389, "Tree": 1_782, "Grass": 5_837, "Soil": 1_628, "Rock": 7_787,
-    "Gravel": 775, "Sand": 223, "Plants": 1_441, "Others": 539,
-}  # fmt: skip
+    "Concrete": 18_047,
+    "Plastic": 6_001,
+    "Glass": 1_458,
+    "Wood": 21_846,
+    "Metal": 10_633,
+    "Brick": 7_337,
+    "Tile": 3_068,
+    "Leather": 2_730,
+    "Synthetic Fabric": 28_010,
+    "Natural Fabric": 0,
+    "Rubber": 330,
+    "Paper": 2_389,
+    "Tree": 1_782,
+    "Grass": 5_837,
+    "Soil": 1_628,
+    "Rock": 7_787,
+    "Gravel": 775,
+    "Sand": 223,
+    "Plants": 1_441,
+    "Others": 539,
+}
 #: Objects that a material has at least, so that train and test can both have one.
 LEAST = 2
 
@@ -39,14 +56,18 @@ def _shared(weights: dict[str, float], total: int) -> dict[str, int]:
     small: set[str] = set()
     while True:
         rest = total - LEAST * len(small)
-        scale = rest / (sum(w for name, w in weights.items() if name not in small) or 1.0)  # 1.0: all are small
+        scale = rest / (
+            sum(w for name, w in weights.items() if name not in small) or 1.0
+        )  # 1.0: all are small
         more = {name for name, w in weights.items() if name not in small and w * scale < LEAST}
         if not more:
             break
         small |= more
     exact = {name: float(LEAST) if name in small else w * scale for name, w in weights.items()}
     counts = {name: int(value) for name, value in exact.items()}
-    by_remainder = sorted(exact, key=lambda name: counts[name] - exact[name])  # the largest remainder first, ties in the given order
+    by_remainder = sorted(
+        exact, key=lambda name: counts[name] - exact[name]
+    )  # the largest remainder first, ties in the given order
     for name in by_remainder[: total - sum(counts.values())]:
         counts[name] += 1
     return counts

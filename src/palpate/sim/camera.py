@@ -22,13 +22,13 @@ from palpate.sim.tile import TILE_MM
 
 @dataclass(frozen=True)
 class Stain:
-    """A spot on the object that shows but is not felt: place and radius in mm, aspect, angle, colour, opacity."""
+    """A spot on the object that shows but is not felt: place and radius in mm, aspect, angle, color, opacity."""
 
     place: tuple[float, float]
     radius: float
     aspect: float
     angle: float
-    colour: Array
+    color: Array
     opacity: float
 
 
@@ -40,9 +40,9 @@ class Camera:
         view: width of the view in mm; turn, tilt: pose.
         sun_to: unit vector towards the sun; sun, ambient: strengths; light: RGB of the light; exposure: error of the auto-exposure.
         blur: deviation in pixels at 128 px; noise: deviation.
-        hand: direction it enters from, or None; skin: its colour.
+        hand: direction it enters from, or None; skin: its color.
         shadow: direction, offset and factor of a cast shadow, or None.
-        edge: direction and distance of the object's edge, or None; beyond: colour behind it.
+        edge: direction and distance of the object's edge, or None; beyond: color behind it.
     """
 
     view: float
@@ -76,25 +76,46 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
     rng = options.rng("camera", video)
     scale = 2.0 * options.hard
     happens = lambda share: bool(rng.random() < min(0.95, share * scale))  # noqa: E731
-    elevation, azimuth = math.radians(rng.uniform(*options.elevation_deg)), rng.uniform(0.0, 2.0 * math.pi)
+    elevation, azimuth = (
+        math.radians(rng.uniform(*options.elevation_deg)),
+        rng.uniform(0.0, 2.0 * math.pi),
+    )
     warm = rng.uniform(-1.0, 1.0) * scale
     near, far = (math.log(end) for end in options.view_mm)
-    view = math.exp((near + far) / 2.0 + rng.uniform(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale))
+    view = math.exp(
+        (near + far) / 2.0 + rng.uniform(-0.5, 0.5) * (far - near) * min(1.0, 0.4 + 0.6 * scale)
+    )
     lean = 0.2 * min(1.4, scale)
     hand, from_side = happens(options.hand), rng.uniform(0.0, 2.0 * math.pi)
-    shadow, shadow_at = happens(options.shadow), (rng.uniform(0.0, math.pi), rng.uniform(-0.6, 0.6), rng.uniform(0.35, 0.75))
-    edge, edge_at = happens(options.edge), (rng.uniform(0.0, 2.0 * math.pi), rng.uniform(0.25, 0.75))
+    shadow, shadow_at = (
+        happens(options.shadow),
+        (rng.uniform(0.0, math.pi), rng.uniform(-0.6, 0.6), rng.uniform(0.35, 0.75)),
+    )
+    edge, edge_at = (
+        happens(options.edge),
+        (rng.uniform(0.0, 2.0 * math.pi), rng.uniform(0.25, 0.75)),
+    )
     bare = rng.random() < 0.6
     skin = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.25, 0.55), rng.uniform(0.25, 0.9))
     glove = hsv(rng.random(), 0.2, rng.uniform(0.08, 0.5))
     return Camera(
         view=view,
         turn=rng.uniform(0.0, 2.0 * math.pi),
-        tilt=(max(-0.5, min(0.5, rng.normal(0.0, lean + 1e-9))), max(-0.5, min(0.5, rng.normal(0.0, lean + 1e-9)))),
-        sun_to=(math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation)),
+        tilt=(
+            max(-0.5, min(0.5, rng.normal(0.0, lean + 1e-9))),
+            max(-0.5, min(0.5, rng.normal(0.0, lean + 1e-9))),
+        ),
+        sun_to=(
+            math.cos(azimuth) * math.cos(elevation),
+            math.sin(azimuth) * math.cos(elevation),
+            math.sin(elevation),
+        ),
         sun=rng.uniform(0.25, 1.0),
         ambient=rng.uniform(0.35, 0.8),
-        light=f32(np.array([1.0 + 0.13 * warm, 1.0, 1.0 - 0.13 * warm]) * np.exp(rng.normal(0.0, 0.03 * scale + 1e-9, 3))),
+        light=f32(
+            np.array([1.0 + 0.13 * warm, 1.0, 1.0 - 0.13 * warm])
+            * np.exp(rng.normal(0.0, 0.03 * scale + 1e-9, 3))
+        ),
         exposure=math.exp(rng.normal(0.0, 0.2 * scale + 1e-9)),
         blur=options.blur_px[int(rng.integers(len(options.blur_px)))],
         noise=rng.uniform(0.004, 0.01 + 0.018 * options.hard),
@@ -115,14 +136,16 @@ def _stains(options: WorldOptions, video: int, thing: int) -> list[Stain]:
             radius=rng.uniform(1.0, 6.0),
             aspect=rng.uniform(0.4, 1.6),
             angle=rng.uniform(0.0, math.pi),
-            colour=hsv(rng.random(), rng.uniform(0.2, 1.0), rng.uniform(0.1, 1.0)),
+            color=hsv(rng.random(), rng.uniform(0.2, 1.0), rng.uniform(0.1, 1.0)),
             opacity=rng.uniform(0.4, 1.0),
         )
         for _ in range(count)
     ]
 
 
-def light_object(options: WorldOptions, camera: Camera, thing: Thing, video: int, number: int) -> Scene:
+def light_object(
+    options: WorldOptions, camera: Camera, thing: Thing, video: int, number: int
+) -> Scene:
     """Lights the tile of ``thing`` (object ``number`` of the video) and filters it for the camera's pixel size."""
     height, px, n = thing.surface.height, thing.px, options.tile
     softened = ndimage.gaussian_filter(height, 0.6, mode="wrap")
@@ -140,40 +163,70 @@ def light_object(options: WorldOptions, camera: Camera, thing: Thing, video: int
         dx = (at[None] - stain.place[1] + half) % TILE_MM - half
         c, s = math.cos(stain.angle), math.sin(stain.angle)
         distance = np.hypot((c * dx + s * dy) * (1.0 / stain.aspect), c * dy - s * dx)
-        albedo = blend(albedo, stain.colour, smoothstep(distance, stain.radius, stain.radius * 0.9) * stain.opacity)
+        albedo = blend(
+            albedo,
+            stain.color,
+            smoothstep(distance, stain.radius, stain.radius * 0.9) * stain.opacity,
+        )
     norm = math.sqrt(lx * lx + ly * ly + (lz + 1.0) ** 2)
-    mirror = np.maximum(((lz + 1.0) - slope_x * lx - slope_y * ly) * upright * (1.0 / norm), 0.0) ** 60
+    mirror = (
+        np.maximum(((lz + 1.0) - slope_x * lx - slope_y * ly) * upright * (1.0 / norm), 0.0) ** 60
+    )
     rgb = albedo * (camera.ambient * open_sky + camera.sun * direct)[..., None] * camera.light
     rgb += (mirror * (thing.surface.gloss * 0.55 * camera.sun))[..., None]
-    exposure = (0.40 * camera.exposure / (0.12 + float(rgb.mean()))) ** 0.75  # imperfect, so that dark things stay darker
+    exposure = (
+        0.40 * camera.exposure / (0.12 + float(rgb.mean()))
+    ) ** 0.75  # imperfect, so that dark things stay darker
     blur = max(0.3, 0.42 * camera.view / options.size / px)
     lit = np.ascontiguousarray(np.moveaxis(rgb * exposure, 2, 0))
-    return Scene(ndimage.gaussian_filter(lit, (0.0, blur, blur), mode="wrap", truncate=3.0), px, exposure)
+    return Scene(
+        ndimage.gaussian_filter(lit, (0.0, blur, blur), mode="wrap", truncate=3.0), px, exposure
+    )
 
 
-def photo(options: WorldOptions, camera: Camera, scene: Scene, state: State, video: int, frame: int) -> Array:
+def photo(
+    options: WorldOptions, camera: Camera, scene: Scene, state: State, video: int, frame: int
+) -> Array:
     """The photo of one frame, shape (n, n, 3), about [0, 1]; depends on no other frame."""
     rng = options.rng("photo", video, frame)
     size = options.size
     y, x = grid(size)
-    sway = [0.012 * options.sway * math.sin(w * frame + video * p) for w, p in ((0.31, 1.0), (0.23, 2.0), (0.17, 3.0), (0.11, 5.0))]
+    sway = [
+        0.012 * options.sway * math.sin(w * frame + video * p)
+        for w, p in ((0.31, 1.0), (0.23, 2.0), (0.17, 3.0), (0.11, 5.0))
+    ]
     depth = 1.0 + x * (camera.tilt[0] + sway[0]) + y * (camera.tilt[1] + sway[1])
     wy, wx = y / depth, x / depth
     reach = camera.view / 2.0 * (1.0 + sway[3]) / scene.px
     c, s = math.cos(camera.turn + sway[2]) * reach, math.sin(camera.turn + sway[2]) * reach
     shift_x, shift_y = rng.normal(0.0, 0.004) * reach, rng.normal(0.0, 0.004) * reach
     image = sample_periodic(
-        scene.tile, s * wx + c * wy + (state.place[1] / scene.px + shift_y), c * wx - s * wy + (state.place[0] / scene.px + shift_x)
+        scene.tile,
+        s * wx + c * wy + (state.place[1] / scene.px + shift_y),
+        c * wx - s * wy + (state.place[0] / scene.px + shift_x),
     )
     if camera.edge is not None:
         angle, distance = camera.edge
         past = smoothstep(math.cos(angle) * wx + math.sin(angle) * wy, distance, distance + 0.03)
-        image = over(image, camera.beyond[:, None, None] * (0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(video))), past)
+        image = over(
+            image,
+            camera.beyond[:, None, None]
+            * (0.8 + 0.25 * np.sin(5.0 * wx + 3.0 * wy + float(video))),
+            past,
+        )
     if camera.shadow is not None:
         angle, offset, factor = camera.shadow
-        image *= 1.0 - (1.0 - factor) * smoothstep(math.cos(angle) * x + math.sin(angle) * y, offset, offset + 0.12)
+        image *= 1.0 - (1.0 - factor) * smoothstep(
+            math.cos(angle) * x + math.sin(angle) * y, offset, offset + 0.12
+        )
     if camera.hand is not None:
-        image = _hand(image, camera, scene.exposure, camera.hand + 0.02 * math.sin(0.2 * frame), 0.10 + 0.55 * state.lift)
+        image = _hand(
+            image,
+            camera,
+            scene.exposure,
+            camera.hand + 0.02 * math.sin(0.2 * frame),
+            0.10 + 0.55 * state.lift,
+        )
     blur = camera.blur * size / 128.0
     if blur > 0.2:
         image = ndimage.gaussian_filter(image, (0.0, blur, blur), truncate=2.5)
@@ -185,11 +238,16 @@ def photo(options: WorldOptions, camera: Camera, scene: Scene, state: State, vid
 def _hand(image: Array, camera: Camera, exposure: float, angle: float, tip: float) -> Array:
     """Shadow, sensor and two fingers and a back of the hand, entering along ``angle`` up to ``tip`` half widths from the middle."""
     y, x = grid(image.shape[1])
-    along, across = math.cos(angle) * x + math.sin(angle) * y, math.cos(angle) * y - math.sin(angle) * x
+    along, across = (
+        math.cos(angle) * x + math.sin(angle) * y,
+        math.cos(angle) * y - math.sin(angle) * x,
+    )
     box = np.maximum(np.abs(across - 0.06) - 0.2, tip - 0.03 - along)
     image = image * (1.0 - 0.45 * smoothstep(box, 0.10, -0.06))
     body = np.maximum(np.abs(across) - 0.15, tip - along)
-    case = f32([0.07, 0.07, 0.08])[:, None, None] + 0.9 * np.maximum(0.09 - np.abs(across - 0.03), 0.0)
+    case = f32([0.07, 0.07, 0.08])[:, None, None] + 0.9 * np.maximum(
+        0.09 - np.abs(across - 0.03), 0.0
+    )
     image = over(image, case, smoothstep(body, 0.02, -0.02))
     rim = np.maximum(np.abs(across) - 0.12, np.abs(along - tip - 0.02) - 0.02)
     image = over(image, f32([0.16, 0.4, 0.36]), smoothstep(rim, 0.01, -0.01))
@@ -197,5 +255,9 @@ def _hand(image: Array, camera: Camera, exposure: float, angle: float, tip: floa
     for middle, width, start in ((-0.20, 0.13, 0.24), (0.20, 0.13, 0.32), (0.0, 0.30, 0.68)):
         distance = np.hypot(np.minimum(along - (start + tip), 0.0), across - middle)
         round_ = np.sqrt(np.clip(1.0 - (distance * (1.0 / width)) ** 2, 0.0, 1.0))
-        image = over(image, skin[:, None, None] * (0.45 + 0.6 * round_), smoothstep(distance, width, width * 0.86))
+        image = over(
+            image,
+            skin[:, None, None] * (0.45 + 0.6 * round_),
+            smoothstep(distance, width, width * 0.86),
+        )
     return image

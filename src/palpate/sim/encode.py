@@ -48,7 +48,11 @@ def write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
     import av
 
     with av.open(str(path), "w", format="mp4") as file:
-        stream = file.add_stream("libx264", rate=FPS, options={"crf": "18", "preset": "veryfast", "x264-params": "cpu-independent=1"})
+        stream = file.add_stream(
+            "libx264",
+            rate=FPS,
+            options={"crf": "18", "preset": "veryfast", "x264-params": "cpu-independent=1"},
+        )
         stream.width = stream.height = size
         stream.pix_fmt = "yuv420p"
         stream.thread_count = 1

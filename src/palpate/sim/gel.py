@@ -1,11 +1,11 @@
-"""The touch sensor: a gel pad (14 mm by default), pressed with a given force, lit by three coloured lights, with or without markers.
+"""The touch sensor: a gel pad (14 mm by default), pressed with a given force, lit by three colored lights, with or without markers.
 
 - Press: a Winkler foundation. The gap between relief and gel dome is g; the approach d is solved exactly from
   mean(max(g + d, 0)) = load (sort g, then the k largest values touch for the k at which d_k = (N load - sum of k) / k is consistent).
 - Membrane: penetration p = max(g + d, 0), held h = G tanh(p / G) for a gel of depth G, grip w = p / (p + :data:`GRIP_MM`). From m = h, each blur of
   ``relax_mm`` gives m <- S m + w (h - S m): the gel follows what presses hard, and bridges the hollows and the rim where it is hardly
   touched, so that a contact ends softly. The blur ``optical_mm`` follows.
-- Light: with n the normal of m + texture, I = ((ambient + sum_k colour_k F_k(x, y) max(0, n . l_k)) V (1 - q m) (1 - 0.96 ink) gain)^gamma. Near
+- Light: with n the normal of m + texture, I = ((ambient + sum_k color_k F_k(x, y) max(0, n . l_k)) V (1 - q m) (1 - 0.96 ink) gain)^gamma. Near
   field F_k = 1 + a + 0.35 a² - hump_k r², a = fall_k (x, y) . azimuth_k, in units of half the pad; V = vignette times dirt; q, a unit's own
   sign, dims or brightens what is indented, as pressing a real pad does. The background image is the same formula with m = 0.
 - Markers: a jittered grid of small squarish dots of ink, large round ones where they are worn, and dust; they move with the gel.
@@ -24,7 +24,16 @@ import numpy as np
 from scipy import ndimage
 
 from palpate.core import rng_for
-from palpate.sim.arrays import Array, f32, grid, resample, sample_clipped, slopes, smooth, smoothstep
+from palpate.sim.arrays import (
+    Array,
+    f32,
+    grid,
+    resample,
+    sample_clipped,
+    slopes,
+    smooth,
+    smoothstep,
+)
 from palpate.sim.objects import Thing
 from palpate.sim.options import VERSION, WorldOptions
 
@@ -57,7 +66,7 @@ class _Look:
 
 
 _LOOKS = {
-    "gelsight": _Look(  # grey-pink and bright, faint lobes: teal at the top left, violet at the lower left, red on the right
+    "gelsight": _Look(  # gray-pink and bright, faint lobes: teal at the top left, violet at the lower left, red on the right
         azimuth=(-2.2, 2.4, 0.25),
         elevation=(26.0, 33.0),
         mixed=0.12,
@@ -86,7 +95,7 @@ class Sensor:
 
     Attributes:
         look, unit, size: which it is; pad: its side in mm; px: pixel size in mm.
-        field: near-field factor of each light, shape (3, n, n); colour: their RGB, (3, 3); light: unit vectors towards them, (3, 3).
+        field: near-field factor of each light, shape (3, n, n); color: their RGB, (3, 3); light: unit vectors towards them, (3, 3).
         ambient: RGB, (3,); veil: vignette times dirt, (n, n); texture, dome: gel relief in mm, (n, n).
         ink: opacity of the markers in [0, 1], (n, n), or None without markers.
         dim: loss of light for each mm of indentation; gel: depth that can be indented, in mm; relax, optical: blurs in mm.
@@ -99,7 +108,7 @@ class Sensor:
     pad: float
     px: float
     field: Array
-    colour: Array
+    color: Array
     light: Array
     ambient: Array
     veil: Array
@@ -116,11 +125,29 @@ class Sensor:
 
 def make_sensor(options: WorldOptions, unit: int) -> Sensor:
     """A unit of the family ``options.look``; the family is the same product in every world, the unit depends on the seed."""
-    return _make(WorldOptions(materials=options.materials, **{name: getattr(options, name) for name in _ASKED}), unit)
+    return _make(
+        WorldOptions(
+            materials=options.materials, **{name: getattr(options, name) for name in _ASKED}
+        ),
+        unit,
+    )
 
 
 #: The options that a unit depends on.
-_ASKED = ("look", "seed", "size", "pad_mm", "gel_mm", "relax_mm", "optical_mm", "dome_mm", "markers", "dirt", "vignette", "sensor_noise")
+_ASKED = (
+    "look",
+    "seed",
+    "size",
+    "pad_mm",
+    "gel_mm",
+    "relax_mm",
+    "optical_mm",
+    "dome_mm",
+    "markers",
+    "dirt",
+    "vignette",
+    "sensor_noise",
+)
 
 
 @lru_cache(maxsize=64)
@@ -132,8 +159,17 @@ def _make(options: WorldOptions, unit: int) -> Sensor:
     azimuth = [a + rng.normal(0.0, 0.05) for a in look.azimuth]
     elevation = np.deg2rad(family.uniform(*look.elevation, 3))
     mixed = look.mixed * spread[0]
-    colour = (_PURE * (1.0 - mixed) + mixed) * (np.exp(rng.normal(0.0, 0.05, (3, 1))) * np.asarray(look.gain)[:, None] * spread[1])
-    light = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
+    color = (_PURE * (1.0 - mixed) + mixed) * (
+        np.exp(rng.normal(0.0, 0.05, (3, 1))) * np.asarray(look.gain)[:, None] * spread[1]
+    )
+    light = np.stack(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ],
+        1,
+    )
     y, x = grid(DRAWN)
     square = x * x + y * y
     field: list[Array] = []
@@ -141,30 +177,59 @@ def _make(options: WorldOptions, unit: int) -> Sensor:
         along = (math.cos(a) * x + math.sin(a) * y) * (fall * spread[2])
         field.append(np.clip(1.0 + along + 0.35 * along * along - hump * square, 0.08, None))
     veil = (1.0 - rng.uniform(*options.vignette) * square) * (1.0 + options.dirt * _dirt(rng))
-    texture = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 0.3 / (pad / DRAWN))
+    texture = ndimage.gaussian_filter(
+        rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 0.3 / (pad / DRAWN)
+    )
     texture *= 0.0022 / float(texture.std())
     dome = square * ((pad / 2.0) ** 2 / (2.0 * rng.uniform(*options.dome_mm)))
-    ink = _markers(options.markers, pad, rng) if options.look == "gelsight" and options.markers else None
+    ink = (
+        _markers(options.markers, pad, rng)
+        if options.look == "gelsight" and options.markers
+        else None
+    )
     down = lambda a: resample(f32(a), options.size)  # noqa: E731
     return Sensor(
-        options.look, unit, options.size, pad, pad / options.size, np.stack([down(f) for f in field]), f32(colour), f32(light),
-        f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3)), down(veil), down(texture), down(dome),
-        None if ink is None else down(ink), rng.normal(0.03, 0.06), options.gel_mm, options.relax_mm, options.optical_mm, rng.uniform(0.9, 1.1),
+        options.look,
+        unit,
+        options.size,
+        pad,
+        pad / options.size,
+        np.stack([down(f) for f in field]),
+        f32(color),
+        f32(light),
+        f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3)),
+        down(veil),
+        down(texture),
+        down(dome),
+        None if ink is None else down(ink),
+        rng.normal(0.03, 0.06),
+        options.gel_mm,
+        options.relax_mm,
+        options.optical_mm,
+        rng.uniform(0.9, 1.1),
         rng.uniform(*options.sensor_noise),
-    )  # fmt: skip
+    )
 
 
 def _dirt(rng: np.random.Generator) -> Array:
     """Uneven coating, specks and scratches as a change of brightness around 0, on the drawn grid."""
     y, x = grid(DRAWN)
-    low = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), DRAWN / 7, mode="reflect")
+    low = ndimage.gaussian_filter(
+        rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), DRAWN / 7, mode="reflect"
+    )
     fine = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 1.6)
     dirt = low * (0.018 / float(low.std())) + fine * (0.004 / float(fine.std()))
     for _ in range(int(rng.integers(2, 9))):
         cx, cy, width = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.008, 0.03)
-        dirt -= rng.uniform(0.03, 0.18) * np.exp(((x - cx) ** 2 + (y - cy) ** 2) * (-0.5 / width**2))
+        dirt -= rng.uniform(0.03, 0.18) * np.exp(
+            ((x - cx) ** 2 + (y - cy) ** 2) * (-0.5 / width**2)
+        )
     for _ in range(int(rng.integers(0, 4))):
-        angle, offset, middle = rng.uniform(0.0, math.pi), rng.uniform(-1.0, 1.0), rng.uniform(-0.5, 0.5)
+        angle, offset, middle = (
+            rng.uniform(0.0, math.pi),
+            rng.uniform(-1.0, 1.0),
+            rng.uniform(-0.5, 0.5),
+        )
         across = (x * math.cos(angle) + y * math.sin(angle) - offset) * (1.0 / 0.012)
         along = y * math.cos(angle) - x * math.sin(angle) - middle
         dirt += rng.uniform(0.01, 0.05) * np.exp(-across * across) * (np.abs(along) < 0.35)
@@ -184,10 +249,22 @@ def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
     wear_x, wear_y, wear = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.15, 0.5)
     for i in range(rows + 3):
         for j in range(rows + 3):
-            cy, cx = first[0] + (i * step + rng.normal(0.0, 0.012)), first[1] + (j * step + rng.normal(0.0, 0.012))
-            worn = rng.random() < 0.07 + 0.75 * math.exp(-((cx - wear_x) ** 2 + (cy - wear_y) ** 2) / (2.0 * wear * wear))
+            cy, cx = (
+                first[0] + (i * step + rng.normal(0.0, 0.012)),
+                first[1] + (j * step + rng.normal(0.0, 0.012)),
+            )
+            worn = rng.random() < 0.07 + 0.75 * math.exp(
+                -((cx - wear_x) ** 2 + (cy - wear_y) ** 2) / (2.0 * wear * wear)
+            )
             radius = (rng.uniform(0.26, 0.40) if worn else rng.uniform(0.16, 0.215)) * scale
-            _dot(ink, (cy, cx), radius, rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.0), 2.0 if worn else 4.0)
+            _dot(
+                ink,
+                (cy, cx),
+                radius,
+                rng.uniform(0.85, 1.2),
+                rng.uniform(0.93, 1.0),
+                2.0 if worn else 4.0,
+            )
     for _ in range(int(rng.integers(0, 14))):
         _dot(
             ink,
@@ -200,15 +277,24 @@ def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
     return ink
 
 
-def _dot(ink: Array, place: tuple[float, float], radius: float, aspect: float, dark: float, power: float) -> None:
+def _dot(
+    ink: Array, place: tuple[float, float], radius: float, aspect: float, dark: float, power: float
+) -> None:
     """Draws one dot (|x|^power + |y|^power < radius^power) of opacity ``dark`` at ``place`` (y, x) in [-1, 1]."""
     y, x = grid(DRAWN)
     reach = 1.3 * radius + 0.02
-    (top, bottom), (left, right) = ([int(v) for v in np.searchsorted(y.ravel(), (c - reach, c + reach))] for c in place)
+    (top, bottom), (left, right) = (
+        [int(v) for v in np.searchsorted(y.ravel(), (c - reach, c + reach))] for c in place
+    )
     if bottom > top and right > left:
-        distance = (np.abs((x[:, left:right] - place[1]) / aspect) ** power + np.abs(y[top:bottom] - place[0]) ** power) ** (1.0 / power)
+        distance = (
+            np.abs((x[:, left:right] - place[1]) / aspect) ** power
+            + np.abs(y[top:bottom] - place[0]) ** power
+        ) ** (1.0 / power)
         part = np.s_[top:bottom, left:right]
-        ink[part] = np.maximum(ink[part], smoothstep(distance, radius + 0.006, radius - 0.006) * dark)
+        ink[part] = np.maximum(
+            ink[part], smoothstep(distance, radius + 0.006, radius - 0.006) * dark
+        )
 
 
 def solve_approach(gap: Array, load: float) -> float:
@@ -222,13 +308,20 @@ def solve_approach(gap: Array, load: float) -> float:
     return float(d[int(np.argmax(consistent))])
 
 
-def gap_of(thing: Thing, sensor: Sensor, relief: Array, load: float, tilt: tuple[float, float]) -> Array:
+def gap_of(
+    thing: Thing, sensor: Sensor, relief: Array, load: float, tilt: tuple[float, float]
+) -> Array:
     """Relief of the object minus the gel's dome, tilted and curved, in mm, shape (n, n); soft objects flatten under the load."""
     y, x = grid(sensor.size)
     half = sensor.pad / 2.0
     if thing.surface.softness:
         relief = relief * (1.0 - 0.5 * thing.surface.softness * min(1.0, load / 0.3))
-    return relief - sensor.dome - (x * (half * tilt[0]) + y * (half * tilt[1])) - x * x * (thing.curvature / 2.0 * half * half)
+    return (
+        relief
+        - sensor.dome
+        - (x * (half * tilt[0]) + y * (half * tilt[1]))
+        - x * x * (thing.curvature / 2.0 * half * half)
+    )
 
 
 def press(sensor: Sensor, gap: Array, load: float) -> tuple[Array, Array]:
@@ -249,15 +342,21 @@ def press(sensor: Sensor, gap: Array, load: float) -> tuple[Array, Array]:
     return smooth(membrane, sensor.optical / sensor.px), contact
 
 
-def marker_shift(sensor: Sensor, membrane: Array, shear: tuple[float, float]) -> tuple[Array, Array]:
+def marker_shift(
+    sensor: Sensor, membrane: Array, shear: tuple[float, float]
+) -> tuple[Array, Array]:
     """Displacement (dy, dx) of the markers in pixels: dragged by ``shear`` (mm per mm of depth), pushed apart where the gel is deep."""
     depth = smooth(np.minimum(membrane, 1.0), sensor.size / 10)
     slope_y, slope_x = slopes(depth, sensor.px)
     unit = 1.0 / sensor.px
-    return f32(depth * (shear[1] * unit) - slope_y * (0.107 * unit)), f32(depth * (shear[0] * unit) - slope_x * (0.107 * unit))
+    return f32(depth * (shear[1] * unit) - slope_y * (0.107 * unit)), f32(
+        depth * (shear[0] * unit) - slope_x * (0.107 * unit)
+    )
 
 
-def shade(sensor: Sensor, membrane: Array, gain: Array, shift: tuple[Array, Array] | None = None) -> Array:
+def shade(
+    sensor: Sensor, membrane: Array, gain: Array, shift: tuple[Array, Array] | None = None
+) -> Array:
     """The image of the gel, shape (n, n, 3), in [0, 1.2]^gamma, without noise.
 
     Args:
@@ -281,6 +380,8 @@ def shade(sensor: Sensor, membrane: Array, gain: Array, shift: tuple[Array, Arra
         veil = veil * (1.0 - 0.96 * ink)
     image = np.empty((sensor.size, sensor.size, 3), np.float32)
     for c in range(3):
-        total = sum(light[k] * float(sensor.colour[k, c]) for k in range(3)) + float(sensor.ambient[c])
+        total = sum(light[k] * float(sensor.color[k, c]) for k in range(3)) + float(
+            sensor.ambient[c]
+        )
         image[..., c] = total * veil * float(gain[c])
     return np.clip(image, 0.0, 1.2) ** sensor.gamma

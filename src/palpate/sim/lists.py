@@ -24,7 +24,9 @@ from palpate.sim.plan import VideoPlan
 LEAK_COLUMNS = ("id", "video_in_train", "touch_in_train", "object_in_train", "gap", "nearest")
 
 
-def cut(options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+def cut(
+    options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]
+) -> tuple[list[Row], list[Row]]:
     """Train and test rows, both shuffled: the world's own split, which leaks as ``options.leak`` tells.
 
     Raises:
@@ -33,25 +35,35 @@ def cut(options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]) 
     rng = options.rng("cut", options.leak)
     unit_of = {
         "frame": lambda row: (row.video.index, row.frame),
-        "touch": lambda row: (row.video.index, row.touch),
+        "contact": lambda row: (row.video.index, row.touch),
         "none": lambda row: (row.video.index,),
     }[options.leak]
     units = list(dict.fromkeys(unit_of(row) for row in rows))
     if len(units) < 2:
-        what = {"frame": "contact frames", "touch": "touches", "none": "videos"}[options.leak]
-        raise PalpateError(f"leak={options.leak!r} needs at least two {what}", f"{len(units)}", "Ask for a larger world")
+        what = {"frame": "contact frames", "contact": "touches", "none": "videos"}[options.leak]
+        raise PalpateError(
+            f"leak={options.leak!r} needs at least two {what}",
+            f"{len(units)}",
+            "Ask for a larger world",
+        )
     order = [units[k] for k in rng.permutation(len(units))]
     if options.leak == "none":  # by video, material by material
         main = {(plan.index,): options.names.index(plan.objects[0].material) for plan in plans}
         order.sort(key=lambda unit: main[unit])
     # Error diffusion: unit k goes to test where the running share passes a whole number, so that every stretch has its share.
-    chosen = {u for k, u in enumerate(order) if int((k + 1) * options.test + 0.5) > int(k * options.test + 0.5)}
+    chosen = {
+        u
+        for k, u in enumerate(order)
+        if int((k + 1) * options.test + 0.5) > int(k * options.test + 0.5)
+    }
     if not chosen:  # the share is too small for one unit, or too large to leave one: both lists have one at least
         chosen = {order[0]}
     elif len(chosen) == len(order):
         chosen.discard(order[-1])
     shuffled = [rows[k] for k in rng.permutation(len(rows))]
-    return [r for r in shuffled if unit_of(r) not in chosen], [r for r in shuffled if unit_of(r) in chosen]
+    return [r for r in shuffled if unit_of(r) not in chosen], [
+        r for r in shuffled if unit_of(r) in chosen
+    ]
 
 
 @dataclass(frozen=True)
@@ -82,9 +94,22 @@ def leaks(train: Sequence[Row], test: Sequence[Row]) -> list[Leaked]:
     objects = {row.object for row in train}
     found: list[Leaked] = []
     for row in sorted(test, key=lambda row: (row.video.index, row.frame)):
-        near = min(frames.get(row.video.index, ()), key=lambda frame: (abs(frame - row.frame), frame), default=None)
+        near = min(
+            frames.get(row.video.index, ()),
+            key=lambda frame: (abs(frame - row.frame), frame),
+            default=None,
+        )
         gap = None if near is None else abs(near - row.frame)
-        found.append(Leaked(row, near is not None, (row.video.index, row.touch) in touches, row.object in objects, gap, near))
+        found.append(
+            Leaked(
+                row,
+                near is not None,
+                (row.video.index, row.touch) in touches,
+                row.object in objects,
+                gap,
+                near,
+            )
+        )
     return found
 
 
@@ -99,7 +124,9 @@ def leak_counts(train: Sequence[Row], test: Sequence[Row]) -> dict[str, int | fl
         "test_frames_of_shared_objects": sum(leak.object for leak in every),
         "leaked_fraction": len(gaps) / len(test),
         "videos_shared": len({leak.row.video.index for leak in every if leak.video}),
-        "touches_shared": len({(leak.row.video.index, leak.row.touch) for leak in every if leak.touch}),
+        "touches_shared": len(
+            {(leak.row.video.index, leak.row.touch) for leak in every if leak.touch}
+        ),
         "objects_shared": len({leak.row.object for leak in every if leak.object}),
         "gap_min": min(gaps, default=None),
         "gap_median": statistics.median(gaps) if gaps else None,
@@ -113,7 +140,14 @@ def leak_file(options: WorldOptions, train: Sequence[Row], test: Sequence[Row]) 
     for leak in leaks(train, test):
         near = "" if leak.nearest is None else sample_id(options, leak.row.video, leak.nearest)
         flags = (str(int(flag)) for flag in (leak.video, leak.touch, leak.object))
-        rows.append((sample_id(options, leak.row.video, leak.row.frame), *flags, "" if leak.gap is None else str(leak.gap), near))
+        rows.append(
+            (
+                sample_id(options, leak.row.video, leak.row.frame),
+                *flags,
+                "" if leak.gap is None else str(leak.gap),
+                near,
+            )
+        )
     return table(LEAK_COLUMNS, rows)
 
 
@@ -126,7 +160,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return text.getvalue()
 
 
-def list_files(rows: Sequence[Row], train: Sequence[Row], test: Sequence[Row], captions: Mapping[str, Sequence[str]]) -> dict[str, str]:
+def list_files(
+    rows: Sequence[Row],
+    train: Sequence[Row],
+    test: Sequence[Row],
+    captions: Mapping[str, Sequence[str]],
+) -> dict[str, str]:
     """Touch and Go's lists by file name.
 
     Args:
@@ -139,9 +178,13 @@ def list_files(rows: Sequence[Row], train: Sequence[Row], test: Sequence[Row], c
     line = lambda row: f"{path(row)},{MATERIALS[row.video.object_of(row.touch).material].label}"  # noqa: E731
     return {
         "label.txt": "".join(f"{line(row)}\n" for row in rows),
-        "category_reference.txt": "".join(f"{name}: {material.label}\n" for name, material in MATERIALS.items()),
+        "category_reference.txt": "".join(
+            f"{name}: {material.label}\n" for name, material in MATERIALS.items()
+        ),
         "train.txt": "\n".join(map(line, train)),
         "test.txt": "\n".join(map(line, test)),
         "objects.csv": table(("frame", "object"), ((path(row), row.object) for row in rows)),
-        "captions.csv": table(("frame", "text"), ((path(row), captions[row.video.name][row.touch]) for row in rows)),
+        "captions.csv": table(
+            ("frame", "text"), ((path(row), captions[row.video.name][row.touch]) for row in rows)
+        ),
     }

@@ -16,11 +16,17 @@ from palpate.sim.options import WorldOptions
 from palpate.sim.plan import VideoPlan, contact_frames, written_frames
 
 COLUMNS = ("url", "tactile", "tactile_background", "caption")
-_QUESTION = "<image>\nThis is a tactile image of a synthetic surface. Describe how it feels, in adjectives."
+_QUESTION = (
+    "<image>\nThis is a tactile image of a synthetic surface. Describe how it feels, in adjectives."
+)
 
 
 def hct_list_files(
-    options: WorldOptions, plans: Sequence[VideoPlan], train: Sequence[Row], test: Sequence[Row], captions: Mapping[str, Sequence[str]]
+    options: WorldOptions,
+    plans: Sequence[VideoPlan],
+    train: Sequence[Row],
+    test: Sequence[Row],
+    captions: Mapping[str, Sequence[str]],
 ) -> dict[str, str]:
     """HCT's lists by path below ``hct/``.
 
@@ -32,11 +38,21 @@ def hct_list_files(
         captions: video name -> one caption a touch.
     """
     files: dict[str, str] = {}
-    touching = {frame for touch in range(options.touches_per_video) for frame in contact_frames(options, touch)}
+    touching = {
+        frame
+        for touch in range(options.touches_per_video)
+        for frame in contact_frames(options, touch)
+    }
     for rig in sorted({rig_of(plan) for plan in plans}):
-        listed = {part: [row for row in rows if rig_of(row.video) == rig] for part, rows in (("train", train), ("test", test))}
+        listed = {
+            part: [row for row in rows if rig_of(row.video) == rig]
+            for part, rows in (("train", train), ("test", test))
+        }
         cells = {
-            part: [(*_paths(options, row.video, row.frame), captions[row.video.name][row.touch]) for row in rows]
+            part: [
+                (*_paths(options, row.video, row.frame), captions[row.video.name][row.touch])
+                for row in rows
+            ]
             for part, rows in listed.items()
         }
         files |= {f"{rig}/{part}.csv": table(COLUMNS, rows) for part, rows in cells.items() if rows}
@@ -48,14 +64,20 @@ def hct_list_files(
                 for frame in written_frames(options)
                 if (frame in touching) is wanted
             ]
-            columns = {key: [paths[k] for paths in frames] for key, k in (("tactile", 1), ("vision", 0), ("background", 2))}
+            columns = {
+                key: [paths[k] for paths in frames]
+                for key, k in (("tactile", 1), ("vision", 0), ("background", 2))
+            }
             files[f"{rig}/{name}.json"] = json.dumps(columns) + "\n"
         talks = [
             {
                 "image": vision,
                 "tactile": tactile,
                 "tactile_background": background,
-                "conversations": [{"from": "human", "value": _QUESTION}, {"from": "gpt", "value": text}],
+                "conversations": [
+                    {"from": "human", "value": _QUESTION},
+                    {"from": "gpt", "value": text},
+                ],
             }
             for vision, tactile, background, text in cells["train"]
         ]

@@ -60,10 +60,17 @@ def make_touches(options: WorldOptions, plan: VideoPlan) -> list[Touch]:
     for thing in plan.touched:
         fresh = thing != last
         if fresh:
-            home, turn, last = (rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM)), rng.uniform(0.0, 2.0 * math.pi), thing
+            home, turn, last = (
+                (rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM)),
+                rng.uniform(0.0, 2.0 * math.pi),
+                thing,
+            )
         far = bool(rng.random() < options.jump) and not fresh
         away = (rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM))
-        near = (home[0] + options.revisit_mm * rng.normal(), home[1] + options.revisit_mm * rng.normal())
+        near = (
+            home[0] + options.revisit_mm * rng.normal(),
+            home[1] + options.revisit_mm * rng.normal(),
+        )
         reach = options.slide_mm[int(rng.integers(len(options.slide_mm)))]
         touches.append(
             Touch(

@@ -73,16 +73,26 @@ def sides(options: WorldOptions) -> tuple[str, str]:
     return ("vision", "tactile") if options.layout == "hct" else ("video_frame", "gelsight_frame")
 
 
-def image_paths(options: WorldOptions, plan: VideoPlan, touch: int, frame: int) -> dict[str, str | None]:
+def image_paths(
+    options: WorldOptions, plan: VideoPlan, touch: int, frame: int
+) -> dict[str, str | None]:
     """``vision``, ``tactile``, ``background`` of a contact frame relative to the manifest's root; None where there are no image files."""
     if options.layout not in ("frames", "hct"):
         return {"vision": None, "tactile": None, "background": None}
-    folder, (vision, tactile), name = video_folder(options, plan), sides(options), frame_name(options, plan, frame)
+    folder, (vision, tactile), name = (
+        video_folder(options, plan),
+        sides(options),
+        frame_name(options, plan, frame),
+    )
     if options.layout == "hct":
         background = f"{folder}/background.png"
     else:
         background = f"{folder}/{tactile}/{frame_name(options, plan, first_contact(options, touch) - BACKGROUND_OFFSET)}"
-    return {"vision": f"{folder}/{vision}/{name}", "tactile": f"{folder}/{tactile}/{name}", "background": background}
+    return {
+        "vision": f"{folder}/{vision}/{name}",
+        "tactile": f"{folder}/{tactile}/{name}",
+        "background": background,
+    }
 
 
 @dataclass(frozen=True)
@@ -108,4 +118,7 @@ def contact_row(options: WorldOptions, plans: list[VideoPlan], k: int) -> Row:
 
 def contact_rows(options: WorldOptions, plans: list[VideoPlan]) -> Iterator[Row]:
     """Every contact frame, by video and frame: the order of manifest and arrays."""
-    return (contact_row(options, plans, k) for k in range(len(plans) * options.touches_per_video * options.frames_per_touch))
+    return (
+        contact_row(options, plans, k)
+        for k in range(len(plans) * options.touches_per_video * options.frames_per_touch)
+    )

@@ -38,11 +38,20 @@ def make_object(options: WorldOptions, ref: ObjectRef) -> Thing:
     Raises:
         PalpateError: if the material draws something invalid.
     """
-    return _make(options.seed, ref, MATERIALS[ref.material], options.tile, options.curved, options.radius_mm)
+    return _make(
+        options.seed, ref, MATERIALS[ref.material], options.tile, options.curved, options.radius_mm
+    )
 
 
 @lru_cache(maxsize=6)
-def _make(seed: int, ref: ObjectRef, material: Material, tile: int, curved: float, radius_mm: tuple[float, float]) -> Thing:
+def _make(
+    seed: int,
+    ref: ObjectRef,
+    material: Material,
+    tile: int,
+    curved: float,
+    radius_mm: tuple[float, float],
+) -> Thing:
     rng: np.random.Generator = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
     surface = draw_surface(ref.material, material, tile, rng)
     flat = rng.random() >= curved

@@ -13,7 +13,15 @@ import numpy as np
 from palpate.core import PalpateError, Problem, ProblemsError, digest_json, rng_for
 from palpate.sim.materials import MATERIALS
 from palpate.sim.materials.entries import bad_entries
-from palpate.sim.ranges import BACKGROUND_OFFSET, CHOICES, PAIRS, RANGES, SERIES, out_of_range, shown
+from palpate.sim.ranges import (
+    BACKGROUND_OFFSET,
+    CHOICES,
+    PAIRS,
+    RANGES,
+    SERIES,
+    out_of_range,
+    shown,
+)
 
 __all__ = ["BACKGROUND_OFFSET", "CHOICES", "PAIRS", "RANGES", "SERIES", "VERSION", "WorldOptions"]
 
@@ -41,10 +49,10 @@ class WorldOptions:
         objects_per_video: a mixed video touches 2 to this many objects of different materials (1: no video is mixed).
         mixed: share of the videos that are mixed; their further objects appear in no other video.
         sensors: gel units of the sensor family; each video uses one.
-        look: ``"gelsight"`` (markers, near-field colours) or ``"digit"`` (no markers, darker, stronger colours).
+        look: ``"gelsight"`` (markers, near-field colors) or ``"digit"`` (no markers, darker, stronger colors).
         hard: 0 to 1, scales everything in the photos that is irrelevant to touch (stains, hand, edges, shadows, light, gain drift).
         named: share of the captions that name the thing; the others say only how it feels.
-        leak: how the world's own train and test lists are cut: random ``"frame"``, random whole ``"touch"``, or by video (``"none"``).
+        leak: how the world's own train and test lists are cut: random ``"frame"``, random whole ``"contact"``, or by video (``"none"``).
         test: share of the contact frames in the test list, nearly.
         layout: ``"frames"`` (Touch and Go as JPEG files), ``"videos"`` (Touch and Go as H.264, needs PyAV), ``"hct"`` (HCT of TVL) or ``"raw"``
             (uint8 arrays).
@@ -86,7 +94,7 @@ class WorldOptions:
     look: Literal["gelsight", "digit"] = "gelsight"
     hard: float = 0.5
     named: float = 0.5
-    leak: Literal["frame", "touch", "none"] = "touch"
+    leak: Literal["frame", "contact", "none"] = "contact"
     test: float = 0.25
     layout: Literal["frames", "videos", "hct", "raw"] = "frames"
     tile: int = 256
@@ -121,7 +129,9 @@ class WorldOptions:
             if isinstance(getattr(self, name), list):  # as JSON gives them
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in (*PAIRS, *SERIES):
-            if isinstance(value := getattr(self, name), tuple):  # 26 and 26.0 are one option, with one digest
+            if isinstance(
+                value := getattr(self, name), tuple
+            ):  # 26 and 26.0 are one option, with one digest
                 object.__setattr__(self, name, tuple(map(_real, value)))
         for name, (low, _) in RANGES.items():
             if isinstance(low, float) and type(value := getattr(self, name)) is int:
@@ -133,7 +143,11 @@ class WorldOptions:
             raise found[0]
         if found:
             problems = [Problem("WorldOptions", "bad-option", str(e)) for e in found]
-            raise ProblemsError(problems, str(found[0]), "Every option of the world must lie in its range and fit the others")
+            raise ProblemsError(
+                problems,
+                str(found[0]),
+                "Every option of the world must lie in its range and fit the others",
+            )
 
     def _materials(self) -> list[PalpateError]:
         """Turns a count into names; what is wrong with the names."""
@@ -143,31 +157,55 @@ class WorldOptions:
                 must = f"materials must be 1 to {len(MATERIALS)}"
                 return [PalpateError(must, shown(count), "Pass a smaller count, or names")]
             names = list(MATERIALS)
-            object.__setattr__(self, "materials", tuple(names[k * len(names) // count] for k in range(count)))
+            object.__setattr__(
+                self, "materials", tuple(names[k * len(names) // count] for k in range(count))
+            )
             return [*bad_entries(self.names)]
-        if not isinstance(self.materials, tuple) or not all(isinstance(name, str) for name in self.materials):
-            return [PalpateError("materials must be names or a count", shown(self.materials), "Pass e.g. materials=('Wood', 'Grass')")]
+        if not isinstance(self.materials, tuple) or not all(
+            isinstance(name, str) for name in self.materials
+        ):
+            return [
+                PalpateError(
+                    "materials must be names or a count",
+                    shown(self.materials),
+                    "Pass e.g. materials=('Wood', 'Grass')",
+                )
+            ]
         return _unknown_materials(self.materials) or [*bad_entries(self.materials)]
 
     def _inconsistent(self) -> Iterator[PalpateError]:
         """What is wrong between options that are each in range."""
         if self.layout == "videos" and self.size % 2:
-            yield PalpateError("size must be even for layout='videos'", str(self.size), f"Pass size={self.size + 1}")
+            yield PalpateError(
+                "size must be even for layout='videos'",
+                str(self.size),
+                f"Pass size={self.size + 1}",
+            )
         if self.layout == "videos" and self.free_written != "all":
-            yield PalpateError("layout='videos' must write all free frames", "free_written='background'", "Leave free_written out")
+            yield PalpateError(
+                "layout='videos' must write all free frames",
+                "free_written='background'",
+                "Leave free_written out",
+            )
         if self.load_mm[1] > self.gel_mm:
             got = f"load_mm up to {self.load_mm[1]:g}, gel_mm {self.gel_mm:g}"
             yield PalpateError(
-                "load_mm must not exceed gel_mm", got, f"Pass load_mm=({min(self.load_mm[0], self.gel_mm):g}, {self.gel_mm:g})"
+                "load_mm must not exceed gel_mm",
+                got,
+                f"Pass load_mm=({min(self.load_mm[0], self.gel_mm):g}, {self.gel_mm:g})",
             )
         if self.pad_mm > self.view_mm[0]:
             got = f"pad_mm {self.pad_mm:g}, view_mm from {self.view_mm[0]:g}"
             yield PalpateError(
-                "the pad must lie in the photo: pad_mm must not exceed the lower end of view_mm", got, "Pass a smaller pad_mm"
+                "the pad must lie in the photo: pad_mm must not exceed the lower end of view_mm",
+                got,
+                "Pass a smaller pad_mm",
             )
         if self.balance != "uniform" and self.objects_per_material < 2:
             yield PalpateError(
-                f"balance={self.balance!r} must have 2 objects a material or more", "1", "Pass objects_per_material=2 or more"
+                f"balance={self.balance!r} must have 2 objects a material or more",
+                "1",
+                "Pass objects_per_material=2 or more",
             )
 
     @property
@@ -201,12 +239,28 @@ def _real(value: object) -> object:
 def _unknown_materials(names: tuple[str, ...]) -> list[PalpateError]:
     found: list[PalpateError] = []
     if not names:
-        found.append(PalpateError("materials must name at least one material", "none", "Pass e.g. materials=('Wood', 'Grass')"))
+        found.append(
+            PalpateError(
+                "materials must name at least one material",
+                "none",
+                "Pass e.g. materials=('Wood', 'Grass')",
+            )
+        )
     if len(set(names)) < len(names):
-        found.append(PalpateError("materials must name each material once", repr(names), "Leave out the repeated names"))
+        found.append(
+            PalpateError(
+                "materials must name each material once",
+                repr(names),
+                "Leave out the repeated names",
+            )
+        )
     for name in names:
         if name not in MATERIALS:
             near = difflib.get_close_matches(name, MATERIALS, 1, 0.3)
-            fix = f"Did you mean {near[0]!r}? Known: {', '.join(MATERIALS)}" if near else f"Known: {', '.join(MATERIALS)}"
+            fix = (
+                f"Did you mean {near[0]!r}? Known: {', '.join(MATERIALS)}"
+                if near
+                else f"Known: {', '.join(MATERIALS)}"
+            )
             found.append(PalpateError("materials must be names of MATERIALS", repr(name), fix))
     return found

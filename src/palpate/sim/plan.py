@@ -58,7 +58,9 @@ def first_contact(options: WorldOptions, touch: int) -> int:
 
 def contact_frames(options: WorldOptions, touch: int) -> range:
     """Frame numbers of a touch in contact."""
-    return range(first_contact(options, touch), first_contact(options, touch) + options.frames_per_touch)
+    return range(
+        first_contact(options, touch), first_contact(options, touch) + options.frames_per_touch
+    )
 
 
 def written_frames(options: WorldOptions) -> list[int]:
@@ -67,15 +69,25 @@ def written_frames(options: WorldOptions) -> list[int]:
         return list(range(options.video_length))
     frames: list[int] = []
     for touch in range(options.touches_per_video):
-        frames += [first_contact(options, touch) - BACKGROUND_OFFSET, *contact_frames(options, touch)]
+        frames += [
+            first_contact(options, touch) - BACKGROUND_OFFSET,
+            *contact_frames(options, touch),
+        ]
     return frames
 
 
 def chosen_twice(options: WorldOptions, listed: list[ObjectRef]) -> set[ObjectRef]:
     """The share ``two_videos`` of the objects, drawn so that every material has its share, nearly."""
     rng = options.rng("two videos")
-    order = sorted((listed[k] for k in rng.permutation(len(listed))), key=lambda ref: options.names.index(ref.material))
-    return {ref for k, ref in enumerate(order) if int((k + 1) * options.two_videos + 0.5) > int(k * options.two_videos + 0.5)}
+    order = sorted(
+        (listed[k] for k in rng.permutation(len(listed))),
+        key=lambda ref: options.names.index(ref.material),
+    )
+    return {
+        ref
+        for k, ref in enumerate(order)
+        if int((k + 1) * options.two_videos + 0.5) > int(k * options.two_videos + 0.5)
+    }
 
 
 def plan_world(options: WorldOptions) -> list[VideoPlan]:
@@ -85,7 +97,9 @@ def plan_world(options: WorldOptions) -> list[VideoPlan]:
     twice = chosen_twice(options, listed)
     own = [listed[k] for k in options.rng("order").permutation(len(listed))]
     guests = dict(objects)
-    day = datetime.datetime(2026, 1, 1) + datetime.timedelta(days=seed_for(options.seed, "world", VERSION, "date") % 3650)
+    day = datetime.datetime(2026, 1, 1) + datetime.timedelta(
+        days=seed_for(options.seed, "world", VERSION, "date") % 3650
+    )
     plans: list[VideoPlan] = []
     for ref in own:
         for _ in range(options.videos_per_object + (ref in twice)):
@@ -98,8 +112,17 @@ def plan_world(options: WorldOptions) -> list[VideoPlan]:
                 for k in rng.permutation(len(others))[: int(rng.integers(1, most))]:
                     touched_objects.append(ObjectRef(others[k], guests[others[k]]))
                     guests[others[k]] += 1
-            cuts = sorted(int(c) + 1 for c in rng.permutation(options.touches_per_video - 1)[: len(touched_objects) - 1])
-            touched = tuple(sum(touch >= cut for cut in cuts) for touch in range(options.touches_per_video))
+            cuts = sorted(
+                int(c) + 1
+                for c in rng.permutation(options.touches_per_video - 1)[: len(touched_objects) - 1]
+            )
+            touched = tuple(
+                sum(touch >= cut for cut in cuts) for touch in range(options.touches_per_video)
+            )
             name = (day + datetime.timedelta(seconds=index * 97)).strftime("%Y%m%d_%H%M%S")
-            plans.append(VideoPlan(index, name, int(rng.integers(options.sensors)), tuple(touched_objects), touched))
+            plans.append(
+                VideoPlan(
+                    index, name, int(rng.integers(options.sensors)), tuple(touched_objects), touched
+                )
+            )
     return plans

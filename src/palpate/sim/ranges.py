@@ -71,7 +71,7 @@ LONGEST = 8
 CHOICES: dict[str, tuple[str, ...]] = {
     "look": ("gelsight", "digit"),
     "balance": ("uniform", "touch-and-go"),
-    "leak": ("frame", "touch", "none"),
+    "leak": ("frame", "contact", "none"),
     "layout": ("frames", "videos", "hct", "raw"),
     "free_written": ("all", "background"),
 }
@@ -115,22 +115,44 @@ def out_of_range(values: dict[str, Any]) -> Iterator[PalpateError]:
             kind = "a whole number" if whole else "a number"
             near = _nearest(value, low, high) if is_number(value) else low
             must = f"{name} must be {kind} from {_written(low)} to {_written(high)}"
-            yield PalpateError(must, shown(value), f"Pass e.g. {name}={_written(round(near) if whole else near)}")
+            yield PalpateError(
+                must, shown(value), f"Pass e.g. {name}={_written(round(near) if whole else near)}"
+            )
     for name, (low, high) in PAIRS.items():
         value = values[name]
-        if not isinstance(value, tuple) or len(value) != 2 or not all(is_number(v) and low <= v <= high for v in value):
+        if (
+            not isinstance(value, tuple)
+            or len(value) != 2
+            or not all(is_number(v) and low <= v <= high for v in value)
+        ):
             numbers = isinstance(value, tuple) and len(value) == 2 and all(map(is_number, value))
             near = [_nearest(v, low, high) for v in sorted(value)] if numbers else [low, high]
             fix = f"Pass e.g. {name}=({near[0]:g}, {near[1]:g})"
-            yield PalpateError(f"{name} must be two numbers from {low:g} to {high:g}", shown(value), fix)
+            yield PalpateError(
+                f"{name} must be two numbers from {low:g} to {high:g}", shown(value), fix
+            )
         elif value[0] > value[1]:
-            yield PalpateError(f"{name} must be a range, the lower end first", shown(value), f"Pass {name}=({value[1]:g}, {value[0]:g})")
+            yield PalpateError(
+                f"{name} must be a range, the lower end first",
+                shown(value),
+                f"Pass {name}=({value[1]:g}, {value[0]:g})",
+            )
     for name, (low, high, least) in SERIES.items():
         value = values[name]
-        if not isinstance(value, tuple) or not least <= len(value) <= LONGEST or not all(is_number(v) and low <= v <= high for v in value):
+        if (
+            not isinstance(value, tuple)
+            or not least <= len(value) <= LONGEST
+            or not all(is_number(v) and low <= v <= high for v in value)
+        ):
             many = f"{least} to {LONGEST} numbers from {low:g} to {high:g}"
-            yield PalpateError(f"{name} must be {many}", shown(value), f"Pass e.g. {name}=({low:g}, {high:g})")
+            yield PalpateError(
+                f"{name} must be {many}", shown(value), f"Pass e.g. {name}=({low:g}, {high:g})"
+            )
     for name, choices in CHOICES.items():
         if not isinstance(values[name], str) or values[name] not in choices:
             listed = ", ".join(map(repr, choices))
-            yield PalpateError(f"{name} must be one of {listed}", shown(values[name]), f"Pass {name}={choices[0]!r}")
+            yield PalpateError(
+                f"{name} must be one of {listed}",
+                shown(values[name]),
+                f"Pass {name}={choices[0]!r}",
+            )

@@ -56,12 +56,27 @@ def open_arrays(folder: Path) -> Arrays:
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
         except FileNotFoundError:
-            raise PalpateError("A raw world must have vision.npy, tactile.npy and background.npy", f"no file {path}", fix) from None
+            raise PalpateError(
+                "A raw world must have vision.npy, tactile.npy and background.npy",
+                f"no file {path}",
+                fix,
+            ) from None
         except (ValueError, EOFError) as error:
-            raise PalpateError(f"{path} must be an array in NumPy's format", str(error), fix) from None
-        if array.dtype != np.uint8 or array.ndim != 4 or len(array) != len(manifest) or array.shape[3] != 3:
+            raise PalpateError(
+                f"{path} must be an array in NumPy's format", str(error), fix
+            ) from None
+        if (
+            array.dtype != np.uint8
+            or array.ndim != 4
+            or len(array) != len(manifest)
+            or array.shape[3] != 3
+        ):
             got = f"{array.dtype} of shape {array.shape}"
-            raise PalpateError(f"{path} must be uint8 of shape ({len(manifest)}, size, size, 3), as its manifest has rows", got, fix)
+            raise PalpateError(
+                f"{path} must be uint8 of shape ({len(manifest)}, size, size, 3), as its manifest has rows",
+                got,
+                fix,
+            )
         found[name] = array
     return Arrays(manifest, found["vision"], found["tactile"], found["background"])
 
@@ -77,7 +92,9 @@ def allocate_arrays(folder: Path, options: WorldOptions, rows: int) -> None:
         if path.is_file():
             continue
         with atomic_path(path) as part:
-            np.lib.format.open_memmap(part, "w+", np.uint8, (rows, options.size, options.size, 3)).flush()
+            np.lib.format.open_memmap(
+                part, "w+", np.uint8, (rows, options.size, options.size, 3)
+            ).flush()
             with part.open("r+b") as file:
                 _reserve(file.fileno(), part.stat().st_size)
 
@@ -106,7 +123,11 @@ def write_rows(folder: Path, options: WorldOptions, plan: VideoPlan, video: Vide
     for touch in range(options.touches_per_video):
         background = video.background_of(touch)
         for frame in contact_frames(options, touch):
-            whole["vision"][at], whole["tactile"][at], whole["background"][at] = video.vision(frame), video.tactile(frame), background
+            whole["vision"][at], whole["tactile"][at], whole["background"][at] = (
+                video.vision(frame),
+                video.tactile(frame),
+                background,
+            )
             at += 1
     for array in whole.values():
         array.flush()

@@ -33,10 +33,14 @@ def require_sheet_path(path: Path, world: Path) -> None:
         raise PalpateError(f"The contact sheet {path} must be a file", "a folder", fix)
     place = next(p for p in path.absolute().parents if p.exists())
     if not place.is_dir():
-        raise PalpateError(f"The contact sheet {path} must lie in a folder", f"the file {place}", fix)
+        raise PalpateError(
+            f"The contact sheet {path} must lie in a folder", f"the file {place}", fix
+        )
     if not os.access(place, os.W_OK | os.X_OK):
         raise PalpateError(
-            f"The folder of the contact sheet {path} must be writable", f"no right to write to {place}", "Choose another path"
+            f"The folder of the contact sheet {path} must be writable",
+            f"no right to write to {place}",
+            "Choose another path",
         )
 
 

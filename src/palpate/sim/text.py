@@ -18,7 +18,10 @@ NAMED = ("{phrase}", "this is {phrase}", "the sensor touches {phrase}", "it feel
 #: ``{list}``: the adjectives, joined by commas and "and".
 UNNAMED = ("{list}", "it feels {list}", "a surface that feels {list}", "{list} to the touch")
 #: Words with a vowel letter but a consonant sound in front (uniform, usual, one-sided; not uninterrupted), or the reverse (hour, honest).
-_CONSONANT, _VOWEL = re.compile(r"uni(?![nm])|us[eu]|eu|once|one\b"), re.compile(r"[aeiou]|hour|hono|hones|heir")
+_CONSONANT, _VOWEL = (
+    re.compile(r"uni(?![nm])|us[eu]|eu|once|one\b"),
+    re.compile(r"[aeiou]|hour|hono|hones|heir"),
+)
 
 
 def article(word: str) -> str:
@@ -54,5 +57,7 @@ def caption(options: WorldOptions, video: int, touch: int, surface: Surface) -> 
     if options.layout == "hct":
         return ", ".join([*words, bare(surface.noun)] if named else words)
     templates = NAMED if named else UNNAMED
-    sentence = templates[int(rng.integers(len(templates)))].format(phrase=phrase(words, surface.noun), list=listed(words))
+    sentence = templates[int(rng.integers(len(templates)))].format(
+        phrase=phrase(words, surface.noun), list=listed(words)
+    )
     return f"{sentence[0].upper()}{sentence[1:]}."

@@ -1,6 +1,6 @@
 """Periodic fields on a square tile of 64 mm, the toolbox that materials are made from.
 
-Every field repeats without a seam: noise is shaped in the Fourier domain, cells live on a jittered grid with wrapped neighbours, waves
+Every field repeats without a seam: noise is shaped in the Fourier domain, cells live on a jittered grid with wrapped neighbors, waves
 have whole numbers of periods along both sides, strokes are drawn modulo the tile.
 
 - Band-limited fractal noise: white noise with amplitude f^-(beta + 1)/2 between two wavelengths, f stretched along an angle.
@@ -31,7 +31,13 @@ class Cells:
     """
 
     def __init__(self, near: Array, far: Array, index: np.ndarray, seeds: Array) -> None:
-        self.near, self.far, self.index, self.seeds, self.count = near, far, index, seeds, len(seeds)
+        self.near, self.far, self.index, self.seeds, self.count = (
+            near,
+            far,
+            index,
+            seeds,
+            len(seeds),
+        )
 
     def keep(self, rng: np.random.Generator, share: float) -> Array:
         """1 in a random ``share`` of the cells, 0 in the others; shape (n, n)."""
@@ -69,7 +75,9 @@ class Tile:
         """A flat field."""
         return np.zeros((self.n, self.n), np.float32)
 
-    def noise(self, low: float, high: float, beta: float = 2.0, stretch: float = 1.0, angle: float = 0.0) -> Array:
+    def noise(
+        self, low: float, high: float, beta: float = 2.0, stretch: float = 1.0, angle: float = 0.0
+    ) -> Array:
         """Fractal noise of zero mean and unit deviation.
 
         Args:
@@ -80,21 +88,29 @@ class Tile:
             angle: direction in radians, 0 along x.
         """
         c, s, root = math.cos(angle), math.sin(angle), math.sqrt(stretch)
-        along, across = (c * self._fx + s * self._fy) * root, (c * self._fy - s * self._fx) * (1.0 / root)
+        along, across = (
+            (c * self._fx + s * self._fy) * root,
+            (c * self._fy - s * self._fx) * (1.0 / root),
+        )
         f = np.sqrt(along * along + across * across) + 1e-9
         weight = f ** (-beta / 2.0 - 0.5) * np.exp(f * f * (-low * low / 2.0)) * (f > 1.0 / high)
         white = self.rng.standard_normal((self.n, self.n), dtype=np.float32)
         z = np.fft.irfft2(np.fft.rfft2(white) * weight, s=(self.n, self.n))
         return f32(z * (1.0 / (float(z.std()) + 1e-12)))
 
-    def ridged(self, low: float, high: float, beta: float = 2.0, stretch: float = 1.0, angle: float = 0.0) -> Array:
+    def ridged(
+        self, low: float, high: float, beta: float = 2.0, stretch: float = 1.0, angle: float = 0.0
+    ) -> Array:
         """Noise folded at zero, so that it has sharp crests; zero mean, unit deviation."""
         z = -np.abs(self.noise(low, high, beta, stretch, angle))
         return (z - float(z.mean())) * (1.0 / float(z.std()))
 
     def warp(self, field: Array, amount: float, low: float = 4.0, high: float = 20.0) -> Array:
         """``field`` looked up at places displaced by smooth noise of deviation ``amount`` mm."""
-        dy, dx = self.noise(low, high) * (amount / self.px), self.noise(low, high) * (amount / self.px)
+        dy, dx = (
+            self.noise(low, high) * (amount / self.px),
+            self.noise(low, high) * (amount / self.px),
+        )
         return sample_periodic(field, self.y * (1.0 / self.px) + dy, self.x * (1.0 / self.px) + dx)
 
     def cells(self, size: float, jitter: float = 0.9) -> Cells:
@@ -112,7 +128,9 @@ class Tile:
             for dx in (-1, 0, 1):
                 column = (cell + dx) % k
                 seed = offsets[row[:, None], column[None]]
-                distance = (seed[..., 0] + (dy - part)[:, None]) ** 2 + (seed[..., 1] + (dx - part)[None]) ** 2
+                distance = (seed[..., 0] + (dy - part)[:, None]) ** 2 + (
+                    seed[..., 1] + (dx - part)[None]
+                ) ** 2
                 closer = distance < near
                 far = np.where(closer, near, np.minimum(far, distance))
                 near = np.where(closer, distance, near)
@@ -121,7 +139,9 @@ class Tile:
         seeds = f32((corner + offsets).reshape(-1, 2) * side)
         return Cells(np.sqrt(near) * side, np.sqrt(far) * side, index, seeds)
 
-    def grains(self, size: float, spread: float = 0.35, cover: float = 1.0, edge: float = 0.6) -> tuple[Array, Cells]:
+    def grains(
+        self, size: float, spread: float = 0.35, cover: float = 1.0, edge: float = 0.6
+    ) -> tuple[Array, Cells]:
         """Packed stones.
 
         Args:
@@ -141,7 +161,9 @@ class Tile:
         half = TILE_MM / 2.0
         dy = (self.y - seed[..., 0] + half) % TILE_MM - half
         dx = (self.x - seed[..., 1] + half) % TILE_MM - half
-        return (z + (lean[..., 0] * dy + lean[..., 1] * dx) * (2.0 / size) * dome) * cells.keep(self.rng, cover), cells
+        return (z + (lean[..., 0] * dy + lean[..., 1] * dx) * (2.0 / size) * dome) * cells.keep(
+            self.rng, cover
+        ), cells
 
     def wave(self, period: float, angle: float = 0.0, wobble: float = 0.0) -> Array:
         """The phase of a plane wave in radians, shape (n, n), for ``sin`` and the like.
@@ -172,7 +194,16 @@ class Tile:
         across = lambda at: np.minimum(at % side, side - at % side)  # noqa: E731
         return np.minimum(across(self.y), across(self.x))
 
-    def strokes(self, count: int, length: float, width: float, angle: float, spread: float, height: float, bend: float = 0.3) -> Array:
+    def strokes(
+        self,
+        count: int,
+        length: float,
+        width: float,
+        angle: float,
+        spread: float,
+        height: float,
+        bend: float = 0.3,
+    ) -> Array:
         """Curved ridges (blades, fibres, scratches), the highest winning where they cross; heights in mm.
 
         Args:
@@ -185,7 +216,10 @@ class Tile:
             bend: deviation of the total turn in radians.
         """
         n, rng = self.n, self.rng
-        lengths, widths = length * rng.uniform(0.6, 1.4, count), width * rng.uniform(0.6, 1.5, count)
+        lengths, widths = (
+            length * rng.uniform(0.6, 1.4, count),
+            width * rng.uniform(0.6, 1.5, count),
+        )
         start = angle + rng.normal(0.0, spread, count)
         steps = max(4, round(length * 1.7 / self.px))
         t = f32(np.linspace(0.0, 1.0, steps))[None]
@@ -197,9 +231,17 @@ class Tile:
         reach = max(1, math.ceil(width * 0.75 / self.px))
         offset = f32(np.arange(-reach, reach + 1) * self.px)[None, None]
         half = f32(widths / 2.0)[:, None] * (1.0 - 0.85 * np.abs(2.0 * t - 1.0) ** 3) + 1e-3
-        profile = np.sqrt(np.clip(1.0 - (offset / half[..., None]) ** 2, 0.0, 1.0)) * top[:, None, None]
-        iy = np.round((y[..., None] + cos[..., None] * offset) * (1.0 / self.px)).astype(np.intp) % n
-        ix = np.round((x[..., None] - sin[..., None] * offset) * (1.0 / self.px)).astype(np.intp) % n
+        profile = (
+            np.sqrt(np.clip(1.0 - (offset / half[..., None]) ** 2, 0.0, 1.0)) * top[:, None, None]
+        )
+        iy = (
+            np.round((y[..., None] + cos[..., None] * offset) * (1.0 / self.px)).astype(np.intp) % n
+        )
+        ix = (
+            np.round((x[..., None] - sin[..., None] * offset) * (1.0 / self.px)).astype(np.intp) % n
+        )
         z = np.zeros(n * n, np.float32)
         np.maximum.at(z, (iy * n + ix).ravel(), profile.ravel())
-        return ndimage.grey_closing(z.reshape(n, n), 2, mode="wrap")  # fills pixels that the rounded steps left out
+        return ndimage.grey_closing(
+            z.reshape(n, n), 2, mode="wrap"
+        )  # fills pixels that the rounded steps left out

@@ -34,7 +34,9 @@ def place(options: WorldOptions, part: Path, plan: VideoPlan) -> Path:
 
 def is_written(options: WorldOptions, part: Path, plan: VideoPlan) -> bool:
     """Whether a video is there, whole."""
-    return captions_path(part, plan).is_file() and (options.layout == "raw" or place(options, part, plan).is_dir())
+    return captions_path(part, plan).is_file() and (
+        options.layout == "raw" or place(options, part, plan).is_dir()
+    )
 
 
 def write_video(options: WorldOptions, part: Path, plan: VideoPlan) -> str:

@@ -28,7 +28,9 @@ def real_folder(out: Path) -> Path:
     """
     fix = "Choose another folder or remove it"
     if out.is_symlink() and not out.exists():
-        raise PalpateError(f"{out} must be absent, empty or a finished world", "a link to nothing", fix)
+        raise PalpateError(
+            f"{out} must be absent, empty or a finished world", "a link to nothing", fix
+        )
     try:
         return out.resolve()
     except (OSError, RuntimeError) as error:  # links in a circle
@@ -46,9 +48,17 @@ def require_free(out: Path, folder: Path) -> None:
         PalpateError: if something is there, or it is the folder that this process stands in (which would be taken from under it).
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PalpateError(f"{out} must be absent, empty or a finished world", "something else there", "Choose another folder or remove it")
+        raise PalpateError(
+            f"{out} must be absent, empty or a finished world",
+            "something else there",
+            "Choose another folder or remove it",
+        )
     if folder.exists() and folder == Path.cwd().resolve():
-        raise PalpateError(f"{out} must not be the folder that you are in", str(folder), "Name a folder within it, or go one up")
+        raise PalpateError(
+            f"{out} must not be the folder that you are in",
+            str(folder),
+            "Name a folder within it, or go one up",
+        )
 
 
 def part_of(folder: Path, options: WorldOptions) -> Path:
@@ -66,13 +76,20 @@ def require_same_version(part: Path) -> None:
     """
     begin = part.name.rsplit(".", 2)[0]
     for other in sorted(part.parent.glob("*.part")) if part.parent.is_dir() else []:
-        if other.name.rsplit(".", 2)[0] != begin or not other.is_dir() or not any(p.name not in (WORK, LOCK) for p in other.rglob("*")):
+        if (
+            other.name.rsplit(".", 2)[0] != begin
+            or not other.is_dir()
+            or not any(p.name not in (WORK, LOCK) for p in other.rglob("*"))
+        ):
             continue
         state = other / WORK / "state.json"
         data = read_json(state, "state of an unfinished world") if state.is_file() else {}
         if (other / "world.json").is_file():
             data = read_json(other / "world.json", "world record")
-        require_version(data if isinstance(data, dict) else {}, f"The unfinished world {other} (remove it to begin anew)")
+        require_version(
+            data if isinstance(data, dict) else {},
+            f"The unfinished world {other} (remove it to begin anew)",
+        )
 
 
 @contextmanager
@@ -99,6 +116,10 @@ def _lock(file: int, out: Path) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise PalpateError(f"{out} must be written by one run", "another run is writing this world", "Wait for it, or stop it") from None
+        raise PalpateError(
+            f"{out} must be written by one run",
+            "another run is writing this world",
+            "Wait for it, or stop it",
+        ) from None
     except OSError:  # a file system without locks
         return

@@ -32,7 +32,11 @@ class Video:
         if isinstance(plan, int):
             plans = plan_world(options)
             if not 0 <= plan < len(plans):
-                raise PalpateError(f"A video of this world must be 0 to {len(plans) - 1}", str(plan), "Choose another video")
+                raise PalpateError(
+                    f"A video of this world must be 0 to {len(plans) - 1}",
+                    str(plan),
+                    "Choose another video",
+                )
             plan = plans[plan]
         self.options, self.plan = options, plan
         self.sensor = make_sensor(options, plan.sensor)
@@ -40,7 +44,9 @@ class Video:
         self.camera = make_camera(options, plan.index)
         rng = options.rng("gain", plan.index)
         spread = 2.0 * options.hard
-        self.gain: Array = f32(np.exp(0.03 * spread * rng.standard_normal(3) + 0.05 * spread * rng.standard_normal()))
+        self.gain: Array = f32(
+            np.exp(0.03 * spread * rng.standard_normal(3) + 0.05 * spread * rng.standard_normal())
+        )
         self._scenes: dict[int, Scene] = {}
         self._states: dict[int, State] = {}
 
@@ -52,9 +58,15 @@ class Video:
         """
         if not 0 <= frame < self.options.video_length:
             last = self.options.video_length - 1
-            raise PalpateError(f"A frame of video {self.plan.name} must be 0 to {last}", str(frame), "Choose another frame")
+            raise PalpateError(
+                f"A frame of video {self.plan.name} must be 0 to {last}",
+                str(frame),
+                "Choose another frame",
+            )
         if frame not in self._states:
-            self._states = {frame: state_at(self.options, self.plan, self.touches, frame)}  # photo and touch ask for the same one
+            self._states = {
+                frame: state_at(self.options, self.plan, self.touches, frame)
+            }  # photo and touch ask for the same one
         return self._states[frame]
 
     def thing(self, touch: int) -> Thing:
@@ -70,8 +82,12 @@ class Video:
         state = self.state(frame)
         number = self.plan.touched[state.touch]
         if number not in self._scenes:
-            self._scenes[number] = light_object(self.options, self.camera, self.thing(state.touch), self.plan.index, number)
-        return to_bytes(photo(self.options, self.camera, self._scenes[number], state, self.plan.index, frame))
+            self._scenes[number] = light_object(
+                self.options, self.camera, self.thing(state.touch), self.plan.index, number
+            )
+        return to_bytes(
+            photo(self.options, self.camera, self._scenes[number], state, self.plan.index, frame)
+        )
 
     def tactile(self, frame: int) -> np.ndarray:
         """The sensor's image: uint8, shape (n, n, 3)."""
@@ -83,7 +99,9 @@ class Video:
         else:
             image = self._passive
         rng = self.options.rng("noise", self.plan.index, frame)
-        return to_bytes(image + rng.standard_normal(image.shape, dtype=np.float32) * np.float32(sensor.noise))
+        return to_bytes(
+            image + rng.standard_normal(image.shape, dtype=np.float32) * np.float32(sensor.noise)
+        )
 
     def membrane(self, state: State) -> tuple[Array, Array]:
         """Displacement of the gel in mm and contact mask, both (n, n), of a state in contact."""
@@ -97,7 +115,11 @@ class Video:
         y, x = grid(self.options.size)
         half = self.options.pad_mm / 2.0 / thing.px
         c, s = float(np.cos(state.rotation)) * half, float(np.sin(state.rotation)) * half
-        return sample_periodic(thing.surface.height, s * x + c * y + state.place[1] / thing.px, c * x - s * y + state.place[0] / thing.px)
+        return sample_periodic(
+            thing.surface.height,
+            s * x + c * y + state.place[1] / thing.px,
+            c * x - s * y + state.place[0] / thing.px,
+        )
 
     def background(self) -> np.ndarray:
         """The sensor's image when it touches nothing, without noise: uint8, shape (n, n, 3)."""
@@ -111,4 +133,6 @@ class Video:
 
     @cached_property
     def _passive(self) -> Array:
-        return shade(self.sensor, np.zeros((self.options.size, self.options.size), np.float32), self.gain)
+        return shade(
+            self.sensor, np.zeros((self.options.size, self.options.size), np.float32), self.gain
+        )

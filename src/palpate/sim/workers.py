@@ -29,7 +29,9 @@ def render_all(job: Job, plans: Sequence[VideoPlan], workers: int) -> Iterator[s
         yield from map(job, plans)
         return
     _require_importable()
-    context = multiprocessing.get_context("spawn")  # a forked copy of a process with threads may hang
+    context = multiprocessing.get_context(
+        "spawn"
+    )  # a forked copy of a process with threads may hang
     with ProcessPoolExecutor(workers, context, _start_worker, (dict(MATERIALS),)) as pool:
         try:
             yield from _started(pool, job, plans, chunk=max(1, min(4, len(plans) // (2 * workers))))
@@ -54,10 +56,14 @@ def _require_importable() -> None:
             ForkingPickler.dumps(material)
         except Exception as error:  # pickle raises what it likes
             must = f"The function of the material {name!r} must be importable for several workers"
-            raise PalpateError(must, str(error), "Define it at the top of a module, or pass workers=1") from None
+            raise PalpateError(
+                must, str(error), "Define it at the top of a module, or pass workers=1"
+            ) from None
 
 
-def _started(pool: ProcessPoolExecutor, job: Job, plans: Sequence[VideoPlan], chunk: int) -> Iterator[str]:
+def _started(
+    pool: ProcessPoolExecutor, job: Job, plans: Sequence[VideoPlan], chunk: int
+) -> Iterator[str]:
     """``pool.map``, whose processes start deaf to Ctrl-C: a terminal sends it to all of them, and each would print a traceback."""
     if threading.current_thread() is not threading.main_thread():  # only there can signals be set
         return pool.map(job, plans, chunksize=chunk)

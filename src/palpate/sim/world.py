@@ -43,7 +43,9 @@ class World:
 
     def __init__(self, options: WorldOptions | None = None, *, cache: int = 4) -> None:
         if not is_number(cache, whole=True) or cache < 1:
-            raise PalpateError("cache must be a whole number, at least 1", shown(cache), "Pass cache=4")
+            raise PalpateError(
+                "cache must be a whole number, at least 1", shown(cache), "Pass cache=4"
+            )
         self.options, self.cache = options or WorldOptions(), cache
         self._videos: OrderedDict[int, Video] = OrderedDict()
 
@@ -71,7 +73,10 @@ class World:
     @property
     def ids(self) -> list[str]:
         """The ids, in order: those of the manifest."""
-        return [sample_id(self.options, row.video, row.frame) for row in contact_rows(self.options, self.plans)]
+        return [
+            sample_id(self.options, row.video, row.frame)
+            for row in contact_rows(self.options, self.plans)
+        ]
 
     def row(self, k: SupportsIndex) -> Row:
         """Video, touch and frame of sample ``k``; negative numbers count from the end.
@@ -81,7 +86,11 @@ class World:
         """
         number = operator.index(k)
         if not -len(self) <= number < len(self):
-            raise NoSampleError(f"A sample of this world must be 0 to {len(self) - 1}", shown(number), "Choose another sample")
+            raise NoSampleError(
+                f"A sample of this world must be 0 to {len(self) - 1}",
+                shown(number),
+                "Choose another sample",
+            )
         return contact_row(self.options, self.plans, number % len(self))
 
     def sample(self, k: SupportsIndex) -> dict[str, Any]:
@@ -102,7 +111,7 @@ class World:
             "id": sample_id(self.options, row.video, row.frame),
             "video": video_id(self.options, row.video),
             "frame": row.frame,
-            "touch": touch_id(self.options, row.video, row.touch),
+            "contact": touch_id(self.options, row.video, row.touch),
             "object": row.object,
             "material": material,
             "label": MATERIALS[material].label,
@@ -130,7 +139,9 @@ class World:
         captions: dict[str, list[str]] = {}
         for count, plan in enumerate(self.plans, 1):
             video = self._video(plan)
-            captions[plan.name] = [video.text(touch) for touch in range(self.options.touches_per_video)]
+            captions[plan.name] = [
+                video.text(touch) for touch in range(self.options.touches_per_video)
+            ]
             progress("wording videos", count, len(self.plans))
         return world_manifest(self.options, self.plans, captions, None)
 

@@ -26,7 +26,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, digest_json, digest_lines, quiet, read_json, write_json, write_text
+from palpate.core import (
+    PalpateError,
+    Progress,
+    digest_json,
+    digest_lines,
+    quiet,
+    read_json,
+    write_json,
+    write_text,
+)
 from palpate.sim.encode import require_av
 from palpate.sim.lists import cut, leak_counts, leak_file, list_files
 from palpate.sim.lists_hct import hct_list_files
@@ -65,7 +74,9 @@ class WorldRecord:
     rendered: int
 
 
-def write_world(out: Path, options: WorldOptions | None = None, *, workers: int = 1, progress: Progress = quiet) -> WorldRecord:
+def write_world(
+    out: Path, options: WorldOptions | None = None, *, workers: int = 1, progress: Progress = quiet
+) -> WorldRecord:
     """Writes a world, or goes on with one that was interrupted.
 
     Args:
@@ -81,7 +92,9 @@ def write_world(out: Path, options: WorldOptions | None = None, *, workers: int 
     """
     options, out = options or WorldOptions(), Path(out)
     if not is_number(workers, whole=True) or workers < 1:
-        raise PalpateError("workers must be a whole number, at least 1", shown(workers), "Pass workers=1")
+        raise PalpateError(
+            "workers must be a whole number, at least 1", shown(workers), "Pass workers=1"
+        )
     if options.layout == "videos":
         require_av()
     folder = real_folder(out)
@@ -89,7 +102,9 @@ def write_world(out: Path, options: WorldOptions | None = None, *, workers: int 
         return _finished(out, options)
     require_free(out, folder)
     plans = plan_world(options)
-    cut(options, plans, list(contact_rows(options, plans)))  # refuses a world that is too small before anything is rendered
+    cut(
+        options, plans, list(contact_rows(options, plans))
+    )  # refuses a world that is too small before anything is rendered
     part = part_of(folder, options)
     require_same_version(part)
     try:
@@ -103,14 +118,23 @@ def write_world(out: Path, options: WorldOptions | None = None, *, workers: int 
         raise disk_error(error, folder.parent) from error
 
 
-def _write(part: Path, folder: Path, options: WorldOptions, plans: list[VideoPlan], workers: int, progress: Progress) -> int:
+def _write(
+    part: Path,
+    folder: Path,
+    options: WorldOptions,
+    plans: list[VideoPlan],
+    workers: int,
+    progress: Progress,
+) -> int:
     """Fills ``part`` and renames it to ``folder``; returns how many videos were rendered."""
     todo: list[VideoPlan] = []
     if not (part / "world.json").is_file():
         state = {"version": VERSION, "options_digest": options.digest, **_materials(options)}
         write_json(part / WORK / "state.json", state)
         if options.layout == "raw":
-            allocate_arrays(part, options, len(plans) * options.touches_per_video * options.frames_per_touch)
+            allocate_arrays(
+                part, options, len(plans) * options.touches_per_video * options.frames_per_touch
+            )
         todo = [plan for plan in plans if not is_written(options, part, plan)]
         progress("rendering videos", len(plans) - len(todo), len(plans))
         job = partial(write_video, options, part)
@@ -138,18 +162,26 @@ def _finished(out: Path, options: WorldOptions) -> WorldRecord:
     """
     data = read_json(out / "world.json", "world record")
     if not isinstance(data, dict) or not str(data.get("format", "")).startswith("palpate-world/"):
-        raise PalpateError(f"{out} must hold a world", "another world.json", "Choose another folder or remove it")
+        raise PalpateError(
+            f"{out} must hold a world", "another world.json", "Choose another folder or remove it"
+        )
     require_version(data, f"The world in {out}")
     if data["format"] != WORLD_FORMAT:
         raise PalpateError(
-            f"{out} must hold a world of the format {WORLD_FORMAT}", repr(data["format"]), "Choose another folder or remove it"
+            f"{out} must hold a world of the format {WORLD_FORMAT}",
+            repr(data["format"]),
+            "Choose another folder or remove it",
         )
     if data.get("options_digest") != options.digest:
         must = f"{out} must hold the world that was asked for"
         raise PalpateError(must, "a world of other options", "Choose another folder or remove it")
     if data.get("materials", {}) != _materials(options).get("materials", {}):
         must = f"{out} must hold the world that was asked for"
-        raise PalpateError(must, "a world of materials that were edited since", "Choose another folder or remove it")
+        raise PalpateError(
+            must,
+            "a world of materials that were edited since",
+            "Choose another folder or remove it",
+        )
     return WorldRecord(out, data["digest"], data["counts"], data["leak"], 0)
 
 
@@ -159,7 +191,9 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
         for folder in {place(options, part, plan).parent for plan in plans}:
             for stray in folder.glob(".*"):  # left by a killed process
                 shutil.rmtree(stray, ignore_errors=True)
-    captions = {plan.name: read_json(captions_path(part, plan), "captions of a video") for plan in plans}
+    captions = {
+        plan.name: read_json(captions_path(part, plan), "captions of a video") for plan in plans
+    }
     rows = list(contact_rows(options, plans))
     train, test = cut(options, plans, rows)
     manifest = world_manifest(options, plans, captions, part)
@@ -177,7 +211,14 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
     manifest.save(part / "manifest.parquet")
     settings = dataclasses.asdict(options)
     lists = {name: digest_lines(text.splitlines()) for name, text in files.items()}
-    arrays = {name: {"file": f"{name}.npy", "dtype": "uint8", "shape": [len(rows), options.size, options.size, 3]} for name in ARRAYS}
+    arrays = {
+        name: {
+            "file": f"{name}.npy",
+            "dtype": "uint8",
+            "shape": [len(rows), options.size, options.size, 3],
+        }
+        for name in ARRAYS
+    }
     write_json(
         part / "world.json",
         {
@@ -185,7 +226,9 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
             "version": VERSION,
             "note": NOTE,
             **({"seen_by_shipped_models": SEEN} if seen_by_mini(options) else {}),
-            "digest": digest_json({"version": VERSION, "options": settings, "lists": lists, **_materials(options)}),
+            "digest": digest_json(
+                {"version": VERSION, "options": settings, "lists": lists, **_materials(options)}
+            ),
             "options_digest": options.digest,
             "manifest_digest": manifest.digest,
             "manifest_root": manifest_root(options, Path()).as_posix(),
@@ -198,7 +241,9 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
     )
 
 
-def _counts(options: WorldOptions, plans: Sequence[VideoPlan], contact: int, test: int) -> dict[str, int]:
+def _counts(
+    options: WorldOptions, plans: Sequence[VideoPlan], contact: int, test: int
+) -> dict[str, int]:
     written = contact if options.layout == "raw" else len(plans) * len(written_frames(options))
     return {
         "videos": len(plans),

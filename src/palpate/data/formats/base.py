@@ -1,4 +1,4 @@
-"""What a data-set format is: facts about the data set, a way to recognise it, and a scan of what lies on disk.
+"""What a data-set format is: facts about the data set, a way to recognize it, and a scan of what lies on disk.
 
 A format is one file with ``FACTS``, ``detect`` and ``scan``, and one row in ``palpate.data.formats.FORMATS``. The scan reads
 lists and folders and returns every row with everything that is wrong; :func:`import_scanned` makes a manifest of it
@@ -32,52 +32,77 @@ class Facts:
 
     Attributes:
         name: as its authors write it.
-        citation, licence, url: of the data; ``"unknown"`` where none is stated.
+        citation, license, url: of the data; ``"unknown"`` where none is stated.
         sensor: tactile sensor.
         image_size: (width, height) of the tactile images as released, in pixels, or None.
         samples: how many there are, in words and with the source.
         group: what a split must keep whole, in words.
         group_column: the manifest column that says it; audits and splits take it by themselves.
-        normalisation: name -> (mean, std) of RGB in [0, 1] with what it is for; valid for the crop that the name says, no other.
+        normalization: name -> (mean, std) of RGB in [0, 1] with what it is for; valid for the crop that the name says, no other.
     """
 
     name: str
     citation: str
-    licence: str
+    license: str
     url: str
     sensor: str
     image_size: tuple[int, int] | None
     samples: str
     group: str
-    normalisation: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = field(default_factory=dict)
+    normalization: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = (
+        field(default_factory=dict)
+    )
     group_column: str = "video"
 
     def of_manifest(self) -> dict[str, str]:
         """The facts that a manifest keeps."""
-        about = {"dataset": self.name, "licence": self.licence, "citation": self.citation, "url": self.url}
+        about = {
+            "dataset": self.name,
+            "license": self.license,
+            "citation": self.citation,
+            "url": self.url,
+        }
         return about | ({} if self.group_column == "video" else {"group": self.group_column})
 
 
 #: palpate's own world, in whichever layout.
 WORLD = Facts(
-    name="palpate's procedural world (synthetic)", citation="none: made by palpate world", licence="Apache-2.0", url="", sensor="simulated",
-    image_size=None, samples="as world.json says", group="video",
-)  # fmt: skip
+    name="palpate's procedural world (synthetic)",
+    citation="none: made by palpate world",
+    license="Apache-2.0",
+    url="",
+    sensor="simulated",
+    image_size=None,
+    samples="as world.json says",
+    group="video",
+)
 
 
 def world_facts(folder: Path) -> dict[str, str]:
     """What a tree of palpate's own world says of itself, ``{}`` for any other folder: it must never pass for the real set.
 
-    The blank entries take the place of the real set's licence, citation and address.
+    The blank entries take the place of the real set's license, citation and address.
     """
     mark, up = folder / "world.json", folder.parent / "world.json"  # HCT's rigs lie one folder down
-    about = read_json(mark, "world record") if mark.is_file() else (read_json(up, "world record") if up.is_file() else {})
+    about = (
+        read_json(mark, "world record")
+        if mark.is_file()
+        else (read_json(up, "world record") if up.is_file() else {})
+    )
     if not isinstance(about, dict) or not str(about.get("format", "")).startswith("palpate-world/"):
         return {}
-    named = {"dataset": "palpate's procedural world", "synthetic": "yes", "digest": str(about.get("digest", ""))}
+    named = {
+        "dataset": "palpate's procedural world",
+        "synthetic": "yes",
+        "digest": str(about.get("digest", "")),
+    }
     options = about.get("options")
-    named |= {"world_seed": str(options["seed"])} if isinstance(options, dict) and "seed" in options else {}
-    return named | dict.fromkeys(("licence", "citation", "url"), "")
+    named |= (
+        {"world_seed": str(options["seed"])}
+        if isinstance(options, dict) and "seed" in options
+        else {}
+    )
+    return named | dict.fromkeys(("license", "citation", "url"), "")
 
 
 @dataclass
@@ -158,12 +183,23 @@ class Format:
     @property
     def options(self) -> list[str]:
         """The format's own keywords and the common ones."""
-        own = [p.name for p in inspect.signature(self.run or self.scan).parameters.values() if p.kind is p.KEYWORD_ONLY]
+        own = [
+            p.name
+            for p in inspect.signature(self.run or self.scan).parameters.values()
+            if p.kind is p.KEYWORD_ONLY
+        ]
         return own if self.run else [*dict.fromkeys([*own, "skip_bad", "check", "progress"])]
 
 
 def import_scanned(
-    scan: Scan, source: Path, out: Path, facts: Mapping[str, str], *, skip_bad: bool, check: Check, progress: Progress = quiet
+    scan: Scan,
+    source: Path,
+    out: Path,
+    facts: Mapping[str, str],
+    *,
+    skip_bad: bool,
+    check: Check,
+    progress: Progress = quiet,
 ) -> Imported:
     """Makes a manifest of a scan and writes it to ``out``; images stay where they are.
 
@@ -175,17 +211,27 @@ def import_scanned(
     raise_if(scan.problems, skip_bad)
     require_some(len(rows), source, scan.problems)
     with removing_on_error(out) as created:
-        manifest = Manifest.from_rows((row for _, row in rows), scan.base.resolve(), {**facts, **scan.facts})
+        manifest = Manifest.from_rows(
+            (row for _, row in rows), scan.base.resolve(), {**facts, **scan.facts}
+        )
         there = set(manifest.ids)
         splits = {
-            name: Split({i: part for i, part in parts.items() if i in there}, scan.rules.get(name, {"method": "official"}), manifest.digest)
+            name: Split(
+                {i: part for i, part in parts.items() if i in there},
+                scan.rules.get(name, {"method": "official"}),
+                manifest.digest,
+            )
             for name, parts in scan.parts.items()
             if there & set(parts)
         }
-        return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious).save(out, created)
+        return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious).save(
+            out, created
+        )
 
 
-def validation(name: str, format: Format, scan: Scan, *, check: Check, progress: Progress = quiet) -> Validation:  # noqa: A002
+def validation(
+    name: str, format: Format, scan: Scan, *, check: Check, progress: Progress = quiet
+) -> Validation:
     """Sorts what a scan found into missing, invalid and suspicious."""
     rows = finished(scan, check, progress)
     missing = [p for p in scan.problems if p.kind.startswith(MISSING)]
@@ -211,7 +257,9 @@ def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) ->
     """Rows whose paths stay inside the root and exist, written relative to it."""
     known: dict[str, tuple[str, str] | None] = {}
     root = base.resolve()
-    folders: dict[str, bool] = {}  # resolving a path is slow: each folder once, and files only where they are links
+    folders: dict[
+        str, bool
+    ] = {}  # resolving a path is slow: each folder once, and files only where they are links
     good: list[Found] = []
 
     def problem(given: str) -> tuple[str, str] | None:
@@ -219,7 +267,13 @@ def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) ->
         if folder not in folders:
             folders[folder] = (root / folder).resolve().is_relative_to(root)
         path = root / given
-        leaves = not folders[folder] or name in ("", "..") or "\\" in name or given.startswith("/") or path.is_symlink()
+        leaves = (
+            not folders[folder]
+            or name in ("", "..")
+            or "\\" in name
+            or given.startswith("/")
+            or path.is_symlink()
+        )
         if leaves and inside(root, given) is None:
             return "outside-root", f"the path {given!r} leaves the root {base}"
         try:
@@ -239,7 +293,12 @@ def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) ->
             if (found := known[given]) is not None:
                 problems.append(Problem(where, found[0], f"{name}: {found[1]}"))
                 fine = False
-            elif given.startswith(("/", "./")) or "//" in given or "/../" in given or Path(given).is_absolute():
+            elif (
+                given.startswith(("/", "./"))
+                or "//" in given
+                or "/../" in given
+                or Path(given).is_absolute()
+            ):
                 row[name] = (root / given).resolve().relative_to(root).as_posix()
         if fine:
             good.append((where, row))
@@ -261,7 +320,11 @@ def unique(rows: Sequence[Found], problems: list[Problem]) -> tuple[list[Found],
         if row.get("id") is None:
             named = row.get("video") is not None and row.get("frame") is not None
             path = row.get("tactile") or row.get("vision") or where
-            row["id"] = f"{row['video']}/{row['frame']}" if named else str(Path(path).with_suffix("").as_posix())
+            row["id"] = (
+                f"{row['video']}/{row['frame']}"
+                if named
+                else str(Path(path).with_suffix("").as_posix())
+            )
             made = f", made of {'video and frame' if named else 'the path'} since there is none: map one (--map id=...)"
         i = row["id"]
         if i not in seen:
@@ -271,13 +334,23 @@ def unique(rows: Sequence[Found], problems: list[Problem]) -> tuple[list[Found],
         before, other = seen[i]
         if part and other and part != other:
             both.add(i)
-            problems.append(Problem(where, "two-parts", f"{i} is in {part} here and in {other} at {before}, so in no part"))
+            problems.append(
+                Problem(
+                    where,
+                    "two-parts",
+                    f"{i} is in {part} here and in {other} at {before}, so in no part",
+                )
+            )
         else:
-            problems.append(Problem(where, "duplicate-id", f"the id {i!r} stands at {before} already{made}"))
+            problems.append(
+                Problem(where, "duplicate-id", f"the id {i!r} stands at {before} already{made}")
+            )
     return good, {i: part for i, (_, part) in seen.items() if part and i not in both}
 
 
-def checked_images(rows: Sequence[Found], base: Path, how: Check, problems: list[Problem], progress: Progress) -> list[Found]:
+def checked_images(
+    rows: Sequence[Found], base: Path, how: Check, problems: list[Problem], progress: Progress
+) -> list[Found]:
     """Rows whose images are whole; a file in use by many rows is checked once and told once, with its first row."""
     if how == "none":
         return list(rows)
@@ -289,13 +362,19 @@ def checked_images(rows: Sequence[Found], base: Path, how: Check, problems: list
                 first.setdefault(row[name], where)
                 uses[row[name]] += 1
     bad: set[str] = set()
-    for done, (name, reason) in enumerate(in_threads(lambda n: check_image(base / n, how), first), 1):
+    for done, (name, reason) in enumerate(
+        in_threads(lambda n: check_image(base / n, how), first), 1
+    ):
         if reason:
             bad.add(name)
             rest = f" (used by {uses[name]} rows)" if uses[name] > 1 else ""
             problems.append(Problem(first[name], "bad-image", f"{name}: {reason}{rest}"))
         progress("checking images", done, len(first))
-    return [(where, row) for where, row in rows if not any(row.get(name) in bad for name in IMAGE_COLUMNS)]
+    return [
+        (where, row)
+        for where, row in rows
+        if not any(row.get(name) in bad for name in IMAGE_COLUMNS)
+    ]
 
 
 def _place(problem: Problem) -> tuple[str, int, str]:

@@ -18,7 +18,7 @@ only if no ``dataN/`` has one). Their paths start at ``dataN/`` or at ``hct/``; 
   ``contact.json`` names are counted, and are samples without words and without part if ``contact`` is set. Frames of ``not_contact.json`` are none.
 - **video** is the whole folder name, ``data2/4-1702596295.70``: the number before the dash is used again and again. **frame** is the integer before
   the dash of the file. **touch** is a run of consecutive frames in contact. **session** joins folders of one ``dataN`` of which each starts at most ``session_gap``
-  seconds after the one before, since neighbours may hold the same object. Captions tell no object: frames of one folder are worded differently.
+  seconds after the one before, since neighbors may hold the same object. Captions tell no object: frames of one folder are worded differently.
 - **background**: the list's picture if it is there, else ``digit_background.png``, else of up to 15 frames of the trajectory that
   ``not_contact.json`` names the one nearest to their median, else null.
 - Photos of ``data3`` show the touched spot lower: TVL crops them 200 pixels further down.
@@ -54,11 +54,13 @@ FACTS = Facts(
     (240, 320),
     "39,154 in contact by contact.json, of which a user loaded 38,605 for training; 356 in the test lists",
     "trajectory folder; stricter: folders that follow each other in time (session)",
-    tvl.NORMALISATION,
+    tvl.NORMALIZATION,
 )
 FALLBACK = "digit_background.png"
 COLUMNS = ("url", "tactile", "tactile_background", "caption")
-LOOKED_FOR = "hct/, or dataN/ folders, with trajectories such as 4-1702596295.70/vision/ and .../tactile/"
+LOOKED_FOR = (
+    "hct/, or dataN/ folders, with trajectories such as 4-1702596295.70/vision/ and .../tactile/"
+)
 Swap = Literal["report", "mend"]
 
 
@@ -103,10 +105,14 @@ def scan(
     """
     tvl.require_option("swap", swap, ("report", "mend"))
     if session_gap < 0:
-        raise PalpateError("session_gap must be 0 seconds or more", str(session_gap), "Leave it out for 60 seconds")
+        raise PalpateError(
+            "session_gap must be 0 seconds or more", str(session_gap), "Leave it out for 60 seconds"
+        )
     root, rigs = find(source)
     if not rigs:
-        raise PalpateError(f"{source} must be HCT: {LOOKED_FOR}", "none of these", f"Unpack it from {tvl.URL}")
+        raise PalpateError(
+            f"{source} must be HCT: {LOOKED_FOR}", "none of these", f"Unpack it from {tvl.URL}"
+        )
     found = Scan([], root, facts={"layout": f"hct: {', '.join(rigs)}"})
     found.facts |= world_facts(root)
     sensor = WORLD.sensor if "synthetic" in found.facts else FACTS.sensor
@@ -117,7 +123,10 @@ def scan(
     rows = _present(root, rows, found.problems)
     evidence = _exchanged(root, rows, progress)
     mended = set(evidence) if swap == "mend" else set[Trajectory]()
-    rows = [replace(row, vision=row.tactile, tactile=row.vision) if row.trajectory in mended else row for row in rows]
+    rows = [
+        replace(row, vision=row.tactile, tactile=row.vision) if row.trajectory in mended else row
+        for row in rows
+    ]
     for trajectory, text in evidence.items():
         done = "; their paths were exchanged" if mended else "; --set swap=mend exchanges them back"
         found.suspicious.append(Problem("/".join(trajectory), "swapped-folders", text + done))
@@ -128,21 +137,35 @@ def scan(
             "id": f"{video}/{row.frame}",
             "video": video,
             "frame": row.frame,
-            "touch": touch[row.key],
+            "contact": touch[row.key],
             "text": row.text,
         }
-        cells |= {"session": sessions[row.trajectory], "vision": row.vision, "tactile": row.tactile, "background": background}
-        found.rows.append((row.where, cells | {"sensor": sensor, "domain": row.trajectory[0], "split": row.part}))
+        cells |= {
+            "session": sessions[row.trajectory],
+            "vision": row.vision,
+            "tactile": row.tactile,
+            "background": background,
+        }
+        found.rows.append(
+            (row.where, cells | {"sensor": sensor, "domain": row.trajectory[0], "split": row.part})
+        )
     if any(row.part for row in rows):
         found.own = name = "Orig" if lists is None else "Lists"
-        found.rules[name] = {"method": "official" if lists is None else "lists", "files": reader.files}
+        found.rules[name] = {
+            "method": "official" if lists is None else "lists",
+            "files": reader.files,
+        }
     exchange = f"{len(evidence)}, {'mended' if mended else 'as they are'}" if evidence else "none"
     found.facts |= {"session_gap": f"{session_gap:g} s", "swapped_folders": exchange}
     worded = dict.fromkeys(f"{r.part}.csv" if r.part else "finetune.json" for r in rows if r.text)
     found.facts |= {"text_source": f"captions of {', '.join(sorted(worded))}" if worded else "none"}
     if root == Path(source) / "hct" and (Path(source) / "ssvtp").is_dir():
         found.suspicious.append(
-            Problem(str(source), "other-half", "ssvtp/ lies beside hct/ and was not read: import it with --format ssvtp")
+            Problem(
+                str(source),
+                "other-half",
+                "ssvtp/ lies beside hct/ and was not read: import it with --format ssvtp",
+            )
         )
     return found
 
@@ -176,19 +199,39 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
         rows: dict[str, list[list[str | None]]] = defaultdict(list)
         for row in manifest.part(split, part).table.iter_rows(named=True):
             prefix = f"{row['domain']}/"
-            if row["domain"] is None or not all(str(row[name]).startswith(prefix) for name in ("vision", "tactile")):
+            if row["domain"] is None or not all(
+                str(row[name]).startswith(prefix) for name in ("vision", "tactile")
+            ):
                 got = f"{row['id']!r} with domain {row['domain']!r} and photo {row['vision']!r}"
-                raise PalpateError("HCT's lists need every image below the folder of its domain", got, "Write the split file alone")
-            paths = [row[name] and row[name].removeprefix(prefix) for name in ("vision", "tactile", "background")]
+                raise PalpateError(
+                    "HCT's lists need every image below the folder of its domain",
+                    got,
+                    "Write the split file alone",
+                )
+            paths = [
+                row[name] and row[name].removeprefix(prefix)
+                for name in ("vision", "tactile", "background")
+            ]
             rows[row["domain"]].append([*paths, row["text"]])
-        files += [tvl.write_csv(Path(folder) / domain / f"{part}.csv", COLUMNS, listed) for domain, listed in sorted(rows.items())]
+        files += [
+            tvl.write_csv(Path(folder) / domain / f"{part}.csv", COLUMNS, listed)
+            for domain, listed in sorted(rows.items())
+        ]
     return files
 
 
-def _touches(rows: Sequence[Row], contact: set[tuple[Trajectory, int]]) -> dict[tuple[Trajectory, int], str]:
+def _touches(
+    rows: Sequence[Row], contact: set[tuple[Trajectory, int]]
+) -> dict[tuple[Trajectory, int], str]:
     """Frame -> touch: runs of consecutive frames over all that are known to touch something."""
     frames = sorted(contact | {row.key for row in rows})
-    return dict(zip(frames, touches(["/".join(t) for t, _ in frames], [k for _, k in frames], None), strict=True))
+    return dict(
+        zip(
+            frames,
+            touches(["/".join(t) for t, _ in frames], [k for _, k in frames], None),
+            strict=True,
+        )
+    )
 
 
 def _present(root: Path, rows: Sequence[Row], problems: list[Problem]) -> list[Row]:
@@ -220,7 +263,10 @@ def _exchanged(root: Path, rows: Sequence[Row], progress: Progress) -> dict[Traj
     files: dict[str, tuple[list[Path], list[Path]]] = {}
     for trajectory, own in by.items():
         chosen = [own[k] for k in sorted({0, len(own) // 2, len(own) - 1})]
-        files["/".join(trajectory)] = ([root / r.vision for r in chosen], [root / r.tactile for r in chosen])
+        files["/".join(trajectory)] = (
+            [root / r.vision for r in chosen],
+            [root / r.tactile for r in chosen],
+        )
     seen = tvl.looks(files, progress)
     found: dict[Trajectory, str] = {}
     for rig in sorted({rig for rig, _ in by}):
@@ -231,7 +277,11 @@ def _exchanged(root: Path, rows: Sequence[Row], progress: Progress) -> dict[Traj
 
 
 def _backgrounds(
-    root: Path, rows: Sequence[Row], untouched: Mapping[Trajectory, Sequence[Row]], mended: Collection[Trajectory], found: Scan
+    root: Path,
+    rows: Sequence[Row],
+    untouched: Mapping[Trajectory, Sequence[Row]],
+    mended: Collection[Trajectory],
+    found: Scan,
 ) -> list[str | None]:
     """Each row's background by the rule in the head of this file; how often each source served goes into the facts.
 
@@ -255,7 +305,9 @@ def _backgrounds(
         if name is None:
             if row.trajectory not in typical:
                 side = "vision" if row.trajectory in mended else "tactile"
-                typical[row.trajectory] = _typical(root, [getattr(frame, side) for frame in untouched.get(row.trajectory, [])])
+                typical[row.trajectory] = _typical(
+                    root, [getattr(frame, side) for frame in untouched.get(row.trajectory, [])]
+                )
             name, kind = typical[row.trajectory], "untouched frame"
         if name is None:
             kind = "none"
@@ -264,7 +316,9 @@ def _backgrounds(
         chosen.append(name)
     for places in bare.values():
         found.suspicious += tvl.summed(
-            places, "no-background", f"no picture of the gel untouched, as none is listed and there is no {FALLBACK}"
+            places,
+            "no-background",
+            f"no picture of the gel untouched, as none is listed and there is no {FALLBACK}",
         )
     found.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
     return chosen
@@ -297,9 +351,14 @@ def _typical(root: Path, names: Sequence[str]) -> str | None:
     whole = [name for name in names if inside(root, name) and check_image(root / name) is None]
     if not whole:
         return None
-    some = [whole[int(k)] for k in np.unique(np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round())]
+    some = [
+        whole[int(k)]
+        for k in np.unique(np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round())
+    ]
     try:
-        return some[nearest_to_median(_Pictures(root, [root / name for name in some]), range(len(some)))[0]]
+        return some[
+            nearest_to_median(_Pictures(root, [root / name for name in some]), range(len(some)))[0]
+        ]
     except PalpateError:  # pictures of several sizes
         return None
 
@@ -314,7 +373,9 @@ def _folders(path: Path) -> list[Path]:
 
 def _is_rig(folder: Path) -> bool:
     """Whether a folder holds a trajectory, or lists under a name such as ``data1``."""
-    return _has_trajectory(folder) or (RIG.fullmatch(folder.name) is not None and bool(tvl.part_lists(folder)))
+    return _has_trajectory(folder) or (
+        RIG.fullmatch(folder.name) is not None and bool(tvl.part_lists(folder))
+    )
 
 
 def _has_trajectory(folder: Path) -> bool:
@@ -322,7 +383,9 @@ def _has_trajectory(folder: Path) -> bool:
     try:
         with os.scandir(folder) as entries:
             return any(
-                TRAJECTORY.fullmatch(e.name) and any((folder / e.name / side).is_dir() for side in ("vision", "tactile")) for e in entries
+                TRAJECTORY.fullmatch(e.name)
+                and any((folder / e.name / side).is_dir() for side in ("vision", "tactile"))
+                for e in entries
             )
     except OSError:
         return False

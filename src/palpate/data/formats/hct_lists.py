@@ -74,36 +74,57 @@ class Reader:
         if not any(rows is not None for rows in listed.values()):
             listed[""] = self._listed(place, None)
         if lists is not None and not any(listed.values()):
-            raise PalpateError(f"{lists} must hold lists as HCT does (data1/train.csv ...)", "none with rows", "Check the path")
+            raise PalpateError(
+                f"{lists} must hold lists as HCT does (data1/train.csv ...)",
+                "none with rows",
+                "Check the path",
+            )
         given = [row for rows in listed.values() for row in rows or []]
         known = {row.key for row in given}
         self.contact_frames |= known
-        free = {rig for rig in self.rigs if lists is None and listed[rig] is None and listed.get("") is None}
+        free = {
+            rig
+            for rig in self.rigs
+            if lists is None and listed[rig] is None and listed.get("") is None
+        }
         resting: set[tuple[Trajectory, int]] = set()
         for rig in self.rigs:
             for row in self._pairs(rig, "not_contact.json"):
                 self.untouched[row.trajectory].append(row)
                 resting.add(row.key)
         both = [row.where for row in given if row.key in resting]
-        self.found.suspicious += tvl.summed(both, "contact-and-not", "listed, but not_contact.json calls them untouched")
+        self.found.suspicious += tvl.summed(
+            both, "contact-and-not", "listed, but not_contact.json calls them untouched"
+        )
         for rig in self.rigs:
             given += self._touching(rig, rig in free, known, resting)
         odd = [
             r.where
             for r in given
-            if PurePosixPath(r.vision).name != PurePosixPath(r.tactile).name or not r.tactile.startswith("/".join(r.trajectory) + "/")
+            if PurePosixPath(r.vision).name != PurePosixPath(r.tactile).name
+            or not r.tactile.startswith("/".join(r.trajectory) + "/")
         ]
-        self.found.suspicious += tvl.summed(odd, "unequal-names", "photo and touch differ in trajectory or file name")
+        self.found.suspicious += tvl.summed(
+            odd, "unequal-names", "photo and touch differ in trajectory or file name"
+        )
         self.found.facts["not_contact"] = f"{len(resting)} frames, no samples"
         return sorted(given, key=lambda row: (order(row.trajectory), row.frame))
 
-    def _touching(self, rig: str, free: bool, known: set[tuple[Trajectory, int]], resting: set[tuple[Trajectory, int]]) -> list[Row]:
+    def _touching(
+        self,
+        rig: str,
+        free: bool,
+        known: set[tuple[Trajectory, int]],
+        resting: set[tuple[Trajectory, int]],
+    ) -> list[Row]:
         """What ``contact.json`` adds: all its rows if the rig has no list, those that no list names if asked, else a note."""
         rows = self._pairs(rig, "contact.json")
         self.contact_frames |= {row.key for row in rows if row.key not in resting}
         more = [row for row in rows if row.key not in known]
         self.found.suspicious += tvl.summed(
-            [row.where for row in more if row.key in resting], "contact-and-not", "in contact.json and in not_contact.json, so no samples"
+            [row.where for row in more if row.key in resting],
+            "contact-and-not",
+            "in contact.json and in not_contact.json, so no samples",
         )
         more = [row for row in more if row.key not in resting]
         if free:
@@ -119,7 +140,11 @@ class Reader:
         """The rows of the lists in a folder, or None if it has none."""
         there = tvl.part_lists(folder)
         self.files += [f"{rig}/{path.name}" if rig else path.name for path in there.values()]
-        rows = [row for part, path in there.items() for row in self._parsed(tvl.read_csv(path, self.found.problems), rig, part)]
+        rows = [
+            row
+            for part, path in there.items()
+            for row in self._parsed(tvl.read_csv(path, self.found.problems), rig, part)
+        ]
         return rows if there else None
 
     def _pairs(self, rig: str, name: str) -> list[Row]:
@@ -128,7 +153,12 @@ class Reader:
         read = tvl.read_conversations if name == "finetune.json" else tvl.read_pairs
         return self._parsed(read(path, self.found.problems), rig, None) if path.is_file() else []
 
-    def _parsed(self, cells: Iterable[tuple[str, Mapping[str, str | None]]], rig: str | None, part: str | None) -> list[Row]:
+    def _parsed(
+        self,
+        cells: Iterable[tuple[str, Mapping[str, str | None]]],
+        rig: str | None,
+        part: str | None,
+    ) -> list[Row]:
         rows: list[Row] = []
         for where, row in cells:
             parsed = self._row(where, row, rig, part)
@@ -138,7 +168,9 @@ class Reader:
                 self.found.problems.append(Problem(where, *parsed))
         return rows
 
-    def _row(self, where: str, cells: Mapping[str, str | None], rig: str | None, part: str | None) -> Row | tuple[str, str]:
+    def _row(
+        self, where: str, cells: Mapping[str, str | None], rig: str | None, part: str | None
+    ) -> Row | tuple[str, str]:
         """One row, or what is wrong with it."""
         if lacking := [name for name in ("url", "tactile") if not cells.get(name)]:
             return "empty-cell", f"no {' and no '.join(lacking)} path"
@@ -153,7 +185,16 @@ class Reader:
         if number is None:
             return "bad-frame", f"{pieces[-1]!r} does not begin with a frame number and a dash"
         text = tvl.clean_caption(cells.get("caption"))
-        return Row(where, part, (pieces[0], pieces[1]), int(number[1]), vision, tactile, cells.get("tactile_background"), text)
+        return Row(
+            where,
+            part,
+            (pieces[0], pieces[1]),
+            int(number[1]),
+            vision,
+            tactile,
+            cells.get("tactile_background"),
+            text,
+        )
 
 
 def located(cell: str, rig: str | None) -> str:

@@ -36,10 +36,24 @@ from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classe
 LOOKED_FOR = "a folder written by datasets' save_to_disk, or of Parquet shards; a name on the hub with --format hf"
 FACTS = Facts(
     "Hugging Face data set",
-    "unknown", "unknown", "https://huggingface.co/docs/datasets", "unknown", None, "as many as the data set has rows", "the column video, if there is one",
-)  # fmt: skip
+    "unknown",
+    "unknown",
+    "https://huggingface.co/docs/datasets",
+    "unknown",
+    None,
+    "as many as the data set has rows",
+    "the column video, if there is one",
+)
 BATCH = 64
-SUFFIX_OF = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "BMP": ".bmp", "TIFF": ".tif", "GIF": ".gif"}
+SUFFIX_OF = {
+    "JPEG": ".jpg",
+    "MPO": ".jpg",
+    "PNG": ".png",
+    "WEBP": ".webp",
+    "BMP": ".bmp",
+    "TIFF": ".tif",
+    "GIF": ".gif",
+}
 
 
 @dataclass
@@ -79,7 +93,9 @@ class _Pictures:
         if path.is_file():
             if path.read_bytes() != data:
                 raise PalpateError(
-                    "Images of an earlier import must be the same", f"another one at {path}", "Choose another folder, or remove it"
+                    "Images of an earlier import must be the same",
+                    f"another one at {path}",
+                    "Choose another folder, or remove it",
                 )
             return
         self.created.append(path)
@@ -91,9 +107,13 @@ def detect(source: Path) -> bool:
     """Whether a folder was written by ``save_to_disk``, or holds Parquet shards (but no manifest)."""
     if not source.is_dir():
         return False
-    if (source / "dataset_dict.json").is_file() or all((source / n).is_file() for n in ("state.json", "dataset_info.json")):
+    if (source / "dataset_dict.json").is_file() or all(
+        (source / n).is_file() for n in ("state.json", "dataset_info.json")
+    ):
         return True
-    return not (source / "manifest.parquet").is_file() and any(next((source / p).glob("*.parquet"), None) for p in (".", "data"))
+    return not (source / "manifest.parquet").is_file() and any(
+        next((source / p).glob("*.parquet"), None) for p in (".", "data")
+    )
 
 
 def scan(
@@ -121,8 +141,17 @@ def scan(
         PalpateError: if the source cannot be opened or lacks a needed column.
         MissingExtraError: if ``datasets`` is not installed.
     """
-    found = _scan(open_source(source, config, revision), columns, classes, _Pictures(None, [], check), progress)
-    found.rows = [(where, {k: v for k, v in row.items() if k not in IMAGE_COLUMNS}) for where, row in found.rows]
+    found = _scan(
+        open_source(source, config, revision),
+        columns,
+        classes,
+        _Pictures(None, [], check),
+        progress,
+    )
+    found.rows = [
+        (where, {k: v for k, v in row.items() if k not in IMAGE_COLUMNS})
+        for where, row in found.rows
+    ]
     return found
 
 
@@ -158,18 +187,32 @@ def run(
     """
     opened = open_source(source, config, revision)
     with removing_on_error(out) as created:
-        found = _scan(opened, columns, classes, _Pictures(Path(out) / "images", created, check), progress)
+        found = _scan(
+            opened, columns, classes, _Pictures(Path(out) / "images", created, check), progress
+        )
         found.base.mkdir(parents=True, exist_ok=True)
-        return import_scanned(found, Path(source), Path(out), {}, skip_bad=skip_bad, check="none", progress=progress)
+        return import_scanned(
+            found, Path(source), Path(out), {}, skip_bad=skip_bad, check="none", progress=progress
+        )
 
 
-def _scan(source: Source, columns: Mapping[str, str] | None, classes: Path | None, pictures: _Pictures, progress: Progress) -> Scan:
+def _scan(
+    source: Source,
+    columns: Mapping[str, str] | None,
+    classes: Path | None,
+    pictures: _Pictures,
+    progress: Progress,
+) -> Scan:
     """Reads all rows, putting their images where ``pictures`` does."""
     expressions = compile_maps(columns or {}, source.names, list(SCHEMA))
     sides = [side for side in IMAGE_COLUMNS[:2] if side in expressions]
     if not sides:
         got = f"no vision and no tactile among {', '.join(source.names) or 'no columns'}"
-        raise PalpateError(f"{source.name} must have a column for the images", got, "Map it: --map vision=YOUR_COLUMN")
+        raise PalpateError(
+            f"{source.name} must have a column for the images",
+            got,
+            "Map it: --map vision=YOUR_COLUMN",
+        )
     known = None if classes is None else read_classes(Path(classes))
     problems: list[Problem] = []
     places: dict[int, int] = {}
@@ -177,7 +220,9 @@ def _scan(source: Source, columns: Mapping[str, str] | None, classes: Path | Non
     parts: set[str] = set()
     total = sum(len(data) for data in source.splits.values() if hasattr(data, "__len__"))
     for split, first, batch in _batches(source):
-        rows, unclear = _batch_rows(source, expressions, split, first, batch, known, pictures, problems)
+        rows, unclear = _batch_rows(
+            source, expressions, split, first, batch, known, pictures, problems
+        )
         found.inconclusive += unclear
         for k, (where, row) in rows:
             if ROW in batch:
@@ -190,10 +235,15 @@ def _scan(source: Source, columns: Mapping[str, str] | None, classes: Path | Non
     if len(places) == len(found.rows):
         found.rows = [found.rows[k] for k in sorted(places, key=places.__getitem__)]
     if len(parts) > 1:
-        rule = source.about.get("rule") or {"method": "official", "parts": sorted(s for s in source.splits if s in PART_NAMES)}
+        rule = source.about.get("rule") or {
+            "method": "official",
+            "parts": sorted(s for s in source.splits if s in PART_NAMES),
+        }
         found.own, found.rules = "Orig", {"Orig": dict(rule)}
     words = any("text" in row for _, row in found.rows)
-    found.facts.setdefault("text_source", f"column {(columns or {}).get('text', 'text')}" if words else "none")
+    found.facts.setdefault(
+        "text_source", f"column {(columns or {}).get('text', 'text')}" if words else "none"
+    )
     found.suspicious = odd_groups(Path(source.name), found.rows)
     return found
 
@@ -214,7 +264,11 @@ def _batches(source: Source) -> Iterator[tuple[str, int, Mapping[str, list[Any]]
             raise
         except Exception as error:  # of the library, or of Arrow below it
             place = f"{source.name}/{split}".rstrip("/")
-            raise PalpateError(f"{place} must be readable to its end", f"{one_line(error)} after row {first}", "Fetch it again") from None
+            raise PalpateError(
+                f"{place} must be readable to its end",
+                f"{one_line(error)} after row {first}",
+                "Fetch it again",
+            ) from None
 
 
 def _batch_rows(
@@ -230,7 +284,11 @@ def _batch_rows(
     """The usable rows of a batch by their numbers in the part."""
     count = len(next(iter(batch.values())))
     where = lambda k: f"{source.name}/{split}:{first + k}".replace("/:", ":")  # noqa: E731
-    inner = {target: e.column for target, e in expressions.items() if target in IMAGE_COLUMNS and e.column in source.images}
+    inner = {
+        target: e.column
+        for target, e in expressions.items()
+        if target in IMAGE_COLUMNS and e.column in source.images
+    }
     plain = {target: e for target, e in expressions.items() if target not in inner}
     cells = {name: _texts(source, name, batch[name]) for e in plain.values() for name in e.inputs}
     told: list[Problem] = []
@@ -245,13 +303,20 @@ def _batch_rows(
     for k, row in rows:
         wrong: list[tuple[str, str]] = []
         row.setdefault(
-            "id", f"{row['video']}/{row['frame']}" if "video" in row and "frame" in row else f"{split}/{first + k:08d}".lstrip("/")
+            "id",
+            f"{row['video']}/{row['frame']}"
+            if "video" in row and "frame" in row
+            else f"{split}/{first + k:08d}".lstrip("/"),
         )
         for target in (t for t in IMAGE_COLUMNS if t in expressions):
             column = inner.get(target)
             data = _bytes(source, row.get(target) if column is None else batch[column][k])
             if isinstance(data, bytes):
-                given = batch[f"{target}_path"][k] if source.about and f"{target}_path" in batch else None
+                given = (
+                    batch[f"{target}_path"][k]
+                    if source.about and f"{target}_path" in batch
+                    else None
+                )
                 safe = given if given and not re.search(CLIMBS, given) else None
                 data = pictures.put(data, safe, f"{split or 'all'}/{target}/{first + k:08d}")
             if isinstance(data, tuple):
@@ -266,17 +331,23 @@ def _batch_rows(
     return good, unclear
 
 
-def _labels(source: Source, plain: Mapping[str, Expression], batch: Mapping[str, list[Any]]) -> tuple[set[int], dict[int, str]]:
+def _labels(
+    source: Source, plain: Mapping[str, Expression], batch: Mapping[str, list[Any]]
+) -> tuple[set[int], dict[int, str]]:
     """Rows whose material is the class -1, which is inconclusive, and row -> what is wrong with its number of a class."""
     inconclusive: set[int] = set()
     unknown: dict[int, str] = {}
-    for target, name in ((target, name) for target, e in plain.items() for name in e.inputs if name in source.labels):
+    for target, name in (
+        (target, name) for target, e in plain.items() for name in e.inputs if name in source.labels
+    ):
         count = len(source.labels[name])
         for k, v in enumerate(batch[name]):
             if v == INCONCLUSIVE and target == "material":
                 inconclusive.add(k)
             elif v is not None and v != INCONCLUSIVE and not 0 <= v < count:
-                unknown[k] = f"the column {name} has {count} classes, counted from 0, and none of the number {v}"
+                unknown[k] = (
+                    f"the column {name} has {count} classes, counted from 0, and none of the number {v}"
+                )
     return inconclusive - unknown.keys(), unknown
 
 
@@ -290,10 +361,14 @@ def _texts(source: Source, name: str, values: Sequence[Any]) -> list[Cell]:
         return [None if v is None else text_of(v["path"]) for v in values]
     if name in source.labels:
         classes = source.labels[name]
-        return [classes[v] if isinstance(v, int) and 0 <= v < len(classes) else None for v in values]
+        return [
+            classes[v] if isinstance(v, int) and 0 <= v < len(classes) else None for v in values
+        ]
     if any(isinstance(v, (list, dict, bytes)) for v in values):
         raise PalpateError(
-            f"Columns of {source.name} must hold texts, numbers or images", f"{name} with lists or objects", "Map another column"
+            f"Columns of {source.name} must hold texts, numbers or images",
+            f"{name} with lists or objects",
+            "Map another column",
         )
     return [text_of(v) for v in values]
 
@@ -307,7 +382,10 @@ def _bytes(source: Source, value: Any) -> bytes | tuple[str, str] | None:
         return None
     place = None if source.folder is None else inside(source.folder, str(path))
     if place is None:
-        return "outside-root", f"the path {path!r} leaves the data set, and the image is not stored in it"
+        return (
+            "outside-root",
+            f"the path {path!r} leaves the data set, and the image is not stored in it",
+        )
     return place.read_bytes() if place.is_file() else ("missing-file", f"no file {path!r}")
 
 

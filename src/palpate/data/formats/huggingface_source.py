@@ -61,33 +61,62 @@ def open_source(source: Path, config: str | None = None, revision: str | None = 
     local = source.is_dir()
     name = source.name if local else source.as_posix()
     if not local and (source.exists() or re.fullmatch(r"[\w.\-]+(/[\w.\-]+)?", name) is None):
-        raise PalpateError("The source must be a folder, or a name on the hub like user/name", str(source), "Check the path")
-    saved = local and ((source / "dataset_dict.json").is_file() or (source / "state.json").is_file())
+        raise PalpateError(
+            "The source must be a folder, or a name on the hub like user/name",
+            str(source),
+            "Check the path",
+        )
+    saved = local and (
+        (source / "dataset_dict.json").is_file() or (source / "state.json").is_file()
+    )
     if not local:
         _require_hub(name, revision)
     try:
-        loaded = datasets.load_from_disk(str(source)) if saved else _streamed(str(source) if local else name, config, revision, local)
+        loaded = (
+            datasets.load_from_disk(str(source))
+            if saved
+            else _streamed(str(source) if local else name, config, revision, local)
+        )
     except PalpateError:
         raise
     except Exception as error:  # the library raises many kinds
-        fix = "Write it again with save_to_disk, or as Parquet" if local else "Check the name, --set config=... and --set revision=..."
-        raise PalpateError(f"The data set {name} must be whole and readable", one_line(error), fix) from None
-    splits: dict[str, Any] = {str(k): v for k, v in loaded.items()} if isinstance(loaded, dict) else {"": loaded}
+        fix = (
+            "Write it again with save_to_disk, or as Parquet"
+            if local
+            else "Check the name, --set config=... and --set revision=..."
+        )
+        raise PalpateError(
+            f"The data set {name} must be whole and readable", one_line(error), fix
+        ) from None
+    splits: dict[str, Any] = (
+        {str(k): v for k, v in loaded.items()} if isinstance(loaded, dict) else {"": loaded}
+    )
     features = dict(next(iter(splits.values())).features or {}) if splits else {}
     images = [n for n, f in features.items() if isinstance(f, datasets.Image)]
     for split, data in splits.items():
         if list(data.features or {}) != list(features):
             got = f"{split or 'one'} with {', '.join(data.features or {}) or 'none'}"
-            raise PalpateError(f"All parts of {name} must have the columns {', '.join(features)}", got, "Import the parts one by one")
+            raise PalpateError(
+                f"All parts of {name} must have the columns {', '.join(features)}",
+                got,
+                "Import the parts one by one",
+            )
         for image in images:
             data = data.cast_column(image, datasets.Image(decode=False))
         splits[split] = data.with_format(None)
     labels = {n: list(f.names) for n, f in features.items() if isinstance(f, datasets.ClassLabel)}
     info = next(iter(splits.values())).info
     about = _about(info.description)
-    told = {"licence": info.license, "citation": info.citation, "url": info.homepage}
-    facts = {"dataset": name, **{k: str(v).strip() or "unknown" for k, v in told.items()}, "format": "hf", **about.get("facts", {})}
-    return Source(name, splits, images, labels, list(features), about, facts, source if local else None)
+    told = {"license": info.license, "citation": info.citation, "url": info.homepage}
+    facts = {
+        "dataset": name,
+        **{k: str(v).strip() or "unknown" for k, v in told.items()},
+        "format": "hf",
+        **about.get("facts", {}),
+    }
+    return Source(
+        name, splits, images, labels, list(features), about, facts, source if local else None
+    )
 
 
 def _require_hub(name: str, revision: str | None) -> None:
@@ -106,7 +135,9 @@ def _require_hub(name: str, revision: str | None) -> None:
     except HfHubHTTPError as error:
         got = f"the answer {one_line(error)}"
         raise PalpateError(
-            f"The Hugging Face hub must have the data set {name}", got, "Check the name; for a private one log in: hf auth login"
+            f"The Hugging Face hub must have the data set {name}",
+            got,
+            "Check the name; for a private one log in: hf auth login",
         ) from None
     except Exception as error:  # of the network library
         raise PalpateError(
@@ -125,8 +156,16 @@ def _streamed(place: str, config: str | None, revision: str | None, local: bool)
         options["trust_remote_code"] = False  # the default of today, said for all versions
     builder = datasets.load_dataset_builder(place, config, **options)
     if builder.name not in (LOCAL if local else REMOTE):
-        fix = "Convert it to Parquet" if local else "The hub keeps a copy in Parquet: --set revision=refs/convert/parquet"
-        raise PalpateError(f"{place} must be made of {' or '.join(LOCAL if local else REMOTE)} files", str(builder.name), fix)
+        fix = (
+            "Convert it to Parquet"
+            if local
+            else "The hub keeps a copy in Parquet: --set revision=refs/convert/parquet"
+        )
+        raise PalpateError(
+            f"{place} must be made of {' or '.join(LOCAL if local else REMOTE)} files",
+            str(builder.name),
+            fix,
+        )
     return builder.as_streaming_dataset()
 
 
@@ -136,9 +175,17 @@ def _about(description: str | None) -> Mapping[str, Any]:
         found = json.loads(description or "")
     except ValueError:
         return {}
-    return found if isinstance(found, dict) and found.get("format") == MARK and isinstance(found.get("facts"), dict) else {}
+    return (
+        found
+        if isinstance(found, dict)
+        and found.get("format") == MARK
+        and isinstance(found.get("facts"), dict)
+        else {}
+    )
 
 
 def one_line(error: BaseException) -> str:
     """The first line of what an error says, or its kind."""
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)[:300]
+    return next(
+        (line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__
+    )[:300]

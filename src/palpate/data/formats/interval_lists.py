@@ -45,7 +45,9 @@ class Interval:
     touch: str = ""
 
 
-def read_intervals(path: Path, maps: dict[str, str], classes: Path | None, half_open: bool, problems: list[Problem]) -> list[Interval]:
+def read_intervals(
+    path: Path, maps: dict[str, str], classes: Path | None, half_open: bool, problems: list[Problem]
+) -> list[Interval]:
     """The well-formed lines of the list, in its order."""
     header = header_of(path)
     table = open_table(path, ORDER[: len(header)] if is_bare(header) else None)
@@ -56,14 +58,24 @@ def read_intervals(path: Path, maps: dict[str, str], classes: Path | None, half_
     expressions = compile_maps(maps, table.names, list(NAMES))
     if (absent := [name for name in NEEDED if name not in expressions]) and not table.problems:
         got = f"no {', '.join(absent)} among {', '.join(table.names) or 'no columns'}"
-        raise PalpateError(f"{path} must have the columns {', '.join(NEEDED)}", got, "Map them: --map start=YOUR_COLUMN")
+        raise PalpateError(
+            f"{path} must have the columns {', '.join(NEEDED)}",
+            got,
+            "Map them: --map start=YOUR_COLUMN",
+        )
     table.read([name for expression in expressions.values() for name in expression.inputs])
     problems += table.problems
     known = None if classes is None else read_classes(Path(classes))
     # An inconclusive touch is contact all the same, so -1 is told apart here and not left out with the row.
     labels = expressions.pop("material", None)
-    said, failed = ([None] * len(table.lines), {}) if labels is None else labels.values(table.cells.__getitem__, len(table.lines))
-    found, _ = manifest_rows(expressions, table.cells.__getitem__, len(table.lines), table.where, None, problems)
+    said, failed = (
+        ([None] * len(table.lines), {})
+        if labels is None
+        else labels.values(table.cells.__getitem__, len(table.lines))
+    )
+    found, _ = manifest_rows(
+        expressions, table.cells.__getitem__, len(table.lines), table.where, None, problems
+    )
     intervals: list[Interval] = []
     for k, row in found:
         where, label = table.where(k), said[k]
@@ -73,40 +85,73 @@ def read_intervals(path: Path, maps: dict[str, str], classes: Path | None, half_
         if lacking := [name for name in NEEDED if name not in row]:
             wrong = "empty-cell", f"no {' and no '.join(lacking)}"
         elif last < row["start"]:
-            wrong = "bad-interval", f"the touch ends at frame {last} before it starts at {row['start']}"
+            wrong = (
+                "bad-interval",
+                f"the touch ends at frame {last} before it starts at {row['start']}",
+            )
         elif background is not None and not background.isdecimal():
             wrong = "bad-frame", f"the background {background!r} is not a whole number from 0"
         elif k in failed:
             wrong = "bad-map", f"material has no value: {failed[k]}"
         elif known is not None and label not in (None, "-1", *known.values()):
             name = known.get(int(label)) if str(label).isdecimal() else None
-            wrong = None if name else ("unknown-label", f"the class {label!r} is not in the table of classes")
+            wrong = (
+                None
+                if name
+                else ("unknown-label", f"the class {label!r} is not in the table of classes")
+            )
             label = name
         if wrong is not None:
             problems.append(Problem(where, *wrong))
             continue
-        words = {name: row[name] for name in ("object", "text", "session") if name in row} | ({"material": label} if label else {})
+        words = {name: row[name] for name in ("object", "text", "session") if name in row} | (
+            {"material": label} if label else {}
+        )
         first = row["start"]
-        intervals.append(Interval(where, row["video"], first, last, words, None if background is None else int(background), label == "-1"))
+        intervals.append(
+            Interval(
+                where,
+                row["video"],
+                first,
+                last,
+                words,
+                None if background is None else int(background),
+                label == "-1",
+            )
+        )
     return intervals
 
 
 def apart(listed: list[Interval], problems: list[Problem]) -> list[Interval]:
     """The intervals that share no frame with another, sorted by video and frame."""
-    order = sorted(range(len(listed)), key=lambda k: (listed[k].video, listed[k].first, listed[k].last, k))
+    order = sorted(
+        range(len(listed)), key=lambda k: (listed[k].video, listed[k].first, listed[k].last, k)
+    )
     partner: dict[int, int] = {}
     again: set[int] = set()
     widest = -1  # of those before, the one that reaches furthest
     for k in order:
-        if widest >= 0 and listed[widest].video == listed[k].video and listed[k].first <= listed[widest].last:
+        if (
+            widest >= 0
+            and listed[widest].video == listed[k].video
+            and listed[k].first <= listed[widest].last
+        ):
             i, j = listed[widest], listed[k]
             if (i.first, i.last, i.words) == (j.first, j.last, j.words):
                 again.add(k)
-                problems.append(Problem(j.where, "duplicate-row", f"the same interval stands at {i.where} already"))
+                problems.append(
+                    Problem(
+                        j.where, "duplicate-row", f"the same interval stands at {i.where} already"
+                    )
+                )
                 continue
             partner[k] = widest
             partner.setdefault(widest, k)
-        if widest < 0 or listed[widest].video != listed[k].video or listed[k].last > listed[widest].last:
+        if (
+            widest < 0
+            or listed[widest].video != listed[k].video
+            or listed[k].last > listed[widest].last
+        ):
             widest = k
     for k, other in sorted(partner.items()):
         i, o = listed[k], listed[other]
@@ -121,7 +166,16 @@ def numbered(listed: list[Interval]) -> Iterator[Interval]:
     for i in listed:
         if not i.inconclusive:
             count[i.video] = count.get(i.video, 0) + 1
-            yield Interval(i.where, i.video, i.first, i.last, i.words, i.background, False, f"{i.video}#{count[i.video]:04d}")
+            yield Interval(
+                i.where,
+                i.video,
+                i.first,
+                i.last,
+                i.words,
+                i.background,
+                False,
+                f"{i.video}#{count[i.video]:04d}",
+            )
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
@@ -137,7 +191,9 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
         table = manifest.part(split, part).table.sort("video", "frame")
         if len(bad := table.filter(pl.col("video").is_null() | pl.col("frame").is_null())["id"]):
             raise PalpateError(
-                "An interval list needs the video and frame of every sample", f"none for {bad[0]!r}", "Write the split file alone"
+                "An interval list needs the video and frame of every sample",
+                f"none for {bad[0]!r}",
+                "Write the split file alone",
             )
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
@@ -152,7 +208,9 @@ def _runs(table: pl.DataFrame) -> Iterator[tuple[object, ...]]:
     """(video, first, last, material, object, text) of each run of consecutive frames with the same of all else."""
     run: tuple[object, ...] | None = None
     first = last = 0
-    for video, frame, *said in table.select("video", "frame", "touch", "material", "object", "text").iter_rows():
+    for video, frame, *said in table.select(
+        "video", "frame", "contact", "material", "object", "text"
+    ).iter_rows():
         key = (video, *said)
         if run == key and frame == last + 1:
             last = frame
@@ -166,4 +224,6 @@ def _runs(table: pl.DataFrame) -> Iterator[tuple[object, ...]]:
 
 def is_bare(header: list[str]) -> bool:
     """Whether the first line of a table is an interval already, and no header."""
-    return len(header) in (3, 4) and header[0] != "" and all(cell.isdecimal() for cell in header[1:3])
+    return (
+        len(header) in (3, 4) and header[0] != "" and all(cell.isdecimal() for cell in header[1:3])
+    )

@@ -21,7 +21,16 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, quiet
 from palpate.data.formats.base import Facts, Found, Scan
-from palpate.data.formats.interval_lists import NAMES, NEEDED, ORDER, Interval, apart, is_bare, numbered, read_intervals
+from palpate.data.formats.interval_lists import (
+    NAMES,
+    NEEDED,
+    ORDER,
+    Interval,
+    apart,
+    is_bare,
+    numbered,
+    read_intervals,
+)
 from palpate.data.formats.touch_and_go import find_videos
 from palpate.data.frames import IMAGE_FORMATS, FolderFrames, ImageFormat
 from palpate.data.images import Check
@@ -35,8 +44,14 @@ from palpate.data.tables import header_of
 LOOKED_FOR = f"a table with the columns {', '.join(ORDER)}, beside folders of recordings"
 FACTS = Facts(
     "recordings of one's own with an interval list",
-    "unknown", "unknown", "unknown", "unknown", None, "as many as the intervals have frames", "the column video",
-)  # fmt: skip
+    "unknown",
+    "unknown",
+    "unknown",
+    "unknown",
+    None,
+    "as many as the intervals have frames",
+    "the column video",
+)
 
 
 class _Whole(Recordings):
@@ -53,7 +68,9 @@ def detect(source: Path) -> bool:
     header = [name.lower() for name in header_of(source)]
     if {"vision", "tactile"} & set(header):
         return False
-    return all(any(name in header for name in NAMES[target]) for target in NEEDED) or is_bare(header)
+    return all(any(name in header for name in NAMES[target]) for target in NEEDED) or is_bare(
+        header
+    )
 
 
 def scan(
@@ -84,12 +101,31 @@ def scan(
     """
     base = _root(source, root, every)
     work = _Whole(base, base, _videos(base), {}, "jpg", None, [])
-    rows, touches, inconclusive = _prepared(work, Path(source), columns, classes, half_open, every, check, progress)
+    rows, touches, inconclusive = _prepared(
+        work, Path(source), columns, classes, half_open, every, check, progress
+    )
     rows = work.decode(rows, progress) if check == "decode" else rows
     found: list[Found] = [
-        (r.where, {"id": r.id, "video": r.video, "frame": r.frame, "touch": r.touch, **touches[r.touch].words}) for r in rows
+        (
+            r.where,
+            {
+                "id": r.id,
+                "video": r.video,
+                "frame": r.frame,
+                "contact": r.touch,
+                **touches[r.touch].words,
+            },
+        )
+        for r in rows
     ]
-    return Scan(found, base, work.problems, work.suspicious, {"dataset": source.stem}, inconclusive=inconclusive)
+    return Scan(
+        found,
+        base,
+        work.problems,
+        work.suspicious,
+        {"dataset": source.stem},
+        inconclusive=inconclusive,
+    )
 
 
 def run(
@@ -131,37 +167,66 @@ def run(
     """
     base = _root(source, root, every)
     if size is not None and size < 1:
-        raise PalpateError("size must be at least 1 pixel", str(size), "Leave it out to keep the frames as they are")
+        raise PalpateError(
+            "size must be at least 1 pixel",
+            str(size),
+            "Leave it out to keep the frames as they are",
+        )
     if image_format not in IMAGE_FORMATS:
-        raise PalpateError(f"image_format must be one of {', '.join(IMAGE_FORMATS)}", repr(image_format), "Choose one of these")
+        raise PalpateError(
+            f"image_format must be one of {', '.join(IMAGE_FORMATS)}",
+            repr(image_format),
+            "Choose one of these",
+        )
     with removing_on_error(out) as created:
         work = _Whole(base, Path(out), _videos(base), {}, image_format, size, created)
-        rows, touches, inconclusive = _prepared(work, Path(source), columns, classes, half_open, every, check, progress)
+        rows, touches, inconclusive = _prepared(
+            work, Path(source), columns, classes, half_open, every, check, progress
+        )
         raise_if(work.problems, skip_bad)
         require_some(len(rows), source, work.problems)
         rows = work.extract(rows, progress)
         raise_if(work.problems, skip_bad)
         require_some(len(rows), source, work.problems)
         words = {
-            name: FrameTable({(r.video, r.frame): touches[r.touch].words[name] for r in rows if name in touches[r.touch].words}, [])
+            name: FrameTable(
+                {
+                    (r.video, r.frame): touches[r.touch].words[name]
+                    for r in rows
+                    if name in touches[r.touch].words
+                },
+                [],
+            )
             for name in ("material", "object", "text", "session")
         }
         text = (columns or {}).get("text", "text")
         facts = {
-            **FACTS.of_manifest(), "format": "intervals", "dataset": Path(source).stem,
+            **FACTS.of_manifest(),
+            "format": "intervals",
+            "dataset": Path(source).stem,
             "text_source": f"column {text}" if words["text"].values else "none",
-        }  # fmt: skip
+        }
         manifest = work.manifest(rows, facts, "", words)
         named = manifest.table.with_columns(sensor=pl.lit(sensor, dtype=pl.String))
-        return Imported(Manifest(named, manifest.root, manifest.facts), work.problems, {}, inconclusive, work.suspicious).save(out, created)
+        return Imported(
+            Manifest(named, manifest.root, manifest.facts),
+            work.problems,
+            {},
+            inconclusive,
+            work.suspicious,
+        ).save(out, created)
 
 
 def _root(source: Path, root: Path | None, every: int) -> Path:
     if every < 1:
-        raise PalpateError("every must be at least 1", str(every), "Leave it out to take every frame")
+        raise PalpateError(
+            "every must be at least 1", str(every), "Leave it out to take every frame"
+        )
     base = Path(source).parent if root is None else Path(root)
     if not base.is_dir():
-        raise PalpateError("The folder of the recordings must exist", f"no folder {base}", "Check --root")
+        raise PalpateError(
+            "The folder of the recordings must exist", f"no folder {base}", "Check --root"
+        )
     return base
 
 
@@ -215,7 +280,12 @@ def _prepared(
     ]
     bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
     work.suspicious += [
-        Problem(touches[t].where, "no-background", f"no frame of {touches[t].video!r} shows the gel untouched") for t in bare
+        Problem(
+            touches[t].where,
+            "no-background",
+            f"no frame of {touches[t].video!r} shows the gel untouched",
+        )
+        for t in bare
     ]
     return rows, touches, sum(i.inconclusive for i in listed)
 
@@ -243,13 +313,19 @@ def _frames(work: Recordings, touch: Interval, every: int) -> list[Row]:
         for side in without:
             lacking.setdefault(side, []).append(k)
         if not without:
-            rows.append(Row(touch.where, f"{touch.video}/{k:010d}", touch.video, k, touch.touch, ""))
+            rows.append(
+                Row(touch.where, f"{touch.video}/{k:010d}", touch.video, k, touch.touch, "")
+            )
     for side, missing in lacking.items():
         source = work.sides[touch.video][side]
         leaving = isinstance(source, FolderFrames) and any(k in source.leaving for k in missing)
         text = f"no {side} picture of {len(missing)} of the frames of {touch.touch}, the first of them {missing[0]}, in {source.source}"
         work.problems.append(
-            Problem(touch.where, "outside-root" if leaving else "missing-file", text + ": a link that leaves it" * leaving)
+            Problem(
+                touch.where,
+                "outside-root" if leaving else "missing-file",
+                text + ": a link that leaves it" * leaving,
+            )
         )
     return rows
 
@@ -261,11 +337,17 @@ def _named_background(work: Recordings, touch: Interval) -> None:
     frames = work.sides[touch.video]["tactile"]
     if not frames.has(touch.background):
         work.problems.append(
-            Problem(touch.where, "missing-file", f"no picture of the background, frame {touch.background}, in {frames.source}")
+            Problem(
+                touch.where,
+                "missing-file",
+                f"no picture of the background, frame {touch.background}, in {frames.source}",
+            )
         )
         return
     if touch.background in work.contact.get(touch.video, set()):
-        text = f"the listed background, frame {touch.background} of {touch.video!r}, lies in a touch"
+        text = (
+            f"the listed background, frame {touch.background} of {touch.video!r}, lies in a touch"
+        )
         work.suspicious.append(Problem(touch.where, "background-in-touch", text))
     work.background_frames[touch.touch] = touch.background
     work.background[touch.touch] = frames.path(touch.background)

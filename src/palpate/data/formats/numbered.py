@@ -39,7 +39,9 @@ class Numbered:
     odd: list[str] = field(default_factory=list)
 
 
-def numbered(folder: Path, pattern: str = r"([0-9]+)", suffixes: Sequence[str] = SUFFIXES) -> Numbered:
+def numbered(
+    folder: Path, pattern: str = r"([0-9]+)", suffixes: Sequence[str] = SUFFIXES
+) -> Numbered:
     """Lists the pictures of a folder by their number; an absent or locked folder has none.
 
     Args:
@@ -67,27 +69,47 @@ def numbered(folder: Path, pattern: str = r"([0-9]+)", suffixes: Sequence[str] =
     return out
 
 
-def tell(found: Numbered, where: str, problems: list[Problem], suspicious: list[Problem], *, steady: bool = False) -> None:
+def tell(
+    found: Numbered,
+    where: str,
+    problems: list[Problem],
+    suspicious: list[Problem],
+    *,
+    steady: bool = False,
+) -> None:
     """Reports doubled numbers one by one, and pictures of another name in one line a folder.
 
     With ``steady`` also holes in the numbering, unless most numbers are holes: then the set was thinned.
     """
-    problems += [Problem(f"{where}/{name}", "duplicate-frame", f"{before} has the same number") for name, before in found.doubled]
+    problems += [
+        Problem(f"{where}/{name}", "duplicate-frame", f"{before} has the same number")
+        for name, before in found.doubled
+    ]
     if found.odd:
-        suspicious.append(Problem(where, "unknown-name", f"pictures that carry no frame number: {few(found.odd)}"))
+        suspicious.append(
+            Problem(where, "unknown-name", f"pictures that carry no frame number: {few(found.odd)}")
+        )
     if steady and len(found.files) > 1:
         first, *_, last = found.files
         holes = last - first + 1 - len(found.files)
         if 0 < holes < len(found.files):
             lost = few(k for k in range(first, last) if k not in found.files)
-            suspicious.append(Problem(where, "frame-gap", f"numbers that are missing between {first} and {last}: {lost}"))
+            suspicious.append(
+                Problem(
+                    where,
+                    "frame-gap",
+                    f"numbers that are missing between {first} and {last}: {lost}",
+                )
+            )
 
 
 def subfolders(folder: Path) -> list[str]:
     """Names of the folders in a folder, integers first and by value; hidden ones are left out, an absent or locked folder has none."""
     try:
         with os.scandir(folder) as entries:
-            return sorted((e.name for e in entries if e.is_dir() and not e.name.startswith(".")), key=natural)
+            return sorted(
+                (e.name for e in entries if e.is_dir() and not e.name.startswith(".")), key=natural
+            )
     except OSError:
         return []
 
@@ -100,7 +122,11 @@ def natural(name: str) -> tuple[int, int, str]:
 def few(names: Iterable[object]) -> str:
     """How many there are, and the first of them: ``"12: a, b, c ..."``, or ``"none"``."""
     every = [str(n) for n in names]
-    return f"{len(every)}: {', '.join(every[:FEW])}{' ...' if len(every) > FEW else ''}" if every else "none"
+    return (
+        f"{len(every)}: {', '.join(every[:FEW])}{' ...' if len(every) > FEW else ''}"
+        if every
+        else "none"
+    )
 
 
 def require_folder(root: Path, name: str) -> None:
@@ -111,7 +137,9 @@ def require_folder(root: Path, name: str) -> None:
     """
     if not root.is_dir():
         got = f"the file {root}" if root.exists() else f"nothing at {root}"
-        raise PalpateError(f"The source of an import of {name} must be a folder", got, "Check the path")
+        raise PalpateError(
+            f"The source of an import of {name} must be a folder", got, "Check the path"
+        )
 
 
 @dataclass(frozen=True)
@@ -135,18 +163,42 @@ def read_pairs(path: Path, problems: list[Problem]) -> list[Entry] | None:
     except (ValueError, RecursionError) as error:
         problems.append(Problem(str(path), "bad-list", f"not JSON: {error}"))
         return None
-    if not isinstance(data, dict) or not set(data) & set(PARTS) or not all(isinstance(rows, list) for rows in data.values()):
+    if (
+        not isinstance(data, dict)
+        or not set(data) & set(PARTS)
+        or not all(isinstance(rows, list) for rows in data.values())
+    ):
         return None
     entries: list[Entry] = []
     for part, rows in data.items():
         if part not in PARTS:
-            problems.append(Problem(str(path), "unknown-part", f"the part {part!r} ({len(rows)} entries) is none of {', '.join(PARTS)}"))
+            problems.append(
+                Problem(
+                    str(path),
+                    "unknown-part",
+                    f"the part {part!r} ({len(rows)} entries) is none of {', '.join(PARTS)}",
+                )
+            )
             continue
         for k, row in enumerate(rows):
             where = f"{path} {part}[{k}]"
-            names = [str(n).strip() for n in row if isinstance(n, (str, int)) and not isinstance(n, bool)] if isinstance(row, list) else []
+            names = (
+                [
+                    str(n).strip()
+                    for n in row
+                    if isinstance(n, (str, int)) and not isinstance(n, bool)
+                ]
+                if isinstance(row, list)
+                else []
+            )
             if len(names) != 2 or len(row) != 2 or not all(names):
-                problems.append(Problem(where, "bad-line", f"{json.dumps(row, ensure_ascii=False)[:80]} is no pair of names"))
+                problems.append(
+                    Problem(
+                        where,
+                        "bad-line",
+                        f"{json.dumps(row, ensure_ascii=False)[:80]} is no pair of names",
+                    )
+                )
             elif any(re.search(CLIMBS, n) or "/" in n or "\\" in n for n in names):
                 problems.append(Problem(where, "outside-root", f"{names!r} are no plain names"))
             else:
@@ -154,7 +206,12 @@ def read_pairs(path: Path, problems: list[Problem]) -> list[Entry] | None:
     return entries
 
 
-def assign(path: Path, entries: Sequence[tuple[Entry, Hashable]], ids: Mapping[Any, str], problems: list[Problem]) -> dict[str, str]:
+def assign(
+    path: Path,
+    entries: Sequence[tuple[Entry, Hashable]],
+    ids: Mapping[Any, str],
+    problems: list[Problem],
+) -> dict[str, str]:
     """The part of every listed sample.
 
     Entries without a sample, doubled ones and samples in two parts are problems; the last are in no part.
@@ -178,11 +235,24 @@ def assign(path: Path, entries: Sequence[tuple[Entry, Hashable]], ids: Mapping[A
         if i is None and isinstance(key, tuple) and key[0] not in folders:
             lost[str(key[0])] += 1
         elif i is None:
-            problems.append(Problem(entry.where, "missing-file", f"{entry.first}/{entry.second} is listed but not there"))
+            problems.append(
+                Problem(
+                    entry.where,
+                    "missing-file",
+                    f"{entry.first}/{entry.second} is listed but not there",
+                )
+            )
         elif (before := seen.setdefault(i, entry)) is not entry:
             if before.part != entry.part:
                 both.add(i)
-            kind, text = ("duplicate-row", "listed twice") if before.part == entry.part else ("two-parts", f"in {before.part}, too")
+            kind, text = (
+                ("duplicate-row", "listed twice")
+                if before.part == entry.part
+                else ("two-parts", f"in {before.part}, too")
+            )
             problems.append(Problem(entry.where, kind, f"{entry.first}/{entry.second} is {text}"))
-    problems += [Problem(str(path), "missing-folder", f"no folder {name!r}, of which {n} entries are listed") for name, n in lost.items()]
+    problems += [
+        Problem(str(path), "missing-folder", f"no folder {name!r}, of which {n} entries are listed")
+        for name, n in lost.items()
+    ]
     return {i: entry.part for i, entry in seen.items() if i not in both}

@@ -55,10 +55,14 @@ FACTS = Facts(
 def detect(source: Path) -> bool:
     """Whether this is a table file, a folder with a vision and a touch folder, or a folder of images (or of folders of them)."""
     if source.is_file():
-        return source.suffix.lower() in TABLES and (source.suffix.lower() != ".json" or bool(header_of(source)))
+        return source.suffix.lower() in TABLES and (
+            source.suffix.lower() != ".json" or bool(header_of(source))
+        )
     if not source.is_dir():
         return False
-    return all(any((source / name).is_dir() for name in names) for names in (VISION, TACTILE)) or _has_images(source)
+    return all(
+        any((source / name).is_dir() for name in names) for names in (VISION, TACTILE)
+    ) or _has_images(source)
 
 
 def scan(
@@ -94,74 +98,133 @@ def scan(
     if source.is_file():
         if side is not None:
             raise PalpateError(
-                "side says what a folder of images shows", f"the table {source.name}", f"Leave it out; map a column: {side}=..."
+                "side says what a folder of images shows",
+                f"the table {source.name}",
+                f"Leave it out; map a column: {side}=...",
             )
-        base, layout = Path(root) if root is not None else source.parent, f"table {source.suffix.lower()[1:] or 'csv'}"
+        base, layout = (
+            Path(root) if root is not None else source.parent,
+            f"table {source.suffix.lower()[1:] or 'csv'}",
+        )
         rows, inconclusive = _table_rows(source, maps, names, known, problems)
     elif source.is_dir():
         if root is not None or names is not None:
-            raise PalpateError("Only a table has a root and names of columns", f"the folder {source}", "Leave root and names out")
+            raise PalpateError(
+                "Only a table has a root and names of columns",
+                f"the folder {source}",
+                "Leave root and names out",
+            )
         base, layout = source, "folders" if side is None else f"folder of {side} images"
         files = _pairs(source, problems) if side is None else _single(source, side, problems)
         rows, inconclusive = _file_rows(files, source, maps, known, problems)
     else:
-        raise PalpateError("The source of an import must exist", f"nothing at {source}", "Check the path")
+        raise PalpateError(
+            "The source of an import must exist", f"nothing at {source}", "Check the path"
+        )
     progress("reading rows", 1, 1)
     suspicious = odd_groups(source, rows)
     if rows and side is None and (lone := [name for name, _ in SIDES if name not in rows[0][1]]):
         text = f"no column {lone[0]}, so the samples have one image each; if there should be two, map it: --map {lone[0]}=YOUR_COLUMN"
         suspicious.append(Problem(str(source), "one-sided", text))
     words = any("text" in row for _, row in rows)
-    facts = {"dataset": source.stem, "layout": layout, "text_source": f"column {maps.get('text', 'text')}" if words else "none"}
+    facts = {
+        "dataset": source.stem,
+        "layout": layout,
+        "text_source": f"column {maps.get('text', 'text')}" if words else "none",
+    }
     found = Scan(rows, base, problems, suspicious, facts, inconclusive=inconclusive)
     if any("split" in row for _, row in rows):
-        found.own, found.rules = "Orig", {"Orig": {"method": "official", "column": maps.get("split", "split")}}
+        found.own, found.rules = (
+            "Orig",
+            {"Orig": {"method": "official", "column": maps.get("split", "split")}},
+        )
     return found
 
 
 def _table_rows(
-    path: Path, maps: Mapping[str, str], names: str | None, classes: Mapping[int, str] | None, problems: list[Problem]
+    path: Path,
+    maps: Mapping[str, str],
+    names: str | None,
+    classes: Mapping[int, str] | None,
+    problems: list[Problem],
 ) -> tuple[list[Found], int]:
     """(place, manifest row) of each usable row of a table, and how many rows are inconclusive."""
     table = open_table(path, None if names is None else [name.strip() for name in names.split(",")])
-    expressions = compile_maps(maps, table.names, TARGETS) if table.names or not table.problems else {}
+    expressions = (
+        compile_maps(maps, table.names, TARGETS) if table.names or not table.problems else {}
+    )
     sides = [side for side, _ in SIDES if side in expressions]
     if not sides and not table.problems:
-        got = f"no tactile among {', '.join(table.names)}, and no vision" if table.names else "an empty file"
-        raise PalpateError(f"{path} must have the columns vision and tactile, or one of them", got, "Map it: --map vision=YOUR_COLUMN")
+        got = (
+            f"no tactile among {', '.join(table.names)}, and no vision"
+            if table.names
+            else "an empty file"
+        )
+        raise PalpateError(
+            f"{path} must have the columns vision and tactile, or one of them",
+            got,
+            "Map it: --map vision=YOUR_COLUMN",
+        )
     table.read([name for expression in expressions.values() for name in expression.inputs])
     problems += table.problems
     found, inconclusive = manifest_rows(
         expressions, table.cells.__getitem__, len(table.lines), table.where, classes, problems
-    )  # fmt: skip
+    )
     rows: list[Found] = []
     for k, row in found:
         if lacking := [side for side in sides if side not in row]:
-            problems.append(Problem(table.where(k), "empty-cell", f"no {' and no '.join(lacking)} path"))
+            problems.append(
+                Problem(table.where(k), "empty-cell", f"no {' and no '.join(lacking)} path")
+            )
             continue
-        if long := [side for side in sides if len(row[side]) > 80 and any(len(p.encode()) > 255 for p in row[side].split("/"))]:
-            problems.append(Problem(table.where(k), "bad-path", f"no file system holds a name as long as that of the {long[0]} path"))
+        if long := [
+            side
+            for side in sides
+            if len(row[side]) > 80 and any(len(p.encode()) > 255 for p in row[side].split("/"))
+        ]:
+            problems.append(
+                Problem(
+                    table.where(k),
+                    "bad-path",
+                    f"no file system holds a name as long as that of the {long[0]} path",
+                )
+            )
             continue
         rows.append((table.where(k), row))
     return rows, inconclusive
 
 
 def _file_rows(
-    files: Sequence[tuple[str, Row]], folder: Path, maps: Mapping[str, str], classes: Mapping[int, str] | None, problems: list[Problem]
+    files: Sequence[tuple[str, Row]],
+    folder: Path,
+    maps: Mapping[str, str],
+    classes: Mapping[int, str] | None,
+    problems: list[Problem],
 ) -> tuple[list[Found], int]:
     """Rows of image files by their paths below the folder of images, with what map expressions say in place of the folder's rule."""
     sides = [side for side, _ in SIDES if any(side in row for _, row in files)]
-    cells = {"path": [path for path, _ in files], **{side: [row[side] for _, row in files] for side in sides}}
+    cells = {
+        "path": [path for path, _ in files],
+        **{side: [row[side] for _, row in files] for side in sides},
+    }
     where = lambda k: str(files[k][1].get("tactile") or files[k][1]["vision"])  # noqa: E731
-    expressions = {target: e for target, e in compile_maps(maps, list(cells), TARGETS).items() if target in maps}
-    found, inconclusive = manifest_rows(expressions, cells.__getitem__, len(files), where, classes, problems)
+    expressions = {
+        target: e
+        for target, e in compile_maps(maps, list(cells), TARGETS).items()
+        if target in maps
+    }
+    found, inconclusive = manifest_rows(
+        expressions, cells.__getitem__, len(files), where, classes, problems
+    )
     rows: list[Found] = []
     for k, row in found:
         path, images = files[k]
         stem = posixpath.splitext(path)[0]
         number = re.search(r"\d{1,18}$", stem)
         place: Row = (
-            {"id": stem} | ({"video": posixpath.dirname(path)} if "/" in path else {}) | ({"frame": int(number[0])} if number else {})
+            {"id": stem}
+            | ({"video": posixpath.dirname(path)} if "/" in path else {})
+            | ({"frame": int(number[0])} if number else {})
         )
         rows.append((where(k), {**place, **images, **row}))
     return rows, inconclusive
@@ -176,15 +239,21 @@ def _pairs(folder: Path, problems: list[Problem]) -> list[tuple[str, Row]]:
         if len(there) != 1:
             got = f"{len(there)} of them: {', '.join(there)}" if there else "none of them"
             fix = "Rename the folder, or name another format; for one folder of images of one kind: --as vision or --as tactile"
-            raise PalpateError(f"{folder} must hold one folder of {side} images ({', '.join(names)})", got, fix)
+            raise PalpateError(
+                f"{folder} must hold one folder of {side} images ({', '.join(names)})", got, fix
+            )
         tops[side] = there[0]
         files[side] = _stems(folder / there[0], there[0], problems)
     rows: list[tuple[str, Row]] = []
     for stem in sorted({*files["vision"], *files["tactile"]}):
-        pair: Row = {side: f"{tops[side]}/{files[side][stem]}" for side in files if stem in files[side]}
+        pair: Row = {
+            side: f"{tops[side]}/{files[side][stem]}" for side in files if stem in files[side]
+        }
         for side, other in SIDES:
             if side not in pair:
-                problems.append(Problem(pair[other], "unpaired", f"no {side} image of the name {stem!r}"))
+                problems.append(
+                    Problem(pair[other], "unpaired", f"no {side} image of the name {stem!r}")
+                )
         if len(pair) == 2:
             rows.append((files["tactile"][stem], pair))
     return rows
@@ -202,7 +271,11 @@ def _stems(base: Path, top: str, problems: list[Problem]) -> dict[str, str]:
         stem = posixpath.splitext(path)[0]
         if stem in found:
             where = f"{top}/{path}" if top else path
-            problems.append(Problem(where, "duplicate-id", f"{posixpath.basename(found[stem])} has the same stem"))
+            problems.append(
+                Problem(
+                    where, "duplicate-id", f"{posixpath.basename(found[stem])} has the same stem"
+                )
+            )
         else:
             found[stem] = path
     return found
@@ -225,4 +298,8 @@ def _images(base: Path) -> Iterator[str]:
 
 def _has_images(folder: Path) -> bool:
     """Whether one of the first folders of a tree holds an image."""
-    return any(name.lower().endswith(SUFFIXES) for _, _, files in islice(os.walk(folder), 50) for name in files)
+    return any(
+        name.lower().endswith(SUFFIXES)
+        for _, _, files in islice(os.walk(folder), 50)
+        for name in files
+    )

@@ -42,13 +42,15 @@ FACTS = Facts(
     (240, 320),
     "4,587 by TVL's paper; 46 in the test list",
     "none is given: clusters of near-duplicates",
-    tvl.NORMALISATION,
+    tvl.NORMALIZATION,
 )
 FOLDERS = {"vision": ("images_rgb", "rgb"), "tactile": ("images_tac", "tac")}
 NAME = re.compile(r"image_(.+?)(?:_rgb|_tac)?")
 BACKGROUND = "tac_background.png"
 COLUMNS = ("url", "tactile", "caption")
-LOOKED_FOR = "ssvtp/, or images_rgb/ with image_<id>_rgb.jpg and images_tac/ with image_<id>_tac.jpg"
+LOOKED_FOR = (
+    "ssvtp/, or images_rgb/ with image_<id>_rgb.jpg and images_tac/ with image_<id>_tac.jpg"
+)
 
 
 def detect(source: Path) -> bool:
@@ -60,7 +62,14 @@ def detect(source: Path) -> bool:
 def find(source: Path) -> Path | None:
     """``ssvtp/``, from there or from the folder that holds it."""
     both = [name for name, _ in FOLDERS.values()]
-    return next((root for root in (Path(source), Path(source) / "ssvtp") if all((root / name).is_dir() for name in both)), None)
+    return next(
+        (
+            root
+            for root in (Path(source), Path(source) / "ssvtp")
+            if all((root / name).is_dir() for name in both)
+        ),
+        None,
+    )
 
 
 def scan(source: Path, *, lists: Path | None = None, progress: Progress = quiet) -> Scan:
@@ -76,7 +85,9 @@ def scan(source: Path, *, lists: Path | None = None, progress: Progress = quiet)
     """
     root = find(source)
     if root is None:
-        raise PalpateError(f"{source} must be SSVTP: {LOOKED_FOR}", "none of these", f"Unpack it from {tvl.URL}")
+        raise PalpateError(
+            f"{source} must be SSVTP: {LOOKED_FOR}", "none of these", f"Unpack it from {tvl.URL}"
+        )
     found = Scan([], root, facts={"layout": "ssvtp"})
     there = tvl.part_lists(lists if lists is not None else root)
     if lists is not None and not there:
@@ -92,10 +103,15 @@ def scan(source: Path, *, lists: Path | None = None, progress: Progress = quiet)
     if not there:
         found.rows += work.unlisted()
     elif more := sorted(work.files["vision"] - used):
-        found.suspicious.append(Problem(str(root / more[0]), "unlisted", f"{len(more)} photos stand in no list"))
+        found.suspicious.append(
+            Problem(str(root / more[0]), "unlisted", f"{len(more)} photos stand in no list")
+        )
     if there:
         found.own = name = "Orig" if lists is None else "Lists"
-        found.rules[name] = {"method": "official" if lists is None else "lists", "files": [path.name for path in there.values()]}
+        found.rules[name] = {
+            "method": "official" if lists is None else "lists",
+            "files": [path.name for path in there.values()],
+        }
     found.rows.sort(key=lambda row: _order(row[1]["id"]))
     work.finish()
     return found
@@ -133,7 +149,9 @@ class _Work:
     def __post_init__(self) -> None:
         for side, (folder, _) in FOLDERS.items():
             names = sorted(
-                path.name for path in (self.root / folder).iterdir() if tvl.is_picture(path.name) and not path.name.startswith(".")
+                path.name
+                for path in (self.root / folder).iterdir()
+                if tvl.is_picture(path.name) and not path.name.startswith(".")
             )
             self.files[side] = {f"{folder}/{name}" for name in names}
         self.background = BACKGROUND if (self.root / BACKGROUND).is_file() else None
@@ -146,19 +164,28 @@ class _Work:
             return None
         for cell in listed.values():
             if cell and re.search(CLIMBS, cell):
-                self.found.problems.append(Problem(where, "outside-root", f"the path {cell!r} leaves the data set"))
+                self.found.problems.append(
+                    Problem(where, "outside-root", f"the path {cell!r} leaves the data set")
+                )
                 return None
-        given = {side: PurePosixPath(cell).as_posix().removeprefix("ssvtp/") if cell else None for side, cell in listed.items()}
+        given = {
+            side: PurePosixPath(cell).as_posix().removeprefix("ssvtp/") if cell else None
+            for side, cell in listed.items()
+        }
         path = PurePosixPath(str(given["vision"]))
         match = NAME.fullmatch(path.stem)
         if match is None:
-            self.found.problems.append(Problem(where, "bad-path", f"{path.name!r} is not image_<id>_rgb.jpg"))
+            self.found.problems.append(
+                Problem(where, "bad-path", f"{path.name!r} is not image_<id>_rgb.jpg")
+            )
             return None
         derived = {side: self._derived(side, match[1], path.suffix) for side in FOLDERS}
         if any(cell and cell != derived[side] for side, cell in given.items()):
             self.misnamed.append(where)
         paths = {
-            side: given[side] if name not in self.files[side] and given[side] in self.files[side] else name
+            side: given[side]
+            if name not in self.files[side] and given[side] in self.files[side]
+            else name
             for side, name in derived.items()
         }
         return self._cells(where, match[1], paths, tvl.clean_caption(cells.get("caption")))
@@ -177,19 +204,38 @@ class _Work:
         for key, paths in by_id.items():
             if len(paths) < len(FOLDERS):
                 (name,) = paths.values()
-                self.found.problems.append(Problem(str(self.root / name), "unpaired", f"no picture of the id {key!r} on the other side"))
+                self.found.problems.append(
+                    Problem(
+                        str(self.root / name),
+                        "unpaired",
+                        f"no picture of the id {key!r} on the other side",
+                    )
+                )
             else:
-                rows.append((str(self.root / paths["vision"]), self._cells(str(self.root / paths["vision"]), key, paths, None)))
+                rows.append(
+                    (
+                        str(self.root / paths["vision"]),
+                        self._cells(str(self.root / paths["vision"]), key, paths, None),
+                    )
+                )
         return rows
 
     def finish(self) -> None:
         """Sums up what disagreed."""
         told = self.found.suspicious
-        told += tvl.summed(self.misnamed, "misnamed-path", "other files are named than the photo's id tells")
-        told += tvl.summed(self.worded, "two-captions", "the text file has other words than the list, and counts")
-        told += tvl.summed(self.wordless, "no-text", "neither a text file nor a caption in the list")
+        told += tvl.summed(
+            self.misnamed, "misnamed-path", "other files are named than the photo's id tells"
+        )
+        told += tvl.summed(
+            self.worded, "two-captions", "the text file has other words than the list, and counts"
+        )
+        told += tvl.summed(
+            self.wordless, "no-text", "neither a text file nor a caption in the list"
+        )
         self.found.facts["text_source"] = ", ".join(sorted(self.sources)) or "none"
-        self.found.facts["backgrounds"] = self.background or f"none: put {BACKGROUND} into ssvtp/ to have one"
+        self.found.facts["backgrounds"] = (
+            self.background or f"none: put {BACKGROUND} into ssvtp/ to have one"
+        )
 
     def _derived(self, side: str, key: str, suffix: str) -> str:
         """The file of an id, with the listed suffix or, if only that is there, with another."""
@@ -197,7 +243,9 @@ class _Work:
         names = [f"{folder}/image_{key}_{tail}{s}" for s in (suffix, *SUFFIXES)]
         return next((name for name in names if name in self.files[side]), names[0])
 
-    def _cells(self, where: str, key: str, paths: Mapping[str, str | None], caption: str | None) -> dict[str, Any]:
+    def _cells(
+        self, where: str, key: str, paths: Mapping[str, str | None], caption: str | None
+    ) -> dict[str, Any]:
         file = self.root / "text" / f"labels_{key}.txt"
         text = None
         if file.is_file():
@@ -209,7 +257,13 @@ class _Work:
             self.sources.add("text/labels_<id>.txt" if text else "column caption")
         else:
             self.wordless.append(where)
-        return {"id": f"ssvtp/{key}", **paths, "text": text or caption, "background": self.background, "sensor": FACTS.sensor}
+        return {
+            "id": f"ssvtp/{key}",
+            **paths,
+            "text": text or caption,
+            "background": self.background,
+            "sensor": FACTS.sensor,
+        }
 
 
 def _order(name: str) -> tuple[int, str]:

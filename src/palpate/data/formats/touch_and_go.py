@@ -3,7 +3,7 @@
 ::
 
     root/
-      label.txt                  video/0000000033.jpg,15     every labelled in-contact frame
+      label.txt                  video/0000000033.jpg,15     every labeled in-contact frame
       category_reference.txt     Rock: 15
       train.txt  test.txt        the official split, lines as in label.txt (optional)
       captions.csv  objects.csv  frame,text and frame,object, by the user (optional)
@@ -27,7 +27,15 @@ from palpate.data.formats.base import WORLD, Facts, Scan, world_facts
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
 from palpate.data.images import Check
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
-from palpate.data.listing import INCONCLUSIVE, FrameList, FrameTable, read_categories, read_frame_table, read_lists, write_list
+from palpate.data.listing import (
+    INCONCLUSIVE,
+    FrameList,
+    FrameTable,
+    read_categories,
+    read_frame_table,
+    read_lists,
+    write_list,
+)
 from palpate.data.manifest import Manifest
 from palpate.data.recordings import Recordings, Row, VideoFiles, first_frames, rows_of, thin
 
@@ -44,11 +52,31 @@ FACTS = Facts(
     {"touch, 50 images (T3)": ((0.51808, 0.50300, 0.51457), (0.13893, 0.11343, 0.13497))},
 )
 CATEGORIES: dict[int, str] = dict(
-    enumerate((
-        "Concrete", "Plastic", "Glass", "Wood", "Metal", "Brick", "Tile", "Leather", "Synthetic Fabric", "Natural Fabric",
-        "Rubber", "Paper", "Tree", "Grass", "Soil", "Rock", "Gravel", "Sand", "Plants", "Others",
-    ))
-)  # fmt: skip
+    enumerate(
+        (
+            "Concrete",
+            "Plastic",
+            "Glass",
+            "Wood",
+            "Metal",
+            "Brick",
+            "Tile",
+            "Leather",
+            "Synthetic Fabric",
+            "Natural Fabric",
+            "Rubber",
+            "Paper",
+            "Tree",
+            "Grass",
+            "Soil",
+            "Rock",
+            "Gravel",
+            "Sand",
+            "Plants",
+            "Others",
+        )
+    )
+)
 #: Part of the official split -> its list.
 OFFICIAL = {"train": "train.txt", "test": "test.txt"}
 PLACES = ("dataset", "final_dataset", ".")
@@ -58,7 +86,11 @@ LOOKED_FOR = "label.txt (or train.txt, test.txt), and videos under dataset/, fin
 
 def detect(source: Path) -> bool:
     """Whether a folder looks like Touch and Go: a list and a recording."""
-    return source.is_dir() and any((source / n).is_file() for n in ("label.txt", "train.txt", "test.txt")) and bool(find_videos(source))
+    return (
+        source.is_dir()
+        and any((source / n).is_file() for n in ("label.txt", "train.txt", "test.txt"))
+        and bool(find_videos(source))
+    )
 
 
 def find_videos(root: Path) -> dict[str, VideoFiles]:
@@ -70,7 +102,11 @@ def find_videos(root: Path) -> dict[str, VideoFiles]:
             if folder.name in found or not folder.is_dir():
                 continue
             sides = {
-                side: folder / frames if (folder / frames).is_dir() else folder / video if (folder / video).is_file() else None
+                side: folder / frames
+                if (folder / frames).is_dir()
+                else folder / video
+                if (folder / video).is_file()
+                else None
                 for side, (frames, video) in SIDES.items()
             }
             if any(sides.values()):
@@ -116,22 +152,45 @@ def import_touch_and_go(
     """
     root, out = Path(root), Path(out)
     if max_per_touch is not None and max_per_touch < 1:
-        raise PalpateError("max_per_touch must be at least 1", str(max_per_touch), "Leave it out to take every frame")
+        raise PalpateError(
+            "max_per_touch must be at least 1",
+            str(max_per_touch),
+            "Leave it out to take every frame",
+        )
     if size is not None and size < 1:
-        raise PalpateError("size must be at least 1 pixel", str(size), "Leave it out to keep the frames as they are")
+        raise PalpateError(
+            "size must be at least 1 pixel",
+            str(size),
+            "Leave it out to keep the frames as they are",
+        )
     if image_format not in IMAGE_FORMATS:
-        raise PalpateError(f"image_format must be one of {', '.join(IMAGE_FORMATS)}", repr(image_format), "Choose one of these")
+        raise PalpateError(
+            f"image_format must be one of {', '.join(IMAGE_FORMATS)}",
+            repr(image_format),
+            "Choose one of these",
+        )
     videos = _require_videos(root)
     table = root / "category_reference.txt"
-    categories = {k: v for k, v in (read_categories(table) if table.is_file() else CATEGORIES).items() if k >= 0}
+    categories = {
+        k: v
+        for k, v in (read_categories(table) if table.is_file() else CATEGORIES).items()
+        if k >= 0
+    }
     lists = _require_lists(root, labels)
     listed = read_lists(lists, root=root, skip_bad=True, categories=categories)
     official = listed if lists == [root / name for name in OFFICIAL.values()] else _official(root)
     texts, objects = _optional(root / "captions.csv"), _optional(root / "objects.csv")
     rows = rows_of(listed)
     with removing_on_error(out) as created:
-        work = Recordings(root, out, videos, _contacts(root, listed, official), image_format, size, created)
-        work.problems += [p for part in (listed, None if official is listed else official, texts, objects) if part for p in part.skipped]
+        work = Recordings(
+            root, out, videos, _contacts(root, listed, official), image_format, size, created
+        )
+        work.problems += [
+            p
+            for part in (listed, None if official is listed else official, texts, objects)
+            if part
+            for p in part.skipped
+        ]
         starts = first_frames(rows)
         rows = work.open(thin(rows, max_per_touch, seed), progress)
         work.choose_backgrounds(rows, starts)
@@ -143,12 +202,29 @@ def import_touch_and_go(
         raise_if(work.problems, skip_bad)
         require_some(len(rows), root, work.problems)
         facts = _facts(root, categories) | {"text_source": "captions.csv" if texts else "none"}
-        manifest = work.manifest(rows, facts, WORLD.sensor if "synthetic" in facts else FACTS.sensor, {"text": texts, "object": objects})
-        found = Imported(manifest, work.problems, _splits(manifest, official), listed.inconclusive, work.suspicious)
+        manifest = work.manifest(
+            rows,
+            facts,
+            WORLD.sensor if "synthetic" in facts else FACTS.sensor,
+            {"text": texts, "object": objects},
+        )
+        found = Imported(
+            manifest,
+            work.problems,
+            _splits(manifest, official),
+            listed.inconclusive,
+            work.suspicious,
+        )
         return found.save(out, created)
 
 
-def scan(root: Path, *, labels: Sequence[Path] | Path | None = None, check: Check = "decode", progress: Progress = quiet) -> Scan:
+def scan(
+    root: Path,
+    *,
+    labels: Sequence[Path] | Path | None = None,
+    check: Check = "decode",
+    progress: Progress = quiet,
+) -> Scan:
     """Looks a data set over without writing anything: lists, recordings, frames and pictures.
 
     With ``check="decode"`` the frames in use are decoded as an import would, those of raw videos too. Rows carry no paths, as frames of raw videos have none yet.
@@ -160,20 +236,45 @@ def scan(root: Path, *, labels: Sequence[Path] | Path | None = None, check: Chec
     videos = _require_videos(root)
     lists = _require_lists(root, labels)
     table = root / "category_reference.txt"
-    categories = {k: v for k, v in (read_categories(table) if table.is_file() else CATEGORIES).items() if k >= 0}
+    categories = {
+        k: v
+        for k, v in (read_categories(table) if table.is_file() else CATEGORIES).items()
+        if k >= 0
+    }
     listed = read_lists(lists, root=root, skip_bad=True, categories=categories)
     official = listed if lists == [root / name for name in OFFICIAL.values()] else _official(root)
     rows = rows_of(listed)
     work = Recordings(root, root, videos, _contacts(root, listed, official), "jpg", None, [])
-    work.problems += listed.skipped + (official.skipped if official and official is not listed else [])
+    work.problems += listed.skipped + (
+        official.skipped if official and official is not listed else []
+    )
     starts = first_frames(rows)
     rows = work.open(rows, progress)
     work.choose_backgrounds(rows, starts)
     rows = work.check(rows, check, progress)
     _look(work, rows, listed)
     rows = work.decode(rows, progress) if check == "decode" else rows
-    found = [(r.where, {"id": r.id, "video": r.video, "frame": r.frame, "touch": r.touch, "material": r.material}) for r in rows]
-    return Scan(found, root, work.problems, work.suspicious, _facts(root, categories), inconclusive=listed.inconclusive)
+    found = [
+        (
+            r.where,
+            {
+                "id": r.id,
+                "video": r.video,
+                "frame": r.frame,
+                "contact": r.touch,
+                "material": r.material,
+            },
+        )
+        for r in rows
+    ]
+    return Scan(
+        found,
+        root,
+        work.problems,
+        work.suspicious,
+        _facts(root, categories),
+        inconclusive=listed.inconclusive,
+    )
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
@@ -185,17 +286,31 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     Raises:
         PalpateError: if a sample has no video or frame, or a material that is no class.
     """
-    classes: dict[str, str] = json.loads(manifest.facts["classes"]) if "classes" in manifest.facts else {}
+    classes: dict[str, str] = (
+        json.loads(manifest.facts["classes"]) if "classes" in manifest.facts else {}
+    )
     ids = {name: int(k) for k, name in (classes or CATEGORIES).items()}
     files: list[Path] = []
     for part in split.counts():
         rows: list[tuple[str, int]] = []
-        for row in manifest.part(split, part).table.select("id", "video", "frame", "material").iter_rows(named=True):
+        for row in (
+            manifest.part(split, part)
+            .table.select("id", "video", "frame", "material")
+            .iter_rows(named=True)
+        ):
             name = row["material"]
-            label = INCONCLUSIVE if name is None else ids.get(name, int(name) if str(name).isdecimal() else None)
+            label = (
+                INCONCLUSIVE
+                if name is None
+                else ids.get(name, int(name) if str(name).isdecimal() else None)
+            )
             if row["video"] is None or row["frame"] is None or label is None:
                 got = f"{row['id']!r} with video {row['video']!r}, frame {row['frame']!r} and material {name!r}"
-                raise PalpateError("A frame list needs the video, frame and class of every sample", got, "Write the split file alone")
+                raise PalpateError(
+                    "A frame list needs the video, frame and class of every sample",
+                    got,
+                    "Write the split file alone",
+                )
             rows.append((f"{row['video']}/{row['frame']:010d}.jpg", label))
         files.append(Path(folder) / f"{part}.txt")
         write_list(files[-1], rows)
@@ -205,23 +320,35 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
 def _look(work: Recordings, rows: Sequence[Row], listed: FrameList) -> None:
     """Tells recordings in no list, and touches without a picture of the gel."""
     unlisted = sorted(set(work.videos) - set(listed.contact["video"]))
-    work.suspicious += [Problem(str(work.root), "unlisted-video", f"the recording {name!r} is in no list") for name in unlisted]
+    work.suspicious += [
+        Problem(str(work.root), "unlisted-video", f"the recording {name!r} is in no list")
+        for name in unlisted
+    ]
     bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
-    work.suspicious += [Problem(touch, "no-background", "no frame of its recording shows the gel untouched") for touch in bare]
+    work.suspicious += [
+        Problem(touch, "no-background", "no frame of its recording shows the gel untouched")
+        for touch in bare
+    ]
 
 
 def _facts(root: Path, categories: Mapping[int, str]) -> dict[str, str]:
-    """Name and licence of the data, and its classes if they are not the published ones.
+    """Name and license of the data, and its classes if they are not the published ones.
 
     Palpate's own world comes in this layout, and must never pass for the real set.
     """
-    classes = {} if categories == CATEGORIES else {"classes": json.dumps({str(k): name for k, name in categories.items()})}
+    classes = (
+        {}
+        if categories == CATEGORIES
+        else {"classes": json.dumps({str(k): name for k, name in categories.items()})}
+    )
     return {**FACTS.of_manifest(), **world_facts(root), "format": "touch-and-go", **classes}
 
 
 def _require_videos(root: Path) -> dict[str, VideoFiles]:
     if not root.is_dir():
-        raise PalpateError("The data set's folder must exist", f"no folder {root}", "Check the path")
+        raise PalpateError(
+            "The data set's folder must exist", f"no folder {root}", "Check the path"
+        )
     videos = find_videos(root)
     if not videos:
         raise PalpateError(
@@ -241,7 +368,9 @@ def _require_lists(root: Path, labels: Sequence[Path] | Path | None) -> list[Pat
     lists = [root / name for name in OFFICIAL.values() if (root / name).is_file()]
     if not lists:
         raise PalpateError(
-            f"{root} must hold label.txt, or train.txt and test.txt", "none of them", "Put a list there, or name it: --labels FILE"
+            f"{root} must hold label.txt, or train.txt and test.txt",
+            "none of them",
+            "Put a list there, or name it: --labels FILE",
         )
     return lists
 
@@ -274,7 +403,10 @@ def _splits(manifest: Manifest, official: FrameList | None) -> dict[str, Split]:
     if official is None:
         return {}
     part_of = {name: part for part, name in OFFICIAL.items()}
-    parts = {(r["video"], r["frame"]): part_of[Path(r["source"]).name] for r in official.rows.iter_rows(named=True)}
+    parts = {
+        (r["video"], r["frame"]): part_of[Path(r["source"]).name]
+        for r in official.rows.iter_rows(named=True)
+    }
     table = manifest.table.select("id", "video", "frame").iter_rows()
     found = {i: parts[video, frame] for i, video, frame in table if (video, frame) in parts}
     rule = {"method": "official", "files": list(OFFICIAL.values())}

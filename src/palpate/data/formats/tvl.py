@@ -8,10 +8,10 @@ pictures are, in order, vision, touch and background, and the first other column
 **Captions** are adjectives between commas; spaces are trimmed, letters made small, full stops dropped.
 
 **Exchanged folders**: where the two sides of a recording differ in size and one has the sensor's, that one is the touch. Where
-sizes say nothing, colours do: each side becomes an 8 x 8 thumbnail (the mean of a few frames, RGB in [0, 1]). Untouched
+sizes say nothing, colors do: each side becomes an 8 x 8 thumbnail (the mean of a few frames, RGB in [0, 1]). Untouched
 gel looks alike in every recording of one rig, so the side whose thumbnails ``x`` spread less around their median ``c`` is the gel's, if it spreads less than
 half as much. With ``d(x) = sqrt(mean((x - c)^2))`` a recording is exchanged if its picture named vision has ``d`` under half that of its touch,
-and no more than three spreads (plus 0.02, five grey levels).
+and no more than three spreads (plus 0.02, five gray levels).
 """
 
 from __future__ import annotations
@@ -43,9 +43,15 @@ CITATION = (
 )
 URL = "https://huggingface.co/datasets/mlfu7/Touch-Vision-Language-Dataset"
 #: Of touch images as the TVL encoders see them, and un-padded; valid for that crop alone.
-NORMALISATION = {
-    "touch, zero-padded to a square and turned by 90 degrees (TVL)": ((0.29175, 0.29713, 0.29104), (0.18764, 0.19468, 0.21872)),
-    "touch minus background, signed and without offset (TVL)": ((-0.00809, -0.01887, -0.01843), (0.04535, 0.04403, 0.05333)),
+NORMALIZATION = {
+    "touch, zero-padded to a square and turned by 90 degrees (TVL)": (
+        (0.29175, 0.29713, 0.29104),
+        (0.18764, 0.19468, 0.21872),
+    ),
+    "touch minus background, signed and without offset (TVL)": (
+        (-0.00809, -0.01887, -0.01843),
+        (0.04535, 0.04403, 0.05333),
+    ),
     "touch, not padded, 50 images (T3)": ((0.42094, 0.44041, 0.44151), (0.14661, 0.08972, 0.09041)),
 }
 
@@ -66,7 +72,9 @@ def read_csv(path: Path, problems: list[Problem], columns: Sequence[str] = NAMED
     Returns:
         (``file:line``, cells by the names of ``columns``), where absent columns are absent and empty cells are None.
     """
-    reader = csv.reader(io.StringIO(path.read_bytes().decode("utf-8-sig", errors="replace"), newline=""))
+    reader = csv.reader(
+        io.StringIO(path.read_bytes().decode("utf-8-sig", errors="replace"), newline="")
+    )
     rows: list[tuple[str, list[str]]] = []
     start = 1
     try:
@@ -75,7 +83,11 @@ def read_csv(path: Path, problems: list[Problem], columns: Sequence[str] = NAMED
             if any(cell.strip() for cell in cells):
                 rows.append((where, [cell.strip() for cell in cells]))
     except csv.Error as error:
-        problems.append(Problem(f"{path}:{start}", "bad-row", f"not CSV, and nothing after it was read: {error}"))
+        problems.append(
+            Problem(
+                f"{path}:{start}", "bad-row", f"not CSV, and nothing after it was read: {error}"
+            )
+        )
     if not rows:
         problems.append(Problem(str(path), "empty-list", "the list has no lines"))
         return []
@@ -84,16 +96,29 @@ def read_csv(path: Path, problems: list[Problem], columns: Sequence[str] = NAMED
         return []
     names = _columns(header, [cells for _, cells in rows], columns)
     if "url" not in names:
-        problems.append(Problem(str(path), "missing-column", f"no column of photos (url) among {', '.join(header or []) or 'its cells'}"))
+        problems.append(
+            Problem(
+                str(path),
+                "missing-column",
+                f"no column of photos (url) among {', '.join(header or []) or 'its cells'}",
+            )
+        )
         return []
     found: list[Found] = []
     for where, cells in rows:
         if len(cells) != len(names):
-            problems.append(Problem(where, "bad-row", f"{len(cells)} cells in a list of {len(names)} columns"))
+            problems.append(
+                Problem(where, "bad-row", f"{len(cells)} cells in a list of {len(names)} columns")
+            )
         elif any("\ufffd" in cell for cell in cells):
             problems.append(Problem(where, "bad-encoding", "the line is not UTF-8"))
         else:
-            found.append((where, {name: cell or None for name, cell in zip(names, cells, strict=True) if name}))
+            found.append(
+                (
+                    where,
+                    {name: cell or None for name, cell in zip(names, cells, strict=True) if name},
+                )
+            )
     return found
 
 
@@ -107,15 +132,34 @@ def read_pairs(path: Path, problems: list[Problem]) -> list[Found]:
     if data is None:
         return []
     keys = {"vision": "url", "tactile": "tactile", "background": "tactile_background"}
-    lists: dict[str, Any] = {theirs: data[key] for key, theirs in keys.items() if key in data} if isinstance(data, dict) else {}
-    if not {"url", "tactile"} <= set(lists) or not all(isinstance(v, list) and all(isinstance(p, str) for p in v) for v in lists.values()):
-        problems.append(Problem(str(path), "bad-json", "not an object with lists of paths under vision and tactile"))
+    lists: dict[str, Any] = (
+        {theirs: data[key] for key, theirs in keys.items() if key in data}
+        if isinstance(data, dict)
+        else {}
+    )
+    if not {"url", "tactile"} <= set(lists) or not all(
+        isinstance(v, list) and all(isinstance(p, str) for p in v) for v in lists.values()
+    ):
+        problems.append(
+            Problem(
+                str(path), "bad-json", "not an object with lists of paths under vision and tactile"
+            )
+        )
         return []
     if len({len(v) for v in lists.values()}) > 1:
         told = ", ".join(f"{len(data[key])} {key}" for key in keys if key in data)
-        problems.append(Problem(str(path), "unequal-lists", f"its lists differ in length ({told}), so what belongs together is unknown"))
+        problems.append(
+            Problem(
+                str(path),
+                "unequal-lists",
+                f"its lists differ in length ({told}), so what belongs together is unknown",
+            )
+        )
         return []
-    return [(f"{path}:{k}", dict(zip(lists, cells, strict=True))) for k, cells in enumerate(zip(*lists.values(), strict=True), 1)]
+    return [
+        (f"{path}:{k}", dict(zip(lists, cells, strict=True)))
+        for k, cells in enumerate(zip(*lists.values(), strict=True), 1)
+    ]
 
 
 def read_conversations(path: Path, problems: list[Problem]) -> list[Found]:
@@ -123,16 +167,34 @@ def read_conversations(path: Path, problems: list[Problem]) -> list[Found]:
     data = _json(path, problems)
     if data is None:
         return []
-    if not isinstance(data, list) or not all(isinstance(item, dict) and isinstance(item.get("image"), str) for item in data):
+    if not isinstance(data, list) or not all(
+        isinstance(item, dict) and isinstance(item.get("image"), str) for item in data
+    ):
         problems.append(Problem(str(path), "bad-json", "not a list of objects with an image"))
         return []
     found: list[Found] = []
     for k, item in enumerate(data, 1):
-        talk = [turn.get("value") for turn in item.get("conversations") or [] if isinstance(turn, dict) and turn.get("from") != "human"]
+        talk = [
+            turn.get("value")
+            for turn in item.get("conversations") or []
+            if isinstance(turn, dict) and turn.get("from") != "human"
+        ]
         caption = talk[-1] if talk and isinstance(talk[-1], str) else None
-        given = {"url": item["image"], "tactile": item.get("tactile"), "tactile_background": item.get("tactile_background")}
+        given = {
+            "url": item["image"],
+            "tactile": item.get("tactile"),
+            "tactile_background": item.get("tactile_background"),
+        }
         found.append(
-            (f"{path}:{k}", {**{name: cell for name, cell in given.items() if isinstance(cell, str) and cell}, "caption": caption})
+            (
+                f"{path}:{k}",
+                {
+                    **{
+                        name: cell for name, cell in given.items() if isinstance(cell, str) and cell
+                    },
+                    "caption": caption,
+                },
+            )
         )
     return found
 
@@ -160,7 +222,11 @@ def is_picture(cell: str) -> bool:
 
 def summed(places: Sequence[str], kind: str, text: str) -> list[Problem]:
     """One problem for many rows alike, told as ``3 rows: <text>`` at the first of them; none for no rows."""
-    return [Problem(places[0], kind, f"{len(places)} row{'s' * (len(places) != 1)}: {text}")] if places else []
+    return (
+        [Problem(places[0], kind, f"{len(places)} row{'s' * (len(places) != 1)}: {text}")]
+        if places
+        else []
+    )
 
 
 @dataclass(frozen=True)
@@ -186,7 +252,9 @@ def look(paths: Sequence[Path]) -> Look | None:
                 if size is None or image.size == size:
                     this = image.size
                     image.draft("RGB", (max(THUMBNAIL, this[0] // 8), max(THUMBNAIL, this[1] // 8)))
-                    small = image.convert("RGB").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+                    small = image.convert("RGB").resize(
+                        (THUMBNAIL, THUMBNAIL), Image.Resampling.BOX
+                    )
                     size = this
                     thumbnails.append(np.asarray(small, np.float64) / 255)
         except BROKEN:
@@ -194,7 +262,9 @@ def look(paths: Sequence[Path]) -> Look | None:
     return None if size is None else Look(size, np.mean(thumbnails, axis=0))
 
 
-def looks(files: Mapping[str, tuple[Sequence[Path], Sequence[Path]]], progress: Progress) -> dict[str, tuple[Look, Look]]:
+def looks(
+    files: Mapping[str, tuple[Sequence[Path], Sequence[Path]]], progress: Progress
+) -> dict[str, tuple[Look, Look]]:
     """Recording -> (vision, touch) looks, from the frames given for both sides; unreadable recordings are left out."""
     found: dict[str, tuple[Look, Look]] = {}
     pairs = in_threads(lambda name: (look(files[name][0]), look(files[name][1])), files)
@@ -205,47 +275,62 @@ def looks(files: Mapping[str, tuple[Sequence[Path], Sequence[Path]]], progress: 
     return {name: found[name] for name in files if name in found}
 
 
-def exchanged(sides: Mapping[str, tuple[Look, Look]], touch_size: tuple[int, int]) -> dict[str, str]:
+def exchanged(
+    sides: Mapping[str, tuple[Look, Look]], touch_size: tuple[int, int]
+) -> dict[str, str]:
     """Recordings of one rig whose vision and touch are exchanged, with the evidence, by the rule in the head of this file.
 
     Args:
         sides: recording -> (what is named vision, what is named touch).
         touch_size: (width, height) of the sensor's pictures.
     """
-    usual = tuple(Counter(pair[k].size for pair in sides.values()).most_common(1)[0][0] for k in (0, 1)) if len(sides) >= FEWEST else None
+    usual = (
+        tuple(Counter(pair[k].size for pair in sides.values()).most_common(1)[0][0] for k in (0, 1))
+        if len(sides) >= FEWEST
+        else None
+    )
     found: dict[str, str] = {}
     alike: dict[str, tuple[Look, Look]] = {}
     for name, (vision, touch) in sides.items():
         if vision.size == touch.size:
             alike[name] = (vision, touch)
-        elif vision.size == touch_size or (touch.size != touch_size and (touch.size, vision.size) == usual):
-            text = "frames named vision are {}x{} pixels as touch should be, those named touch {}x{}"
+        elif vision.size == touch_size or (
+            touch.size != touch_size and (touch.size, vision.size) == usual
+        ):
+            text = (
+                "frames named vision are {}x{} pixels as touch should be, those named touch {}x{}"
+            )
             found[name] = text.format(*vision.size, *touch.size)
-    return found | _by_colour(alike)
+    return found | _by_color(alike)
 
 
-def _by_colour(sides: Mapping[str, tuple[Look, Look]]) -> dict[str, str]:
+def _by_color(sides: Mapping[str, tuple[Look, Look]]) -> dict[str, str]:
     """Exchanged recordings among those whose sides have one size."""
     if len(sides) < FEWEST:
         return {}
     stacks = [np.stack([pair[k].thumbnail for pair in sides.values()]) for k in (0, 1)]
-    centres = [np.median(stack, axis=0) for stack in stacks]
-    spreads = [float(np.median(_distance(stack, centre))) for stack, centre in zip(stacks, centres, strict=True)]
+    centers = [np.median(stack, axis=0) for stack in stacks]
+    spreads = [
+        float(np.median(_distance(stack, center)))
+        for stack, center in zip(stacks, centers, strict=True)
+    ]
     gel = int(np.argmin(spreads))
     if not min(spreads) < 0.5 * max(spreads):
         return {}
-    far = [_distance(stack, centres[gel]) for stack in stacks]
+    far = [_distance(stack, centers[gel]) for stack in stacks]
     found: dict[str, str] = {}
     for k, name in enumerate(sides):
         vision, touch = float(far[0][k]), float(far[1][k])
         if vision < 0.5 * touch and vision <= 3 * spreads[gel] + 0.02:
-            found[name] = f"colours of frames named vision are {vision:.3f} from this rig's typical gel, those named touch {touch:.3f}"
+            found[name] = (
+                f"colors of frames named vision are {vision:.3f} from this rig's typical gel, those named touch {touch:.3f}"
+            )
     return found
 
 
-def _distance(stack: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+def _distance(stack: NDArray[np.float64], center: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square difference of each thumbnail to one: (n,)."""
-    return np.sqrt(((stack - centre) ** 2).mean(axis=(1, 2, 3)))
+    return np.sqrt(((stack - center) ** 2).mean(axis=(1, 2, 3)))
 
 
 def _json(path: Path, problems: list[Problem]) -> Any:
@@ -256,7 +341,9 @@ def _json(path: Path, problems: list[Problem]) -> Any:
         return None
 
 
-def _columns(header: Sequence[str] | None, rows: Sequence[Sequence[str]], known: Sequence[str]) -> list[str | None]:
+def _columns(
+    header: Sequence[str] | None, rows: Sequence[Sequence[str]], known: Sequence[str]
+) -> list[str | None]:
     """What each column holds, or None where it holds nothing of use."""
     width = len(header) if header is not None else Counter(map(len, rows)).most_common(1)[0][0]
     cells = [[row[k] for row in rows if len(row) == width and row[k]] for k in range(width)]
@@ -265,7 +352,9 @@ def _columns(header: Sequence[str] | None, rows: Sequence[Sequence[str]], known:
     if header is not None and {"url", "tactile"} & set(header):
         for k, name in enumerate(header):
             names[k] = name if name in known and name not in names else None
-        if "url" not in names and (free := [k for k in range(width) if names[k] is None and pictures[k]]):
+        if "url" not in names and (
+            free := [k for k in range(width) if names[k] is None and pictures[k]]
+        ):
             names[free[0]] = "url"
         return names
     paths = [name for name in known if name != "caption"]
@@ -284,4 +373,6 @@ def require_option(name: str, value: object, allowed: Sequence[str]) -> None:
         PalpateError: naming them.
     """
     if value not in allowed:
-        raise PalpateError(f"{name} must be one of {', '.join(allowed)}", repr(value), "Choose one of these")
+        raise PalpateError(
+            f"{name} must be one of {', '.join(allowed)}", repr(value), "Choose one of these"
+        )

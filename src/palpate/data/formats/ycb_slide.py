@@ -40,16 +40,27 @@ FACTS = Facts(
     group_column="object",
 )
 OBJECTS = (
-    "004_sugar_box", "005_tomato_soup_can", "006_mustard_bottle", "021_bleach_cleanser", "025_mug", "035_power_drill", "037_scissors",
-    "042_adjustable_wrench", "048_hammer", "055_baseball",
-)  # fmt: skip
+    "004_sugar_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "021_bleach_cleanser",
+    "025_mug",
+    "035_power_drill",
+    "037_scissors",
+    "042_adjustable_wrench",
+    "048_hammer",
+    "055_baseball",
+)
 LOGS = range(5)
 #: Part -> (name of a log's folder, folder of touch in it, name of a frame, folder of vision in it).
 LAYOUT: dict[str, tuple[str, str, str, str | None]] = {
     "real": (r"dataset_([0-9]+)", "frames", r"frame_([0-9]+)", "webcam_frames"),
     "sim": (r"([0-9]+)", "tactile_images", r"([0-9]+)", None),
 }
-SPARSH = {"method": "logs 0 to 3 of every object train, log 4 (there: validation) tests", "source": "facebookresearch/sparsh"}
+SPARSH = {
+    "method": "logs 0 to 3 of every object train, log 4 (there: validation) tests",
+    "source": "facebookresearch/sparsh",
+}
 LOOKED_FOR = "real/<object>/dataset_0/ or sim/<object>/00/tactile_images/"
 
 
@@ -72,11 +83,17 @@ def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) 
     root = Path(source)
     require_folder(root, FACTS.name)
     if part is not None and part not in LAYOUT:
-        raise PalpateError(f"part must be {' or '.join(get_args(Part))}", repr(part), "Choose one of these")
+        raise PalpateError(
+            f"part must be {' or '.join(get_args(Part))}", repr(part), "Choose one of these"
+        )
     chosen = part or next((p for p in LAYOUT if _logs(root / p, p)), "real")
     logs = _logs(root / chosen, chosen)
     if not logs:
-        raise PalpateError(f"{root} must hold {LOOKED_FOR}", few(subfolders(root)), f"Fetch the data from {FACTS.url}")
+        raise PalpateError(
+            f"{root} must hold {LOOKED_FOR}",
+            few(subfolders(root)),
+            f"Fetch the data from {FACTS.url}",
+        )
     out = Scan([], root, facts={"layout": chosen, "text_source": "none"})
     if chosen == "sim":
         out.facts |= {"simulated": "yes", "vision": "none in this part"}
@@ -85,8 +102,14 @@ def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) 
         progress("reading logs", done, len(logs))
         before = len(out.rows)
         _log(out, chosen, name, f"{chosen}/{name}/{folder}")
-        parts |= {str(row["id"]): "train" if log < max(LOGS) else "test" for _, row in out.rows[before:] if log in LOGS}
-    _odd(out, chosen, {name: [log for other, log, _ in logs if other == name] for name, _, _ in logs})
+        parts |= {
+            str(row["id"]): "train" if log < max(LOGS) else "test"
+            for _, row in out.rows[before:]
+            if log in LOGS
+        }
+    _odd(
+        out, chosen, {name: [log for other, log, _ in logs if other == name] for name, _, _ in logs}
+    )
     if chosen == "real":
         out.parts["sparsh"], out.rules["sparsh"] = parts, SPARSH
     return out
@@ -95,9 +118,17 @@ def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) 
 def _logs(place: Path, part: str) -> list[tuple[str, int, str]]:
     """(object, number of the log, its folder), in order."""
     pattern = LAYOUT[part][0]
-    found = [(name, log, re.fullmatch(pattern, log)) for name in subfolders(place) for log in subfolders(place / name)]
+    found = [
+        (name, log, re.fullmatch(pattern, log))
+        for name in subfolders(place)
+        for log in subfolders(place / name)
+    ]
     logs = [(name, int(match[1]), log) for name, log, match in found if match]
-    return sorted(log for log in logs if part == "real" or (place / log[0] / log[2] / LAYOUT[part][1]).is_dir())
+    return sorted(
+        log
+        for log in logs
+        if part == "real" or (place / log[0] / log[2] / LAYOUT[part][1]).is_dir()
+    )
 
 
 def _log(out: Scan, part: str, name: str, place: str) -> None:
@@ -128,9 +159,15 @@ def _log(out: Scan, part: str, name: str, place: str) -> None:
         if views is None or k in views:
             tactile = f"{place}/{touch}/{file}"
             row = {
-                "id": f"{video}/{k}", "video": video, "frame": k, "object": name, "tactile": tactile,
-                "vision": f"{place}/{webcam}/{views[k]}" if views is not None else None, "sensor": FACTS.sensor, "domain": part,
-            }  # fmt: skip
+                "id": f"{video}/{k}",
+                "video": video,
+                "frame": k,
+                "object": name,
+                "tactile": tactile,
+                "vision": f"{place}/{webcam}/{views[k]}" if views is not None else None,
+                "sensor": FACTS.sensor,
+                "domain": part,
+            }
             out.rows.append((tactile, row))
 
 
@@ -138,17 +175,37 @@ def _no_frames(root: Path, place: str, touch: str) -> Problem:
     """What is missing where a log has no pictures of touch, and how to make them from its video."""
     if (root / place / f"{touch}.mp4").is_file():
         command = f"mkdir -p {touch} && ffmpeg -i {touch}.mp4 -start_number 0 -qscale:v 2 {touch}/frame_%07d.jpg"
-        return Problem(place, "missing-frames", f"only {touch}.mp4 is there; extract it in this folder: {command}")
+        return Problem(
+            place,
+            "missing-frames",
+            f"only {touch}.mp4 is there; extract it in this folder: {command}",
+        )
     return Problem(place, "missing-frames", f"no pictures in {touch}/")
 
 
 def _odd(out: Scan, part: str, logs: dict[str, list[int]]) -> None:
     """Tells objects and logs that differ from the published ones."""
     if unknown := [name for name in logs if name not in OBJECTS]:
-        out.suspicious.append(Problem(part, "unknown-object", f"objects that are not in the publication: {few(unknown)}"))
+        out.suspicious.append(
+            Problem(
+                part, "unknown-object", f"objects that are not in the publication: {few(unknown)}"
+            )
+        )
     if absent := [name for name in OBJECTS if name not in logs]:
-        out.suspicious.append(Problem(part, "missing-object", f"of the {len(OBJECTS)} objects there are not: {few(absent)}"))
+        out.suspicious.append(
+            Problem(
+                part,
+                "missing-object",
+                f"of the {len(OBJECTS)} objects there are not: {few(absent)}",
+            )
+        )
     for name, found in logs.items():
         if found != list(LOGS):
             got = ", ".join(map(str, found))
-            out.suspicious.append(Problem(f"{part}/{name}", "missing-log", f"the logs {got} are there; 0 to {max(LOGS)} were published"))
+            out.suspicious.append(
+                Problem(
+                    f"{part}/{name}",
+                    "missing-log",
+                    f"the logs {got} are there; 0 to {max(LOGS)} were published",
+                )
+            )

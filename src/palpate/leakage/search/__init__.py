@@ -1,4 +1,4 @@
-"""Nearest neighbours and near-duplicates among feature vectors: the search engine of the leak audit.
+"""Nearest neighbors and near-duplicates among feature vectors: the search engine of the leak audit.
 
 Distances are Euclidean, measured as |x - y| in float64 on the rows as given (never as |x|^2 + |y|^2 - 2 xy, which cancels for
 near-duplicates), ties go to the lowest row, and no N x N matrix is ever held. The mathematics of the exact search is in ``search.space``
@@ -26,7 +26,7 @@ BACKENDS = ("auto", "exact", "faiss")
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class Neighbors:
     """The nearest base rows of each query.
 
     Attributes:
@@ -52,7 +52,7 @@ def nearest(
     radius: float | None = None,
     backend: str = "auto",
     progress: Progress = quiet,
-) -> Neighbours:
+) -> Neighbors:
     """The k nearest base rows of each query.
 
     Args:
@@ -80,34 +80,60 @@ def nearest(
     y = x if same else checked_rows("base", base)
     if x.shape[1] != y.shape[1]:
         raise PalpateError(
-            "queries and base must have as many dimensions", f"{x.shape[1]} and {y.shape[1]}", "Make both with the same descriptor or tower"
+            "queries and base must have as many dimensions",
+            f"{x.shape[1]} and {y.shape[1]}",
+            "Make both with the same descriptor or encoder",
         )
     if self_join and len(x) != len(y):
         raise PalpateError(
-            "A self join must search the rows among themselves", f"{len(x)} queries and {len(y)} base rows", "Pass the same rows twice"
+            "A self join must search the rows among themselves",
+            f"{len(x)} queries and {len(y)} base rows",
+            "Pass the same rows twice",
         )
     if k < 1:
-        raise PalpateError("k must be at least 1", str(k), "Ask for one neighbour or more")
+        raise PalpateError("k must be at least 1", str(k), "Ask for one neighbor or more")
     if backend not in BACKENDS:
-        raise PalpateError(f"backend must be one of {', '.join(BACKENDS)}", str(backend), "Choose one of them")
+        raise PalpateError(
+            f"backend must be one of {', '.join(BACKENDS)}", str(backend), "Choose one of them"
+        )
     _check_radius(radius, needed=False)
     if (query_groups is None) != (base_groups is None):
-        raise PalpateError("Groups must be given for queries and base, or for neither", "groups for one of them", "Pass both")
-    qg, bg = checked_labels("query_groups", query_groups, len(x)), checked_labels("base_groups", base_groups, len(y))
+        raise PalpateError(
+            "Groups must be given for queries and base, or for neither",
+            "groups for one of them",
+            "Pass both",
+        )
+    qg, bg = (
+        checked_labels("query_groups", query_groups, len(x)),
+        checked_labels("base_groups", base_groups, len(y)),
+    )
     if not len(x) or not len(y):
-        return Neighbours(np.full((len(x), k), -1), np.full((len(x), k), np.inf, np.float32), "exact")
+        return Neighbors(
+            np.full((len(x), k), -1), np.full((len(x), k), np.inf, np.float32), "exact"
+        )
     found, name = _distinct(x, y, k + self_join, qg, bg, radius, backend, progress)
     index, squared = _without_self(found) if self_join else (found.row, found.squared)
-    return Neighbours(index, np.sqrt(squared).astype(np.float32), name)
+    return Neighbors(index, np.sqrt(squared).astype(np.float32), name)
 
 
 def _check_radius(radius: float | None, needed: bool = True) -> None:
-    if (radius is None and needed) or (radius is not None and not (np.isfinite(radius) and radius >= 0)):
-        raise PalpateError("radius must be a finite distance, zero or more", str(radius), "Pass e.g. radius=0.1")
+    if (radius is None and needed) or (
+        radius is not None and not (np.isfinite(radius) and radius >= 0)
+    ):
+        raise PalpateError(
+            "radius must be a finite distance, zero or more", str(radius), "Pass e.g. radius=0.1"
+        )
 
 
 def _distinct(
-    x: Floats, y: Floats, k: int, qg: Ints | None, bg: Ints | None, radius: float | None, backend: str, progress: Progress
+    x: Floats,
+    y: Floats,
+    k: int,
+    qg: Ints | None,
+    bg: Ints | None,
+    radius: float | None,
+    backend: str,
+    progress: Progress,
 ) -> tuple[Best, str]:
     """Searches each different query once, among the k lowest copies of each different base row: no other can be among the k nearest."""
     first, rank = identical_rows(y, bg)
@@ -122,7 +148,9 @@ def _distinct(
     wanted = rows if x is y and whole else x if len(asked) == len(x) else x[asked]
     groups = (None if qg is None else qg[asked], None if bg is None else bg[kept])
     if backend == "faiss" or (backend == "auto" and len(rows) > EXACT_LIMIT):
-        from palpate.leakage.search.approximate import approximate  # so that nothing of it is imported where nobody asks for it
+        from palpate.leakage.search.approximate import (
+            approximate,
+        )  # so that nothing of it is imported where nobody asks for it
 
         best, name = approximate(wanted, rows, k, *groups, radius, progress)
     else:
@@ -135,7 +163,7 @@ def _distinct(
 
 
 def _without_self(found: Best) -> tuple[Ints, NDArray[np.float64]]:
-    """Drops each row from its own neighbours, or else the last of them."""
+    """Drops each row from its own neighbors, or else the last of them."""
     own = found.row == np.arange(len(found.row))[:, None]
     own[:, -1] |= ~own.any(axis=1)
     shape = (len(own), own.shape[1] - 1)
@@ -143,7 +171,11 @@ def _without_self(found: Best) -> tuple[Ints, NDArray[np.float64]]:
 
 
 def pairs_within(
-    vectors: object, radius: float, *, progress: Progress = quiet, max_pairs_per_block: int = 1 << 16
+    vectors: object,
+    radius: float,
+    *,
+    progress: Progress = quiet,
+    max_pairs_per_block: int = 1 << 16,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]]:
     """Every pair of rows at most ``radius`` apart, exactly, in blocks; use :func:`clusters_within` where rows may be near by the million.
 
@@ -162,11 +194,19 @@ def pairs_within(
     rows = checked_rows("vectors", vectors)
     _check_radius(radius)
     if max_pairs_per_block < 1:
-        raise PalpateError("max_pairs_per_block must be at least 1", str(max_pairs_per_block), "Leave it out")
-    return limited(close_pairs(rows, radius, max_pairs_per_block, progress)) if len(rows) > 1 else iter(())
+        raise PalpateError(
+            "max_pairs_per_block must be at least 1", str(max_pairs_per_block), "Leave it out"
+        )
+    return (
+        limited(close_pairs(rows, radius, max_pairs_per_block, progress))
+        if len(rows) > 1
+        else iter(())
+    )
 
 
-def clusters_within(vectors: object, radius: float, *, progress: Progress = quiet) -> NDArray[np.int64]:
+def clusters_within(
+    vectors: object, radius: float, *, progress: Progress = quiet
+) -> NDArray[np.int64]:
     """Connected components of "at most ``radius`` apart", exactly, without listing the pairs.
 
     Args:
@@ -189,5 +229,7 @@ def clusters_within(vectors: object, radius: float, *, progress: Progress = quie
     with one_blas_thread():
         root = clusters(rows if len(different) == len(rows) else rows[different], radius, progress)
     lowest = np.arange(len(rows))
-    lowest[different] = different[root]  # the different rows ascend, so the lowest of them is the lowest of all
+    lowest[different] = different[
+        root
+    ]  # the different rows ascend, so the lowest of them is the lowest of all
     return lowest[first]

@@ -1,8 +1,8 @@
-"""Exact nearest neighbours by pruning: a guess for each query, then one sweep that keeps only what could beat it.
+"""Exact nearest neighbors by pruning: a guess for each query, then one sweep that keeps only what could beat it.
 
 1. *Guess*: queries are taken cell by cell (:class:`~palpate.leakage.search.space.Cells`) and compared in full with the nearest cells'
-   rows until each has k allowed neighbours. The k-th distance t_x found so far bounds the true one from above.
-2. *Sweep*: for the queries of one block, a base row y survives when its distance to the cell's centre c satisfies |y - c| <= max_x (|x -
+   rows until each has k allowed neighbors. The k-th distance t_x found so far bounds the true one from above.
+2. *Sweep*: for the queries of one block, a base row y survives when its distance to the cell's center c satisfies |y - c| <= max_x (|x -
    c| + t_x), and then when bound (1) of ``search.space`` on the leading p axes does not exceed t_x. p is chosen by counting survivors on
    a sample: few axes cost little and prune little. When the queries are the base itself, each unordered pair is swept once, for both of
    its rows: a row is no candidate any more once it was a query, and t_x^2 becomes t_x^2 + max(0, t_y^2 - t^2) >= max(t_x^2, t_y^2), with
@@ -33,14 +33,17 @@ from palpate.leakage.search.space import (
     Ints,
     Space,
     base_side,
-    centre_side,
+    center_side,
     query_side,
     squared_distances,
     widened,
 )
 from palpate.leakage.search.threads import one_blas_thread
 
-QUERIES, ROWS = 192, 1024  # a block of pairs: 0.75 megabyte of float32, small enough to stay in a processor's cache
+QUERIES, ROWS = (
+    192,
+    1024,
+)  # a block of pairs: 0.75 megabyte of float32, small enough to stay in a processor's cache
 LEAST = 32  # queries of one group that make a block of their own
 GUESS_ROWS = 512
 PENDING = 1 << 15  # survivors measured at once
@@ -70,7 +73,9 @@ class Best:
         q = np.concatenate([np.repeat(touched, k), queries])
         s = np.concatenate([self.squared[touched].ravel(), squared])
         r = np.concatenate([self.row[touched].ravel(), row])
-        order = np.lexsort((r.view(np.uint64), s, q))  # so that -1 (nothing yet) comes after every row
+        order = np.lexsort(
+            (r.view(np.uint64), s, q)
+        )  # so that -1 (nothing yet) comes after every row
         q, s, r = q[order], s[order], r[order]
         fresh = np.ones(len(q), dtype=bool)
         fresh[1:] = (q[1:] != q[:-1]) | (r[1:] != r[:-1]) | (r[1:] < 0)
@@ -98,7 +103,9 @@ class Sieve:
             slab = right[start : start + ROWS]
             size = len(left) * len(slab)
             bound, passed = self.bound.reshape(-1)[:size], self.passed.reshape(-1)[:size]
-            with np.errstate(invalid="ignore"):  # BLAS kernels raise the flag on lanes that they do not use
+            with np.errstate(
+                invalid="ignore"
+            ):  # BLAS kernels raise the flag on lanes that they do not use
                 np.matmul(
                     slab, left.T, out=bound.reshape(len(slab), len(left))
                 )  # base rows first: faster by a fifth than the other way round
@@ -125,21 +132,23 @@ class Index:
         self.cells = Cells.of(z)
         self.z = z[self.cells.order]
         self._near = base_side(self.z, CELL_AXES)
-        centres = self.cells.centres.astype(np.float64)
-        squares = (centres**2).sum(axis=1)
-        self._gaps = squares[:, None] + squares - 2 * (centres @ centres.T)
+        centers = self.cells.centers.astype(np.float64)
+        squares = (centers**2).sum(axis=1)
+        self._gaps = squares[:, None] + squares - 2 * (centers @ centers.T)
 
     @np.errstate(invalid="ignore")
-    def from_centre(self, cell: int) -> Floats:
-        """(m,) squared distances of the sorted base rows from a centre, in units of the space, rounded down by the slack."""
-        return self._near @ centre_side(self.cells.centres[cell], self.rows.shape[1])
+    def from_center(self, cell: int) -> Floats:
+        """(m,) squared distances of the sorted base rows from a center, in units of the space, rounded down by the slack."""
+        return self._near @ center_side(self.cells.centers[cell], self.rows.shape[1])
 
     def outwards(self, cell: int) -> Iterator[Ints]:
         """Positions of the sorted base, from the given cell outwards, in slabs that grow from :data:`GUESS_ROWS`."""
         held: list[Ints] = []
         size, wanted = 0, GUESS_ROWS
         for other in np.argsort(self._gaps[cell], kind="stable"):
-            for start in range(int(self.cells.starts[other]), int(self.cells.starts[other + 1]), ROWS):
+            for start in range(
+                int(self.cells.starts[other]), int(self.cells.starts[other + 1]), ROWS
+            ):
                 held.append(np.arange(start, min(start + ROWS, int(self.cells.starts[other + 1]))))
                 size += len(held[-1])
                 if size >= wanted:
@@ -150,9 +159,13 @@ class Index:
 
 
 def within(limit: Doubles) -> np.float32:
-    """A float32 bound for :meth:`Index.from_centre` that keeps every row within the largest of some distances (in units of the space)."""
+    """A float32 bound for :meth:`Index.from_center` that keeps every row within the largest of some distances (in units of the space)."""
     furthest = float(limit.max())
-    return np.float32(np.inf) if furthest > 1e3 else np.nextafter(np.float32(furthest**2 * (1 + 4e-6) + 1e-36), np.float32(np.inf))
+    return (
+        np.float32(np.inf)
+        if furthest > 1e3
+        else np.nextafter(np.float32(furthest**2 * (1 + 4e-6) + 1e-36), np.float32(np.inf))
+    )
 
 
 def choose_axes(index: Index, samples: list[tuple[Floats, Doubles, Ints]]) -> int:
@@ -181,7 +194,13 @@ class Nearest:
     """
 
     def __init__(
-        self, queries: Floats, base: Floats, k: int, query_groups: Ints | None, base_groups: Ints | None, radius: float | None
+        self,
+        queries: Floats,
+        base: Floats,
+        k: int,
+        query_groups: Ints | None,
+        base_groups: Ints | None,
+        radius: float | None,
     ) -> None:
         same = queries is base
         space = Space.of(base) if same else Space.of(base, queries)
@@ -198,44 +217,52 @@ class Nearest:
         if radius is not None:
             self.best.squared[:] = radius**2
         self.query_groups = query_groups
-        self.base_groups = base_groups[order] if base_groups is not None and query_groups is not None else None
-        self.mutual = same and (query_groups is None or base_groups is None or np.array_equal(query_groups, base_groups))
+        self.base_groups = (
+            base_groups[order] if base_groups is not None and query_groups is not None else None
+        )
+        self.mutual = same and (
+            query_groups is None or base_groups is None or np.array_equal(query_groups, base_groups)
+        )
         self.place = np.empty(len(queries) if self.mutual else 0, dtype=np.int64)
         self.place[order[: len(self.place)]] = np.arange(len(self.place))
         self.open = np.ones(len(base), dtype=bool)  # positions that are still candidates
-        self._merging = (
-            Lock()
-        )  # workers find neighbours of each other's queries; a threshold only ever falls, so an old one is safe to read
+        self._merging = Lock()  # workers find neighbors of each other's queries; a threshold only ever falls, so an old one is safe to read
 
     def solve(self, progress: Progress) -> Best:
         """Guesses, chooses p, sweeps."""
         with one_blas_thread() as workers, ThreadPoolExecutor(workers) as pool:
             guesses = list(self._blocks(np.zeros(len(self.z))))
             for done, _ in enumerate(pool.map(self._guess, *zip(*guesses, strict=True)), 1):
-                progress("guessing neighbours", done, len(guesses))
+                progress("guessing neighbors", done, len(guesses))
             blocks = list(self._blocks(self._reach()))
-            p = choose_axes(self.index, [self._sample(*block) for block in blocks[:: max(1, len(blocks) // 12)]])
+            p = choose_axes(
+                self.index, [self._sample(*block) for block in blocks[:: max(1, len(blocks) // 12)]]
+            )
             right = base_side(self.index.z, p)
             tasks = [[*same] for _, same in groupby(blocks, key=itemgetter(0))]
-            for done, _ in enumerate(pool.map(lambda task: self._sweep_cell(task, right, p), tasks), 1):
-                progress("searching neighbours", done, len(tasks))
+            for done, _ in enumerate(
+                pool.map(lambda task: self._sweep_cell(task, right, p), tasks), 1
+            ):
+                progress("searching neighbors", done, len(tasks))
         self.best.squared[self.best.row < 0] = np.inf
         return self.best
 
     def _sweep_cell(self, blocks: list[tuple[int, Ints]], right: Floats, p: int) -> None:
-        centred, theirs, sieve = self.index.from_centre(blocks[0][0]), self._theirs(), Sieve()
+        centered, theirs, sieve = self.index.from_center(blocks[0][0]), self._theirs(), Sieve()
         for _, queries in blocks:
-            self._sweep(queries, self._candidates(centred, queries, theirs), right, p, sieve)
+            self._sweep(queries, self._candidates(centered, queries, theirs), right, p, sieve)
             if self.mutual:
                 self.open[self.place[queries]] = False
 
     def _reach(self, queries: Ints | slice = slice(None)) -> Doubles:
-        """How far from its cell's centre a query's candidates may lie, in units of the space."""
+        """How far from its cell's center a query's candidates may lie, in units of the space."""
         return self.away[queries] + np.sqrt(self.best.squared[queries, -1] / self.unit)
 
     def _blocks(self, key: Doubles) -> Iterator[tuple[int, Ints]]:
         """(cell, at most :data:`QUERIES` queries), sorted by group and ``key``; blocks of one group where groups are large."""
-        groups = np.zeros(len(key), dtype=np.int64) if self.query_groups is None else self.query_groups
+        groups = (
+            np.zeros(len(key), dtype=np.int64) if self.query_groups is None else self.query_groups
+        )
         order = np.lexsort((key, groups, self.cell))
         cells, labels = self.cell[order], groups[order]
         fresh = np.r_[True, cells[1:] != cells[:-1]]
@@ -256,24 +283,36 @@ class Nearest:
 
     def _theirs(self) -> Doubles | None:
         """Thresholds of the base rows as queries, by position, in units of the space; None where they are not queries."""
-        return np.sqrt(self.best.squared[self.index.cells.order, -1] / self.unit) if self.mutual else None
+        return (
+            np.sqrt(self.best.squared[self.index.cells.order, -1] / self.unit)
+            if self.mutual
+            else None
+        )
 
-    def _candidates(self, centred: Floats, queries: Ints, theirs: Doubles | None) -> Ints | None:
+    def _candidates(self, centered: Floats, queries: Ints, theirs: Doubles | None) -> Ints | None:
         """Positions that may matter to some of the queries, or they to them; None for all."""
-        keep = centred <= within(self._reach(queries))
+        keep = centered <= within(self._reach(queries))
         if theirs is not None:
-            keep |= centred <= ((self.away[queries].max() + theirs) ** 2 * (1 + 4e-6) + 1e-36)
+            keep |= centered <= ((self.away[queries].max() + theirs) ** 2 * (1 + 4e-6) + 1e-36)
             keep &= self.open
         own = self._own(queries)
         if own >= 0 and self.base_groups is not None:
             keep &= self.base_groups != own
         count = int(np.count_nonzero(keep))
-        return None if count > 0.8 * len(keep) and not self.mutual and own < 0 else np.flatnonzero(keep)
+        return (
+            None
+            if count > 0.8 * len(keep) and not self.mutual and own < 0
+            else np.flatnonzero(keep)
+        )
 
     def _sample(self, cell: int, queries: Ints) -> tuple[Floats, Doubles, Ints]:
-        at = self._candidates(self.index.from_centre(cell), queries, self._theirs())
+        at = self._candidates(self.index.from_center(cell), queries, self._theirs())
         at = np.arange(len(self.index.z)) if at is None else at
-        return self.z[queries], self.best.squared[queries, -1] / self.unit, at[:: max(1, len(at) // 1024)]
+        return (
+            self.z[queries],
+            self.best.squared[queries, -1] / self.unit,
+            at[:: max(1, len(at) // 1024)],
+        )
 
     def _allowed(self, queries: Ints, at: Ints) -> NDArray[np.bool_] | None:
         """Which pairs (query, position) are of different or unknown groups; None where all are."""
@@ -286,7 +325,11 @@ class Nearest:
         rows = self.index.cells.order[at]
         squared = squared_distances(self.queries, queries, self.index.rows, rows)
         if self.mutual:
-            queries, rows, squared = np.r_[queries, rows], np.r_[rows, queries], np.r_[squared, squared]
+            queries, rows, squared = (
+                np.r_[queries, rows],
+                np.r_[rows, queries],
+                np.r_[squared, squared],
+            )
         with self._merging:
             self.best.merge(queries, squared, rows)
 
@@ -296,15 +339,24 @@ class Nearest:
         met = np.zeros(len(queries), dtype=np.int64)
         own = self._own(queries)
         for slab in self.index.outwards(cell):
-            at = slab if own < 0 or self.base_groups is None else slab[self.base_groups[slab] != own]
+            at = (
+                slab if own < 0 or self.base_groups is None else slab[self.base_groups[slab] != own]
+            )
             if not len(at):
                 continue
-            bound = query_side(self.z[queries], d, np.zeros(len(queries))) @ base_side(self.index.z[at], d).T
+            bound = (
+                query_side(self.z[queries], d, np.zeros(len(queries)))
+                @ base_side(self.index.z[at], d).T
+            )
             allowed = self._allowed(queries[:, None], at[None])
             if allowed is not None:
                 bound[~allowed] = np.inf
             met += len(at) if allowed is None else allowed.sum(axis=1)
-            few = np.argpartition(bound, k - 1, axis=1)[:, :k] if k < len(at) else np.broadcast_to(np.arange(len(at)), bound.shape)
+            few = (
+                np.argpartition(bound, k - 1, axis=1)[:, :k]
+                if k < len(at)
+                else np.broadcast_to(np.arange(len(at)), bound.shape)
+            )
             i, j = np.nonzero(np.isfinite(np.take_along_axis(bound, few, axis=1)))
             self._found(queries[i], at[few[i, j]])
             lacking = met < max(k, GUESS_ROWS // 2)
@@ -332,7 +384,9 @@ class Nearest:
                 self._found(*(np.concatenate(part) for part in zip(*held, strict=True)))
                 held, size = [], 0
                 if either is None:
-                    left[:] = query_side(self.z[queries], p, self.best.squared[queries, -1] / self.unit)
+                    left[:] = query_side(
+                        self.z[queries], p, self.best.squared[queries, -1] / self.unit
+                    )
         if held:
             self._found(*(np.concatenate(part) for part in zip(*held, strict=True)))
 

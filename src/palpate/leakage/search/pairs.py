@@ -23,9 +23,20 @@ from scipy.sparse.csgraph import connected_components
 
 from palpate.core import Progress
 from palpate.leakage.search.exact import PENDING, QUERIES, Index, Sieve, choose_axes, within
-from palpate.leakage.search.space import Doubles, Floats, Ints, Space, base_side, query_side, squared_distances
+from palpate.leakage.search.space import (
+    Doubles,
+    Floats,
+    Ints,
+    Space,
+    base_side,
+    query_side,
+    squared_distances,
+)
 
-BALL_SHARE, BALLS = 0.05, 32  # a ball must hold this share of the rows that are left, else no more balls are drawn
+BALL_SHARE, BALLS = (
+    0.05,
+    32,
+)  # a ball must hold this share of the rows that are left, else no more balls are drawn
 
 
 class Close:
@@ -41,9 +52,16 @@ class Close:
         self.index, self.radius = Index(rows, space), radius
         self.limit = radius / space.norm
         starts = self.index.cells.starts
-        _, self.away = self.index.cells.assign(self.index.z)  # of each sorted row from its cell's centre
-        self.spans = [(cell, int(a), int(b)) for cell, (a, b) in enumerate(pairwise(starts)) if b > a]
-        self.axes = choose_axes(self.index, [self._sample(*span) for span in self.spans[:: max(1, len(self.spans) // 12)]])
+        _, self.away = self.index.cells.assign(
+            self.index.z
+        )  # of each sorted row from its cell's center
+        self.spans = [
+            (cell, int(a), int(b)) for cell, (a, b) in enumerate(pairwise(starts)) if b > a
+        ]
+        self.axes = choose_axes(
+            self.index,
+            [self._sample(*span) for span in self.spans[:: max(1, len(self.spans) // 12)]],
+        )
         self.right = base_side(self.index.z, self.axes)
         self.sieve = Sieve()
 
@@ -52,12 +70,14 @@ class Close:
 
     def _sample(self, cell: int, start: int, end: int) -> tuple[Floats, Doubles, Ints]:
         end = min(end, start + QUERIES)
-        at = np.flatnonzero(self.index.from_centre(cell) <= within(self.away[start:end] + self.limit))
+        at = np.flatnonzero(
+            self.index.from_center(cell) <= within(self.away[start:end] + self.limit)
+        )
         return self.index.z[start:end], self._threshold(end - start), at[:: max(1, len(at) // 1024)]
 
     def candidates(self, cell: int, start: int, end: int) -> Ints:
         """Positions from ``start`` on that may lie within the radius of a row in [start, end) of the cell."""
-        near = self.index.from_centre(cell)[start:] <= within(self.away[start:end] + self.limit)
+        near = self.index.from_center(cell)[start:] <= within(self.away[start:end] + self.limit)
         return start + np.flatnonzero(near)
 
     def passing(self, at: Ints, candidates: Ints) -> Iterator[tuple[Ints, Ints]]:
@@ -65,7 +85,9 @@ class Close:
         right = self.right[candidates]
         for start in range(0, len(at), QUERIES):
             block = at[start : start + QUERIES]
-            for i, j, _ in self.sieve(query_side(self.index.z[block], self.axes, self._threshold(len(block))), right):
+            for i, j, _ in self.sieve(
+                query_side(self.index.z[block], self.axes, self._threshold(len(block))), right
+            ):
                 yield block[i], candidates[j]
 
     def measured(self, i: Ints, j: Ints) -> tuple[Ints, Ints, Doubles]:
@@ -77,7 +99,9 @@ class Close:
         return np.minimum(a, b), np.maximum(a, b), squared[kept]
 
 
-def close_pairs(rows: Floats, radius: float, limit: int, progress: Progress) -> Iterator[tuple[Ints, Ints, NDArray[np.float32]]]:
+def close_pairs(
+    rows: Floats, radius: float, limit: int, progress: Progress
+) -> Iterator[tuple[Ints, Ints, NDArray[np.float32]]]:
     """Streams each unordered pair within the radius once, at most ``limit`` pairs at a time."""
     close = Close(rows, radius)
     for cell, start, end in close.spans:
@@ -102,7 +126,10 @@ class Joined:
         """Joins rows pairwise."""
         a, b = self.root[a], self.root[b]
         names, local = np.unique(np.concatenate([a, b]), return_inverse=True)
-        edges = coo_array((np.ones(len(a), dtype=np.int8), (local[: len(a)], local[len(a) :])), shape=(len(names), len(names)))
+        edges = coo_array(
+            (np.ones(len(a), dtype=np.int8), (local[: len(a)], local[len(a) :])),
+            shape=(len(names), len(names)),
+        )
         _, part = connected_components(edges, directed=False)
         lowest = np.full(part.max() + 1, len(self.root))
         np.minimum.at(lowest, part, names)
@@ -134,7 +161,9 @@ def _draw_balls(joined: Joined, rows: Floats, left: Ints, radius: float) -> None
     for _ in range(BALLS):
         if len(left) < 2:
             return
-        inside = squared_distances(rows, left, rows, np.broadcast_to(left[:1], left.shape)) <= radius**2
+        inside = (
+            squared_distances(rows, left, rows, np.broadcast_to(left[:1], left.shape)) <= radius**2
+        )
         if inside.sum() > 1:
             joined.ball(left[inside])
         if inside.sum() < max(2, BALL_SHARE * len(left)):

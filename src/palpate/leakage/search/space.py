@@ -1,4 +1,4 @@
-"""The geometry behind the exact neighbour search: principal axes, a safe lower bound, cells, identical rows.
+"""The geometry behind the exact neighbor search: principal axes, a safe lower bound, cells, identical rows.
 
 Rows x are shifted by a mean, rotated to principal axes and divided by the largest norm. None of it changes which rows are near: a shift
 and a rotation keep distances, and the scale is the same for all. With P the leading p axes and rho(x) the norm of what they leave out,
@@ -29,7 +29,9 @@ Doubles = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CHUNK = 8192  # rows that are worked on at a time in float64
-CELL_AXES = 29  # leading axes in which cells are made; with the three extra columns a multiple of 16
+CELL_AXES = (
+    29  # leading axes in which cells are made; with the three extra columns a multiple of 16
+)
 FIT_ROWS = 20_000
 _U = 2.0**-24
 _ETA = 1e-6  # (t + e)^2 <= (1 + eta) t^2 + (1 + 1/eta) e^2
@@ -50,7 +52,9 @@ def checked_rows(name: str, rows: object) -> Floats:
     array = np.asarray(rows)
     if array.ndim != 2 or not array.shape[1] or array.dtype.kind not in "fiub":
         raise PalpateError(
-            f"{name} must be a matrix of numbers, (rows, dimensions >= 1)", f"{array.dtype} {array.shape}", "Pass one vector a row"
+            f"{name} must be a matrix of numbers, (rows, dimensions >= 1)",
+            f"{array.dtype} {array.shape}",
+            "Pass one vector a row",
         )
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(array, dtype=np.float32)
@@ -78,7 +82,9 @@ def checked_labels(name: str, labels: object, rows: int) -> Ints | None:
     array = np.asarray(labels)
     if array.shape != (rows,) or (array.dtype.kind not in "iu" and rows):
         raise PalpateError(
-            f"{name} must be one integer a row ({rows})", f"{array.dtype} {array.shape}", "Number the groups 0, 1, 2, ...; -1 where unknown"
+            f"{name} must be one integer a row ({rows})",
+            f"{array.dtype} {array.shape}",
+            "Number the groups 0, 1, 2, ...; -1 where unknown",
         )
     return array.astype(np.int64)
 
@@ -121,13 +127,19 @@ class Space:
             for start in range(0, len(rows), CHUNK):
                 gap = rows[start : start + CHUNK] - mean
                 largest = max(largest, float(np.einsum("ij,ij->i", gap, gap).max(initial=0.0)))
-        return Space(mean, np.ascontiguousarray(axes[:, np.argsort(-values, kind="stable")]), float(np.sqrt(largest)) or 1.0)
+        return Space(
+            mean,
+            np.ascontiguousarray(axes[:, np.argsort(-values, kind="stable")]),
+            float(np.sqrt(largest)) or 1.0,
+        )
 
     def rotate(self, rows: Floats) -> Floats:
         """(n, d) coordinates along the axes, of norm at most one; worked out in float64, rounded once."""
         out = np.empty(rows.shape, dtype=np.float32)
         for start in range(0, len(rows), CHUNK):
-            out[start : start + CHUNK] = ((rows[start : start + CHUNK] - self.mean) @ self.axes) / self.norm
+            out[start : start + CHUNK] = (
+                (rows[start : start + CHUNK] - self.mean) @ self.axes
+            ) / self.norm
         return out
 
 
@@ -170,10 +182,12 @@ def query_side(z: Floats, p: int, squared: Doubles) -> Floats:
     return out
 
 
-def centre_side(centre: Floats, d: int) -> Floats:
-    """The left factor for a centre in :data:`CELL_AXES` axes: gives its squared distance from base rows, slack taken off."""
-    square = float(np.dot(centre.astype(np.float64), centre))
-    return np.r_[-2 * centre, np.float32(square * (1 - _slack(CELL_AXES, d))), np.float32(1)].astype(np.float32)
+def center_side(center: Floats, d: int) -> Floats:
+    """The left factor for a center in :data:`CELL_AXES` axes: gives its squared distance from base rows, slack taken off."""
+    square = float(np.dot(center.astype(np.float64), center))
+    return np.r_[
+        -2 * center, np.float32(square * (1 - _slack(CELL_AXES, d))), np.float32(1)
+    ].astype(np.float32)
 
 
 def widened(squared: Doubles, columns: int) -> Doubles:
@@ -183,16 +197,16 @@ def widened(squared: Doubles, columns: int) -> Doubles:
 
 @dataclass(frozen=True)
 class Cells:
-    """Rows sorted into cells round centres (a few Lloyd steps from evenly spaced rows), in the space of bound (1) with :data:`CELL_AXES`
+    """Rows sorted into cells round centers (a few Lloyd steps from evenly spaced rows), in the space of bound (1) with :data:`CELL_AXES`
     axes.
 
     Attributes:
-        centres: (c, w) centres.
+        centers: (c, w) centers.
         order: (n,) rows, cell after cell, ascending within a cell.
         starts: (c + 1,) where each cell starts in ``order``.
     """
 
-    centres: Floats
+    centers: Floats
     order: Ints
     starts: Ints
 
@@ -201,31 +215,33 @@ class Cells:
         """Makes about sqrt(n) cells, at most 256, of rotated rows z (n, d)."""
         points = _leading(z, CELL_AXES, 0)[0]
         count = int(np.clip(np.sqrt(len(z)), 1, 256))
-        centres = points[np.linspace(0, len(z) - 1, count).astype(np.int64)]
+        centers = points[np.linspace(0, len(z) - 1, count).astype(np.int64)]
         some = points[:: max(1, len(z) // (64 * count))]
         for _ in range(4):
-            labels = _closest(some, centres)
+            labels = _closest(some, centers)
             sizes = np.bincount(labels, minlength=count)
             order = np.argsort(labels, kind="stable")
             kept = np.flatnonzero(sizes)
-            sums = np.add.reduceat(some[order].astype(np.float64), np.r_[0, np.cumsum(sizes[kept])[:-1]], axis=0)
-            centres[kept] = sums / sizes[kept, None]
-        labels = _closest(points, centres)
+            sums = np.add.reduceat(
+                some[order].astype(np.float64), np.r_[0, np.cumsum(sizes[kept])[:-1]], axis=0
+            )
+            centers[kept] = sums / sizes[kept, None]
+        labels = _closest(points, centers)
         starts = np.r_[0, np.cumsum(np.bincount(labels, minlength=count))].astype(np.int64)
-        return Cells(centres, np.argsort(labels, kind="stable"), starts)
+        return Cells(centers, np.argsort(labels, kind="stable"), starts)
 
     def assign(self, z: Floats) -> tuple[Ints, Doubles]:
-        """The cell of the nearest centre for rotated rows z (n, d), and the distance from that centre."""
+        """The cell of the nearest center for rotated rows z (n, d), and the distance from that center."""
         points = _leading(z, CELL_AXES, 0)[0]
-        labels = _closest(points, self.centres)
-        return labels, np.sqrt(squared_distances(points, np.arange(len(z)), self.centres, labels))
+        labels = _closest(points, self.centers)
+        return labels, np.sqrt(squared_distances(points, np.arange(len(z)), self.centers, labels))
 
 
-def _closest(points: Floats, centres: Floats) -> Ints:
-    half = 0.5 * np.einsum("ij,ij->i", centres, centres)
+def _closest(points: Floats, centers: Floats) -> Ints:
+    half = 0.5 * np.einsum("ij,ij->i", centers, centers)
     out = np.empty(len(points), dtype=np.int64)
     for start in range(0, len(points), 2048):
-        out[start : start + 2048] = (half - points[start : start + 2048] @ centres.T).argmin(axis=1)
+        out[start : start + 2048] = (half - points[start : start + 2048] @ centers.T).argmin(axis=1)
     return out
 
 

@@ -2,7 +2,7 @@
 
 The blocks of a sweep are small, and a BLAS that splits a small product over threads spends its time waiting for them, the more so on a
 busy machine. Where threadpoolctl is installed (scikit-learn brings it), BLAS is held to one thread while a search runs and as many
-workers as BLAS had threads take cells instead (``OMP_NUM_THREADS`` and its like are honoured); without it one worker leaves BLAS as it
+workers as BLAS had threads take cells instead (``OMP_NUM_THREADS`` and its like are honored); without it one worker leaves BLAS as it
 is. Results do not depend on it.
 """
 

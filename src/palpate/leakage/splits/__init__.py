@@ -1,7 +1,7 @@
 """Leak-free splits: whole groups go to one part, and every material keeps its share as well as it can.
 
 Groups are connected components (:mod:`palpate.leakage.splits.groups`); with n_gm the samples of material m in group g and r_p the wanted share of part p,
-the assignment a(g) minimises the largest deviation
+the assignment a(g) minimizes the largest deviation
 
     max_{m, p} | sum_{g: a(g)=p} n_gm / n_m - r_p |
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from palpate.core import PARTS, PalpateError, Split
 from palpate.data.manifest import Manifest
-from palpate.leakage.splits.assign import RESOLUTION, Optimum, draw, optimise
+from palpate.leakage.splits.assign import RESOLUTION, Optimum, draw, optimize
 from palpate.leakage.splits.groups import COLUMNS, Nulls, components
 from palpate.leakage.splits.polish import Ints, Problem
 from palpate.leakage.splits.program import EXACT
@@ -74,7 +74,7 @@ class SplitPlan:
 
 @dataclass(frozen=True)
 class _Task:
-    """A manifest cut into groups: everything that the optimiser and the rule need.
+    """A manifest cut into groups: everything that the optimizer and the rule need.
 
     ``counts`` (G, M + 1): samples of each group by material, then all; ``names`` (G) in its order; ``of`` the group of each sample.
     """
@@ -105,7 +105,11 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, str]:
     """
     table = manifest.table
     said = [manifest.facts["group"]] if manifest.facts.get("group") in COLUMNS else []
-    known = [g for g in (*said, "video", "object", "touch") if table[g].null_count() == 0 and table.height]
+    known = [
+        g
+        for g in (*said, "video", "object", "contact")
+        if table[g].null_count() == 0 and table.height
+    ]
     if not known:
         raise PalpateError(
             "A leak-free split needs the video, object or touch of every sample",
@@ -113,28 +117,42 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, str]:
             "Import a table that has one (palpate import table.csv --map video=YOUR_COLUMN), or group by --near",
         )
     first = known[0]
-    if first == "touch":
-        return "touch", "The manifest knows no videos: the touch is kept whole."
-    if table[first].n_unique() < parts and "touch" in known:
+    if first == "contact":
+        return "contact", "The manifest knows no videos: the touch is kept whole."
+    if table[first].n_unique() < parts and "contact" in known:
         return (
-            "touch",
+            "contact",
             f"There are fewer than {parts} {first}s: whole touches are kept together instead, and train and test share a {first}.",
         )
-    normal = "" if first == "video" else f"The data set says so: the {first} is kept whole." if said == [first] else ""
-    normal = normal or ("" if first == "video" else f"The manifest knows no videos: the {first} is kept whole.")
-    groups = table.filter(pl.col("material").is_not_null()).group_by("material").agg(pl.col(first).n_unique().alias("n"))
+    normal = (
+        ""
+        if first == "video"
+        else f"The data set says so: the {first} is kept whole."
+        if said == [first]
+        else ""
+    )
+    normal = normal or (
+        "" if first == "video" else f"The manifest knows no videos: the {first} is kept whole."
+    )
+    groups = (
+        table.filter(pl.col("material").is_not_null())
+        .group_by("material")
+        .agg(pl.col(first).n_unique().alias("n"))
+    )
     if not groups.height:
         return first, normal
     enough = groups.filter(pl.col("n") >= parts).height
-    if 2 * enough >= groups.height or "touch" not in known:
+    if 2 * enough >= groups.height or "contact" not in known:
         return first, normal
-    return "touch", (
+    return "contact", (
         f"Only {enough} of {groups.height} materials occur in {parts} or more {first}s, too few for the {first} to be the group: whole touches are "
         f"kept together instead. Train and test then share {first}s, so scores are optimistic for new places."
     )
 
 
-def leak_free_split(manifest: Manifest, *, train: float = 0.8, val: float = 0.0, seed: int = 0, **options: Any) -> SplitPlan:
+def leak_free_split(
+    manifest: Manifest, *, train: float = 0.8, val: float = 0.0, seed: int = 0, **options: Any
+) -> SplitPlan:
     """A split in which no group stands in two parts, stratified by material; see :func:`leak_free_splits`."""
     return leak_free_splits(manifest, [seed], train=train, val=val, **options)[0]
 
@@ -183,7 +201,7 @@ def leak_free_splits(
     wanted = {part: round(share, 12) for part in PARTS if (share := shares[part]) > 1e-9}
     task = _task(manifest, len(wanted), group, by, links, link_facts, nulls)
     problem = _problem(task, np.array(list(wanted.values())))
-    optimum, plans = optimise(problem), []
+    optimum, plans = optimize(problem), []
     for seed in seeds:
         assignment = draw(problem, optimum, seed, tolerance)
         where = {g: list(wanted)[a] for g, a in zip(task.names, assignment.tolist(), strict=True)}
@@ -226,19 +244,46 @@ def leak_free_folds(
         PalpateError: as :func:`leak_free_splits`.
     """
     if folds < 2 + val:
-        raise PalpateError(f"There must be at least {2 + val} folds" + " with a validation fold" * val, str(folds), "Pass e.g. --folds 5")
+        raise PalpateError(
+            f"There must be at least {2 + val} folds" + " with a validation fold" * val,
+            str(folds),
+            "Pass e.g. --folds 5",
+        )
     task = _task(manifest, folds, group, by, links, link_facts, nulls)
     problem = _problem(task, np.full(folds, 1 / folds))
-    optimum = optimise(problem)
+    optimum = optimize(problem)
     assignment = draw(problem, optimum, seed, tolerance)
     plans: list[SplitPlan] = []
     for fold in range(folds):
-        part = {k: "test" if k == fold else "val" if val and k == (fold + 1) % folds else "train" for k in range(folds)}
+        part = {
+            k: "test" if k == fold else "val" if val and k == (fold + 1) % folds else "train"
+            for k in range(folds)
+        }
         where = {g: part[a] for g, a in zip(task.names, assignment.tolist(), strict=True)}
         fold_of = {g: f"fold {a}" for g, a in zip(task.names, assignment.tolist(), strict=True)}
-        rule = {"name": f"NoLeak fold {fold} of {folds}", **task.rule, "folds": folds, "fold": fold, "seed": seed, "tolerance": tolerance}
-        rule["shares"] = {p: round(n / folds, 12) for p in PARTS if (n := list(part.values()).count(p))}
-        plans.append(_plan(task, problem, optimum, assignment, [f"fold {k}" for k in range(folds)], where, fold_of, rule))
+        rule = {
+            "name": f"NoLeak fold {fold} of {folds}",
+            **task.rule,
+            "folds": folds,
+            "fold": fold,
+            "seed": seed,
+            "tolerance": tolerance,
+        }
+        rule["shares"] = {
+            p: round(n / folds, 12) for p in PARTS if (n := list(part.values()).count(p))
+        }
+        plans.append(
+            _plan(
+                task,
+                problem,
+                optimum,
+                assignment,
+                [f"fold {k}" for k in range(folds)],
+                where,
+                fold_of,
+                rule,
+            )
+        )
     return plans
 
 
@@ -262,7 +307,7 @@ def _task(
     if not columns and group != "auto":
         columns = (group,)
     elif not columns:
-        if links and all(table[c].null_count() for c in ("video", "object", "touch")):
+        if links and all(table[c].null_count() for c in ("video", "object", "contact")):
             reason = "The manifest knows no videos: near-duplicates alone are kept together."
         else:
             column, reason = choose_group(manifest, parts)
@@ -293,10 +338,16 @@ def _task(
     if not materials:
         notes.append("No sample has a material: only the sizes of the parts are balanced.")
     rule = {
-        "method": "whole groups, smallest largest deviation of any material's share", "version": RULE_VERSION, "group": columns[0] if columns else LINKED,
-        "by": list(columns), "near": dict(facts or {"labels": len(links)}) if links else None, "nulls": nulls, "asked": list(by) or group, "reason": reason,
+        "method": "whole groups, smallest largest deviation of any material's share",
+        "version": RULE_VERSION,
+        "group": columns[0] if columns else LINKED,
+        "by": list(columns),
+        "near": dict(facts or {"labels": len(links)}) if links else None,
+        "nulls": nulls,
+        "asked": list(by) or group,
+        "reason": reason,
         "groups": len(names),
-    }  # fmt: skip
+    }
     return _Task(manifest, columns, reason, names, of, materials, counts, rule, notes)
 
 
@@ -320,13 +371,21 @@ def _problem(task: _Task, target: NDArray[np.float64]) -> Problem:
 
 
 def _plan(
-    task: _Task, problem: Problem, optimum: Optimum, assignment: Ints, parts: Sequence[str], where: Mapping[str, str], shown: Mapping[str, str],
+    task: _Task,
+    problem: Problem,
+    optimum: Optimum,
+    assignment: Ints,
+    parts: Sequence[str],
+    where: Mapping[str, str],
+    shown: Mapping[str, str],
     rule: Mapping[str, Any],
-) -> SplitPlan:  # fmt: skip
+) -> SplitPlan:
     """One assignment as a plan, everything recounted from it."""
     deviation = problem.worst(assignment)
     if optimum.bound > deviation + EXACT:  # a proof that is wrong must never pass for one
-        raise RuntimeError(f"the lower bound {optimum.bound} lies above a deviation that was reached, {deviation}")
+        raise RuntimeError(
+            f"the lower bound {optimum.bound} lies above a deviation that was reached, {deviation}"
+        )
     bound = min(optimum.bound, deviation)
     gap = deviation - bound
     status = f"within {gap:.5f} of the optimum"
@@ -336,13 +395,20 @@ def _plan(
         status = f"below the resolution of {RESOLUTION:g}, {status}"
     columns = [*task.materials, "all samples"]
     off = problem.deviations(assignment).max(0) * problem.used
-    gone = [f"{columns[m]}: {parts[p]}" for p, m in np.argwhere((problem.present(assignment) == 0) & problem.possible).tolist()]
-    rare = [m for m, possible in zip(task.materials, problem.possible, strict=False) if not possible]
+    gone = [
+        f"{columns[m]}: {parts[p]}"
+        for p, m in np.argwhere((problem.present(assignment) == 0) & problem.possible).tolist()
+    ]
+    rare = [
+        m for m, possible in zip(task.materials, problem.possible, strict=False) if not possible
+    ]
     notes = list(task.notes)
     if rare:
         notes.append(f"In fewer than {len(parts)} groups, so not in every part: {', '.join(rare)}.")
     if gone:
-        notes.append(f"Could be in every part, but not together with the others: {', '.join(gone)}.")
+        notes.append(
+            f"Could be in every part, but not together with the others: {', '.join(gone)}."
+        )
     rule = {**rule, "deviation": round(deviation, 6), "bound": round(bound, 6), "status": status}
     parts_of = {i: where[g] for i, g in zip(task.manifest.ids, task.of, strict=True)}
     split = Split(parts_of, rule, task.manifest.digest)
@@ -366,10 +432,21 @@ def _plan(
 def describe(plan: SplitPlan) -> Mapping[str, Any]:
     """The plan as JSON for terminals and reports."""
     return {
-        "digest": plan.split.digest, "group": plan.group, "by": list(plan.by), "groups": len(plan.where), "reason": plan.reason, "counts": plan.split.counts(),
-        "largest_material_deviation": round(plan.deviation, 5), "lower_bound": round(plan.bound, 5), "gap": round(plan.gap, 5), "status": plan.status,
-        "limiting_material": plan.limiting, "nodes": plan.nodes, "materials_in_too_few_groups": plan.rare, "materials_left_out": plan.missing,
-    }  # fmt: skip
+        "digest": plan.split.digest,
+        "group": plan.group,
+        "by": list(plan.by),
+        "groups": len(plan.where),
+        "reason": plan.reason,
+        "counts": plan.split.counts(),
+        "largest_material_deviation": round(plan.deviation, 5),
+        "lower_bound": round(plan.bound, 5),
+        "gap": round(plan.gap, 5),
+        "status": plan.status,
+        "limiting_material": plan.limiting,
+        "nodes": plan.nodes,
+        "materials_in_too_few_groups": plan.rare,
+        "materials_left_out": plan.missing,
+    }
 
 
 def renamed(plan: SplitPlan, **rule: Any) -> SplitPlan:

@@ -1,6 +1,6 @@
 """Groups to parts: the smallest largest deviation that exists, and how far from it the answer may be.
 
-*Phase 1* (:func:`optimise`) looks for the smallest t* such that every material that can be in every part, and the whole, deviates by at most
+*Phase 1* (:func:`optimize`) looks for the smallest t* such that every material that can be in every part, and the whole, deviates by at most
 t* from its wanted share, all present in every part. Upper bounds come from local search (:mod:`palpate.leakage.splits.polish`) and from solving small
 programs exactly (:mod:`palpate.leakage.splits.program`, ``FREE`` groups at a time, those that hold the worst materials among them), then from HiGHS on the
 whole program; lower bounds from each column alone (the subset sums of its groups, or whole numbers of samples) and from HiGHS. Deviations
@@ -73,13 +73,16 @@ class Optimum:
         return self.aim + (0 if self.deviation <= self.bound + EXACT else RESOLUTION)
 
 
-def optimise(problem: Problem) -> Optimum:
+def optimize(problem: Problem) -> Optimum:
     """Phase 1: the smallest largest deviation, with a lower bound.
 
     Args:
         problem: at least as many groups as parts.
     """
-    best = min((start(problem, rng_for(0, "split bound", k)) for k in range(STARTS)), key=lambda a: _rank(problem, a))
+    best = min(
+        (start(problem, rng_for(0, "split bound", k)) for k in range(STARTS)),
+        key=lambda a: _rank(problem, a),
+    )
     bound = max(column_bound(problem, int(m)) for m in np.flatnonzero(problem.used))
     floor, nodes = max(bound, RESOLUTION), 0
     whole = len(problem.counts) <= MILP_GROUPS
@@ -90,7 +93,9 @@ def optimise(problem: Problem) -> Optimum:
     if not whole or (not found.missing and found.deviation <= floor + EXACT):
         return found
     program = Program(problem, missing=found.missing)
-    answer = program.smallest(min(floor, found.deviation), found.deviation + EXACT, _nodes(problem), symmetric=True)
+    answer = program.smallest(
+        min(floor, found.deviation), found.deviation + EXACT, _nodes(problem), symmetric=True
+    )
     found = replace(found, nodes=nodes + answer.nodes, solver="HiGHS")
     if answer.assignment is not None and _rank(problem, answer.assignment) < _rank(problem, best):
         best = repair(problem, answer.assignment, floor, rng_for(0, "split bound polish"))
@@ -109,7 +114,11 @@ def draw(problem: Problem, optimum: Optimum, seed: int, tolerance: float = 0.0) 
         begin, cost = start(problem, rng), 0.5 + rng.random(len(problem.counts))
         near: Ints | None = repair(problem, begin, limit, rng)
         if small and _rank(problem, near) > allowed:
-            near = Program(problem, missing=optimum.missing).nearest(begin, cost, limit, _nodes(problem), 0.1).assignment
+            near = (
+                Program(problem, missing=optimum.missing)
+                .nearest(begin, cost, limit, _nodes(problem), 0.1)
+                .assignment
+            )
         if near is not None and _rank(problem, near) <= allowed:
             chosen = near
             break
@@ -135,7 +144,10 @@ def repair(problem: Problem, assignment: Ints, floor: float, rng: np.random.Gene
         program = Program(problem, assignment, free, problem.missing(assignment))
         answer = program.smallest(min(floor, worst), worst + EXACT, FREE_NODES).assignment
         stale += 1
-        if answer is not None and _rank(problem, answer) < (problem.missing(assignment), worst - EXACT):
+        if answer is not None and _rank(problem, answer) < (
+            problem.missing(assignment),
+            worst - EXACT,
+        ):
             assignment, stale = answer, 0
     return assignment
 
@@ -165,7 +177,9 @@ def column_bound(problem: Problem, column: int) -> float:
 def _fewest_missing(problem: Problem, assignment: Ints) -> tuple[Ints, int]:
     """An assignment that leaves as few materials out of parts as possible, and the nodes used."""
     answer = Program(problem, missing=None).fewest_missing(_nodes(problem))
-    if answer.assignment is None or problem.missing(answer.assignment) >= problem.missing(assignment):
+    if answer.assignment is None or problem.missing(answer.assignment) >= problem.missing(
+        assignment
+    ):
         return assignment, answer.nodes
     return Search(problem, answer.assignment, 8).run(rng_for(0, "split presence")), answer.nodes
 

@@ -20,11 +20,17 @@ from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 
 #: Columns that a split can keep whole.
-COLUMNS = ("video", "object", "session", "touch", "domain", "sensor")
+COLUMNS = ("video", "object", "session", "contact", "domain", "sensor")
 Nulls = Literal["refuse", "own"]
 
 
-def components(manifest: Manifest, by: Sequence[str], links: Sequence[NDArray[np.integer]] = (), *, nulls: Nulls = "refuse") -> list[str]:
+def components(
+    manifest: Manifest,
+    by: Sequence[str],
+    links: Sequence[NDArray[np.integer]] = (),
+    *,
+    nulls: Nulls = "refuse",
+) -> list[str]:
     """The group of each sample.
 
     Args:
@@ -43,15 +49,27 @@ def components(manifest: Manifest, by: Sequence[str], links: Sequence[NDArray[np
     table, n = manifest.table, len(manifest)
     for column in by:
         if column not in COLUMNS:
-            raise PalpateError(f"Groups must be among {', '.join(COLUMNS)}", repr(column), "Pass e.g. --by video object")
+            raise PalpateError(
+                f"Groups must be among {', '.join(COLUMNS)}",
+                repr(column),
+                "Pass e.g. --by video object",
+            )
         empty = table[column].null_count()
         if empty and (nulls == "refuse" or empty == n):
             fix = f"Fill the column, leave {column} out of --by" + (
-                "" if empty == n else ", or pass --nulls own to let each such sample be a group of its own"
+                ""
+                if empty == n
+                else ", or pass --nulls own to let each such sample be a group of its own"
             )
-            raise PalpateError(f"Every sample needs a {column} to be split by it", f"{empty} of {n} samples without", fix)
+            raise PalpateError(
+                f"Every sample needs a {column} to be split by it",
+                f"{empty} of {n} samples without",
+                fix,
+            )
     if not by and not links:
-        raise PalpateError("A group needs a column or near-duplicate links", "neither", "Pass e.g. --by video")
+        raise PalpateError(
+            "A group needs a column or near-duplicate links", "neither", "Pass e.g. --by video"
+        )
     labels: list[NDArray[np.int64]] = []
     for column in by:
         rank = table[column].rank("dense").cast(pl.Int64) - 1
@@ -60,9 +78,15 @@ def components(manifest: Manifest, by: Sequence[str], links: Sequence[NDArray[np
         array = np.asarray(link)
         if array.shape != (n,) or array.dtype.kind not in "iu":
             raise PalpateError(
-                f"Links must be {n} integers, one a sample", f"{array.dtype} of shape {array.shape}", "Compute them on this manifest"
+                f"Links must be {n} integers, one a sample",
+                f"{array.dtype} of shape {array.shape}",
+                "Compute them on this manifest",
             )
-        labels.append(np.unique(np.where(array < 0, -1, array.astype(np.int64)), return_inverse=True)[1].astype(np.int64))
+        labels.append(
+            np.unique(np.where(array < 0, -1, array.astype(np.int64)), return_inverse=True)[
+                1
+            ].astype(np.int64)
+        )
         if (array < 0).any():
             labels[-1] -= 1
     return _names(manifest, by, _joined(labels, n))
@@ -85,13 +109,21 @@ def _joined(labels: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
 
 def _names(manifest: Manifest, by: Sequence[str], component: NDArray[np.int64]) -> list[str]:
     """A name for each sample's component: the smallest value of the first column that has one, else the smallest id."""
-    table = manifest.table.select("id", *(c for c in by if c != "id")).with_columns(pl.Series("component", component))
+    table = manifest.table.select("id", *(c for c in by if c != "id")).with_columns(
+        pl.Series("component", component)
+    )
     least = table.group_by("component").agg(pl.col(c).min() for c in ("id", *by)).sort("component")
     names: dict[int, str] = {}
     taken: set[str] = set()
     for row in least.iter_rows(named=True):
         first = next((c for c in by if row[c] is not None), None)
-        name = f"sample:{row['id']}" if first is None else row[first] if first == by[0] else f"{first}:{row[first]}"
+        name = (
+            f"sample:{row['id']}"
+            if first is None
+            else row[first]
+            if first == by[0]
+            else f"{first}:{row[first]}"
+        )
         while name in taken:  # a video that is called like another column's group
             name += "'"
         taken.add(name)

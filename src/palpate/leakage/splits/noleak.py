@@ -4,8 +4,8 @@
 each ratio and seed the part of every video, what was achieved, and a digest over the sorted lines ``video TAB part``. Its own checksum is SHA-256
 of its canonical JSON without the field ``sha256``; it is verified whenever it is read. ``recipes/tag_noleak.py`` writes it again.
 
-**HCT-NoLeak** is the same optimiser on a user's own tree: groups are trajectory folders, joined where they start within a minute of each other
-(the manifest's ``session``), since neighbouring folders may show the same object.
+**HCT-NoLeak** is the same optimizer on a user's own tree: groups are trajectory folders, joined where they start within a minute of each other
+(the manifest's ``session``), since neighboring folders may show the same object.
 """
 
 from __future__ import annotations
@@ -18,14 +18,26 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PARTS, PalpateError, Split, digest_file, digest_json, digest_lines, read_json
+from palpate.core import (
+    PARTS,
+    PalpateError,
+    Split,
+    digest_file,
+    digest_json,
+    digest_lines,
+    read_json,
+)
 from palpate.data.listing import read_lists
 from palpate.data.manifest import Manifest
 from palpate.leakage.splits import RULE_VERSION, SplitPlan, leak_free_splits, renamed
 
 FORMAT = "palpate-noleak/1"
 #: Train and validation shares of the record, by the name of the ratio.
-RATIOS: dict[str, tuple[float, float]] = {"80/20": (0.8, 0.0), "70/30": (0.7, 0.0), "80/10/10": (0.8, 0.1)}
+RATIOS: dict[str, tuple[float, float]] = {
+    "80/20": (0.8, 0.0),
+    "70/30": (0.7, 0.0),
+    "80/10/10": (0.8, 0.1),
+}
 SEEDS = range(5)
 #: Data set -> record.
 RECORDS = {"touch-and-go": "tag_noleak.json"}
@@ -54,7 +66,9 @@ def ratio_name(train: float, val: float) -> str:
             return name
     known = ", ".join(f"{name} (--train {t} --val {v})" for name, (t, v) in RATIOS.items())
     raise PalpateError(
-        f"The record's ratios are {known}", f"--train {train} --val {val}", "Choose one of these, or make a split of your own"
+        f"The record's ratios are {known}",
+        f"--train {train} --val {val}",
+        "Choose one of these, or make a split of your own",
     )
 
 
@@ -64,18 +78,37 @@ def make_record(lists: Sequence[Path]) -> dict[str, Any]:
     splits: dict[str, dict[str, Any]] = {}
     for name, (train, val) in RATIOS.items():
         splits[name] = {}
-        for seed, plan in zip(SEEDS, leak_free_splits(manifest, list(SEEDS), train=train, val=val, by=["video"]), strict=True):
+        for seed, plan in zip(
+            SEEDS,
+            leak_free_splits(manifest, list(SEEDS), train=train, val=val, by=["video"]),
+            strict=True,
+        ):
             parts = {part: sorted(v for v, p in plan.where.items() if p == part) for part in PARTS}
             splits[name][str(seed)] = {
-                "digest": _digest(plan.where), "deviation": round(plan.deviation, 6), "bound": round(plan.bound, 6), "status": plan.status,
-                "limiting": plan.limiting, "samples": plan.split.counts(), "videos": {p: v for p, v in parts.items() if v},
-            }  # fmt: skip
+                "digest": _digest(plan.where),
+                "deviation": round(plan.deviation, 6),
+                "bound": round(plan.bound, 6),
+                "status": plan.status,
+                "limiting": plan.limiting,
+                "samples": plan.split.counts(),
+                "videos": {p: v for p, v in parts.items() if v},
+            }
     record: dict[str, Any] = {
-        "format": FORMAT, "name": "TaG-NoLeak", "dataset": "touch-and-go", "source": CITE,
-        "rule": {"method": "whole videos, smallest largest deviation of any class's share of frames", "version": RULE_VERSION, "group": "video"},
+        "format": FORMAT,
+        "name": "TaG-NoLeak",
+        "dataset": "touch-and-go",
+        "source": CITE,
+        "rule": {
+            "method": "whole videos, smallest largest deviation of any class's share of frames",
+            "version": RULE_VERSION,
+            "group": "video",
+        },
         "lists": {p.name: digest_file(p) for p in lists},
-        "frames": len(manifest), "videos": manifest.table["video"].n_unique(), "classes": manifest.table["material"].n_unique(), "splits": splits,
-    }  # fmt: skip
+        "frames": len(manifest),
+        "videos": manifest.table["video"].n_unique(),
+        "classes": manifest.table["material"].n_unique(),
+        "splits": splits,
+    }
     return record | {"sha256": digest_json(record)}
 
 
@@ -87,9 +120,13 @@ def load_record(dataset: str) -> dict[str, Any]:
     """
     if dataset not in RECORDS:
         raise PalpateError(
-            f"There is a record for {', '.join(RECORDS)}, and a rule for hct", repr(dataset), "Name one of these before --noleak"
+            f"There is a record for {', '.join(RECORDS)}, and a rule for hct",
+            repr(dataset),
+            "Name one of these before --noleak",
         )
-    with resources.as_file(resources.files("palpate.leakage.splits") / "records" / RECORDS[dataset]) as path:
+    with resources.as_file(
+        resources.files("palpate.leakage.splits") / "records" / RECORDS[dataset]
+    ) as path:
         record = read_json(path, "record")
     verify_record(record)
     return record
@@ -103,8 +140,16 @@ def verify_record(record: Mapping[str, Any]) -> None:
     """
     body = {k: v for k, v in record.items() if k != "sha256"}
     same = record.get("format") == FORMAT and digest_json(body) == record.get("sha256")
-    if not same or any(_digest(_parts(e)) != e["digest"] for by_seed in record["splits"].values() for e in by_seed.values()):
-        raise PalpateError("A NoLeak record must match its checksum", "a record that was changed", "Install palpate again")
+    if not same or any(
+        _digest(_parts(e)) != e["digest"]
+        for by_seed in record["splits"].values()
+        for e in by_seed.values()
+    ):
+        raise PalpateError(
+            "A NoLeak record must match its checksum",
+            "a record that was changed",
+            "Install palpate again",
+        )
 
 
 def entry(record: Mapping[str, Any], ratio: str, seed: int) -> Entry:
@@ -116,15 +161,22 @@ def entry(record: Mapping[str, Any], ratio: str, seed: int) -> Entry:
     by_seed = record["splits"][ratio]
     if str(seed) not in by_seed:
         raise PalpateError(
-            f"The record's seeds are {', '.join(by_seed)}", f"--seed {seed}", "Choose one of these, or make a split of your own"
+            f"The record's seeds are {', '.join(by_seed)}",
+            f"--seed {seed}",
+            "Choose one of these, or make a split of your own",
         )
     found = by_seed[str(seed)]
     train, val = RATIOS[ratio]
     shares = {"train": train, "val": val, "test": round(1 - train - val, 12)}
     rule = {
-        "name": record["name"], **record["rule"], "by": ["video"], "record": record["sha256"], "shares": {p: s for p, s in shares.items() if s},
-        "seed": seed, "on_the_official_lists": {k: found[k] for k in ("deviation", "bound", "status")},
-    }  # fmt: skip
+        "name": record["name"],
+        **record["rule"],
+        "by": ["video"],
+        "record": record["sha256"],
+        "shares": {p: s for p, s in shares.items() if s},
+        "seed": seed,
+        "on_the_official_lists": {k: found[k] for k in ("deviation", "bound", "status")},
+    }
     return Entry(_parts(found), rule, found["digest"])
 
 
@@ -142,15 +194,25 @@ def record_split(chosen: Entry, manifest: Manifest) -> tuple[Split, list[str]]:
     strange = sorted(str(v) for v in known if v not in chosen.parts)
     fix = "Use the data set's own video ids, or make a split of your own: palpate split MANIFEST"
     if nulls := sum(v is None for v in videos):
-        raise PalpateError("Every sample needs a video to be looked up in the record", f"{nulls} samples without", fix)
+        raise PalpateError(
+            "Every sample needs a video to be looked up in the record",
+            f"{nulls} samples without",
+            fix,
+        )
     if strange:
         shown = ", ".join(map(repr, strange[:8])) + (" ..." if len(strange) > 8 else "")
-        raise PalpateError("Every video must be one that the record knows", f"{len(strange)} of {len(known)} that are not: {shown}", fix)
+        raise PalpateError(
+            "Every video must be one that the record knows",
+            f"{len(strange)} of {len(known)} that are not: {shown}",
+            fix,
+        )
     parts = {i: chosen.parts[str(v)] for i, v in zip(manifest.ids, videos, strict=True)}
     return Split(parts, chosen.rule, manifest.digest), sorted(set(chosen.parts) - known)
 
 
-def hct_noleak(manifest: Manifest, *, train: float = 0.8, val: float = 0.0, seeds: Sequence[int] = (0,)) -> list[SplitPlan]:
+def hct_noleak(
+    manifest: Manifest, *, train: float = 0.8, val: float = 0.0, seeds: Sequence[int] = (0,)
+) -> list[SplitPlan]:
     """HCT-NoLeak: the rule of this module on a user's own import of HCT.
 
     Args:
@@ -171,9 +233,13 @@ def hct_noleak(manifest: Manifest, *, train: float = 0.8, val: float = 0.0, seed
         )
     if empty := manifest.table.select(pl.col("session").null_count()).item():
         raise PalpateError(
-            "HCT-NoLeak needs the session of every sample", f"{empty} without", "Import the tree with: palpate import --format hct"
+            "HCT-NoLeak needs the session of every sample",
+            f"{empty} without",
+            "Import the tree with: palpate import --format hct",
         )
-    plans = leak_free_splits(manifest, seeds, train=train, val=val, by=["video", "session"], name="HCT-NoLeak")
+    plans = leak_free_splits(
+        manifest, seeds, train=train, val=val, by=["video", "session"], name="HCT-NoLeak"
+    )
     return [renamed(plan, session_gap=gap) for plan in plans]
 
 

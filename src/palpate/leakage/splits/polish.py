@@ -91,7 +91,9 @@ def greedy(problem: Problem, rng: np.random.Generator) -> Ints:
         behind[part] -= problem.share[g]
     for part in range(parts):  # no part may stay empty
         if not (assignment == part).any():
-            crowded = np.flatnonzero(assignment == np.bincount(assignment, minlength=parts).argmax())
+            crowded = np.flatnonzero(
+                assignment == np.bincount(assignment, minlength=parts).argmax()
+            )
             assignment[crowded[np.argmin(problem.counts[crowded, -1])]] = part
     return assignment
 
@@ -99,12 +101,16 @@ def greedy(problem: Problem, rng: np.random.Generator) -> Ints:
 class Search:
     """Local search from one assignment; see the module. ``limit`` bounds the largest deviation of every state it goes to."""
 
-    def __init__(self, problem: Problem, assignment: Ints, power: int, limit: float = np.inf) -> None:
+    def __init__(
+        self, problem: Problem, assignment: Ints, power: int, limit: float = np.inf
+    ) -> None:
         self.problem, self.power, self.limit = problem, power, limit
         self.assignment = assignment.copy()
         self.sums = problem.parts(assignment).T.copy()  # (C, P)
         self.groups = problem.present(assignment).T.copy()
-        self.rows, self.gone, self.high = self._rows(self.sums, self.groups, np.arange(len(problem.target)))
+        self.rows, self.gone, self.high = self._rows(
+            self.sums, self.groups, np.arange(len(problem.target))
+        )
 
     def _rows(self, sums: Ints, groups: Ints, parts: Ints) -> tuple[Floats, Ints, Floats]:
         """Cost without missing columns, their number, and largest deviation of parts: ``sums``, ``groups`` (C, ...), ``parts`` (...) their numbers."""
@@ -124,21 +130,32 @@ class Search:
             self.groups[:, part] += sign * self.problem.has[g]
         self.assignment[g] = there
         both = np.array([here, there])
-        self.rows[both], self.gone[both], self.high[both] = self._rows(self.sums[:, both], self.groups[:, both], both)
+        self.rows[both], self.gone[both], self.high[both] = self._rows(
+            self.sums[:, both], self.groups[:, both], both
+        )
 
     def _change(self, cost: Floats, gone: Ints, high: Floats) -> Floats:
         """The change of C_q, infinite where it is not allowed or too small to be more than rounding."""
         change = cost + MISSING_COST * gone
-        helps = (high <= max(self.limit, float(self.high.max()))) & (change < -LEAST_GAIN * float(self.rows.sum()))
+        helps = (high <= max(self.limit, float(self.high.max()))) & (
+            change < -LEAST_GAIN * float(self.rows.sum())
+        )
         return np.where(helps, change, np.inf)
 
     def move(self, batch: Ints) -> bool:
         """The best move of one of these groups to another part, if it helps."""
         here, every = self.assignment[batch], np.arange(len(self.problem.target))
         counts, has = self.problem.counts[batch].T, self.problem.has[batch].T.astype(np.int64)
-        left, left_gone, left_high = self._rows(self.sums[:, here] - counts, self.groups[:, here] - has, here)
-        sums, groups = self.sums[:, None, :] + counts[:, :, None], self.groups[:, None, :] + has[:, :, None]
-        new, new_gone, new_high = self._rows(sums, groups, np.broadcast_to(every, (len(batch), len(every))))
+        left, left_gone, left_high = self._rows(
+            self.sums[:, here] - counts, self.groups[:, here] - has, here
+        )
+        sums, groups = (
+            self.sums[:, None, :] + counts[:, :, None],
+            self.groups[:, None, :] + has[:, :, None],
+        )
+        new, new_gone, new_high = self._rows(
+            sums, groups, np.broadcast_to(every, (len(batch), len(every)))
+        )
         change = self._change(
             (left - self.rows[here])[:, None] + (new - self.rows),
             (left_gone - self.gone[here])[:, None] + (new_gone - self.gone),

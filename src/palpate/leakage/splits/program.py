@@ -44,7 +44,13 @@ class Program:
         missing: presence constraints that may be given up: 0 for none, None for any number.
     """
 
-    def __init__(self, problem: Problem, assignment: Ints | None = None, free: Ints | None = None, missing: int | None = 0) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        assignment: Ints | None = None,
+        free: Ints | None = None,
+        missing: int | None = 0,
+    ) -> None:
         self.problem = problem
         groups, parts = len(problem.counts), len(problem.target)
         self.free: Ints = np.arange(groups) if free is None else free
@@ -53,7 +59,10 @@ class Program:
         fixed[self.free] = False
         self.binaries = len(self.free) * parts
         self.t = self.binaries
-        base, there = np.zeros((parts, problem.counts.shape[1])), np.zeros((parts, problem.counts.shape[1]), np.int64)
+        base, there = (
+            np.zeros((parts, problem.counts.shape[1])),
+            np.zeros((parts, problem.counts.shape[1]), np.int64),
+        )
         np.add.at(base, self.assignment[fixed], problem.share[fixed])
         np.add.at(there, self.assignment[fixed], problem.has[fixed])
 
@@ -61,8 +70,12 @@ class Program:
         shares = sparse.kron(sparse.csr_matrix(problem.share[np.ix_(self.free, used)].T), eye)
         minus = sparse.csr_matrix(-np.ones((int(used.sum()) * parts, 1)))
         wanted: Any = (problem.target[:, None] - base[:, used]).T.ravel()
-        every: Any = sparse.kron(sparse.csr_matrix(problem.has[np.ix_(self.free, problem.possible)].T.astype(float)), eye)
-        presence: Any = sparse.csr_matrix(every)[np.flatnonzero((there[:, problem.possible] == 0).T.ravel())]
+        every: Any = sparse.kron(
+            sparse.csr_matrix(problem.has[np.ix_(self.free, problem.possible)].T.astype(float)), eye
+        )
+        presence: Any = sparse.csr_matrix(every)[
+            np.flatnonzero((there[:, problem.possible] == 0).T.ravel())
+        ]
         self.slacks = 0 if missing == 0 else presence.shape[0]
         self.size = self.binaries + 1 + self.slacks
         one = sparse.kron(sparse.identity(len(self.free)), np.ones((1, parts)))
@@ -87,7 +100,7 @@ class Program:
         return sparse.hstack(blocks).tocsr()
 
     def smallest(self, low: float, high: float, nodes: int, *, symmetric: bool = False) -> Answer:
-        """Minimises t within [low, high]; ``symmetric`` breaks the symmetry of parts of equal share (all groups free only)."""
+        """Minimizes t within [low, high]; ``symmetric`` breaks the symmetry of parts of equal share (all groups free only)."""
         objective = np.zeros(self.size)
         objective[self.t] = 1
         most = self._ones(high)
@@ -98,7 +111,9 @@ class Program:
     def nearest(self, start: Ints, cost: Floats, high: float, nodes: int, within: float) -> Answer:
         """Moves groups away from ``start`` at the least cost (G,) such that t <= ``high``; stops ``within`` a relative gap of the least."""
         objective = np.zeros(self.size)
-        objective[: self.binaries] = np.repeat(cost[self.free] / cost[self.free].sum(), len(self.problem.target))
+        objective[: self.binaries] = np.repeat(
+            cost[self.free] / cost[self.free].sum(), len(self.problem.target)
+        )
         objective[np.arange(len(self.free)) * len(self.problem.target) + start[self.free]] = 0
         return self._solve(objective, 0.0, self._ones(high), nodes, within)
 
@@ -125,7 +140,9 @@ class Program:
                 zero += [int(g) * parts + int(p) for p in same[k + 1 :]]
         return np.array(zero, np.int64)
 
-    def _solve(self, objective: Floats, low: float, most: Floats, nodes: int, within: float = 0.0) -> Answer:
+    def _solve(
+        self, objective: Floats, low: float, most: Floats, nodes: int, within: float = 0.0
+    ) -> Answer:
         least: Any = np.zeros(self.size)
         bounds: Any = most
         integral = np.ones(self.size)

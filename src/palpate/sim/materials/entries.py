@@ -38,7 +38,11 @@ def bad_entries(names: tuple[str, ...]) -> Iterator[PalpateError]:
             must = "The name of a material must be made of letters, digits, _ ( ) - and spaces between them"
             yield PalpateError(must, ascii(name), "Enter it in MATERIALS under another name")
         elif problem := _wrong(MATERIALS[name]):
-            yield PalpateError(f"The material {name!r} must have {problem[0]}", problem[1], f"Mend MATERIALS[{name!r}]")
+            yield PalpateError(
+                f"The material {name!r} must have {problem[0]}",
+                problem[1],
+                f"Mend MATERIALS[{name!r}]",
+            )
         else:
             yield from _shared(name)
 
@@ -48,7 +52,10 @@ def _wrong(entry: Any) -> tuple[str, str] | None:
     if not isinstance(entry, Material):
         return "a Material as its entry", type(entry).__name__
     if type(entry.label) is not int or not 0 <= entry.label < 2**31:
-        return "a whole number from 0 to 2147483647 as its label", f"{type(entry.label).__name__} {str(entry.label)[:40]}"
+        return (
+            "a whole number from 0 to 2147483647 as its label",
+            f"{type(entry.label).__name__} {str(entry.label)[:40]}",
+        )
     if not is_line(entry.noun):
         return "a noun of one line", ascii(entry.noun)
     if not isinstance(entry.subtypes, tuple) or not all(is_line(kind) for kind in entry.subtypes):  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -63,17 +70,30 @@ def _shared(name: str) -> Iterator[PalpateError]:
             continue
         if isinstance(entry, Material) and entry.label == MATERIALS[name].label:  # pyright: ignore[reportUnnecessaryIsInstance]
             got = f"label {entry.label} of {name!r} and {other!r}"
-            yield PalpateError("Every material must have a label of its own", got, "Give the added one a label from 20")
+            yield PalpateError(
+                "Every material must have a label of its own",
+                got,
+                "Give the added one a label from 20",
+            )
         if isinstance(other, str) and object_prefix(other) == object_prefix(name):  # pyright: ignore[reportUnnecessaryIsInstance]
             got = f"{object_prefix(name)!r} of {name!r} and {other!r}"
-            yield PalpateError("The objects of every material must have names of their own", got, "Give the added one another name")
+            yield PalpateError(
+                "The objects of every material must have names of their own",
+                got,
+                "Give the added one another name",
+            )
 
 
 def added_materials(names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """Of the materials that are not built in: name -> label, noun, subtypes and the SHA-256 of the function, see the module's text."""
     used = {name: MATERIALS[name] for name in names if BUILT_IN.get(name) != MATERIALS[name]}
     return {
-        name: {"label": m.label, "noun": m.noun, "subtypes": list(m.subtypes), "function": digest_json(_code_of(m.draw, set()))}
+        name: {
+            "label": m.label,
+            "noun": m.noun,
+            "subtypes": list(m.subtypes),
+            "function": digest_json(_code_of(m.draw, set())),
+        }
         for name, m in used.items()
     }
 
@@ -84,28 +104,55 @@ def _code_of(function: Any, seen: set[int]) -> Any:
         return "above"
     seen.add(id(function))
     if isinstance(function, functools.partial):
-        return [_code_of(function.func, seen), [_value(v, seen) for v in function.args], _values(function.keywords, seen)]
+        return [
+            _code_of(function.func, seen),
+            [_value(v, seen) for v in function.args],
+            _values(function.keywords, seen),
+        ]
     if isinstance(function, types.MethodType):
         return [_code_of(function.__func__, seen), _value(function.__self__, seen)]
     if not isinstance(function, types.FunctionType):  # an object that can be called
-        return [_source(type(function)), _code_of(type(function).__call__, seen), _values(getattr(function, "__dict__", {}), seen)]
+        return [
+            _source(type(function)),
+            _code_of(type(function).__call__, seen),
+            _values(getattr(function, "__dict__", {}), seen),
+        ]
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    used = {name: function.__globals__[name] for name in _names(function.__code__) if name in function.__globals__}
+    used = {
+        name: function.__globals__[name]
+        for name in _names(function.__code__)
+        if name in function.__globals__
+    }
     used |= {name: cell.cell_contents for name, cell in cells}
-    own = {k: v for k, v in used.items() if not isinstance(v, types.FunctionType) or v.__module__ == function.__module__}
+    own = {
+        k: v
+        for k, v in used.items()
+        if not isinstance(v, types.FunctionType) or v.__module__ == function.__module__
+    }
     defaults = [_value(v, seen) for v in function.__defaults__ or ()]
-    return [_source(function) or _bytes(function.__code__), defaults, _values(function.__kwdefaults__ or {}, seen), _values(own, seen)]
+    return [
+        _source(function) or _bytes(function.__code__),
+        defaults,
+        _values(function.__kwdefaults__ or {}, seen),
+        _values(own, seen),
+    ]
 
 
 def _source(of: Any) -> str:
     try:
         return inspect.getsource(of)
-    except (OSError, TypeError, SyntaxError):  # typed at a prompt, made by exec, or not written in Python
+    except (
+        OSError,
+        TypeError,
+        SyntaxError,
+    ):  # typed at a prompt, made by exec, or not written in Python
         return ""
 
 
 def _bytes(code: types.CodeType) -> list[Any]:
-    inner = [_bytes(c) if isinstance(c, types.CodeType) else _value(c, set()) for c in code.co_consts]
+    inner = [
+        _bytes(c) if isinstance(c, types.CodeType) else _value(c, set()) for c in code.co_consts
+    ]
     return [code.co_code.hex(), inner, list(code.co_names)]
 
 
@@ -131,4 +178,8 @@ def _value(value: Any, seen: set[int]) -> Any:
         return {repr(k): _value(v, seen) for k, v in value.items()}
     if isinstance(value, np.ndarray) and value.dtype != object:
         return [str(value.dtype), list(value.shape), value.tobytes().hex()]
-    return _code_of(value, seen) if isinstance(value, types.FunctionType | functools.partial) else type(value).__name__
+    return (
+        _code_of(value, seen)
+        if isinstance(value, types.FunctionType | functools.partial)
+        else type(value).__name__
+    )

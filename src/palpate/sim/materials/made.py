@@ -28,7 +28,9 @@ def plastic(tile: Tile, rng: np.random.Generator) -> Surface:
         height = height + tile.cells(rng.uniform(0.9, 1.8)).walls(0.5) * rng.uniform(0.03, 0.07)
         words = ("finely textured", "even", "hard")
     elif kind == "ribbed":
-        height = height + smoothstep(np.sin(tile.wave(rng.uniform(2.5, 7.0), angle)), -0.3, 0.3) * rng.uniform(0.12, 0.3)
+        height = height + smoothstep(
+            np.sin(tile.wave(rng.uniform(2.5, 7.0), angle)), -0.3, 0.3
+        ) * rng.uniform(0.12, 0.3)
         words = ("ribbed", "smooth", "hard")
     elif kind == "dotted":
         step = rng.uniform(3.5, 7.0)
@@ -50,7 +52,9 @@ def glass(tile: Tile, rng: np.random.Generator) -> Surface:
         height = height + tile.noise(0.35, 1.6, 0.8) * rng.uniform(0.012, 0.03)
         words = ("frosted", "faintly rough", "hard")
     elif kind == "fluted":
-        height = height + np.cos(tile.wave(rng.uniform(4.0, 9.0), rng.uniform(0.0, math.pi))) * rng.uniform(0.1, 0.25)
+        height = height + np.cos(
+            tile.wave(rng.uniform(4.0, 9.0), rng.uniform(0.0, math.pi))
+        ) * rng.uniform(0.1, 0.25)
         words = ("fluted", "slick", "hard")
     albedo = tint(colour, 0.75 + 0.16 * tile.noise(18.0, 64.0, 3.0))
     for _ in range(int(rng.integers(1, 4))):
@@ -58,8 +62,13 @@ def glass(tile: Tile, rng: np.random.Generator) -> Surface:
         dy = (tile.y - rng.uniform(0.0, TILE_MM) + half) % TILE_MM - half
         dx = (tile.x - rng.uniform(0.0, TILE_MM) + half) % TILE_MM - half
         c, s = math.cos(angle), math.sin(angle)
-        reach = np.maximum(np.abs(c * dx + s * dy) * (1 / rng.uniform(3.0, 12.0)), np.abs(c * dy - s * dx) * (1 / rng.uniform(5.0, 16.0)))
-        albedo = blend(albedo, f32([0.93, 0.96, 1.0]), smoothstep(reach, 1.08, 0.95) * rng.uniform(0.25, 0.7))
+        reach = np.maximum(
+            np.abs(c * dx + s * dy) * (1 / rng.uniform(3.0, 12.0)),
+            np.abs(c * dy - s * dx) * (1 / rng.uniform(5.0, 16.0)),
+        )
+        albedo = blend(
+            albedo, f32([0.93, 0.96, 1.0]), smoothstep(reach, 1.08, 0.95) * rng.uniform(0.25, 0.7)
+        )
     dust = f32(tile.noise(0.2, 0.8, 0.0) > 3.0)
     return Surface(height, blend(albedo, f32([0.9, 0.9, 0.9]), dust), kind, words, gloss=1.0)
 
@@ -87,13 +96,23 @@ def metal(tile: Tile, rng: np.random.Generator) -> Surface:
     albedo = plain(tile, colour)
     if kind == "brushed":
         lines = tile.noise(0.2, 1.6, 0.7, 60.0, angle)
-        height, albedo = height + lines * rng.uniform(0.006, 0.016), tint(albedo, 1.0 + 0.10 * lines)
+        height, albedo = (
+            height + lines * rng.uniform(0.006, 0.016),
+            tint(albedo, 1.0 + 0.10 * lines),
+        )
         words = ("brushed", "fine-lined", "cold", "hard")
     elif kind == "tread plate":
-        height, words = height + _tread(tile, rng) * rng.uniform(0.35, 0.5), ("studded", "diamond-plated", "cold", "hard")
+        height, words = (
+            height + _tread(tile, rng) * rng.uniform(0.35, 0.5),
+            ("studded", "diamond-plated", "cold", "hard"),
+        )
     elif kind == "perforated":
         step = rng.uniform(4.5, 7.0)
-        hole = smoothstep(np.cos(tile.wave(step, angle)) + np.cos(tile.wave(step, angle + math.pi / 2.0)), 0.7, 1.0)
+        hole = smoothstep(
+            np.cos(tile.wave(step, angle)) + np.cos(tile.wave(step, angle + math.pi / 2.0)),
+            0.7,
+            1.0,
+        )
         height, albedo = height - hole * 0.9, tint(albedo, 1.0 - 0.8 * hole)
         words = ("perforated", "smooth", "cold", "hard")
     elif kind == "rusted":
@@ -105,7 +124,13 @@ def metal(tile: Tile, rng: np.random.Generator) -> Surface:
         scratch = tile.strokes(30, 25.0, 0.6, angle, 0.8, 0.09, 0.1)
         height, albedo = height - scratch, tint(albedo, 1.0 - 2.5 * scratch)
         words = ("scratched", "smooth", "cold", "hard")
-    return Surface(height, albedo, kind, words, gloss=rng.uniform(0.5, 0.95) * (0.4 if kind == "rusted" else 1.0))
+    return Surface(
+        height,
+        albedo,
+        kind,
+        words,
+        gloss=rng.uniform(0.5, 0.95) * (0.4 if kind == "rusted" else 1.0),
+    )
 
 
 def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -127,7 +152,14 @@ def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
         height, first = tile.grains(rng.uniform(1.5, 3.0))[0] * 0.2, "granular"
     height = height + tile.noise(0.3, 2.0, 1.0) * 0.008
     albedo = tint(colour, 0.75 + 0.25 * _rising(height))
-    return Surface(height, albedo, kind, (first, "grippy", "elastic"), gloss=rng.uniform(0.05, 0.25), softness=0.45)
+    return Surface(
+        height,
+        albedo,
+        kind,
+        (first, "grippy", "elastic"),
+        gloss=rng.uniform(0.05, 0.25),
+        softness=0.45,
+    )
 
 
 def paper(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -148,7 +180,9 @@ def paper(tile: Tile, rng: np.random.Generator) -> Surface:
     albedo = tint(colour, 1.0 + 0.03 * fibre)
     if flip(rng, 0.5):
         line = smoothstep(np.sin(tile.wave(rng.uniform(3.0, 6.0), math.pi / 2.0)), 0.2, 0.4)
-        albedo = blend(albedo, f32([0.1, 0.1, 0.15]), line * (tile.noise(0.6, 3.0, 0.5, 3.0) > 0) * 0.85)
+        albedo = blend(
+            albedo, f32([0.1, 0.1, 0.15]), line * (tile.noise(0.6, 3.0, 0.5, 3.0) > 0) * 0.85
+        )
     return Surface(height, albedo, kind, words, gloss=0.05, softness=0.3)
 
 
@@ -173,4 +207,6 @@ def other(tile: Tile, rng: np.random.Generator) -> Surface:
         height = strand * 0.8 + 0.25 * np.sin(tile.wave(rng.uniform(2.0, 3.0), angle + 0.9))
         words, noun = ("corded", "twisted", "unusual"), "a rope"
     albedo = tint(colour, 0.55 + 0.45 * _rising(height))
-    return Surface(height + tile.noise(0.5, 4.0) * 0.02, albedo, kind, words, rng.uniform(0.05, 0.4), 0.4, noun)
+    return Surface(
+        height + tile.noise(0.5, 4.0) * 0.02, albedo, kind, words, rng.uniform(0.05, 0.4), 0.4, noun
+    )

@@ -33,7 +33,13 @@ def concrete(tile: Tile, rng: np.random.Generator) -> Surface:
         height = height * 0.5 + lines * rng.uniform(0.1, 0.2)
         factor = 1.0 + 0.05 * lines
         words = ("scored", "rough", "hard")
-    return Surface(height, tint(base, factor * (1.0 + 0.07 * tile.noise(0.3, 20.0, 1.6))), kind, words, gloss=0.03)
+    return Surface(
+        height,
+        tint(base, factor * (1.0 + 0.07 * tile.noise(0.3, 20.0, 1.6))),
+        kind,
+        words,
+        gloss=0.03,
+    )
 
 
 def brick(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -49,14 +55,19 @@ def brick(tile: Tile, rng: np.random.Generator) -> Surface:
         course, length = TILE_MM / 4.0, TILE_MM / 2.0
         y = tile.y % course
         x = (tile.x + np.floor(tile.y / course) % 2.0 * (length / 2.0)) % length
-        edge = np.minimum(np.minimum(y, course - y), np.minimum(x, length - x)) + tile.noise(2.0, 10.0) * 0.2
+        edge = (
+            np.minimum(np.minimum(y, course - y), np.minimum(x, length - x))
+            + tile.noise(2.0, 10.0) * 0.2
+        )
         solid = smoothstep(edge, 0.9, 2.4)
         words = ("jointed", "gritty", "hard")
     elif kind == "wire-cut":
         cuts = tile.noise(0.5, 5.0, 1.0, 20.0, pick_angle(rng))
         relief = relief + cuts * rng.uniform(0.08, 0.16)
         words = ("scraped", "gritty", "hard")
-    height = solid * (rng.uniform(0.8, 1.6) + relief) + (1.0 - solid) * tile.noise(0.3, 1.5, 0.8) * 0.12
+    height = (
+        solid * (rng.uniform(0.8, 1.6) + relief) + (1.0 - solid) * tile.noise(0.3, 1.5, 0.8) * 0.12
+    )
     tone = (1.0 + 0.16 * tile.noise(1.0, 20.0)) * (1.0 + 0.10 * grit) * (1.0 - 0.25 * pits)
     joint = tint(mortar, 1.0 + 0.06 * tile.noise(0.3, 2.0))
     return Surface(height, blend(joint, tint(clay, tone), solid), kind, words, gloss=0.02)
@@ -84,10 +95,14 @@ def ceramic_tile(tile: Tile, rng: np.random.Generator) -> Surface:
     elif kind == "mosaic":
         words = ("slick", "smooth", "densely jointed")
     marble = tile.ridged(1.0, 25.0, 2.4) * (0.0, 0.06, 0.12)[int(rng.integers(3))]
-    height = body * (rng.uniform(0.4, 0.9) + relief) + (1.0 - body) * tile.noise(0.3, 1.2, 0.6) * 0.05
+    height = (
+        body * (rng.uniform(0.4, 0.9) + relief) + (1.0 - body) * tile.noise(0.3, 1.2, 0.6) * 0.05
+    )
     grout = f32([0.6, 0.59, 0.57]) * rng.uniform(0.5, 1.3)
     gloss = rng.uniform(0.1, 0.3) if kind == "textured" else rng.uniform(0.4, 0.9)
-    return Surface(height, blend(grout, tint(colour, shade + marble), body), kind, words, gloss=gloss)
+    return Surface(
+        height, blend(grout, tint(colour, shade + marble), body), kind, words, gloss=gloss
+    )
 
 
 def rock(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -117,7 +132,9 @@ def gravel(tile: Tile, rng: np.random.Generator) -> Surface:
     size = rng.uniform(5.0, 11.0)
     stones, cells = tile.grains(size, 0.35, edge=0.75 if kind == "rounded" else 0.35)
     base = hsv(rng.uniform(0.03, 0.62), rng.uniform(0.02, 0.2), rng.uniform(0.4, 0.7))
-    colours = f32(base * rng.uniform(0.55, 1.4, (cells.count, 1)) * rng.uniform(0.9, 1.1, (cells.count, 3)))
+    colours = f32(
+        base * rng.uniform(0.55, 1.4, (cells.count, 1)) * rng.uniform(0.9, 1.1, (cells.count, 3))
+    )
     height = stones * (size * 0.28)
     if kind == "crushed":
         height = height + tile.ridged(0.8, 8.0, 1.8) * 0.12
@@ -125,7 +142,9 @@ def gravel(tile: Tile, rng: np.random.Generator) -> Surface:
     else:
         height = height + tile.noise(0.4, 3.0, 1.2) * 0.04
         words = ("pebbly", "lumpy", "hard")
-    albedo = tint(colours[cells.index], (1.0 + 0.1 * tile.noise(0.3, 3.0)) * smoothstep(stones, -0.05, 0.5))
+    albedo = tint(
+        colours[cells.index], (1.0 + 0.1 * tile.noise(0.3, 3.0)) * smoothstep(stones, -0.05, 0.5)
+    )
     return Surface(height, albedo, kind, words, gloss=0.05, softness=0.1)
 
 
@@ -135,25 +154,44 @@ def sand(tile: Tile, rng: np.random.Generator) -> Surface:
     size = rng.uniform(0.6, 1.1)
     fine, cells = tile.grains(size, 0.5)
     coarse, _ = tile.grains(size * 1.8, 0.6, 0.25)
-    height = fine * (size * 0.45) + coarse * (size * 0.5) + tile.noise(3.0, 25.0, 2.4) * rng.uniform(0.05, 0.2)
+    height = (
+        fine * (size * 0.45)
+        + coarse * (size * 0.5)
+        + tile.noise(3.0, 25.0, 2.4) * rng.uniform(0.05, 0.2)
+    )
     softness, words = 0.4, ("granular", "fine-grained", "loose")
     if kind == "rippled":
-        height = height * 0.8 + np.sin(tile.wave(rng.uniform(10.0, 20.0), rng.uniform(0.0, math.pi), 0.5)) * rng.uniform(0.5, 0.8)
+        height = height * 0.8 + np.sin(
+            tile.wave(rng.uniform(10.0, 20.0), rng.uniform(0.0, math.pi), 0.5)
+        ) * rng.uniform(0.5, 0.8)
         words = ("granular", "rippled", "loose")
     elif kind == "packed":
         height, softness, words = height * 0.5, 0.15, ("granular", "fine-grained", "firm")
     colour = hsv(rng.uniform(0.07, 0.13), rng.uniform(0.15, 0.45), rng.uniform(0.55, 0.9))
     speckle = np.clip(cells.each(rng, 1.0, 0.25), 0.4, 1.6)
-    return Surface(height, tint(colour, speckle * (1.0 + 0.05 * tile.noise(3.0, 30.0))), kind, words, gloss=0.03, softness=softness)
+    return Surface(
+        height,
+        tint(colour, speckle * (1.0 + 0.05 * tile.noise(3.0, 30.0))),
+        kind,
+        words,
+        gloss=0.03,
+        softness=softness,
+    )
 
 
 def soil(tile: Tile, rng: np.random.Generator) -> Surface:
     """Crumbs, clods, or soil with plant litter."""
     kind = pick(rng, "crumbs", "clods", "litter")
     colour = hsv(rng.uniform(0.04, 0.1), rng.uniform(0.3, 0.6), rng.uniform(0.15, 0.45))
-    clods, _ = tile.grains(rng.uniform(4.0, 7.0) if kind == "clods" else rng.uniform(2.2, 3.5), 0.6, 0.6)
+    clods, _ = tile.grains(
+        rng.uniform(4.0, 7.0) if kind == "clods" else rng.uniform(2.2, 3.5), 0.6, 0.6
+    )
     crumbs, _ = tile.grains(rng.uniform(0.8, 1.6), 0.5)
-    height = tile.noise(0.5, 9.0, 2.0) * rng.uniform(0.2, 0.4) + clods * rng.uniform(0.3, 0.7) + crumbs * 0.2
+    height = (
+        tile.noise(0.5, 9.0, 2.0) * rng.uniform(0.2, 0.4)
+        + clods * rng.uniform(0.3, 0.7)
+        + crumbs * 0.2
+    )
     tone = (1.0 + 0.22 * tile.noise(0.3, 6.0, 1.2)) * (0.75 + 0.25 * np.clip(clods, 0.0, 1.0))
     albedo = tint(colour, tone)
     words = {

@@ -28,7 +28,9 @@ def leather(tile: Tile, rng: np.random.Generator) -> Surface:
     words: tuple[str, ...] = ("supple", "fine-grained" if kind == "fine" else "pebbled", "soft")
     if kind == "stitched":
         line, _ = tile.lines(16.0, 0.0)
-        stitch = smoothstep(line, 0.8, 0.3) * smoothstep(np.sin(tile.wave(2.6, math.pi / 2.0)), -0.3, 0.2)
+        stitch = smoothstep(line, 0.8, 0.3) * smoothstep(
+            np.sin(tile.wave(2.6, math.pi / 2.0)), -0.3, 0.2
+        )
         height, albedo = height + stitch * 0.3, blend(albedo, hsv(0.12, 0.2, 0.85), stitch)
         words = ("supple", "stitched", "soft")
     return Surface(height, albedo, kind, words, gloss=rng.uniform(0.15, 0.45), softness=0.35)
@@ -56,15 +58,27 @@ def _weave(tile: Tile, rng: np.random.Generator, kind: str, step: float, wobble:
 def synthetic_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
     """Twill, knit, mesh, rib, or plain weave of fine even threads; a third of them striped, which nobody can feel."""
     kind = pick(rng, "twill", "knit", "mesh", "rib", "plain")
-    relief = _weave(tile, rng, kind, rng.uniform(1.8, 3.6) if kind == "mesh" else rng.uniform(1.0, 2.2), 1.0)
+    relief = _weave(
+        tile, rng, kind, rng.uniform(1.8, 3.6) if kind == "mesh" else rng.uniform(1.0, 2.2), 1.0
+    )
     height = relief * rng.uniform(0.12, 0.28) + tile.noise(6.0, 30.0, 3.0) * 0.12
     tone = 0.55 + 0.45 * np.clip(relief * (1.0 / float(relief.max())), 0.0, 1.0)
     albedo = tint(hsv(rng.random(), rng.uniform(0.1, 1.0), rng.uniform(0.15, 0.9)), tone)
     if flip(rng, 0.35):
-        stripe = smoothstep(np.sin(tile.wave(rng.uniform(8.0, 20.0), rng.uniform(0.0, math.pi))), -0.1, 0.1)
+        stripe = smoothstep(
+            np.sin(tile.wave(rng.uniform(8.0, 20.0), rng.uniform(0.0, math.pi))), -0.1, 0.1
+        )
         albedo = blend(albedo, tint(hsv(rng.random(), 0.7, 0.7), tone), stripe)
-    first = {"twill": "woven", "plain": "woven", "knit": "knitted", "mesh": "meshed", "rib": "ribbed"}[kind]
-    return Surface(height, albedo, kind, (first, "fine", "soft"), gloss=rng.uniform(0.1, 0.35), softness=0.6)
+    first = {
+        "twill": "woven",
+        "plain": "woven",
+        "knit": "knitted",
+        "mesh": "meshed",
+        "rib": "ribbed",
+    }[kind]
+    return Surface(
+        height, albedo, kind, (first, "fine", "soft"), gloss=rng.uniform(0.1, 0.35), softness=0.6
+    )
 
 
 def natural_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
@@ -72,7 +86,11 @@ def natural_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
     kind = pick(rng, "plain", "plain", "knit", "rib")
     relief = _weave(tile, rng, kind, rng.uniform(1.8, 4.2), 2.5)
     fuzz = tile.strokes(260, 5.0, 0.3, 0.0, 3.0, 0.16)
-    height = relief * rng.uniform(0.2, 0.45) + fuzz * rng.uniform(0.3, 1.0) + tile.noise(5.0, 30.0, 3.0) * 0.15
+    height = (
+        relief * rng.uniform(0.2, 0.45)
+        + fuzz * rng.uniform(0.3, 1.0)
+        + tile.noise(5.0, 30.0, 3.0) * 0.15
+    )
     if flip(rng, 0.6):
         colour = hsv(rng.uniform(0.06, 0.14), rng.uniform(0.05, 0.4), rng.uniform(0.45, 0.95))
     else:

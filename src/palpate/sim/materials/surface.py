@@ -95,20 +95,46 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
     except PalpateError:
         raise
     except Exception as error:  # whatever a user's function raises
-        raise PalpateError(f"The material {name!r} must draw a piece without an error", _told(error), fix) from error
+        raise PalpateError(
+            f"The material {name!r} must draw a piece without an error", _told(error), fix
+        ) from error
     if not isinstance(surface, Surface):  # pyright: ignore[reportUnnecessaryIsInstance] - the function may be a user's
-        raise PalpateError(f"The material {name!r} must return a Surface", type(surface).__name__, fix)
-    height = _field(name, fix, "a height", surface.height, (n, n), (-HIGHEST_MM, HIGHEST_MM), f"-{HIGHEST_MM:g} to {HIGHEST_MM:g} mm")
+        raise PalpateError(
+            f"The material {name!r} must return a Surface", type(surface).__name__, fix
+        )
+    height = _field(
+        name,
+        fix,
+        "a height",
+        surface.height,
+        (n, n),
+        (-HIGHEST_MM, HIGHEST_MM),
+        f"-{HIGHEST_MM:g} to {HIGHEST_MM:g} mm",
+    )
     albedo = _field(name, fix, "an albedo", surface.albedo, (n, n, 3), ALBEDO, "0 to 1")
-    if material.subtypes and (not isinstance(surface.subtype, str) or surface.subtype not in material.subtypes):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise PalpateError(f"The material {name!r} must draw one of its subtypes {material.subtypes}", ascii(surface.subtype), fix)
+    if material.subtypes and (
+        not isinstance(surface.subtype, str) or surface.subtype not in material.subtypes
+    ):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise PalpateError(
+            f"The material {name!r} must draw one of its subtypes {material.subtypes}",
+            ascii(surface.subtype),
+            fix,
+        )
     words = _words(name, fix, surface.words)
-    gloss, softness = (_share(name, fix, what, getattr(surface, what)) for what in ("gloss", "softness"))
+    gloss, softness = (
+        _share(name, fix, what, getattr(surface, what)) for what in ("gloss", "softness")
+    )
     if not isinstance(surface.noun, str) or (surface.noun and not is_line(surface.noun)):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise PalpateError(f"The material {name!r} must have a noun of one line, or '' for its own", ascii(surface.noun), fix)
+        raise PalpateError(
+            f"The material {name!r} must have a noun of one line, or '' for its own",
+            ascii(surface.noun),
+            fix,
+        )
     height = np.ascontiguousarray(height - float(np.median(height)))
     albedo = np.ascontiguousarray(np.clip(albedo, 0.01, 1.0))
-    return Surface(height, albedo, surface.subtype, words, gloss, softness, surface.noun or material.noun)
+    return Surface(
+        height, albedo, surface.subtype, words, gloss, softness, surface.noun or material.noun
+    )
 
 
 def is_line(value: object) -> bool:
@@ -122,7 +148,15 @@ def _told(error: Exception) -> str:
     return f"{type(error).__name__}: {said}" if said else type(error).__name__
 
 
-def _field(name: str, fix: str, what: str, given: object, shape: tuple[int, ...], bounds: tuple[float, float], wanted: str) -> Array:
+def _field(
+    name: str,
+    fix: str,
+    what: str,
+    given: object,
+    shape: tuple[int, ...],
+    bounds: tuple[float, float],
+    wanted: str,
+) -> Array:
     """``given`` as float32, if it is real numbers of that shape within ``bounds``."""
     must = f"The material {name!r} must return {what}"
     if isinstance(given, np.ma.MaskedArray):
@@ -139,7 +173,9 @@ def _field(name: str, fix: str, what: str, given: object, shape: tuple[int, ...]
         array = f32(array)
     if bad := int(np.count_nonzero(~np.isfinite(array))):
         finite = what.replace("an ", "a ").replace("a ", "a finite ")
-        raise PalpateError(f"The material {name!r} must return {finite}", f"NaN or infinity in {bad} places", fix)
+        raise PalpateError(
+            f"The material {name!r} must return {finite}", f"NaN or infinity in {bad} places", fix
+        )
     low, high = float(array.min()), float(array.max())
     if low < bounds[0] or high > bounds[1]:
         raise PalpateError(f"{must} of {wanted}", f"{low:g} to {high:g}", fix)
@@ -148,14 +184,24 @@ def _field(name: str, fix: str, what: str, given: object, shape: tuple[int, ...]
 
 def _words(name: str, fix: str, given: object) -> tuple[str, ...]:
     words = tuple(given) if isinstance(given, tuple | list) else ()
-    if not all(map(is_line, words)) or not FEWEST <= len(words) <= MOST or len(set(words)) < len(words):
+    if (
+        not all(map(is_line, words))
+        or not FEWEST <= len(words) <= MOST
+        or len(set(words)) < len(words)
+    ):
         must = f"The material {name!r} must say how it feels in {FEWEST} to {MOST} different words"
         raise PalpateError(must, ascii(given)[:200] if words or given else "no words", fix)
     return words
 
 
 def _share(name: str, fix: str, what: str, given: Any) -> float:
-    number = isinstance(given, int | float | np.integer | np.floating) and not isinstance(given, bool)
+    number = isinstance(given, int | float | np.integer | np.floating) and not isinstance(
+        given, bool
+    )
     if not number or not 0.0 <= given <= 1.0:
-        raise PalpateError(f"The material {name!r} must have gloss and softness in [0, 1]", f"{what} {ascii(given)[:80]}", fix)
+        raise PalpateError(
+            f"The material {name!r} must have gloss and softness in [0, 1]",
+            f"{what} {ascii(given)[:80]}",
+            fix,
+        )
     return float(given)

@@ -1,0 +1,1 @@
+"""Studies: experiments as graphs of stages, each cached by the digest of what it read."""

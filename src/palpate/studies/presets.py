@@ -1,0 +1,109 @@
+"""Presets of the whole pipeline, one row each: worlds, encoders, generator, and what a run costs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from palpate.core import PalpateError
+from palpate.sim import PRESETS as WORLDS
+from palpate.sim import WorldOptions
+
+
+@dataclass(frozen=True)
+class PipelinePreset:
+    """A complete run.
+
+    Attributes:
+        name: for ``--preset``.
+        world: the embedded data set, used where no data is given.
+        pretraining: another world, of other objects, on which encoders and autoencoder are trained where no ready ones are taken.
+        encoder, diffusion: names of the presets of those rooms.
+        models: shipped models that stand for the pretrained ones: the frozen CLIP and autoencoder, and the tactile encoder that training
+            goes on from; None: all are trained in the run.
+        start: whether the generator goes on from that of ``models`` instead of from random weights.
+        train: share of the train part.
+        repeat: the train part's touches are repeated until they are this share of the autoencoder's training set.
+        touch_epochs: passes of the tactile encoder over the pretraining samples, then over the train part (the first are left out where
+            it goes on from a ready one).
+        cost: measured on two CPU cores.
+    """
+
+    name: str
+    world: WorldOptions
+    pretraining: WorldOptions
+    encoder: str
+    diffusion: str
+    models: str | None = None
+    start: bool = False
+    train: float = 0.75
+    repeat: float = 1 / 3
+    touch_epochs: tuple[float, float] = (5, 6)
+    cost: str = ""
+
+
+#: Ten materials that differ in touch: with all twenty, minutes of training leave the encoders close to chance.
+_TEN = (
+    "Wood",
+    "Brick",
+    "Tile",
+    "Leather",
+    "Synthetic Fabric",
+    "Rubber",
+    "Tree",
+    "Grass",
+    "Gravel",
+    "Sand",
+)
+_TINY = replace(WORLDS["tiny"], objects_per_material=4, touches_per_video=2, frames_per_touch=2)
+_MINI = replace(
+    WORLDS["demo"],
+    materials=_TEN,
+    objects_per_material=24,
+    touches_per_video=3,
+    frames_per_touch=2,
+    free_written="background",
+)
+_MINI_BEFORE = replace(WORLDS["pretrain"], materials=_TEN, objects_per_material=40)
+
+
+PRESETS = {
+    p.name: p
+    for p in (
+        #              name    world   pretraining                encoder diffusion
+        PipelinePreset(
+            "tiny",
+            _TINY,
+            replace(_TINY, seed=1000),
+            "tiny",
+            "tiny",
+            train=0.75,
+            cost="for tests: under a minute",
+        ),
+        PipelinePreset(
+            "mini",
+            _MINI,
+            _MINI_BEFORE,
+            "mini",
+            "mini",
+            models="palpate/mini",
+            start=True,
+            train=0.85,
+            cost="about 4 minutes on two x86-64 cores, one of them busy most of the time",
+        ),
+    )
+}
+
+
+def preset(name: str) -> PipelinePreset:
+    """A preset by name.
+
+    Raises:
+        PalpateError: if there is none of that name.
+    """
+    if name not in PRESETS:
+        raise PalpateError(
+            f"A preset of the pipeline must be one of {', '.join(PRESETS)}",
+            repr(name),
+            "Choose one of these",
+        )
+    return PRESETS[name]

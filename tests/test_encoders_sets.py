@@ -1,0 +1,361 @@
+"""Frozen encoders, the small tokenizer and the preprocessing: saved and loaded they give the same embeddings, in transformers' own layout."""
+
+import json
+import types
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from safetensors.torch import load_file, save_file
+from transformers import AutoTokenizer, CLIPModel
+
+from palpate.core import PalpateError
+from palpate.encoders import encoder_set as module
+from palpate.encoders import hub
+from palpate.encoders.contrastive import new_clip
+from palpate.encoders.embed import embed_images, embed_texts
+from palpate.encoders.encoder_set import EncoderSet, load_clip, new_touch, pick_device
+from palpate.encoders.preprocess import (
+    CLIP_MEAN,
+    CLIP_STD,
+    Augment,
+    Preprocess,
+    statistics,
+    to_unit,
+)
+from palpate.encoders.presets import preset
+from palpate.encoders.tokenizer import train_tokenizer
+
+TINY = preset("tiny")
+TEXTS = [
+    "Rough, bumpy bark.",
+    "smooth cold metal",
+    "soft woven fabric",
+    "x",
+    "a very long description of a rough surface " * 5,
+]
+
+
+@pytest.fixture
+def clip():
+    return new_clip(TINY, TEXTS, seed=0)
+
+
+@pytest.fixture
+def encoders(clip):
+    return EncoderSet(
+        clip,
+        new_touch(TINY.touch_config(8), 1).eval(),
+        Preprocess.of_size(16, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4)),
+        {"preset": "tiny"},
+    )
+
+
+def pictures(n=5, side=16):
+    return np.random.default_rng(0).integers(0, 256, (n, side, side, 3), dtype=np.uint8)
+
+
+def test_tokenizer_ids_cut_and_determinism():
+    tokenizer = train_tokenizer(TEXTS, vocabulary=300, context=16)
+    assert (tokenizer.pad_token_id, tokenizer.bos_token_id, tokenizer.eos_token_id) == (0, 1, 3)
+    ids = tokenizer([*TEXTS, "", "ünïcödé 触覚"], padding=True, truncation=True, max_length=16)[
+        "input_ids"
+    ]
+    assert all(row[0] == 1 and row.count(3) == 1 and 2 not in row and len(row) <= 16 for row in ids)
+    assert (
+        ids[1]
+        == tokenizer(["SMOOTH Cold METAL"], padding="max_length", max_length=len(ids[1]))[
+            "input_ids"
+        ][0]
+    )
+    again = train_tokenizer([*reversed(TEXTS), TEXTS[0]], vocabulary=300, context=16)
+    assert (
+        again.backend_tokenizer.to_str()
+        == train_tokenizer(TEXTS, vocabulary=300, context=16).backend_tokenizer.to_str()
+    )
+    for texts, size in (([" "], 300), (["a"], 100)):
+        with pytest.raises(PalpateError):
+            train_tokenizer(texts, vocabulary=size)
+
+
+def test_text_is_pooled_at_the_first_end_token(clip):
+    tokens = clip.tokens(TEXTS)
+    states = clip.model.text_model(**tokens).last_hidden_state
+    for k, row in enumerate(tokens["input_ids"].tolist()):
+        at = row.index(clip.tokenizer.eos_token_id)
+        expect = torch.nn.functional.normalize(clip.model.text_projection(states[k, at]), dim=-1)
+        assert torch.allclose(clip.encode_text(TEXTS)[k], expect, atol=1e-6)
+
+
+def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
+    clip.save(tmp_path / "clip")
+    plain = CLIPModel.from_pretrained(tmp_path / "clip").eval()
+    tokenizer = AutoTokenizer.from_pretrained(tmp_path / "clip")
+    pixels = clip.preprocess.normalize(to_unit(pictures()))
+    tokens = tokenizer(TEXTS, padding=True, truncation=True, max_length=16, return_tensors="pt")
+    with torch.no_grad():
+        out = plain(
+            input_ids=tokens["input_ids"],
+            attention_mask=tokens["attention_mask"],
+            pixel_values=pixels,
+        )
+    assert torch.equal(out.image_embeds, clip.encode_vision(pixels))
+    assert torch.allclose(out.text_embeds, clip.encode_text(TEXTS), atol=1e-6)
+    again = load_clip(tmp_path / "clip")
+    assert (again.preprocess, again.name, again.dim) == (clip.preprocess, "tiny", 8)
+    assert [again.digest(t) for t in ("vision", "text")] == [
+        clip.digest(t) for t in ("vision", "text")
+    ]
+    assert (
+        json.loads((tmp_path / "clip" / "tokenizer_config.json").read_text())["tokenizer_class"]
+        == "PreTrainedTokenizerFast"
+    )
+
+
+def test_tensor_of_transformers_4_and_output_of_5_are_both_read(clip):
+    pixels = torch.zeros(2, 3, 16, 16)
+    expect = clip.encode_vision(pixels)
+    raw = clip.model.visual_projection(clip.model.vision_model(pixel_values=pixels).pooler_output)
+    for output in (raw, types.SimpleNamespace(pooler_output=raw)):
+        clip.model.get_image_features = lambda pixel_values, output=output: output
+        assert torch.allclose(clip.encode_vision(pixels), expect, atol=1e-6)
+
+
+def test_encoders_survive_a_folder(encoders, tmp_path):
+    encoders.save(tmp_path / "set")
+    again = EncoderSet.load(tmp_path / "set")
+    assert again.card == {"preset": "tiny"}
+    assert again.touch_preprocess == encoders.touch_preprocess
+    for encoder in ("vision", "tactile"):
+        assert np.array_equal(
+            embed_images(pictures(), again, encoder), embed_images(pictures(), encoders, encoder)
+        )
+    assert np.array_equal(embed_texts(TEXTS, again), embed_texts(TEXTS, encoders))
+    assert not [p for p in (tmp_path / "set").rglob("*") if p.suffix in (".bin", ".pt", ".pkl")]
+    with pytest.raises(PalpateError, match="empty folder"):
+        encoders.save(tmp_path / "set")
+    EncoderSet(encoders.clip).save(tmp_path / "two")
+    assert EncoderSet.load(tmp_path / "two").touch is None
+
+
+def test_digest_changes_with_one_weight_and_with_preprocessing(encoders):
+    before = {t: encoders.digest(t) for t in ("vision", "text", "tactile")}
+    assert len(set(before.values())) == 3
+    with torch.no_grad():
+        encoders.touch.visual_projection.weight[0, 0] += 1e-6
+    assert encoders.digest("tactile") != before["tactile"]
+    assert (encoders.digest("vision"), encoders.digest("text")) == (
+        before["vision"],
+        before["text"],
+    )
+    with torch.no_grad():
+        encoders.clip.model.text_model.embeddings.token_embedding.weight[5, 0] += 1e-6
+    assert encoders.digest("text") != before["text"]
+    encoders.clip.preprocess = Preprocess.of_size(16)
+    now = encoders.digest("vision")
+    encoders.clip.preprocess = Preprocess.of_size(16, (0.0, 0.0, 0.0))
+    assert encoders.digest("vision") != now
+
+
+def test_digest_does_not_depend_on_earlier_calls(clip):
+    before = clip.digest("text")
+    clip.encode_text(["a", "a much longer text"])
+    assert clip.digest("text") == before
+
+
+def test_changed_weights_on_disk_are_noticed(encoders, tmp_path):
+    encoders.save(tmp_path / "set")
+    file = tmp_path / "set" / "tactile" / "model.safetensors"
+    tensors = load_file(file)
+    tensors["visual_projection.weight"][0, 0] += 0.5
+    save_file(tensors, file, metadata={"format": "pt"})
+    with pytest.raises(PalpateError, match=r"tactile encoder .* digest"):
+        EncoderSet.load(tmp_path / "set")
+
+
+def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
+    clip.save(tmp_path / "clip")
+    (tmp_path / "clip" / "preprocessor_config.json").unlink()
+    with pytest.raises(
+        PalpateError,
+        match=r"must hold config\.json, model\.safetensors.*no preprocessor_config\.json",
+    ):
+        load_clip(tmp_path / "clip")
+    clip.save(tmp_path / "cut")
+    weights = tmp_path / "cut" / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:100])
+    with pytest.raises(PalpateError, match="must be a CLIP model"):
+        load_clip(tmp_path / "cut")
+    clip.save(tmp_path / "hole")
+    tensors = load_file(tmp_path / "hole" / "model.safetensors")
+    del tensors["visual_projection.weight"]
+    save_file(tensors, tmp_path / "hole" / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(PalpateError, match="1 weights are missing, first visual_projection"):
+        load_clip(tmp_path / "hole")
+    (tmp_path / "cut" / "palpate.json").write_text("{}")
+    with pytest.raises(PalpateError, match="palpate-encoders"):
+        EncoderSet.load(tmp_path / "cut")
+    with pytest.raises(PalpateError, match="must exist"):
+        EncoderSet.load(tmp_path / "nothing")
+
+    def unreachable(*args, **kwargs):
+        raise OSError("We couldn't connect to the hub\nand many more lines")
+
+    refusal = r"within reach.*couldn't connect to the hub\. Pass a folder that holds config\.json, model\.safe"
+    monkeypatch.setattr(hub, "snapshot_download", unreachable)  # asked once, before anything else
+    with pytest.raises(PalpateError, match=refusal):
+        load_clip("openai/clip-vit-base-patch32")
+    monkeypatch.setattr(hub, "snapshot_download", lambda name, allow_patterns: tmp_path / "nothing")
+    monkeypatch.setattr(module.CLIPModel, "from_pretrained", unreachable)
+    with pytest.raises(PalpateError, match=refusal):
+        load_clip("openai/clip-vit-base-patch32")
+
+
+def test_unknown_and_missing_encoders(clip, encoders):
+    for encoder in ("taste", "", "Touch"):
+        with pytest.raises(PalpateError, match="vision, text, touch"):
+            embed_images(pictures(), encoders, encoder)
+    with pytest.raises(PalpateError, match="text encoder"):
+        embed_images(pictures(), encoders, "text")
+    with pytest.raises(PalpateError, match="include a tactile encoder"):
+        embed_images(pictures(), EncoderSet(clip), "tactile")
+    with pytest.raises(PalpateError, match="uint8"):
+        embed_images(pictures().astype(np.float32), encoders, "tactile")
+    with pytest.raises(PalpateError, match="device"):
+        pick_device("cuda:99")
+    assert pick_device("cpu").type == "cpu"
+
+
+def test_random_weights_belong_to_the_seed():
+    torch.manual_seed(1)
+    a = new_touch(TINY.touch_config(8), 5).state_dict()
+    torch.manual_seed(2)
+    b, c = (
+        new_touch(TINY.touch_config(8), 5).state_dict(),
+        new_touch(TINY.touch_config(8), 6).state_dict(),
+    )
+    assert all(torch.equal(a[k], b[k]) for k in a)
+    assert not torch.equal(a["visual_projection.weight"], c["visual_projection.weight"])
+
+
+def test_preprocess_reads_both_spellings_and_refuses_other_sizes():
+    old = {
+        "size": 224,
+        "crop_size": 224,
+        "image_mean": list(CLIP_MEAN),
+        "image_std": list(CLIP_STD),
+        "do_normalize": True,
+    }
+    new = {
+        "size": {"shortest_edge": 224},
+        "crop_size": {"height": 224, "width": 224},
+        "image_mean": [0.5, 0.5, 0.5],
+    }
+    assert Preprocess.from_config(old, 224) == Preprocess.of_size(224)
+    assert Preprocess.from_config(new, 224) == Preprocess.of_size(224, (0.5, 0.5, 0.5))
+    assert (
+        Preprocess.from_config({"size": {"shortest_edge": 256}, "crop_size": 224}, 224).resize
+        == 256
+    )
+    assert Preprocess.from_config({}, 64) == Preprocess.of_size(64)
+    made = Preprocess(24, 32, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+    assert Preprocess.from_config(json.loads(json.dumps(made.to_config())), 24) == made
+    with pytest.raises(PalpateError, match="224 px"):
+        Preprocess.from_config({"size": 336, "crop_size": 336}, 224)
+
+
+def test_preprocess_equals_transformers_processor():
+    from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
+
+    ours = Preprocess(16, 20, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
+    config = {k: v for k, v in ours.to_config().items() if k != "image_processor_type"}
+    theirs = CLIPImageProcessorPil(**config)(
+        Image.fromarray(pictures(1, 40)[0]), return_tensors="pt"
+    )["pixel_values"]
+    mine = ours.normalize(ours.crop(to_unit(ours.fit(pictures(1, 40)))))
+    assert torch.allclose(mine, theirs, atol=1e-5)
+
+
+def test_fit_cuts_the_center_square():
+    wide = np.zeros((1, 16, 32, 3), np.uint8)
+    wide[:, :, 8:24] = 200
+    assert (Preprocess.of_size(8).fit(wide) == 200).all()
+
+
+def test_statistics_by_hand():
+    images = pictures(7)
+    mean, std = statistics(images)
+    assert mean == pytest.approx((images / 255).mean(axis=(0, 1, 2)), abs=1e-6)
+    assert std == pytest.approx((images / 255).std(axis=(0, 1, 2)), abs=1e-6)
+
+
+def test_augmentation():
+    images = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    seeded = lambda s: torch.Generator().manual_seed(s)  # noqa: E731
+    nothing = Augment(crop=0, gain=0, offset=0)
+    assert torch.allclose(nothing(images, seeded(1)), images, atol=1e-5)
+    some = Augment()
+    assert torch.equal(some(images, seeded(1)), some(images, seeded(1)))
+    assert not torch.equal(some(images, seeded(1)), some(images, seeded(2)))
+    # only mirrors and turns: each result is one of the eight symmetries of its picture
+    turned = Augment(crop=0, gain=0, offset=0, flips=True, quarter_turns=True)(images, seeded(3))
+    seen = set()
+    for picture, result in zip(images, turned, strict=True):
+        ways = [torch.rot90(p, k, (1, 2)) for p in (picture, picture.flip(2)) for k in range(4)]
+        match = [k for k, way in enumerate(ways) if torch.allclose(way, result, atol=1e-4)]
+        assert len(match) == 1
+        seen.update(match)
+    assert len(seen) > 1
+    lit = Augment(crop=0, gain=0.3, offset=0.2)(images, seeded(4))
+    for picture, result in zip(images, lit, strict=True):  # one straight line through all pixels
+        line = np.polyfit(picture.flatten().numpy(), result.flatten().numpy(), 1)
+        assert np.allclose(
+            np.polyval(line, picture.flatten().numpy()), result.flatten().numpy(), atol=1e-4
+        )
+    with pytest.raises(PalpateError, match="crop"):
+        Augment(crop=1.0)
+
+
+def test_json_that_cannot_be_used_is_told(encoders, tmp_path):
+    encoders.save(tmp_path / "t")
+    own, inner = tmp_path / "t" / "palpate.json", tmp_path / "t" / "clip" / "palpate.json"
+    cases = []
+    for file in (own, inner):
+        about = json.loads(file.read_text())
+        cases += [
+            (file, [], "must be a JSON object"),
+            (file, about | {"format": "x"}, "must have the format palpate-"),
+        ]
+        cases += [
+            (file, {k: v for k, v in about.items() if k != key}, f"Got no {key}")
+            for key in ("digests", "card")
+        ]
+        cases += [
+            (file, about | {"digests": value}, "an object with vision and text")
+            for value in ({}, [], None, {"vision": "0"})
+        ]
+        cases += [(file, about | {"card": value}, "card an object") for value in ([], None, "x")]
+    for place in ("clip", "tactile"):
+        file = tmp_path / "t" / place / "preprocessor_config.json"
+        about = json.loads(file.read_text())
+        cases += [(file, [], "must be a JSON object")]
+        wrong = (
+            {"size": "x"},
+            {"size": []},
+            {"image_mean": [1]},
+            {"image_std": "abc"},
+            {"crop_size": {"height": []}},
+        )
+        cases += [
+            (file, about | change, "An entry in .* must be as palpate writes it")
+            for change in wrong
+        ]
+    for file, content, word in cases:
+        good = file.read_text()
+        file.write_text(json.dumps(content))
+        with pytest.raises(PalpateError, match=word) as told:
+            EncoderSet.load(tmp_path / "t")
+        assert str(file) in told.value.must
+        file.write_text(good)
+    EncoderSet.load(tmp_path / "t")

@@ -1,0 +1,525 @@
+"""What leaking costs: against brute force, explicit loops, and worlds in which the price is known."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.stats import t as student
+
+from palpate.core import FeatureSet, Impact, PalpateError, ProblemsError, Split
+from palpate.data.formats.touch_and_go import import_touch_and_go
+from palpate.data.manifest import Manifest
+from palpate.evaluation import impact_features, impact_scores
+from palpate.evaluation.impact import impact
+from palpate.evaluation.impact_features import Source, fit_reduction
+from palpate.evaluation.impact_scores import (
+    Table,
+    accuracy,
+    jackknife,
+    nearest_hits,
+    tabulate,
+    thin,
+)
+from palpate.leakage.splits import leak_free_split
+
+
+def videos(materials: int = 4, each: int = 5, frames: int = 6, **columns: object) -> Manifest:
+    """``each`` videos a material, ``frames`` frames a video, no pictures."""
+    rows = [
+        {
+            "id": f"v{m}.{v}/{k}",
+            "video": f"v{m}.{v}",
+            "frame": k,
+            "touch": f"v{m}.{v}#{k // 3}",
+            "material": f"M{m}",
+            **columns,
+        }
+        for m in range(materials)
+        for v in range(each)
+        for k in range(frames)
+    ]
+    return Manifest.from_rows(rows, Path())
+
+
+def by_frame(manifest: Manifest, every: int = 3) -> Split:
+    """Every third frame of each video in test: each video on both sides."""
+    parts = {
+        i: "test" if f % every == 0 else "train"
+        for i, f in zip(manifest.ids, manifest.column("frame"), strict=True)
+    }
+    return Split(parts, {"name": "Orig"}, manifest.digest)
+
+
+def one_hot(names: list[str]) -> np.ndarray:
+    distinct = sorted(set(names))
+    return np.eye(len(distinct), dtype=np.float32)[[distinct.index(n) for n in names]]
+
+
+def test_nearest_hits_are_those_of_brute_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    x, z = (
+        rng.standard_normal((37, 5)).astype(np.float32),
+        rng.standard_normal((83, 5)).astype(np.float32),
+    )
+    y, w = rng.integers(0, 3, 37), rng.integers(0, 4, 83)
+    expected = [
+        float(w[((z.astype(float) - row) ** 2).sum(axis=1).argmin()] == label)
+        for row, label in zip(x.astype(float), y, strict=True)
+    ]
+    assert nearest_hits(x, z, y, w).tolist() == expected
+    monkeypatch.setattr(impact_scores, "CELLS", 200)  # two test rows a block
+    assert nearest_hits(x, z, y, w).tolist() == expected
+    assert 0 < sum(expected) < 37
+
+
+def test_ties_count_as_a_random_choice_would() -> None:
+    base = np.array([[0, 0], [0, 0], [0, 0], [3, 4]], np.float32)
+    queries = np.array([[0, 1], [0, 1], [3, 3], [1.5, 2]], np.float32)
+    hits = nearest_hits(queries, base, np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]))
+    # The last query is 2.5 from all four rows, of which two are of its class.
+    np.testing.assert_allclose(hits, [2 / 3, 1 / 3, 0, 1 / 2])
+
+
+def test_a_table_sums_by_group_and_class() -> None:
+    table = tabulate(
+        np.array([1, 0.5, 0, 1]), np.array([0, 0, 1, 1]), np.array([0, 0, 1, 0]), (2, 2)
+    )
+    assert table.hits.tolist() == [[1.5, 0], [1, 0]]
+    assert table.samples.tolist() == [[2, 0], [1, 1]]
+    assert accuracy(table) == pytest.approx(2.5 / 4)
+    assert accuracy(table, balanced=True) == pytest.approx((2.5 / 3 + 0) / 2)
+
+
+def loop_jackknife(
+    samples: list[tuple[str, int, int, float]], balanced: bool
+) -> tuple[float, float]:
+    """Value and half-width by deleting groups from a list of (group, side, class, hit) one at a time."""
+
+    def statistic(rows: list[tuple[str, int, int, float]]) -> float:
+        out = 0.0
+        for side, sign in ((0, 1.0), (1, -1.0)):
+            hits = [(c, h) for _, s, c, h in rows if s == side]
+            if balanced:
+                classes = {c for c, _ in hits}
+                out += sign * float(
+                    np.mean([np.mean([h for d, h in hits if d == c]) for c in sorted(classes)])
+                )
+            else:
+                out += sign * float(np.mean([h for _, h in hits]))
+        return out
+
+    groups = sorted({g for g, *_ in samples})
+    left = np.array([statistic([r for r in samples if r[0] != g]) for g in groups])
+    n = len(groups)
+    return statistic(samples), float(
+        student.ppf(0.975, n - 1) * np.sqrt((n - 1) / n * ((left - left.mean()) ** 2).sum())
+    )
+
+
+@pytest.mark.parametrize("balanced", [False, True])
+def test_the_paired_jackknife_is_the_explicit_loop(balanced: bool) -> None:
+    rng = np.random.default_rng(1)
+    # Groups 0..5 on the given side, 2..6 on the clean one; group 7 on neither.
+    samples = [
+        (f"g{g}", side, int(rng.integers(0, 3)), float(rng.random() < 0.8 - 0.4 * side))
+        for side, span in ((0, range(6)), (1, range(2, 7)))
+        for g in span
+        for _ in range(int(rng.integers(4, 9)))
+    ]
+    tables = []
+    for side in (0, 1):
+        rows = [(int(g[1:]), c, h) for g, s, c, h in samples if s == side]
+        g, c, h = (np.array(column) for column in zip(*rows, strict=True))
+        tables.append(tabulate(h, g, c, (8, 3)))
+    value, interval, count = jackknife(*tables, balanced=balanced)
+    expected, half = loop_jackknife(samples, balanced)
+    assert value == pytest.approx(expected)
+    assert count == 7
+    assert interval is not None
+    assert interval == pytest.approx((expected - half, min(1.0, expected + half)))
+
+
+def test_an_interval_needs_two_groups_and_some_variation() -> None:
+    one = Table(np.array([[3.0], [0.0]]), np.array([[4.0], [0.0]]))
+    assert jackknife(one) == (0.75, None, 1)
+    sure = Table(np.array([[4.0], [4.0]]), np.array([[4.0], [4.0]]))
+    assert jackknife(sure) == (1.0, None, 2)
+    # Without its only clean group the clean side is empty: no interval of the difference.
+    both = Table(np.array([[3.0], [1.0]]), np.array([[4.0], [4.0]]))
+    assert jackknife(both, one) == (-0.25, None, 2)
+
+
+def test_accuracies_are_cut_to_their_range() -> None:
+    table = Table(np.array([[10.0], [7.0], [10.0]]), np.full((3, 1), 10.0))
+    value, interval, _ = jackknife(table)
+    assert value == pytest.approx(0.9)
+    assert interval is not None
+    assert interval[1] == 1.0
+    assert interval[0] < 0.8
+
+
+def test_thinning_keeps_every_class_and_the_shares_of_groups() -> None:
+    classes = np.repeat([0, 1, 2], [600, 299, 1])
+    groups = np.concatenate([np.arange(600) % 4, 4 + np.arange(299) % 2, [6]])
+    rows = np.arange(900) + 1000
+    kept = thin(rows, groups, classes, 90, seed=3)
+    assert len(kept) == 90 == len(set(kept.tolist()))
+    assert set(kept.tolist()) <= set(rows.tolist())
+    assert np.bincount(classes[kept - 1000])[2] == 1
+    assert np.abs(np.bincount(classes[kept - 1000]) - [60, 29.9, 0.1]).max() <= 1
+    assert np.abs(np.bincount(groups[kept - 1000])[:4] - 15).max() <= 1
+    assert (
+        kept.tolist()
+        == thin(rows, groups, classes, 90, seed=3).tolist()
+        != thin(rows, groups, classes, 90, seed=4).tolist()
+    )
+    assert sorted(thin(rows, groups, classes, 900, seed=3).tolist()) == rows.tolist()
+    assert sorted(classes[thin(rows, groups, classes, 3, seed=3) - 1000].tolist()) == [0, 1, 2]
+
+
+def test_the_reduction_spans_the_principal_axes_of_train_alone() -> None:
+    rng = np.random.default_rng(2)
+    x = (rng.standard_normal((300, 60)) * 0.8 ** np.arange(60)).astype(np.float32) @ np.linalg.qr(
+        rng.standard_normal((60, 60))
+    )[0].astype(np.float32)
+    x[200:] += 50  # what train must not see
+    source = Source("x", 60, lambda at: x[at], False, "")
+    train = np.arange(200)
+    found = fit_reduction(source, train, 6, seed=0)
+    centered = x[:200].astype(float) - x[:200].mean(axis=0)
+    _, s, axes = np.linalg.svd(centered, full_matrices=False)
+    np.testing.assert_allclose(found.axes @ found.axes.T, axes[:6].T @ axes[:6], atol=1e-3)
+    assert found.explained == pytest.approx((s[:6] ** 2).sum() / (s**2).sum(), abs=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(found.apply(source, train), axis=1),
+        np.linalg.norm(centered @ axes[:6].T, axis=1),
+        atol=1e-2,
+    )
+
+
+def test_directions_without_spread_in_train_are_left_out() -> None:
+    x = np.array([[1, 0.1, 5], [2, 0.1, 7], [4, 0.1, 9], [3, 8.0, 6]], np.float32)
+    source = Source("x", 3, lambda at: x[at], True, "")
+    found = fit_reduction(source, np.arange(3), 10, seed=0)
+    out = found.apply(source, np.arange(4))
+    assert out.shape == (4, 2)
+    np.testing.assert_allclose(out[:3].std(axis=0), 1, rtol=1e-5)
+    wide = Source("x", 3, lambda at: x[at], False, "")
+    assert fit_reduction(wide, np.arange(3), 2, seed=0).axes.shape[1] == 2
+    assert fit_reduction(wide, np.array([0, 0]), 2, seed=0).apply(wide, np.arange(4)).shape[0] == 4
+
+
+def test_a_leak_of_known_worth() -> None:
+    """Features that name the video and nothing else: 1-NN is always right when it saw the video, and guesses when it did not."""
+    manifest = videos()
+    found = impact(
+        manifest,
+        by_frame(manifest),
+        features={"video": one_hot(manifest.column("video"))},
+        seeds=(0, 1),
+    )
+    row = found.rows[0]
+    # A new video's one-hot is equally far from all train rows, a quarter of which have its material.
+    assert (row.features, row.classifier, row.given, row.chance) == ("video", "1-NN", 1.0, 0.25)
+    assert (row.clean, row.cost) == pytest.approx((0.25, 0.75), abs=1e-6)
+    assert (found.rows[1].given, found.rows[1].clean) == (1.0, pytest.approx(0.25))
+    assert "100.0 % under Orig, 25.0 % under 2 leak-free splits by video" in found.headline
+    assert "leaking is worth 75.0 points" in found.headline
+    assert (found.group, len(found.clean_splits)) == ("video", 2)
+    assert (found.settings["shared_groups"], found.settings["test_groups"][0]) == (20, 20)
+
+
+def test_no_leak_costs_nothing_where_the_material_is_known() -> None:
+    manifest = videos()
+    found = impact(
+        manifest,
+        by_frame(manifest),
+        features={"material": one_hot(manifest.column("material"))},
+        seeds=(0,),
+    )
+    assert [(r.given, r.clean, r.cost, r.cost_interval) for r in found.rows] == [
+        (1.0, 1.0, 0.0, None)
+    ] * 2
+
+
+def test_a_run_is_the_explicit_one() -> None:
+    """The clean side by hand: leak-free splits, standardized by train, 1-NN by brute force, test samples of all seeds together."""
+    manifest = videos(3, 6, 6)
+    rng = np.random.default_rng(5)
+    video, material = manifest.column("video"), manifest.column("material")
+    x = (
+        one_hot(video)
+        + one_hot(material).repeat(6, axis=1) * 0.15
+        + rng.standard_normal((len(manifest), 18)) * 0.25
+    ).astype(np.float32)
+    split = by_frame(manifest)
+    found = impact(manifest, split, features={"x": x}, seeds=(0, 1, 2))
+    size, y = found.settings["train_samples"], np.array(material)
+    assert size == 72
+    hits: list[list[float]] = []
+    plans = [
+        leak_free_split(manifest, train=72 / 108, group="video", seed=s).split for s in (0, 1, 2)
+    ]
+    assert [p.digest for p in plans] == list(found.clean_splits)
+    for parts in (split, *plans):
+        side = np.array([parts.parts[i] for i in manifest.ids])
+        train, test = np.flatnonzero(side == "train"), np.flatnonzero(side == "test")
+        assert len(train) == size  # so that thinning leaves all
+        z = x / x[train].std(axis=0)
+        hits.append(
+            [float(y[train[((z[train] - z[k]) ** 2).sum(axis=1).argmin()]] == y[k]) for k in test]
+        )
+    assert found.rows[0].given == pytest.approx(np.mean(hits[0]))
+    assert found.rows[0].clean == pytest.approx(np.mean(np.concatenate(hits[1:])))
+    assert found.rows[0].given - found.rows[0].clean > 0.1
+    assert found.settings["features"]["x"]["1-NN"] == [round(float(np.mean(h)), 5) for h in hits]
+
+
+def test_equal_input_gives_an_equal_result_whatever_the_order() -> None:
+    manifest = videos(3, 4, 6)
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((len(manifest), 7)).astype(np.float32)
+    found = impact(manifest, by_frame(manifest), features={"x": x})
+    assert found == impact(manifest, by_frame(manifest), features={"x": x})
+    order = rng.permutation(len(manifest))
+    turned = manifest.take([manifest.ids[k] for k in order])
+    again = impact(turned, by_frame(turned), features={"x": x[order]})
+    assert again.rows == found.rows
+    assert list(again.clean_splits) == list(found.clean_splits)
+    assert Impact.from_json(json.loads(json.dumps(asdict(found)))) == found
+
+
+def test_both_sides_get_the_same_materials_and_as_many_train_samples() -> None:
+    base = videos(3, 4, 6)
+    lone = [{"id": f"lone/{k}", "video": "lone", "frame": k, "material": "Lone"} for k in range(30)]
+    unknown = [{"id": f"blank/{k}", "video": "blank", "frame": k} for k in range(5)]
+    onesided = [
+        {"id": f"s{k % 2}/{k}", "video": f"s{k % 2}", "frame": 1, "material": "Trained"}
+        for k in range(6)
+    ]
+    manifest = Manifest.from_rows(
+        [*base.table.iter_rows(named=True), *lone, *unknown, *onesided], Path()
+    )
+    found = impact(
+        manifest,
+        by_frame(manifest),
+        features={"v": one_hot(manifest.column("video"))},
+        seeds=(0, 1),
+    )
+    assert found.settings["materials"] == ["M0", "M1", "M2"]
+    assert found.rows[0].chance == pytest.approx(1 / 3)
+    assert found.settings["left_out"] == {
+        "Lone": "one video",
+        "Trained": "not in test of the given split",
+    }
+    assert (found.rows[0].given, found.settings["test_samples"][0]) == (1.0, 24)
+    assert found.settings["train_samples"] <= 48
+    told = " ".join(found.notes)
+    assert [
+        "Always guessing" in told,
+        "5 samples without a material" in told,
+        "Lone (one video)" in told,
+    ] == [False, True, True]
+
+
+def test_features_may_be_sets_by_id_and_keep_cosine_order() -> None:
+    manifest = videos(3, 4, 6)
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((len(manifest), 7)).astype(np.float32)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    back = np.arange(len(manifest))[::-1]
+    given = FeatureSet([manifest.ids[k] for k in back], x[back], encoder="encoder")
+    found = impact(
+        manifest,
+        by_frame(manifest),
+        features={"set": given, "array": x, "scaled": 3 * x},
+        seeds=(0,),
+    )
+    assert [r.features for r in found.rows] == ["set", "set", "array", "array", "scaled", "scaled"]
+    facts = found.settings["features"]
+    assert [
+        facts["set"]["digest"],
+        facts["array"]["standardized"],
+        facts["scaled"]["standardized"],
+    ] == ["encoder", False, True]
+    assert [r.given for r in found.rows[:2]] == [r.given for r in found.rows[2:4]]
+
+
+def test_pixels_are_told_by_kind(small_manifest: Manifest, tmp_path: Path) -> None:
+    split = by_frame(small_manifest, every=4)
+    found = impact(small_manifest, split, size=8, seeds=(0,), cache=tmp_path / "cache")
+    assert [r.features for r in found.rows[::2]] == [
+        "touch pixels",
+        "touch minus background",
+        "vision pixels",
+    ]
+    assert [found.rows[k].clean for k in (0, 4)] == [1.0, 1.0]  # brightness is the material there
+    assert found.headline.startswith("1-NN on touch pixels: ")
+    assert len(list((tmp_path / "cache").iterdir())) == 3
+    bare = Manifest(
+        small_manifest.table.with_columns(background=None, vision=None).cast(
+            small_manifest.table.schema
+        ),
+        small_manifest.root,
+    )
+    again = impact(bare, split, size=8, seeds=(0,))
+    assert [r.features for r in again.rows] == ["touch pixels"] * 2
+    assert again.rows[0] == found.rows[0]
+    assert [
+        "no background" in " ".join(again.notes),
+        "No sample has a vision image" in " ".join(again.notes),
+    ] == [True, True]
+
+
+def test_touch_minus_background_is_the_difference(small_manifest: Manifest) -> None:
+    sources, notes = impact_features.pixel_sources(small_manifest, size=32)
+    at = np.array([3, 17])
+    by_name = {s.name: s.read(at) for s in sources}
+    raw = [
+        [np.asarray(Image.open(small_manifest.paths(c)[k]), float) for k in at]
+        for c in ("tactile", "background")
+    ]
+    np.testing.assert_array_equal(
+        by_name["touch minus background"].reshape(2, 32, 32, 3), np.array(raw[0]) - np.array(raw[1])
+    )
+    assert notes == []
+
+
+def test_a_leak_free_split_is_not_charged() -> None:
+    manifest = videos(3, 6, 4)
+    split = leak_free_split(manifest, train=0.66, group="video", seed=9).split
+    found = impact(manifest, split, features={"v": one_hot(manifest.column("video"))}, seeds=(0,))
+    assert ("shares no video" in found.headline, "worth" in found.headline) == (True, False)
+    assert found.rows[0].cost == pytest.approx(0, abs=0.02)
+    assert any("shares no video" in n for n in found.notes)
+
+
+def refuse(match: str, manifest: Manifest, split: Split | None = None, **options: object) -> None:
+    with pytest.raises(PalpateError, match=match):
+        impact(
+            manifest,
+            split or by_frame(manifest),
+            **{"features": {"v": np.eye(len(manifest))}, **options},
+        )  # pyright: ignore[reportArgumentType]
+
+
+def test_bad_input_is_refused_in_words() -> None:
+    good = videos(2, 3, 4)
+    refuse("needs materials", videos(2, 3, 4, material=None))
+    refuse("two materials. Got 1 material", videos(1, 3, 4))
+    refuse("Got 0 of 2 .2 one video.*--group touch", videos(2, 1, 6))
+    refuse("needs a video. Got 24 without", videos(2, 3, 4, video=None))
+    refuse("train part must hold samples", good, Split(dict.fromkeys(good.ids, "test")))
+    refuse("must be in the manifest", good, Split({**by_frame(good).parts, "elsewhere": "train"}))
+    refuse("group must be auto or one of", good, group="color")
+    refuse("at least one seed", good, seeds=())
+    refuse("each once", good, seeds=(1, 1))
+    refuse("at least one component", good, components=0)
+    refuse("'pixels' or a mapping", good, features="touch")
+    refuse("features to classify by", good, features={})
+    refuse(r"shape \(24, d\)", good, features={"x": np.zeros((23, 3))})
+    refuse(r"shape \(24, d\)", good, features={"x": np.zeros(24)})
+    refuse("numbers in at least one column", good, features={"x": np.zeros((24, 0))})
+    refuse("numbers in at least one column", good, features={"x": np.full((24, 2), "a")})
+    refuse(
+        r"NaN or infinity in 1 row \(1: 'v0.0/1'\)",
+        good,
+        features={"x": np.where(np.arange(24)[:, None] == 1, np.nan, 1.0)},
+    )
+    refuse(
+        "without, first",
+        good,
+        features={"x": FeatureSet(good.ids[:20], np.zeros((20, 2), np.float32))},
+    )
+    refuse("vision or tactile", good, features="pixels")
+
+
+def test_missing_and_broken_pictures_are_named(small_manifest: Manifest) -> None:
+    split = by_frame(small_manifest, every=4)
+    small_manifest.paths("tactile")[5].write_bytes(b"")
+    with pytest.raises(ProblemsError) as error:
+        impact(small_manifest, split, size=8)
+    assert [p.where for p in error.value.problems] == [str(small_manifest.paths("tactile")[5])]
+    some = small_manifest.column("vision")
+    some[2] = None
+    holes = Manifest.from_rows(
+        [
+            {**r, "vision": v}
+            for r, v in zip(small_manifest.table.iter_rows(named=True), some, strict=True)
+        ],
+        small_manifest.root,
+    )
+    small_manifest.paths("tactile")[5].write_bytes(small_manifest.paths("tactile")[6].read_bytes())
+    with pytest.raises(
+        PalpateError, match=r"Every sample must have a vision image here\. Got 1 without"
+    ):
+        impact(holes, split, size=8)
+    with pytest.raises(PalpateError, match="at least 4 x 4"):
+        impact(small_manifest, split, size=1)
+
+
+def test_a_common_material_is_told_beside_chance() -> None:
+    base = videos(3, 4, 6)
+    more = [
+        {"id": f"w{v}/{k}", "video": f"w{v}", "frame": k, "material": "M0"}
+        for v in range(12)
+        for k in range(6)
+    ]
+    manifest = Manifest.from_rows([*base.table.iter_rows(named=True), *more], Path())
+    flat = {"flat": np.ones((len(manifest), 2))}
+    found = impact(manifest, by_frame(manifest), features=flat, seeds=(0,))
+    assert found.settings["majority"][0] == round(16 / 24, 5) == round(found.rows[1].given, 5)
+    assert any(
+        "Always guessing the commonest material of train scores 66.7 % under the given split" in n
+        for n in found.notes
+    )
+    assert impact(manifest, by_frame(manifest), features=flat, seeds=(0,), balanced=True).rows[
+        1
+    ].given == pytest.approx(1 / 3)
+
+
+def test_features_without_any_spread_give_chance() -> None:
+    manifest = videos(4, 4, 3)
+    found = impact(
+        manifest, by_frame(manifest), features={"flat": np.ones((len(manifest), 5))}, seeds=(0,)
+    )
+    assert (found.rows[0].given, found.rows[0].clean) == pytest.approx((0.25, 0.25), abs=0.01)
+
+
+def test_torch_is_not_needed() -> None:
+    code = """
+import sys, numpy as np
+from pathlib import Path
+from palpate.core import Split
+from palpate.data.manifest import Manifest
+from palpate.evaluation.impact import impact
+rows = [{"id": f"{v}/{k}", "video": str(v), "frame": k, "material": f"m{v % 2}"} for v in range(6) for k in range(4)]
+m = Manifest.from_rows(rows, Path())
+print(impact(m, Split({i: "test" if i.endswith("0") else "train" for i in m.ids}), features={"x": np.eye(24)}).headline)
+sys.exit("torch" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "under the given split" in done.stdout
+
+
+@pytest.mark.slow
+def test_the_five_real_clips_can_be_told_by_touch_only(real_data: Path, tmp_path: Path) -> None:
+    manifest = import_touch_and_go(
+        real_data / "touch_and_go" / "clips", tmp_path / "out", size=64
+    ).manifest
+    split = by_frame(manifest, every=5)
+    with pytest.raises(PalpateError, match=r"Got 0 of 5 .5 one video.*--group touch"):
+        impact(manifest, split)
+    found = impact(manifest, split, group="touch", cache=tmp_path / "cache")
+    assert len(found.rows) == 6
+    assert len(found.settings["materials"]) == 5
+    assert min(r.given for r in found.rows) > 0.9  # every test frame has a neighbor in train
+    assert any("train and test share videos" in n for n in found.notes)
