@@ -6,7 +6,8 @@ import os
 import numpy as np
 from PIL import Image
 
-from palpate.core import Audit, Impact, ImpactRow, LeakPair, SampleRef, Signal
+from palpate.core import SampleRef
+from palpate.report.results import Audit, Impact, ImpactRow, LeakPair, Signal
 
 #: Gaps of Touch and Go's own split, as `palpate audit` finds them.
 GAPS = {

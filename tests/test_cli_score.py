@@ -10,10 +10,11 @@ import polars as pl
 import pytest
 
 from palpate.cli import main
-from palpate.core import FeatureSet, PalpateError, Results, Split
+from palpate.core import FeatureSet, PalpateError, Split
 from palpate.evaluation import embeddings, streamed
 from palpate.metrics import Polynomial, compare, distance, i_tmmd
 from palpate.metrics.paired import mean_differences
+from palpate.report.results import Results
 from score_calls import call, score
 
 VIDEOS, FRAMES, D = 8, 6, 5

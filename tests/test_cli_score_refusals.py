@@ -10,11 +10,12 @@ import pytest
 from PIL import Image
 
 from palpate.cli import scoring_runs
-from palpate.core import FeatureSet, PalpateError, Results, Score, Split
+from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.core.digest import digest_file
 from palpate.core.score import require_comparable
 from palpate.evaluation import embeddings
 from palpate.metrics import distance
+from palpate.report.results import Results
 from score_calls import call, score
 
 VIDEOS, FRAMES, D = 8, 5, 4

@@ -9,8 +9,9 @@ from rich.console import Console
 
 from palpate.cli.scoring_tables import GEL, show
 from palpate.cli.terminal import Common, Terminal
-from palpate.core import Results, Score
+from palpate.core import Score
 from palpate.report.remarks import INDEPENDENT, NEARER
+from palpate.report.results import Results
 
 SEEN = "The tactile encoder was trained on another split: it may have seen test touches"
 

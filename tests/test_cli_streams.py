@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from palpate.cli import main
-from palpate.core import FeatureSet, Results
+from palpate.core import FeatureSet
+from palpate.report.results import Results
 
 NOPE = ("score", "--generated", "nope.npy", "--reference", "nope.npy")
 AUDIT = ("audit", "train.txt", "test.txt", "--fail-over", "0.01")

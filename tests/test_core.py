@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 
 from palpate.core import (
-    Audit,
     FeatureSet,
-    GalleryItem,
-    LeakPair,
     MissingExtraError,
     PalpateError,
     Problem,
     ProblemsError,
-    Results,
     Run,
     SampleRef,
     Score,
@@ -31,6 +27,7 @@ from palpate.core import (
     rng_for,
     seed_for,
 )
+from palpate.report.results import Audit, GalleryItem, LeakPair, Results
 
 
 def test_an_error_is_one_line_of_must_got_fix():

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from scipy.stats import t as student
 
-from palpate.core import FeatureSet, Impact, PalpateError, ProblemsError, Split
+from palpate.core import FeatureSet, PalpateError, ProblemsError, Split
 from palpate.data.formats.touch_and_go import import_touch_and_go
 from palpate.data.manifest import Manifest
 from palpate.evaluation import impact_features, impact_scores
@@ -28,6 +28,7 @@ from palpate.evaluation.impact_scores import (
     thin,
 )
 from palpate.leakage.splits import leak_free_split
+from palpate.report.results import Impact
 
 
 def videos(materials: int = 4, each: int = 5, frames: int = 6, **columns: object) -> Manifest:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from palpate.core import Audit, PalpateError, Split
+from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.leakage import signals
 from palpate.leakage.audit import (
@@ -21,6 +21,7 @@ from palpate.leakage.audit import (
     known_group,
     nearest_in_video,
 )
+from palpate.report.results import Audit
 
 cells = st.fixed_dictionaries(
     {

@@ -21,10 +21,11 @@ from audit_samples import (
     pretraining_audit,
     signals,
 )
-from palpate.core import MATRIX_ROWS, ImpactRow, LeakPair, PalpateError, Results, SampleRef, Signal
+from palpate.core import PalpateError, SampleRef
 from palpate.report import render_markdown, summary_lines, with_paths, write_report
 from palpate.report.audits import impact_view, matrix_view, pair_facts, pair_lists, signal_view
 from palpate.report.plots import BARS, bins_of, gap_histogram, score_histogram
+from palpate.report.results import MATRIX_ROWS, ImpactRow, LeakPair, Results, Signal
 from palpate.report.sentences import audit_line, leak_line, line_text, meaning_of
 from palpate.report.text import score_text
 from test_report_page import NASTY, Tree, an_audit, written

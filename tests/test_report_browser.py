@@ -12,8 +12,9 @@ import pytest
 from PIL import Image
 
 from audit_samples import clean_audit, full_audit, pictures, pretraining_audit
-from palpate.core import Audit, GalleryItem, LeakPair, Results, SampleRef, Score
+from palpate.core import SampleRef, Score
 from palpate.report import write_report
+from palpate.report.results import Audit, GalleryItem, LeakPair, Results
 
 LONG = "a_recording_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b"
 

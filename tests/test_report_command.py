@@ -8,8 +8,8 @@ import pytest
 
 from audit_samples import clean_audit, full_audit, pictures, pretraining_audit
 from palpate.cli import main
-from palpate.core import Results
 from palpate.report import check_results
+from palpate.report.results import Results
 from test_report_page import Tree, an_audit
 
 

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from palpate.core import Results, Score
+from palpate.core import Score
 from palpate.report.latex import LONG, best_of, escape, latex_tables, number
 from palpate.report.remarks import NEARER
+from palpate.report.results import Results
 
 ODD = r"a_b & 50% $x$ #1 {\input{/etc/passwd}} ~^ <b> [c]"
 

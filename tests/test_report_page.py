@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from palpate.core import Audit, GalleryItem, LeakPair, PalpateError, Results, SampleRef, Score
+from palpate.core import PalpateError, SampleRef, Score
 from palpate.report import summary_lines, write_report
 from palpate.report.page import in_turns
+from palpate.report.results import Audit, GalleryItem, LeakPair, Results
 
 VOID = {"meta", "link", "img", "line", "rect", "path", "circle", "br", "hr"}
 NASTY = "<script>alert(\"x\")</script> & 'quotes'"

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from palpate.core import Audit, GalleryItem, PalpateError, Results, SampleRef, Score
+from palpate.core import PalpateError, SampleRef, Score
 from palpate.report import render_markdown
 from palpate.report.plots import (
     HEIGHT,
@@ -20,6 +20,7 @@ from palpate.report.plots import (
     nice_step,
     uneven,
 )
+from palpate.report.results import Audit, GalleryItem, Results
 from palpate.report.tables import family_of, heat_tables, score_tables
 from palpate.report.text import decimals, number, percent, plural
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from palpate.cli import main
-from palpate.core import Results, Score
+from palpate.core import Score
 from palpate.report import render_markdown, render_page, summary_lines, tables
 from palpate.report.remarks import (
     INDEPENDENT,
@@ -17,6 +17,7 @@ from palpate.report.remarks import (
     reason,
     remarks,
 )
+from palpate.report.results import Results
 from palpate.report.sides import sides
 from palpate.report.tables import GEL, heat_tables, parts, score_tables, settings_of
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from palpate.cli import main
-from palpate.core import Results
+from palpate.report.results import Results
 
 pytestmark = pytest.mark.slow
 

@@ -15,19 +15,16 @@ import tyro
 from palpate import __version__
 from palpate.cli.terminal import FAILED_CHECK, Common, Terminal, guard_output, require_extra
 from palpate.core import (
-    Audit,
     FeatureSet,
-    Impact,
-    ImpactRow,
     PalpateError,
     Problem,
     ProblemsError,
     Progress,
-    Results,
     Split,
     write_json,
     write_text,
 )
+from palpate.report.results import Audit, Impact, ImpactRow, Results
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest

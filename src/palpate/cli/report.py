@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
-from palpate.core import Audit, PalpateError, Results, read_json
+from palpate.core import PalpateError, read_json
+from palpate.report.results import Audit, Results
 
 
 @dataclass(frozen=True, kw_only=True)

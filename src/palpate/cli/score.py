@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, Terminal, guard_output
-from palpate.core import PalpateError, Results
+from palpate.core import PalpateError
+from palpate.report.results import Results
 
 Companion = Literal[
     "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from palpate.cli.terminal import Terminal, require_extra
-from palpate.core import MissingExtraError, PalpateError, Progress, Results, Split
+from palpate.core import MissingExtraError, PalpateError, Progress, Split
 from palpate.core.digest import digest_file
 from palpate.evaluation.comparing import (
     BACKGROUND,
@@ -34,6 +34,7 @@ from palpate.evaluation.embeddings import (
     read_together,
 )
 from palpate.evaluation.streamed import stream_tmmd
+from palpate.report.results import Results
 
 if TYPE_CHECKING:
     from palpate.cli.score import Options

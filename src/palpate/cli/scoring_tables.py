@@ -16,10 +16,11 @@ from rich.table import Table
 from rich.text import Text
 
 from palpate.cli.terminal import Terminal
-from palpate.core import Results, Score
+from palpate.core import Score
 from palpate.core.score import ARROWS
 from palpate.evaluation.comparing import confidence, percent
 from palpate.report.remarks import INDEPENDENT, Footnotes, no_floor, reason, remarks
+from palpate.report.results import Results
 from palpate.report.sides import TAIL
 from palpate.report.tables import gel_of
 

@@ -1,7 +1,13 @@
 """The vocabulary that every room shares; needs NumPy alone."""
 
 from palpate.core.digest import digest_file, digest_folder, digest_json, digest_lines, short
-from palpate.core.errors import MissingExtraError, PalpateError, Problem, ProblemsError
+from palpate.core.errors import (
+    MissingExtraError,
+    PalpateError,
+    PalpateWarning,
+    Problem,
+    ProblemsError,
+)
 from palpate.core.files import (
     atomic_folder,
     atomic_path,
@@ -12,44 +18,27 @@ from palpate.core.files import (
     write_json,
     write_text,
 )
+from palpate.core.notes import Note
 from palpate.core.progress import Progress, quiet, track
 from palpate.core.random import rng_for, seed_for
-from palpate.core.results import (
-    CAUSES,
-    MATRIX_ROWS,
-    Audit,
-    GalleryItem,
-    Impact,
-    ImpactRow,
-    LeakPair,
-    Results,
-    SampleRef,
-    Signal,
-)
+from palpate.core.samples import SampleRef
 from palpate.core.score import FeatureSet, Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
 from palpate.core.stages import Run, Stage
 
 __all__ = [
-    "CAUSES",
-    "MATRIX_ROWS",
     "PARTS",
-    "Audit",
     "FeatureSet",
-    "GalleryItem",
-    "Impact",
-    "ImpactRow",
-    "LeakPair",
     "MissingExtraError",
+    "Note",
     "PalpateError",
+    "PalpateWarning",
     "Problem",
     "ProblemsError",
     "Progress",
-    "Results",
     "Run",
     "SampleRef",
     "Score",
-    "Signal",
     "Split",
     "Stage",
     "atomic_folder",

@@ -7,31 +7,68 @@ without a traceback and exits with status 2.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 
 class PalpateError(Exception):
-    """A user's mistake, told as must / got / fix.
+    """A user's mistake: what must hold, what was given, how to fix it.
 
     Args:
-        must: what has to hold, naming the file, row or flag (``"--ratio must lie in (0, 1)"``).
-        got: what was found (``"1.5"``).
-        fix: what to do next (``"Pass e.g. --ratio 0.8"``).
+        must: what has to hold. With ``argument`` a predicate of it that begins with "must"
+            (``"must lie in (0, 1)"``), else a whole clause (``"The manifest must exist"``).
+        got: what was given (``"1.5"``).
+        fix: what to do next, in words that name no option (``"Choose a smaller share"``).
+        argument: name of the Python argument that is at fault; the command line shows its option.
+        example: arguments that would work (``{"train": 0.8}``); each front end writes them its way.
     """
 
-    def __init__(self, must: str, got: str, fix: str) -> None:
+    def __init__(
+        self,
+        must: str,
+        got: str,
+        fix: str,
+        *,
+        argument: str | None = None,
+        example: Mapping[str, Any] | None = None,
+    ) -> None:
         self.must, self.got, self.fix = must, got, fix
-        super().__init__(f"{must.rstrip('.')}. Got {got.rstrip('.')}. {fix.rstrip('.')}.")
+        self.argument, self.example = argument, dict(example or {})
+        super().__init__(must, got, fix)
 
-    def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
-        # By default an exception is rebuilt from its message alone, which this constructor does not take.
-        return type(self), (self.must, self.got, self.fix)
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By default an exception is rebuilt from its positional arguments alone.
+        return type(self), self.args, self.__dict__
+
+    def __str__(self) -> str:
+        return self.message()
+
+    def message(
+        self,
+        name: Callable[[str], str] = lambda argument: f"`{argument}`",
+        example: Callable[[str, Any], str] = lambda argument, value: f"{argument}={value!r}",
+    ) -> str:
+        """The error in one line: must, got, fix.
+
+        Args:
+            name: how an argument is written; the command line gives its option.
+            example: how an argument with a value is written.
+        """
+        must = f"{name(self.argument)} {self.must}" if self.argument else self.must
+        parts = [must, f"Got {self.got}", self.fix]
+        if self.example:
+            parts.append("E.g. " + " ".join(example(k, v) for k, v in self.example.items()))
+        return " ".join(f"{part.rstrip('.')}." for part in parts if part)
 
     def to_json(self) -> dict[str, object]:
-        """The error as a JSON object: ``error, must, got, fix``."""
-        return {"error": type(self).__name__, "must": self.must, "got": self.got, "fix": self.fix}
+        """The error as a JSON object: ``error, must, got, fix, argument``."""
+        names = ("must", "got", "fix", "argument")
+        return {"error": type(self).__name__} | {name: getattr(self, name) for name in names}
+
+
+class PalpateWarning(UserWarning):
+    """A result that needs a second look; results carry the same fact as a :class:`Note`."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +108,8 @@ class ProblemsError(PalpateError):
             must or "Every row and file of the input must be readable and consistent", got, fix
         )
 
-    def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
-        return type(self), (self.problems, self.fix, self.must)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.problems, self.fix, self.must), self.__dict__
 
     def to_json(self) -> dict[str, object]:
         """The error as a JSON object, with the list ``problems``."""
@@ -90,5 +127,5 @@ class MissingExtraError(PalpateError):
             f"Run: pip install 'palpate[{extra}]'",
         )
 
-    def __reduce__(self) -> tuple[type[PalpateError], tuple[Any, ...]]:
-        return type(self), self._given
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._given, self.__dict__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import html
 import json
 import math
 import mmap
@@ -17,6 +18,7 @@ import numpy as np
 
 from palpate.core.errors import PalpateError
 from palpate.core.files import atomic_path
+from palpate.core.notes import Note
 
 #: Settings that must agree before two scores may stand in one column.
 COMPARABLE = (
@@ -64,7 +66,8 @@ class Score:
         higher_is_better: direction; None where neither is: closer to the floor is better (the metrics without reference).
         settings: further settings that must agree for a comparison.
         details: anything else worth keeping (per class values, matrices as lists); not compared.
-        note: a sentence for people, or ''.
+        notes: what a reader must know beside the number.
+        note: superseded by ``notes``; '' or a sentence.
     """
 
     metric: str
@@ -87,7 +90,45 @@ class Score:
     higher_is_better: bool | None = False
     settings: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+    notes: Sequence[Note] = ()
     note: str = ""
+
+    def __float__(self) -> float:
+        """The value; NaN where it is undefined."""
+        return math.nan if self.value is None else float(self.value)
+
+    def __format__(self, spec: str) -> str:
+        """The value in a number format; without one, the three lines of :meth:`__str__`."""
+        return format(float(self), spec) if spec else str(self)
+
+    def __round__(self, digits: int | None = None) -> float:
+        """The value, rounded."""
+        return round(float(self), digits) if digits is not None else round(float(self))
+
+    def __str__(self) -> str:
+        """Three lines: the number with its interval; how it was made; on what."""
+        value = "undefined" if self.value is None else f"{self.value:.4g}"
+        interval = ""
+        if self.interval is not None:
+            low, high = self.interval
+            interval = f" [{low:.4g}, {high:.4g}] ({self.level:.0%}{_after(self.interval_method)})"
+        bandwidth = f"sigma {self.bandwidth:g}" if self.bandwidth is not None else ""
+        scale = f"scale {self.scale:g}" if self.scale != 1 else ""
+        null = "null {:.4g} to {:.4g}".format(*self.null) if self.null is not None else ""
+        floor = f"floor {self.floor:.4g}" if self.floor is not None else ""
+        how = [self.estimator, bandwidth, scale, null, floor, BETTER[self.higher_is_better]]
+        against = f"{self.n} samples" + (f" against {self.m}" if self.m is not None else "")
+        names = ("encoder", "reference", "split")
+        digests = [f"{name} {d[:12]}" for name in names if (d := getattr(self, name))]
+        seed = f"seed {self.seed}" if self.seed is not None else ""
+        lines = [filter(None, how), filter(None, [against, seed, *digests])]
+        head = f"{self.metric} of {self.subject}: {value}{interval}"
+        return "\n  ".join([head, *(", ".join(line) for line in lines)])
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the three lines."""
+        head, *rest = map(html.escape, str(self).split("\n"))
+        return f"<div><b>{head}</b><br><small>{'<br>'.join(rest)}</small></div>"
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object; NaN and infinity become null."""
@@ -100,9 +141,14 @@ class Score:
             k: tuple(data[k]) if data.get(k) is not None else None for k in ("interval", "null")
         }
         fields: dict[str, Any] = {**data, **pairs}
+        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
         if not isinstance(fields.get("value"), int | float | None):
             raise TypeError(f"the value of a score must be a number, got {fields['value']!r}")
         return cls(**fields)
+
+
+def _after(text: str) -> str:
+    return f", {text}" if text else ""
 
 
 def _finite(value: Any) -> Any:

@@ -13,10 +13,11 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import GalleryItem, PalpateError, ProblemsError, SampleRef, read_json, rng_for
+from palpate.core import PalpateError, ProblemsError, SampleRef, read_json, rng_for
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import Manifest
 from palpate.evaluation.embeddings import KINDS, Columns, known_to
+from palpate.report.results import GalleryItem
 
 #: Rows of the gallery.
 GALLERY = 40

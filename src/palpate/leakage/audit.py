@@ -19,17 +19,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import (
-    MATRIX_ROWS,
-    Audit,
-    LeakPair,
-    PalpateError,
-    Problem,
-    ProblemsError,
-    Progress,
-    Split,
-    quiet,
-)
+from palpate.core import PalpateError, Problem, ProblemsError, Progress, Split, quiet
 from palpate.data.listing import FrameList, number_together, read_list
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.signals import (
@@ -42,6 +32,7 @@ from palpate.leakage.signals import (
     signal_table,
     time_gap,
 )
+from palpate.report.results import MATRIX_ROWS, Audit, LeakPair
 
 GROUPS = ("video", "contact", "object", "session", "domain", "sensor")
 #: In place of a group where none is known and pictures alone are compared.

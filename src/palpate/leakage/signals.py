@@ -25,9 +25,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import CAUSES, LeakPair, Progress, Signal, quiet
+from palpate.core import Progress, quiet
 from palpate.data.images import in_threads
 from palpate.data.manifest import Manifest
+from palpate.report.results import CAUSES, LeakPair, Signal
 
 #: One second of video at 30 frames a second.
 NEAR_FRAMES = 30

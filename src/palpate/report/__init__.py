@@ -6,11 +6,12 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from palpate.core import PalpateError, Progress, Results, quiet, write_json, write_text
+from palpate.core import PalpateError, Progress, quiet, write_json, write_text
 from palpate.report.checks import check_results
 from palpate.report.markdown import render_markdown
 from palpate.report.page import render_page
 from palpate.report.paths import with_paths
+from palpate.report.results import Results
 from palpate.report.sentences import summary_lines
 from palpate.report.text import plain
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from markupsafe import Markup
 
-from palpate.core import MATRIX_ROWS, Audit, Impact, ImpactRow, LeakPair, Signal
 from palpate.report import plots
 from palpate.report.pictures import Picture, Wanted
+from palpate.report.results import MATRIX_ROWS, Audit, Impact, ImpactRow, LeakPair, Signal
 from palpate.report.sentences import (
     HARMLESS,
     cause_notes,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from palpate.core import Results
+from palpate.report.results import Results
 
 _WORDS: Mapping[Any, str] = {
     str: "text",

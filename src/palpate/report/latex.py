@@ -14,8 +14,9 @@ import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 
-from palpate.core import Results, Score, short
+from palpate.core import Score, short
 from palpate.report.remarks import NEARER, Footnotes, by_gap, few, reason, remarks
+from palpate.report.results import Results
 from palpate.report.sides import TAIL, sides
 from palpate.report.tables import gel_of, parts, score_tables
 from palpate.report.text import decimals, defined, setting_of

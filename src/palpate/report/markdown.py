@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from palpate.core import Audit, Impact, LeakPair, Results, SampleRef
+from palpate.core import SampleRef
 from palpate.report.audits import (
     interval_percent,
     matrix_view,
@@ -19,6 +19,7 @@ from palpate.report.audits import (
     signal_view,
 )
 from palpate.report.page import in_turns, material_of
+from palpate.report.results import Audit, Impact, LeakPair, Results
 from palpate.report.sentences import leak_line, purpose, summary_lines, there, where
 from palpate.report.tables import Cell, Heat, Table, heat_tables, score_tables, settings_of
 from palpate.report.text import HINTS, HOW_TO_READ, count, number, percent, plain, plural

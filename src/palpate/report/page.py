@@ -20,7 +20,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from palpate import __version__
-from palpate.core import GalleryItem, LeakPair, PalpateError, Progress, Results, SampleRef, quiet
+from palpate.core import PalpateError, Progress, SampleRef, quiet
 from palpate.report import plots
 from palpate.report.audits import (
     MAX_PAIRS,
@@ -34,6 +34,7 @@ from palpate.report.audits import (
     side_of,
 )
 from palpate.report.pictures import Album, Darkroom, Picture, Wanted
+from palpate.report.results import GalleryItem, LeakPair, Results
 from palpate.report.sentences import purpose, summary_lines, where
 from palpate.report.tables import heat_tables, score_tables, settings_of
 from palpate.report.text import HINTS, HOW_TO_READ, count, defined, number, percent, plain, plural

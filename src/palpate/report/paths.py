@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from palpate.core import Audit, LeakPair, Results, SampleRef
+from palpate.core import SampleRef
+from palpate.report.results import Audit, LeakPair, Results
 
 
 def with_paths(results: Results, change: Callable[[str], str]) -> Results:

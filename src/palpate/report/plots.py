@@ -15,7 +15,8 @@ from itertools import pairwise
 
 from markupsafe import Markup, escape
 
-from palpate.core import Audit, Score, Signal
+from palpate.core import Score
+from palpate.report.results import Audit, Signal
 from palpate.report.text import count, number, score_text
 
 WIDTH, HEIGHT, PAD = 148, 22, 7

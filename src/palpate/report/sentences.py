@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from palpate.core import Audit, Results, SampleRef, Score, Signal, columns
+from palpate.core import SampleRef, Score, columns
 from palpate.core.score import BETTER
+from palpate.report.results import Audit, Results, Signal
 from palpate.report.sides import sides
 from palpate.report.text import (
     count,

@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from palpate.core import Results, Score, columns
+from palpate.core import Score, columns
 from palpate.core.score import ARROWS, BETTER
 from palpate.report.plots import Axis, axis_of
 from palpate.report.remarks import Footnotes, by_gap, reason, remarks
+from palpate.report.results import Results
 from palpate.report.sides import TAIL, Sides, sides
 from palpate.report.text import decimals, defined, interval_text, number, plain, setting_of
 

@@ -26,7 +26,6 @@ import numpy as np
 
 from palpate import __version__
 from palpate.core import (
-    Audit,
     PalpateError,
     Progress,
     Run,
@@ -57,6 +56,7 @@ from palpate.encoders.presets import preset as encoder_preset
 from palpate.evaluation.scoring import score_generated
 from palpate.leakage.audit import Pictures, audit_split
 from palpate.leakage.splits import describe, leak_free_split
+from palpate.report.results import Audit
 from palpate.sim import WorldOptions, write_world
 from palpate.studies.inputs import fresh, reconstruction, repeats, require_unseen, stamp_of
 from palpate.studies.presets import preset as pipeline_preset

@@ -6,11 +6,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from palpate.core import Audit, GalleryItem, Results, Score, rng_for
+from palpate.core import Score, rng_for
 from palpate.core.shipped import is_shipped
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generate import Generated
 from palpate.evaluation.scoring import BACKGROUND
+from palpate.report.results import Audit, GalleryItem, Results
 from palpate.studies.pipeline import PipelineOutcome
 
 #: Rows of the gallery; more would be folded away anyway.

@@ -9,22 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core.files import read_json, write_json
+from palpate.core.samples import SampleRef
 from palpate.core.score import Score
 
 #: Rows of the group-by-part matrix that an audit keeps.
 MATRIX_ROWS = 60
-
-
-@dataclass(frozen=True)
-class SampleRef:
-    """A sample as the report needs it. Paths are absolute or relative to the results file; None = no picture."""
-
-    id: str
-    video: str | None = None
-    frame: int | None = None
-    material: str | None = None
-    vision: str | None = None
-    tactile: str | None = None
 
 
 @dataclass(frozen=True)

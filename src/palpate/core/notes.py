@@ -1,0 +1,35 @@
+"""Notes: what a reader must know beside a number, as a code with parameters.
+
+Rooms make notes; each front end has one table from code to sentence (:mod:`palpate.report.notes`
+for pages, tables and the terminal). No program ever parses a sentence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing that a reader must know.
+
+    Attributes:
+        code: stable and lower-case, words joined by hyphens (``"copied-rows"``).
+        params: what the sentence is filled with; plain JSON values.
+    """
+
+    code: str
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """The note as a JSON object."""
+        return {"code": self.code, "params": dict(self.params)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any] | str) -> Note:
+        """The inverse of :meth:`to_json`; a string, as earlier formats had it, becomes ``text``."""
+        if isinstance(data, str):
+            return cls("text", {"text": data})
+        return cls(data["code"], data["params"])

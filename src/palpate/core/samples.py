@@ -1,0 +1,17 @@
+"""A sample as a report needs it: its names and the places of its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SampleRef:
+    """A sample as the report needs it. Paths are absolute or relative to the results file; None = no picture."""
+
+    id: str
+    video: str | None = None
+    frame: int | None = None
+    material: str | None = None
+    vision: str | None = None
+    tactile: str | None = None
