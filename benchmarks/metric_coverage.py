@@ -1,7 +1,7 @@
 """Whether the error bars of the metrics are true: coverage of 95 % intervals, and how often permutations reject a true null.
 
     python benchmarks/metric_coverage.py                                   # prints the tables, about seven minutes on one core
-    python benchmarks/metric_coverage.py --write docs/metric_coverage.md   # writes them
+    python benchmarks/metric_coverage.py --write docs/studies/metric_coverage.md   # writes them
     python benchmarks/metric_coverage.py --replicates 100                  # a quick look
 
 Frames of a video are drawn as ``normalized(mean + class + video + frame)``: Gaussian effects in 16 dimensions, unit-norm rows. A replicate draws new

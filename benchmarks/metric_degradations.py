@@ -1,7 +1,7 @@
 """Which metric ranks controlled degradations of touches in the right order: Kendall's tau over several procedural worlds.
 
     python benchmarks/metric_degradations.py                                       # prints the tables, about ten minutes on one core
-    python benchmarks/metric_degradations.py --write docs/metric_degradations.md   # writes them
+    python benchmarks/metric_degradations.py --write docs/studies/metric_degradations.md   # writes them
     python benchmarks/metric_degradations.py --worlds 3                            # a quick look
 
 A world has ten materials with eight videos each (one object a video): four for testing, and four *training* videos, from which alone a degradation

@@ -1,7 +1,7 @@
 """What each of the four metrics responds to, on synthetic features whose structure is known.
 
     python benchmarks/metric_responses.py                                    # prints the tables, about four minutes on one core
-    python benchmarks/metric_responses.py --write docs/metric_responses.md   # writes them
+    python benchmarks/metric_responses.py --write docs/studies/metric_responses.md   # writes them
     python benchmarks/metric_responses.py --draws 2                          # a quick look
 
 Frames are drawn as ``normalized(mean + class + video + frame)``, Gaussian effects in 64 dimensions, unit-norm rows: ten classes, eight videos of each, ten

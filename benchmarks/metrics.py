@@ -4,7 +4,7 @@
     python benchmarks/metrics.py --n 4000 --repeats 3                  # a first look
     python benchmarks/metrics.py --parts disk --disk-rows 1000000      # 2 x 3 GB of features streamed from a temporary folder
     python benchmarks/metrics.py --parts gpu --device cuda --n 100000  # 100,000 x 768 blocked on a GPU, share of its peak
-    python benchmarks/metrics.py --write docs/metric_speed.md
+    python benchmarks/metrics.py --write docs/studies/metric_speed.md
 
 Every line runs in a process of its own, which makes the same features from the same seed first; peak memory is the process's largest resident set minus
 what it had with the features made. Ratios are of CPU time where all run on one thread (``--threads 1``, the default), which other work on the

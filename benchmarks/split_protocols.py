@@ -1,6 +1,6 @@
 """One world, several ways to cut it: how much of a touch probe's accuracy is leakage.
 
-    python benchmarks/split_protocols.py --seeds 0 1 2 --write docs/world_protocols.md
+    python benchmarks/split_protocols.py --seeds 0 1 2 --write docs/studies/world_protocols.md
     python benchmarks/split_protocols.py --seeds 0 --modalities touch          # a first look, about five minutes
 
 The contact frames of a preset are cut into train and test by random frame (as HCT-Orig), by random whole touch (as the Touch and Go lists), by whole

@@ -1,6 +1,6 @@
 """What pairwise metrics and random halves reward: the sensor itself. Two tables on real touches of the procedural world, no generator.
 
-    python benchmarks/world_background.py --write docs/world_background.md
+    python benchmarks/world_background.py --write docs/studies/world_background.md
     python benchmarks/world_background.py --preset demo                      # a first look, under a minute
 
 1. PSNR and SSIM against the true touch of: the empty background of the same video, another touch of the same material on the same sensor unit (another

@@ -1,7 +1,7 @@
 """How near the world's GelSight images are to real ones: statistics of five real clips of Touch and Go beside the world's.
 
     python benchmarks/world_fidelity.py                                  # prints the tables, about two minutes
-    python benchmarks/world_fidelity.py --write docs/world_fidelity.md   # writes them
+    python benchmarks/world_fidelity.py --write docs/studies/world_fidelity.md   # writes them
     python benchmarks/world_fidelity.py --sizes 64 --videos 20           # a quick look
 
 The real clips are found under ``PALPATE_SHARED_DATA`` or ``../shared/data`` (``touch_and_go/clips``, needs PyAV). Of each 480 x 640 frame the central

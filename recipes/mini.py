@@ -52,7 +52,7 @@ from palpate.studies.inputs import fresh
 
 NAME = "palpate/mini"
 #: Its table of scores is written from the cards.
-PAGE = Path(__file__).parents[1] / "docs" / "mini.md"
+PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "mini.md"
 SEED = 0
 _BASE = replace(PRESETS["pretrain"], touches_per_video=3, frames_per_touch=2)
 WORLDS: dict[str, WorldOptions] = {

@@ -156,7 +156,7 @@ def scores_table(target: Path) -> str:
 
 
 def write_page(page: Path, target: Path) -> None:
-    """Puts the table between the marks of ``docs/mini.md``."""
+    """Puts the table between the marks of ``docs/concepts/mini.md``."""
     text = page.read_text(encoding="utf-8")
     start, end = text.index(MARKS[0]) + len(MARKS[0]), text.index(MARKS[1])
     write_text(page, f"{text[:start]}\n{scores_table(target)}\n{text[end:]}")

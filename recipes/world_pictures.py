@@ -1,4 +1,4 @@
-"""Draws the pictures of ``docs/world.md``.
+"""Draws the pictures of ``docs/concepts/world.md``.
 
     python recipes/world_pictures.py -o docs/images
 

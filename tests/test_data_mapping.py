@@ -16,7 +16,7 @@ from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.data.mapping import NoValueError, compile_maps, text_of
 
-DOCS = (Path(__file__).resolve().parents[1] / "docs" / "mapping.md").read_text(encoding="utf-8")
+DOCS = (Path(__file__).resolve().parents[1] / "docs" / "concepts" / "mapping.md").read_text(encoding="utf-8")
 PATH = "data2/4-1702596295.70/vision/160-0.0207.jpg"
 ROW = {"path": PATH, "left image": "l.png", "rgb-path": "r", "q": "it's", "none": None}
 

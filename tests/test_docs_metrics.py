@@ -1,4 +1,4 @@
-"""docs/metrics.md is true: its snippets and commands run, its figures are the written tables', its presets are the code's."""
+"""docs/concepts/metrics.md is true: its snippets and commands run, its figures are the written tables', its presets are the code's."""
 
 import importlib.util
 import re
@@ -13,9 +13,9 @@ from palpate.metrics import PRESETS
 
 TOP = Path(__file__).resolve().parents[1]
 DOCS = TOP / "docs"
-PAGE = (DOCS / "metrics.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "concepts" / "metrics.md").read_text(encoding="utf-8")
 TABLES = {
-    name: (DOCS / f"metric_{name}.md").read_text(encoding="utf-8")
+    name: (DOCS / "studies" / f"metric_{name}.md").read_text(encoding="utf-8")
     for name in ("responses", "degradations", "coverage")
 }
 STUDIES = {name: f"metric_{name}" for name in TABLES}

@@ -1,4 +1,4 @@
-"""docs/world.md is true: its commands and snippets run, its tables are the code's, its figures are the benchmarks', its pictures are drawn by the recipe."""
+"""docs/concepts/world.md is true: its commands and snippets run, its tables are the code's, its figures are the benchmarks', its pictures are drawn by the recipe."""
 
 import dataclasses
 import importlib.util
@@ -21,7 +21,7 @@ from palpate.sim.plan import written_frames
 
 TOP = Path(__file__).resolve().parents[1]
 DOCS = TOP / "docs"
-PAGE = (DOCS / "world.md").read_text(encoding="utf-8")
+PAGE = (DOCS / "concepts" / "world.md").read_text(encoding="utf-8")
 COMMANDS = [
     shlex.split(line, comments=True)
     for line in "\n".join(re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)).splitlines()

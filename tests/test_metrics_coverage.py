@@ -1,7 +1,7 @@
 """The error bars of the grouped quantities are true: 95 % intervals cover 92 to 99 %, permutations of videos reject 3 to 8 % of true nulls.
 
 300 replicates a design, a third each with 12, 24 and 40 videos; the truth is that of infinitely many videos. Frame-level intervals and permutations, on the
-same features without groups, fail. The same simulation at full length is ``benchmarks/metric_coverage.py``, its tables ``docs/metric_coverage.md``.
+same features without groups, fail. The same simulation at full length is ``benchmarks/metric_coverage.py``, its tables ``docs/studies/metric_coverage.md``.
 """
 
 import sys

@@ -56,7 +56,7 @@ def small(mini, monkeypatch, tmp_path):
 def test_the_page_tells_the_scores_of_the_cards(mini):
     target = shipped_module.shipped_root() / "mini"
     assert sys.modules["mini_cards"].scores_table(target) in (
-        RECIPES.parent / "docs" / "mini.md"
+        RECIPES.parent / "docs" / "concepts" / "mini.md"
     ).read_text(encoding="utf-8")
 
 

@@ -19,7 +19,7 @@ sampler            DPM-Solver++ 4         DPM-Solver++ 8                    DDIM
 guidance           2                      4                                 7.5
 =================  =====================  ================================  ===============================================
 
-``mini`` is the geometry of the models that ship (docs/mini.md, with their scores and with what did not work): what is trained with it can go on from
+``mini`` is the geometry of the models that ship (docs/concepts/mini.md, with their scores and with what did not work): what is trained with it can go on from
 them. ``--source text`` is the paper's training.
 """
 
