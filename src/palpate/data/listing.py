@@ -111,7 +111,7 @@ def read_lists(
         {label: str(label) for label in labels.unique()} if categories is None else dict(categories)
     )
     table = rows.select("id", "video", "frame").with_columns(
-        touch=pl.Series(touches(rows["video"], rows["frame"], labels), dtype=pl.String),
+        contact=pl.Series(touches(rows["video"], rows["frame"], labels), dtype=pl.String),
         material=labels.replace_strict(names, return_dtype=pl.String)
         if rows.height
         else pl.Series([], dtype=pl.String),
@@ -172,14 +172,14 @@ def number_together(*manifests: Manifest) -> list[Manifest]:
     # A frame that stands in two lists belongs to one touch there and here.
     alone = whole.unique(["video", "frame"], maintain_order=True)
     names = alone.with_columns(
-        touch=pl.Series(touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String)
+        contact=pl.Series(touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String)
     )
     found = whole.join(names, on=["video", "frame"], how="left", maintain_order="left")["contact"]
     out: list[Manifest] = []
     for m in manifests:
         out.append(
             Manifest(
-                m.table.with_columns(touch=found.slice(sum(len(o) for o in out), len(m))),
+                m.table.with_columns(contact=found.slice(sum(len(o) for o in out), len(m))),
                 m.root,
                 m.facts,
             )
