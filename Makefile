@@ -8,34 +8,48 @@ KEY    := $(shell cat pyproject.toml constraints.txt | sha256sum | cut -c1-16)
 READY  := $(VENV)/.ready-$(KEY)
 DEV    := $(VENV)/.dev-$(KEY)
 OUT    ?= runs/demo
+# Processes that run tests; each uses one thread.
+WORKERS ?= auto
+PYTEST = OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -q -n $(WORKERS)
+PIP    = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Spinning threads make two busy cores several times slower than one.
 export OMP_WAIT_POLICY := passive
 
-.PHONY: help demo test test-fast test-slow lint format wheel lock clean
+.PHONY: help demo test test-fast test-slow nightly coverage lint format docs wheel lock clean
 
-help:            ## this list
+help:            ## list the targets
 	@grep -E '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 14
 
 demo: $(READY)   ## the whole pipeline on the embedded world; DATA=path runs it on a Touch and Go tree
-	$(BIN)/palpate demo --out $(OUT) $(if $(DATA),--data $(DATA))
+	$(BIN)/palpate demo --output $(OUT) $(if $(DATA),--data $(DATA))
 
 test: test-fast test-slow  ## all tests, fast ones first
 
 test-fast: $(DEV)  ## tests of under about five seconds each
-	OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -q -m "not slow and not browser"
+	$(PYTEST) -m "not slow and not browser and not nightly"
 
 test-slow: $(DEV)  ## the slow ones, and the page in a browser
-	OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -q -m "slow or browser"
+	$(PYTEST) -m "(slow or browser) and not nightly"
 
-lint: $(DEV)     ## style, types, and the one-way house
+nightly: $(DEV)  ## what takes longer: studies of coverage, the shipped models made again
+	$(PYTEST) -m nightly --timeout=3600
+	$(BIN)/python recipes/mini.py --out runs/mini --verify
+
+coverage: $(DEV)  ## line and branch coverage of the fast tests
+	$(PYTEST) -m "not slow and not browser and not nightly" --cov --cov-report=term --cov-report=xml
+
+lint: $(DEV)     ## style, types, and the direction of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/basedpyright
 
-format: $(DEV)   ## rewrite the sources in the house style
+format: $(DEV)   ## rewrite the sources in the project's style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+docs: $(DEV)     ## the docs site in site/; a broken link fails
+	$(BIN)/zensical build --clean --strict
 
 wheel: $(DEV)    ## build the wheel and try it alone in empty environments
 	PYTHON=$(PYTHON) .ci/wheel $(BIN)/python
@@ -44,16 +58,16 @@ lock:            ## write constraints.txt from a fresh environment
 	PYTHON=$(PYTHON) .ci/lock
 
 clean:           ## remove the environment and everything generated
-	rm -rf $(VENV) build dist runs artifacts .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build dist runs artifacts site .cache .coverage coverage.xml .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
 # torch goes in first and alone: with a version in place, nothing that depends on it brings another build.
 $(READY):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "palpate needs Python 3.11 or newer; got $$($(PYTHON) --version). Try: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $$(grep '^torch==' constraints.txt)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[video,torch]"
+	$(PIP) $$(grep '^torch==' constraints.txt)
+	$(PIP) -c constraints.txt -e ".[video,torch,probe]"
 	touch $@
 
 $(DEV): $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[all,dev]"
+	$(PIP) -c constraints.txt -e ".[all,dev]"
 	touch $@

@@ -1,7 +1,79 @@
-"""palpate: from a photo to the touch it would give, and honest scores for how well.
+"""palpate: tactile images from photos, splits that do not leak, scores with intervals.
 
-Importing this package has no effects and loads neither torch nor polars; import the room you need
-(``palpate.data``, ``palpate.leakage``, ``palpate.metrics`` ...).
+::
+
+    import palpate as pp
+
+    pp.audit("train.txt", "test.txt")                        # does this split leak?
+    pp.split(pp.load("tag/"), by="video")                    # one that does not
+    pp.score("generated/", "real/", encoder="palpate/mini")  # how good are these tactile images?
+    pp.TactilePipeline.from_pretrained("palpate/mini")(photo).images[0]
+
+Every name is imported on first use: ``import palpate`` itself loads neither torch nor polars.
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0.dev0"
+
+if TYPE_CHECKING:
+    from palpate.core import Score, Split
+    from palpate.data import Manifest, load, validate
+    from palpate.diffusion import TactilePipeline, generate, train_generator
+    from palpate.encoders import Encoder, train_encoder
+    from palpate.evaluation import probe, score
+    from palpate.leakage import audit, split
+    from palpate.sim import World
+
+#: Public name -> the room that holds it.
+_ROOMS = {
+    "Encoder": "encoders",
+    "Manifest": "data",
+    "Score": "core",
+    "Split": "core",
+    "TactilePipeline": "diffusion",
+    "World": "sim",
+    "audit": "leakage",
+    "generate": "diffusion",
+    "load": "data",
+    "probe": "evaluation",
+    "score": "evaluation",
+    "split": "leakage",
+    "train_encoder": "encoders",
+    "train_generator": "diffusion",
+    "validate": "data",
+}
+
+__all__ = [
+    "Encoder",
+    "Manifest",
+    "Score",
+    "Split",
+    "TactilePipeline",
+    "World",
+    "audit",
+    "generate",
+    "load",
+    "probe",
+    "score",
+    "split",
+    "train_encoder",
+    "train_generator",
+    "validate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its room on first use (PEP 562)."""
+    if name not in _ROOMS:
+        raise AttributeError(f"module 'palpate' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"palpate.{_ROOMS[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
