@@ -34,7 +34,7 @@ from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
 from palpate.core import FeatureSet, rng_for, short
-from palpate.encoders.probe import retrieval
+from palpate.metrics.probe import retrieval
 from palpate.metrics.intervals import mean_interval
 from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.options import BACKGROUND_OFFSET

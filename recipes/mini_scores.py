@@ -22,7 +22,7 @@ from palpate.diffusion.generate import generate
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.probe import material_accuracy, retrieval, text_positives
+from palpate.metrics.probe import material_accuracy, retrieval, text_positives
 from palpate.encoders.zero_shot import zero_shot_accuracy
 from palpate.evaluation.scoring import score_generated
 from palpate.sim import MATERIALS, WorldOptions

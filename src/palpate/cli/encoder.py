@@ -42,7 +42,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     from palpate.encoders.embed import embed
     from palpate.encoders.encoder_set import load_clip
     from palpate.encoders.presets import preset
-    from palpate.encoders.probe import material_accuracy
+    from palpate.metrics.probe import material_accuracy
 
     if options.epochs is not None and not 0 < options.epochs < float("inf"):
         raise PalpateError(

@@ -13,7 +13,7 @@ import numpy as np
 from palpate.core import FeatureSet, PalpateError, Score
 from palpate.encoders.embed import embed_texts
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.probe import mean_over_groups
+from palpate.metrics.probe import mean_over_groups, recall_by_class
 
 
 def zero_shot_accuracy(
@@ -68,24 +68,19 @@ def zero_shot_accuracy(
     named = [classes[k] for k in (images.features.astype(np.float64) @ prototypes.T).argmax(axis=1)]
     hit = np.array([a == b for a, b in zip(named, labels, strict=True)], dtype=float)
     groups = list(images.groups) if images.groups is not None else list(images.ids)
-    recall = {
-        name: float(hit[[label == name for label in labels]].mean())
-        for name in sorted({str(label) for label in labels})
-    }
     return mean_over_groups(
         "zero-shot accuracy",
         hit,
-        np.ones(len(hit)),
         groups,
-        subject,
-        split,
-        images.encoder,
-        None,
-        {
+        estimator="mean",
+        subject=subject,
+        split=split,
+        encoder=images.encoder,
+        settings={
             "prompts": {name: list(prompts[name]) for name in classes},
             "text": encoders.digest("text"),
         },
-        {"chance": 1 / len(classes), "recall": recall},
+        details={"chance": 1 / len(classes), "recall": recall_by_class(hit, labels)},
     )
 
 

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, Progress, Split, quiet
 from palpate.data.manifest import Manifest
-from palpate.encoders.probe import fit_probe
 from palpate.evaluation.impact_features import (
     Rows,
     Source,
@@ -48,6 +47,7 @@ from palpate.evaluation.impact_scores import (
 )
 from palpate.leakage.audit import GROUPS
 from palpate.leakage.splits import choose_group, leak_free_split
+from palpate.metrics.probe import fit_probe
 from palpate.report.results import Impact, ImpactRow
 
 #: Train samples of the linear probe; its penalty is chosen by twelve fits.

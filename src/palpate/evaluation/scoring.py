@@ -23,7 +23,6 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.generate import Generated
 from palpate.encoders.embed import embed, embed_images
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.probe import fit_probe, material_accuracy
 from palpate.evaluation.companions import (
     ON_GEL,
     Weights,
@@ -42,6 +41,7 @@ from palpate.evaluation.comparing import (
     feature_companions,
 )
 from palpate.evaluation.touches import TOUCH, Wanted, files_digest, own_cache
+from palpate.metrics.probe import fit_probe, material_accuracy
 
 
 def score_generated(
