@@ -362,7 +362,7 @@ def test_more_refusals():
 
 
 def test_copies_are_found_on_disk_and_in_large_sets(tmp_path, monkeypatch):
-    monkeypatch.setattr("palpate.metrics.checks.SLAB", 7)
+    monkeypatch.setattr("palpate.metrics.inputs.SLAB", 7)
     x = unit_rows(0, 40, 3)
     np.save(tmp_path / "x.npy", x)
     with pytest.warns(UserWarning, match="40 rows of x"):

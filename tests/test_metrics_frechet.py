@@ -258,7 +258,7 @@ def test_bad_input_is_refused_by_name():
         fid(features(zero), features(good), normalize=True)
     with pytest.raises(PalpateError, match="one encoder"):
         fid(features(good, encoder="a" * 64), features(good, encoder="b" * 64))
-    with pytest.raises(PalpateError, match="blocks must be a whole number of at least 2"):
+    with pytest.raises(PalpateError, match="`blocks` must be a whole number of at least 2"):
         fid(features(good), features(good), blocks=1)
     with pytest.raises(PalpateError, match="known for every row"):
         fid(features(good, ["v", *[None] * 8]), features(good, ["v"] * 9))

@@ -263,7 +263,7 @@ X = unit_rows(0, 8, 3)
         (bad(X, r2=0.0), X, {}, ["zero vector", "1 row (2)"]),
         (bad(X, r2=0.0), X, {"normalize": True}, ["zero vector"]),
         (2 * X, X, {}, ["L2-normalized", "norm 2", "8 rows"]),
-        ([[1.0, 0.0], [1.0]], X, {}, ["x must turn into a NumPy array"]),
+        ([[1.0, 0.0], [1.0]], X, {}, ["`x` must turn into an array"]),
         (X, X, {"normalize": "yes"}, ["normalize"]),
         (X, X, {"estimator": "grouped"}, ["groups of both sets"]),
         (

@@ -186,7 +186,7 @@ def test_bad_input_is_refused_by_name():
     for args, match in [
         ((features(good[:5]), features(good)), "at least 6 rows"),
         ((features(good), features(good[:5])), "at least 6 rows"),
-        ((features(good), features(good), 0), "k must be a whole number of at least 1"),
+        ((features(good), features(good), 0), "`k` must be a whole number of at least 1"),
         ((features(good), features(good[:, :2])), "same width"),
         ((features((good * 9).astype(int)), features(good)), "floating-point"),
         ((features(good, encoder="a" * 64), features(good, encoder="b" * 64)), "one encoder"),

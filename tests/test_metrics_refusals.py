@@ -30,7 +30,7 @@ def test_rows_too_short_are_refused_as_those_too_long(length):
     x = unit_rows(0, 8, 3)
     x[[2, 5]] *= length
     with pytest.raises(
-        PalpateError, match=rf"x must be L2-normalized. Got norm {length:.4g} in 2 rows \(2, 5\)"
+        PalpateError, match=rf"`x` must be L2-normalized. Got norm {length:.4g} in 2 rows \(2, 5\)"
     ):
         mmd2(x, unit_rows(1, 8, 3))
     with pytest.raises(PalpateError, match=r"L2-normalized.*2 rows \(2, 5\)"):
@@ -174,17 +174,17 @@ X, Y, G = unit_rows(0, 8, 3), unit_rows(1, 8, 3), world(2)
         (lambda: i_tmmd(G, kernel="linear"), "kernel must be a kernel.*Got 'linear'"),
         (
             lambda: ssim(*images(), level=95),
-            r"level must lie in \(0, 1\). Got 95. Pass e.g. level=0.95",
+            r"`level` must lie in \(0, 1\). Got 95. Choose a coverage. E.g. level=0.95",
         ),
         (lambda: psnr(*images(), level=95), "level.*Got 95"),
         (lambda: psnr(*images(), level=95, compat="torchmetrics"), "level.*Got 95"),
         (lambda: fid(G, G, level=2), "level.*Got 2"),
-        (lambda: fid(G, G, blocks=2.5), "blocks must be a whole number of at least 2. Got 2.5"),
+        (lambda: fid(G, G, blocks=2.5), "`blocks` must be a whole number of at least 2. Got 2.5"),
         (lambda: fid(G, G, blocks=1), "blocks.*at least 2. Got 1"),
-        (lambda: prdc(G, G, k=2.5), "k must be a whole number of at least 1. Got 2.5"),
+        (lambda: prdc(G, G, k=2.5), "`k` must be a whole number of at least 1. Got 2.5"),
         (lambda: prdc(G, G, level=95), "level.*Got 95"),
         (lambda: contact_scores(*images(), images()[0], level=3), "level.*Got 3"),
-        (lambda: tmmd(G, G, seed=2**70), f"seed must be a whole number of at least 0. Got {2**70}"),
+        (lambda: tmmd(G, G, seed=2**70), f"`seed` must be a whole number of at least 0. Got {2**70}"),
         (lambda: tmmd(G, G, seed=1.5), "seed.*Got 1.5"),
         (lambda: fid(G, G, seed=-1), "seed.*Got -1"),
         (lambda: tmmd(G, G, level="a"), "level.*Got 'a'"),

@@ -6,7 +6,6 @@ place and in several threads; other libraries run the same blocks on their own d
 
 from __future__ import annotations
 
-import mmap
 import os
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -16,6 +15,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from palpate.metrics.inputs import is_foreign
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -267,22 +268,6 @@ def full_products() -> Generator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-def release(x: Any) -> None:
-    """Lets the system forget the pages of an array on disk that were read: they would count as this process's memory."""
-    held = getattr(x, "_mmap", None)
-    if (
-        isinstance(x, np.memmap) and held is not None and hasattr(held, "madvise") and x.mode != "c"
-    ):  # own changes would be lost
-        held.madvise(mmap.MADV_DONTNEED)
-
-
-def is_foreign(x: Any) -> bool:
-    """Whether ``x`` is an array of a library other than NumPy: a torch tensor, say."""
-    return not isinstance(x, np.ndarray) and (
-        hasattr(x, "__array_namespace__") or type(x).__module__.split(".")[0] == "torch"
-    )
 
 
 def ops_of(x: Any) -> Ops:

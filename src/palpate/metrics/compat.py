@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import checked_choice, checked_images
+from palpate.metrics.inputs import checked_choice, checked_images
 from palpate.metrics.kernels import Array
 
 Compat = Literal["torchmetrics", "skimage", "piq"]

@@ -35,8 +35,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, Score
-from palpate.metrics.checks import checked_choice, checked_images, checked_names
 from palpate.metrics.compat import WINDOW, Convention
+from palpate.metrics.inputs import checked_choice, checked_images, checked_names
 from palpate.metrics.kernels import Array
 from palpate.metrics.masks import (
     LEAST,

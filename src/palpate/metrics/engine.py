@@ -16,8 +16,9 @@ from typing import Any, Literal
 import numpy as np
 
 from palpate.core import PalpateError
-from palpate.metrics.arrays import ops_of, release
+from palpate.metrics.arrays import ops_of
 from palpate.metrics.blocked import Sweep, blocked_sums
+from palpate.metrics.inputs import release
 from palpate.metrics.kernels import Gaussian, Index, Kernel
 from palpate.metrics.moments import Moments, center_of
 from palpate.metrics.sums import PairSums

@@ -24,14 +24,14 @@ from numpy.typing import NDArray
 
 from palpate import __version__
 from palpate.core import FeatureSet, PalpateError, Score, rng_for
-from palpate.metrics.checks import (
+from palpate.metrics.gaussians import Array, Moments, distance_of_features, distance_of_moments
+from palpate.metrics.inputs import (
     Floats,
     checked_level,
     checked_names,
     checked_whole,
     copies_across,
 )
-from palpate.metrics.gaussians import Array, Moments, distance_of_features, distance_of_moments
 from palpate.metrics.intervals import jackknife_errors, t_interval
 from palpate.metrics.neighbors import checked_sets, copies_note
 from palpate.metrics.paired import Comparison, difference, holm, same_samples

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import Floats, checked_features
+from palpate.metrics.inputs import Floats, checked_features
 
 Array = NDArray[np.float64]
 

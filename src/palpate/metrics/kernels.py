@@ -18,13 +18,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from palpate.core import PalpateError, rng_for
-from palpate.metrics.arrays import Ops, ops_of, release
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from palpate.metrics.arrays import Ops, ops_of
+from palpate.metrics.inputs import Array, Index, release
 
 #: Factors on the median distance that make the bandwidths of ``"multi"``: two octaves around it.
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)

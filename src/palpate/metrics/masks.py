@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import checked_images
 from palpate.metrics.compat import as_images
+from palpate.metrics.inputs import checked_images
 from palpate.metrics.kernels import Array
 
 Mask = NDArray[np.bool_]

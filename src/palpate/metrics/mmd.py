@@ -22,17 +22,16 @@ from typing import Any, Literal
 import numpy as np
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import (
+from palpate.metrics.engine import BACKENDS, Backend, kernel_sums
+from palpate.metrics.inputs import (
     Normalize,
     checked_choice,
     checked_names,
-    checked_numbers,
+    checked_number,
     checked_pair,
-    checked_positive,
     checked_whole,
     copies_across,
 )
-from palpate.metrics.engine import BACKENDS, Backend, kernel_sums
 from palpate.metrics.kernels import Array, Index, Kernel, Sigma, checked_kernel, gaussian
 from palpate.metrics.sums import PairSums, Totals
 
@@ -162,13 +161,13 @@ def distance(
         differ; where copies leave few of those, float64 is taken (near-copies that share one large coordinate may leave 2e-6 where sigma is 4).
 
     Raises:
-        PalpateError: on features that :func:`palpate.metrics.checks.checked_features` refuses, fewer than two rows for
+        PalpateError: on features that :func:`palpate.metrics.inputs.checked_features` refuses, fewer than two rows for
             ``"unbiased"``, missing groups, or fewer than two groups a set for ``"grouped"``.
     """
     checked_choice("estimator", estimator, ESTIMATORS)
     checked_choice("backend", backend, BACKENDS)
-    checked_positive(scale=scale)
-    checked_numbers(tolerance=tolerance)
+    checked_number(positive=True, scale=scale)
+    checked_number(tolerance=tolerance)
     checked_whole(1, block=block)
     checked_kernel(kernel)
     x, y = checked_pair(

@@ -26,7 +26,8 @@ import numpy as np
 from scipy import special
 
 from palpate.core import PalpateError
-from palpate.metrics.arrays import Ops, ops_of, release
+from palpate.metrics.arrays import Ops, ops_of
+from palpate.metrics.inputs import release
 from palpate.metrics.kernels import Array, Index
 from palpate.metrics.sums import PairSums
 

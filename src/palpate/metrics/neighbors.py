@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from palpate import __version__
 from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet
-from palpate.metrics.checks import (
+from palpate.metrics.inputs import (
     Floats,
     checked_level,
     checked_names,
@@ -166,7 +166,7 @@ def checked_sets(
     """The features of both sets of one width and dtype.
 
     Raises:
-        PalpateError: as :func:`palpate.metrics.checks.checked_pair`, and on encoders of different digests.
+        PalpateError: as :func:`palpate.metrics.inputs.checked_pair`, and on encoders of different digests.
     """
     if (
         generated.encoder is not None

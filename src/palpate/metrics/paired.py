@@ -24,17 +24,11 @@ import numpy as np
 from scipy import special
 
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
+from palpate.metrics.inputs import require_one_encoder
 from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
 from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Options, plan_for
-from palpate.metrics.scored import (
-    Scored,
-    excess_of,
-    left_out_alike,
-    not_comparable,
-    require_one_encoder,
-    with_floor,
-)
+from palpate.metrics.scored import Scored, excess_of, left_out_alike, not_comparable, with_floor
 from palpate.metrics.tables import build_table
 from palpate.metrics.tactile import floors_of, four_of, tmmd_of
 

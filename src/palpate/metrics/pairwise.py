@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from palpate import __version__
 from palpate.core import PalpateError, Score
-from palpate.metrics.checks import checked_level, checked_names
 from palpate.metrics.compat import (
     SSIM_CONVENTIONS,
     Compat,
@@ -33,6 +32,7 @@ from palpate.metrics.compat import (
     psnr_values,
     ssim_values,
 )
+from palpate.metrics.inputs import checked_level, checked_names
 from palpate.metrics.intervals import mean_interval
 from palpate.metrics.kernels import Array
 

@@ -16,15 +16,14 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypedDict
 
 from palpate.core import PalpateError
-from palpate.metrics.checks import (
+from palpate.metrics.engine import BACKENDS, Backend
+from palpate.metrics.inputs import (
     Normalize,
     checked_choice,
     checked_level,
-    checked_numbers,
-    checked_positive,
+    checked_number,
     checked_whole,
 )
-from palpate.metrics.engine import BACKENDS, Backend
 from palpate.metrics.kernels import Kernel, Sigma, checked_kernel
 from palpate.metrics.mmd import ESTIMATORS, Estimator
 
@@ -46,7 +45,7 @@ class Options(TypedDict, total=False):
             bandwidths around it (:mod:`palpate.metrics.kernels`).
         kernel: another kernel than the Gaussian of ``sigma``, e.g. :class:`palpate.metrics.kernels.Polynomial`.
         scale: factor on the result, default 1000.
-        normalize: ``"check"`` (default), True or False, see :func:`palpate.metrics.checks.checked_features`.
+        normalize: ``"check"`` (default), True or False, see :func:`palpate.metrics.inputs.checked_features`.
         backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
         tolerance: largest bound with which ``auto`` takes moments, default 1e-4 at scale 1000.
         block: rows of a kernel block, default 1024.
@@ -134,8 +133,8 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     checked_choice("denominator", plan.denominator, DENOMINATORS)
     checked_choice("aggregate", plan.aggregate, AGGREGATES)
     checked_choice("backend", plan.backend, BACKENDS)
-    checked_positive(scale=plan.scale, block=plan.block)
-    checked_numbers(tolerance=plan.tolerance)
+    checked_number(positive=True, scale=plan.scale)
+    checked_number(tolerance=plan.tolerance)
     checked_whole(1, block=plan.block)
     checked_whole(0, permutations=plan.permutations, seed=plan.seed)
     checked_whole(4, min_samples=plan.min_samples)  # two for each half

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from palpate import __version__
-from palpate.core import FeatureSet, PalpateError, Score
+from palpate.core import FeatureSet, Score
 from palpate.metrics.intervals import Interval
 from palpate.metrics.kernels import Array
 from palpate.metrics.presets import Plan
@@ -279,20 +279,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
-
-
-def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
-    """Refuses features of different encoders.
-
-    Raises:
-        PalpateError: with both digests.
-    """
-    if a.encoder is not None and b.encoder is not None and a.encoder != b.encoder:
-        raise PalpateError(
-            f"Generated and {what} features must come from one encoder",
-            f"digests {a.encoder[:12]} and {b.encoder[:12]}",
-            "Embed both with the same encoder",
-        )
 
 
 def halves_fields(plan: Plan) -> dict[str, Any]:

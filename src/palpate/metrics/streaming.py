@@ -24,7 +24,7 @@ from typing import Any, ClassVar, Literal, Self, Unpack, cast
 import numpy as np
 
 from palpate.core import FeatureSet, PalpateError, Score, digest_json
-from palpate.metrics.checks import checked_choice
+from palpate.metrics.inputs import checked_choice
 from palpate.metrics.presets import Options, Plan, plan_for
 from palpate.metrics.scored import RANDOM_NOTE, UNBOUNDED, Scored, with_floor
 from palpate.metrics.streaming_states import Columns, FeatureState, Layout, SumState, sized, to_host

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from palpate.core import FeatureSet, PalpateError, seed_for
 from palpate.core.score import is_missing
 from palpate.metrics.arrays import is_foreign
-from palpate.metrics.checks import Normalize, checked_features, checked_names
+from palpate.metrics.inputs import Normalize, checked_features, checked_names
 from palpate.metrics.kernels import Array, Gaussian, Index
 from palpate.metrics.moments import Moments, center_of
 from palpate.metrics.tables import Table
@@ -97,7 +97,7 @@ def names_of(name: str, values: Any, n: int, *, gaps: bool = False) -> list[str]
     """Ids, labels or groups as strings: from a list, a NumPy array or a tensor; ``gaps``: None is the empty string.
 
     Raises:
-        PalpateError: as :func:`palpate.metrics.checks.checked_names`.
+        PalpateError: as :func:`palpate.metrics.inputs.checked_names`.
     """
     if values is None:
         return None

@@ -14,9 +14,9 @@ import numpy as np
 
 from palpate.core import FeatureSet
 from palpate.core.score import is_missing
-from palpate.metrics.checks import checked_features, checked_names, checked_pair, copies_across
 from palpate.metrics.engine import kernel_sums
 from palpate.metrics.halves import half_of, halves_bound, sample_units, self_distances, take_sets
+from palpate.metrics.inputs import checked_features, checked_names, checked_pair, copies_across
 from palpate.metrics.intervals import Interval, jackknife_errors, leave_one_out, t_interval
 from palpate.metrics.kernels import Array, Index, Kernel, gaussian
 from palpate.metrics.mmd import largest_bound, unit_index

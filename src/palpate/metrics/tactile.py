@@ -20,6 +20,7 @@ import numpy as np
 
 from palpate.core import FeatureSet, PalpateError, Score
 from palpate.metrics.halves import Design, design_of, halves_bound, self_distances, whole_sets
+from palpate.metrics.inputs import feature_set, require_one_encoder
 from palpate.metrics.intervals import halves_of, random_halves_sd
 from palpate.metrics.kernels import Array, Index
 from palpate.metrics.mmd import largest_bound, mmd_bound, mmd_matrix
@@ -31,7 +32,6 @@ from palpate.metrics.scored import (
     halves_fields,
     halves_note,
     null_band,
-    require_one_encoder,
     scored,
     unfit,
     units_of,
@@ -41,12 +41,26 @@ from palpate.metrics.sums import PairSums, Totals
 from palpate.metrics.tables import Table, build_table, class_estimate, estimate
 
 
-def tmmd(generated: FeatureSet, reference: FeatureSet, **options: Unpack[Options]) -> Score:
+def tmmd(  # noqa: PLR0913
+    generated: Any,
+    reference: Any,
+    *,
+    ids: Any = None,
+    labels: Any = None,
+    groups: Any = None,
+    reference_ids: Any = None,
+    reference_groups: Any = None,
+    encoder: str | None = None,
+    **options: Unpack[Options],
+) -> Score:
     """TMMD: dist^2 between generated and real touches (paper, Eq. 2).
 
     Args:
-        generated: (n, d) features of generated touches.
-        reference: (m, d) features of real touches; n and m may differ.
+        generated: (n, d) features of generated tactile images: an array, a tensor, a list of rows, or a FeatureSet.
+        reference: (m, d) features of real tactile images; n and m may differ.
+        ids, labels, groups: n each, of ``generated``; see :func:`palpate.metrics.inputs.feature_set`.
+        reference_ids, reference_groups: m each, of ``reference``. The same id or group in both sets is the same sample or group.
+        encoder: digest of the encoder of both.
         **options: see :class:`Options`. Groups count only if both sets have them; the same name is the same group in both.
 
     Returns:
@@ -56,6 +70,12 @@ def tmmd(generated: FeatureSet, reference: FeatureSet, **options: Unpack[Options
     Raises:
         PalpateError: on features that are refused, unequal widths, or encoders of different digests.
     """
+    generated = feature_set(
+        generated, argument="generated", ids=ids, labels=labels, groups=groups, encoder=encoder
+    )
+    reference = feature_set(
+        reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
+    )
     require_one_encoder(generated, reference, "reference")
     grouped = generated.groups is not None and reference.groups is not None
     plan = plan_for(options, grouped=grouped)
@@ -124,7 +144,15 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
     )
 
 
-def i_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
+def i_tmmd(
+    generated: Any,
+    *,
+    ids: Any = None,
+    labels: Any = None,
+    groups: Any = None,
+    encoder: str | None = None,
+    **options: Unpack[Options],
+) -> Score:
     """I-TMMD: dist^2 between two halves of the generated touches (paper, Eq. 3).
 
     With ``halves="group"`` the value is the average over halvings by whole groups, in closed form (:mod:`palpate.metrics.halves`).
@@ -136,6 +164,9 @@ def i_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
     Raises:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
+    generated = feature_set(
+        generated, argument="generated", ids=ids, labels=labels, groups=groups, encoder=encoder
+    )
     plan = plan_for(options, grouped=generated.groups is not None)
     return i_tmmd_of(
         build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan
@@ -232,7 +263,15 @@ def _usable(table: Table, plan: Plan) -> tuple[Index, dict[str, str]]:
     return kept, {name: reason for name, reason in reasons.items() if reason}
 
 
-def ci_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
+def ci_tmmd(
+    generated: Any,
+    *,
+    ids: Any = None,
+    labels: Any = None,
+    groups: Any = None,
+    encoder: str | None = None,
+    **options: Unpack[Options],
+) -> Score:
     """CI-TMMD: the mean over classes of dist^2 between two halves of a class (paper, Eq. 4).
 
     A class counts with at least ``min_samples`` samples and, for halves by group, two groups of which one has two samples.
@@ -243,6 +282,9 @@ def ci_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
     Raises:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
+    generated = feature_set(
+        generated, argument="generated", ids=ids, labels=labels, groups=groups, encoder=encoder
+    )
     plan = plan_for(options, grouped=generated.groups is not None)
     return ci_tmmd_of(
         build_table(generated, None, plan, grouped=generated.groups is not None), generated, plan
@@ -312,7 +354,15 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     )
 
 
-def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
+def d_tmmd(
+    generated: Any,
+    *,
+    ids: Any = None,
+    labels: Any = None,
+    groups: Any = None,
+    encoder: str | None = None,
+    **options: Unpack[Options],
+) -> Score:
     """D-TMMD: how much a class differs from itself, against how much from the others (paper, Eq. 5-7).
 
     ``denominator``: ``"sum"`` over c' including c (Eq. 7), ``"mean"`` of the same, or ``"mean_off_diagonal"``. ``aggregate``: the mean over
@@ -326,6 +376,9 @@ def d_tmmd(generated: FeatureSet, **options: Unpack[Options]) -> Score:
     Raises:
         PalpateError: on features that are refused, or ``halves="group"`` without groups.
     """
+    generated = feature_set(
+        generated, argument="generated", ids=ids, labels=labels, groups=groups, encoder=encoder
+    )
     plan = plan_for(options, grouped=generated.groups is not None)
     return d_tmmd_of(
         build_table(

@@ -1,0 +1,391 @@
+"""What the metrics take, and what they reject: every input is checked once, at the public function.
+
+Features are finite floating-point rows ``(n, d)``: a NumPy array (also one on disk), a torch tensor on
+any device, a list of rows, or a :class:`palpate.core.FeatureSet`. Integers are rejected, since the
+distance of wrapped integers has no meaning; half precision is widened, since ``exp`` of a small exponent
+rounds to 1 there (a perfect score for anything). Images are ``(n, h, w, c)`` in [0, 1] or 8 bit.
+"""
+
+from __future__ import annotations
+
+import mmap
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import FeatureSet, PalpateError, PalpateWarning
+from palpate.core.score import is_missing
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Floats = NDArray[np.floating[Any]]
+Normalize = Literal["check"] | bool
+
+#: Rows may differ from unit length by this much before ``normalize="check"`` rejects them.
+NORM_TOLERANCE = 1e-3
+#: Rows of an array on disk that are read together.
+SLAB = 8192
+
+
+def invalid(name: str, must: str, got: str, fix: str, **example: Any) -> PalpateError:
+    """The error for an input; ``name`` is an argument ("x") or a clause ("The features of 'a'")."""
+    if name.isidentifier():
+        return PalpateError(must, got, fix, argument=name, example=example)
+    return PalpateError(f"{name} {must}", got, fix, example=example)
+
+
+def feature_set(
+    features: Any,
+    *,
+    argument: str,
+    ids: Any = None,
+    labels: Any = None,
+    groups: Any = None,
+    encoder: str | None = None,
+) -> FeatureSet:
+    """Features as a :class:`FeatureSet`: the door of every metric on features.
+
+    Args:
+        features: (n, d) array, tensor on any device, list of rows, or a FeatureSet, whose columns the
+            other arguments replace.
+        argument: name of the caller's argument, for errors and for default ids.
+        ids: n sample ids. Without, the row numbers behind the name of the argument: rows of two
+            arrays without ids are different samples.
+        labels: n classes.
+        groups: n groups, e.g. videos.
+        encoder: digest of the encoder.
+
+    Raises:
+        PalpateError: on what does not turn into rows, or columns of another length.
+    """
+    if isinstance(features, FeatureSet):
+        given: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups}
+        changed = {k: column(k, v, len(features.ids)) for k, v in given.items() if v is not None}
+        if encoder is not None:
+            changed["encoder"] = encoder
+        return replace(features, **changed) if changed else features
+    x = as_array(argument, to_host(features))
+    if x.ndim != 2:
+        raise _not_rows(argument, x)
+    n = len(x)
+    names = column("ids", ids, n)
+    if names is None:
+        width = len(str(n))
+        names = [f"{argument} {k:0{width}d}" for k in range(n)]
+    return FeatureSet(names, x, column("labels", labels, n), column("groups", groups, n), encoder)
+
+
+def column(name: str, values: Any, n: int) -> list[Any] | None:
+    """One value a row, from a list, an array, a series or a tensor; None stays None.
+
+    Raises:
+        PalpateError: on another length.
+    """
+    if values is None:
+        return None
+    items: Any = values.tolist() if hasattr(values, "tolist") else list(values)
+    if not isinstance(items, list) or len(items) != n:
+        got = str(len(items)) if isinstance(items, list) else repr(items)
+        raise invalid(name, f"must have one entry a row ({n})", got, "Pass the order of the rows")
+    return items
+
+
+def to_host(x: Any) -> Any:
+    """An array of another device on this one, without its graph; everything else as it is."""
+    if not is_foreign(x):
+        return x
+    x = x.detach() if hasattr(x, "detach") else x
+    return x.cpu() if hasattr(x, "cpu") else x.get() if hasattr(x, "get") else x
+
+
+def is_foreign(x: Any) -> bool:
+    """Whether ``x`` is an array of a library other than NumPy, e.g. a torch tensor."""
+    return not isinstance(x, np.ndarray) and (
+        hasattr(x, "__array_namespace__") or type(x).__module__.split(".")[0] == "torch"
+    )
+
+
+def release(x: Any) -> None:
+    """Drop the pages of an array on disk that were read; they would count as this process's memory."""
+    pages = getattr(x, "_mmap", None)
+    if isinstance(x, np.memmap) and hasattr(pages, "madvise") and x.mode != "c":
+        pages.madvise(mmap.MADV_DONTNEED)  # in mode "c" the caller's changes would be lost
+
+
+def as_array(name: str, x: Any) -> Any:
+    """``np.asarray``; arrays on other devices stay there, tensors on the CPU share their memory.
+
+    Raises:
+        PalpateError: on ragged lists and whatever else has no array.
+    """
+    if is_foreign(x):
+        x = x.detach() if getattr(x, "requires_grad", False) else x
+        if getattr(getattr(x, "device", None), "type", "") != "cpu":
+            return x
+        if str(x.dtype).endswith("bfloat16"):  # NumPy has none
+            _warn_widened(name, "bfloat16")
+            x = x.float()
+    if isinstance(x, np.memmap):  # np.asarray would forget where it comes from
+        return x
+    try:
+        return np.asarray(x)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = str(error).splitlines()[0]
+        raise invalid(name, "must turn into an array", got, "Pass rows of one width") from None
+
+
+def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Any:
+    """``x`` as a float32 or float64 array (n, d), checked slab by slab.
+
+    An array on disk of float32 or float64 rows is read but not kept; one that has to be normalized or
+    widened is copied into memory.
+
+    Args:
+        name: argument or clause for errors, see :func:`invalid`.
+        x: an array (n, d), or one of a library of the array-API standard, which stays on its device.
+        normalize: ``"check"`` rejects rows whose L2 norm is not 1 within 1e-3; ``True`` divides by the
+            norm; ``False`` takes rows as they are.
+        least: the fewest rows that the estimator can use.
+
+    Raises:
+        PalpateError: on integers, a wrong shape, too few rows, NaN or infinity, zero or
+            un-normalized rows (their numbers are given).
+    """
+    if normalize not in (True, False, "check"):
+        must = 'must be "check", True or False'
+        raise PalpateError(must, repr(normalize), "Choose one of these", argument="normalize")
+    x = as_array(name, x)
+    kind = str(x.dtype).rsplit(".", maxsplit=1)[-1]
+    if not kind.startswith(("float", "bfloat", "longdouble", ">f", "<f")):
+        fix = "Pass the encoder's float output, not pixels or codes"
+        raise invalid(name, "must be floating-point features", f"dtype {x.dtype}", fix)
+    if x.ndim != 2 or x.shape[1] == 0:
+        raise _not_rows(name, x)
+    if len(x) < least:
+        must = f"must have at least {least} rows for this estimator"
+        raise invalid(name, must, str(len(x)), "Pass more samples")
+    if kind in ("float16", "bfloat16"):
+        _warn_widened(name, kind)
+    x = _at_least_float32(x)
+    norms = row_norms(x)
+    fix = "Check what those rows were made from"
+    if (bad := ~np.isfinite(norms)).any():
+        raise invalid(name, "must be finite", f"NaN or infinity in {rows_text(bad)}", fix)
+    if normalize is False:
+        return x
+    if (bad := norms == 0).any():
+        raise invalid(name, "must have no zero vector", f"zeros in {rows_text(bad)}", fix)
+    if normalize is True:
+        scale = norms[:, None] if isinstance(x, np.ndarray) else _like(norms[:, None], x)
+        return (x / scale).astype(x.dtype) if isinstance(x, np.ndarray) else x / scale
+    if (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
+        got = f"norm {norms[np.flatnonzero(bad)[0]]:.4g} in {rows_text(bad)}"
+        fix = "Divide by the norm, or keep the norms with normalize=False"
+        raise invalid(name, "must be L2-normalized", got, fix, normalize=True)
+    return x
+
+
+def checked_pair(
+    x: Any, y: Any, *, normalize: Normalize, least: int, names: tuple[str, str] = ("x", "y")
+) -> tuple[Any, Any]:
+    """Both feature arrays, checked, of one width, one library and one dtype.
+
+    Raises:
+        PalpateError: as :func:`checked_features`, and if widths or libraries differ.
+    """
+    x, y = as_array(names[0], x), as_array(names[1], y)
+    first, second = (f"`{name}`" if name.isidentifier() else name for name in names)
+    both = f"{first} and {second.replace('The ', 'the ', 1)}"
+    if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
+        got, fix = f"{x.shape[1]} and {y.shape[1]}", "Embed both with the same encoder"
+        raise PalpateError(f"{both} must have the same width", got, fix)
+    homes = [
+        f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}"
+        if is_foreign(v)
+        else "numpy"
+        for v in (x, y)
+    ]
+    if homes[0] != homes[1]:
+        must = f"{both} must be arrays of one library on one device"
+        raise PalpateError(must, " and ".join(homes), "Move one of them")
+    a, b = (
+        checked_features(name, v, normalize=normalize, least=least)
+        for name, v in zip(names, (x, y), strict=True)
+    )
+    if isinstance(a, np.ndarray):
+        dtype = np.result_type(a.dtype, b.dtype)
+        return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
+    return (_like(a, b), b) if "64" in str(b.dtype) else (a, _like(b, a))
+
+
+def _like(x: Any, other: Any) -> Any:
+    """``x`` in the type, library and device of ``other``."""
+    from array_api_compat import array_namespace, device
+
+    return array_namespace(other).asarray(x, dtype=other.dtype, device=device(other))
+
+
+def _at_least_float32(x: Any) -> Any:
+    """As float32 or float64, in native byte order."""
+    if isinstance(x, np.ndarray):
+        return x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)
+    from array_api_compat import array_namespace
+
+    xp = array_namespace(x)
+    return x if x.dtype == xp.float64 else xp.astype(x, xp.float32)
+
+
+def row_norms(x: Any) -> Array:
+    """(n,) L2 norms in float64, slab by slab."""
+    norms = np.empty(len(x))
+    for k in range(0, len(x), SLAB):
+        slab = x[k : k + SLAB]
+        if isinstance(x, np.ndarray):
+            squares = np.einsum("ij,ij->i", slab, slab, dtype=np.float64)
+        else:
+            from array_api_compat import array_namespace
+
+            xp = array_namespace(x)
+            squares = np.asarray(to_host(xp.sum(xp.astype(slab, xp.float64) ** 2, axis=1)))
+        norms[k : k + SLAB] = np.sqrt(squares)
+        release(x)
+    return norms
+
+
+def _not_rows(name: str, x: Any) -> PalpateError:
+    must = "must have shape (n, d), one row a sample"
+    return invalid(name, must, f"shape {tuple(x.shape)}", "Stack one feature vector a row")
+
+
+def _warn_widened(name: str, kind: str) -> None:
+    text = f"{name}: {kind} features were widened to float32; their rounding stays"
+    warnings.warn(text, PalpateWarning, stacklevel=4)
+
+
+def rows_text(bad: NDArray[np.bool_]) -> str:
+    """``"3 rows (0, 4, 7)"`` for a boolean mask of rows."""
+    at = np.flatnonzero(bad)
+    first = ", ".join(str(int(i)) for i in at[:5])
+    return f"{at.size} row{'s' * (at.size != 1)} ({first}{', ...' * (at.size > 5)})"
+
+
+def copies_across(x: Any, y: Any) -> int | None:
+    """How many rows of ``x`` are also rows of ``y``, bit for bit; None for arrays on a device.
+
+    By 64-bit hashes of the rows, slab by slab, so that arrays on disk are read but not kept.
+    """
+    if is_foreign(x) or is_foreign(y):
+        return None
+    seen = set(_row_hashes(y))
+    return sum(h in seen for h in _row_hashes(x))
+
+
+def _row_hashes(x: NDArray[Any]) -> Iterator[int]:
+    for k in range(0, len(x), SLAB):
+        for row in np.ascontiguousarray(x[k : k + SLAB]):
+            yield hash(row.tobytes())
+        release(x)
+
+
+def checked_names(name: str, values: Any, n: int) -> list[str] | None:
+    """Names, one a row, as strings; None stays None.
+
+    Raises:
+        PalpateError: on a wrong length, or if some rows have a name and others none.
+    """
+    items = column(name, values, n)
+    if items is None:
+        return None
+    missing = np.array([is_missing(v) for v in items], dtype=bool)
+    if missing.any():
+        fix = f"Fill {name}, or pass None for all"
+        raise invalid(name, "must be known for every row", f"none in {rows_text(missing)}", fix)
+    return [str(v) for v in items]
+
+
+def checked_level(level: Any) -> None:
+    """Reject a coverage that is not inside (0, 1)."""
+    if not isinstance(level, int | float | np.number) or not 0 < level < 1:
+        raise invalid("level", "must lie in (0, 1)", repr(level), "Choose a coverage", level=0.95)
+
+
+def checked_whole(least: int, **values: Any) -> None:
+    """Reject parameters that are not whole numbers of at least ``least``."""
+    for name, value in values.items():
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not whole or not least <= value < 2**63:
+            must = f"must be a whole number of at least {least}"
+            raise invalid(name, must, repr(value), "Drop it for the default")
+
+
+def checked_number(*, positive: bool = False, **values: Any) -> None:
+    """Reject parameters that are not finite numbers from 0 on, or above 0."""
+    for name, value in values.items():
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if not number or not np.isfinite(value) or value < 0 or (positive and value == 0):
+            must = "must be positive" if positive else "must be a finite number of at least 0"
+            raise invalid(name, must, repr(value), "Drop it for the default")
+
+
+def checked_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Reject a word that is not among ``choices``."""
+    if value not in choices:
+        must = f"must be one of {', '.join(choices)}"
+        raise invalid(name, must, repr(value), "Choose one of these")
+
+
+def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
+    """Reject features of different encoders.
+
+    Raises:
+        PalpateError: with both digests.
+    """
+    if a.encoder is not None and b.encoder is not None and a.encoder != b.encoder:
+        must = f"Generated and {what} features must come from one encoder"
+        got = f"digests {a.encoder[:12]} and {b.encoder[:12]}"
+        raise PalpateError(must, got, "Embed both with the same encoder")
+
+
+def checked_images(generated: Any, reference: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Two image stacks (n, h, w, c), c = 1 or 3, of one shape, each 8 bit or float in [0, 1].
+
+    Raises:
+        PalpateError: on other shapes, dtypes or ranges; image numbers are given.
+    """
+    pair = [
+        np.asarray(as_array(f"The {name} images", v))
+        for name, v in (("generated", generated), ("reference", reference))
+    ]
+    for name, images in zip(("generated", "reference"), pair, strict=True):
+        if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
+            raise PalpateError(
+                f"The {name} images must have shape (n, h, w, 3), n >= 1",
+                f"shape {images.shape}",
+                "Stack them with channels last",
+            )
+        if images.dtype != np.uint8 and images.dtype.kind != "f":
+            raise PalpateError(
+                f"The {name} images must be uint8, or floats in [0, 1]",
+                f"dtype {images.dtype}",
+                "Convert them",
+            )
+        if images.dtype.kind == "f":
+            for number, image in enumerate(images):
+                low, high = float(image.min()), float(image.max())
+                if not (low >= -1e-6 and high <= 1 + 1e-6):  # also false for NaN
+                    raise PalpateError(
+                        f"The {name} images must lie in [0, 1]",
+                        f"[{low:.4g}, {high:.4g}] in image {number}",
+                        "Scale them to [0, 1]",
+                    )
+    if pair[0].shape != pair[1].shape:
+        raise PalpateError(
+            "Generated and reference images must pair one to one in one size",
+            f"shapes {pair[0].shape} and {pair[1].shape}",
+            "Pass the same samples in the same order and size",
+        )
+    return pair[0], pair[1]
