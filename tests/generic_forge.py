@@ -75,8 +75,8 @@ def forge_hf(folder: Path) -> Forged:
     maps = {
         "vision": "rgb",
         "tactile": "gel",
-        "video": "parent(path)",
-        "frame": "stem(gel)",
+        "video": "regexp_replace(path, '/[^/]*$', '')",
+        "frame": "split_part(gel, '.', 1)",
         "material": "kind",
     }
 

@@ -17,8 +17,8 @@ datasets = pytest.importorskip("datasets", reason="the extra hf is not installed
 MAPS = {
     "vision": "rgb",
     "tactile": "gel",
-    "video": "parent(path)",
-    "frame": "stem(gel)",
+    "video": "regexp_replace(path, '/[^/]*$', '')",
+    "frame": "split_part(gel, '.', 1)",
     "material": "kind",
 }
 
@@ -148,7 +148,7 @@ def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_ma
     found = import_dataset(
         save_hf(tmp_path / "mine", rows, **kinds()),
         tmp_path / "out",
-        columns=MAPS | {"frame": "stem(path)"},
+        columns=MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"},
     )
     assert set(found.manifest.column("tactile")) == {"train/tactile/00000000.jpg"}
     export_dataset(small_manifest, tmp_path / "hf", to="hf")
@@ -183,7 +183,7 @@ def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_p
         for row in rows
     ]
     save_hf(source, table, **kinds())
-    maps = MAPS | {"frame": "stem(path)"}
+    maps = MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"}
     with pytest.raises(ProblemsError) as caught:
         import_dataset(source, tmp_path / "out", columns=maps)
     told = sorted((p.where, p.kind) for p in caught.value.problems)
@@ -264,7 +264,7 @@ def test_an_id_of_two_parts_is_in_neither_and_parts_follow_the_kept_row(tmp_path
     found = import_dataset(
         save_hf(tmp_path / "mine", rows, **kinds()),
         tmp_path / "out",
-        columns=MAPS | {"frame": "stem(path)"},
+        columns=MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"},
         skip_bad=True,
     )
     assert [(p.where, p.kind) for p in found.skipped] == [

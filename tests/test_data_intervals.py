@@ -66,7 +66,12 @@ def test_intervals_give_what_a_frame_list_of_the_same_touches_gives(tmp_path, ra
         ("video,start,end,label\na,10,13,Wood\na,20,21,Rock", {"half_open": True}),
         (
             "file,from,to,what\nx/a.mp4,10,12,Wood\nx/a.mp4,20,20,Rock",
-            {"columns": {"video": "stem(file)", "material": "what"}},
+            {
+                "columns": {
+                    "video": "replace(split_part(file, '/', -1), '.mp4', '')",
+                    "material": "what",
+                }
+            },
         ),
         ("label,end,start,video\nRock,20,20,a\nWood,12.0,10,a", {}),
     ],

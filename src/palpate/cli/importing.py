@@ -51,7 +51,7 @@ class SourceOptions(Common):
     """Name of the format; `auto` recognizes it. `palpate validate --list` tells all formats and their options."""
     maps: Maps = ()
     """Manifest columns as expressions over the columns of a table, an interval list or a Hugging Face data set, or over the `path`
-    of images in a folder: `--map vision=rgb tactile="replace(rgb, '_rgb', '_tac')" video=rgb[:15]`."""
+    of images in a folder: `--map vision=rgb tactile="replace(rgb, '_rgb', '_tac')" "video=substr(rgb, 1, 15)"`."""
     root: Path | None = None
     """Where the paths of a table, or the recordings of an interval list, lie (default: the folder of the table)."""
     side: Annotated[Literal["vision", "tactile"] | None, tyro.conf.arg(name="as")] = None
@@ -68,9 +68,8 @@ class SourceOptions(Common):
 class Options(SourceOptions):
     r"""Turn a data set on disk into a manifest: any known format, a table, folders of images, an interval list, a Hugging Face data set.
 
-    Expressions of --map: a column, "odd name" for one with spaces, 'text', path[0:15], path[-1], name(path), stem(path),
-    parent(path), part(path, 0) for a piece between slashes, int(x), replace(x, 'old', 'new'), x ~ /_(\d+)/ for what the group
-    of a pattern matches, x + y.
+    Expressions of --map are a column's name or polars SQL over the columns, e.g. substr(path, 1, 15), split_part(path, '/', -1),
+    replace(path, 'old', 'new'), path || '.jpg'; see docs/concepts/mapping.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional]

@@ -172,7 +172,9 @@ def number_together(*manifests: Manifest) -> list[Manifest]:
     # A frame that stands in two lists belongs to one touch there and here.
     alone = whole.unique(["video", "frame"], maintain_order=True)
     names = alone.with_columns(
-        contact=pl.Series(touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String)
+        contact=pl.Series(
+            touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String
+        )
     )
     found = whole.join(names, on=["video", "frame"], how="left", maintain_order="left")["contact"]
     out: list[Manifest] = []

@@ -1,9 +1,10 @@
-"""Tables of anyone's data: CSV, TSV, JSON lines, JSON arrays and Parquet, as columns of text with the line of every row.
+"""Tables of anyone's data: CSV, TSV, JSON lines, JSON arrays, Parquet, data frames and lists of dictionaries.
 
-CSV and TSV are UTF-8 (or UTF-16 with a byte-order mark), with any line ends; a ``.csv`` whose header has semicolons but no
-commas is split at those. A quoted cell may span lines; its row counts by its first. Rows of another width, lines that are not
-JSON, bytes that are not UTF-8 and quotation marks that stay open are problems of their line; blank lines are nothing.
-Parquet has no lines: its rows are counted from 1. Only the columns asked for are kept.
+Cells are read as texts; each row keeps its place for messages. CSV and TSV are UTF-8 (or UTF-16 with a byte-order
+mark), with any line ends; a ``.csv`` whose header has semicolons but no commas is split at those. A quoted cell may span
+lines; its row counts by its first. Rows of another width, lines that are not JSON, bytes that are not UTF-8 and quotation
+marks that stay open are problems of their line; blank lines are ignored. Items of a JSON array, rows of Parquet and of
+data frames are counted from 1. Only the requested columns are kept.
 """
 
 from __future__ import annotations
@@ -12,64 +13,82 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem
-from palpate.data.mapping import Cell, text_of
+from palpate.data.mapping import text_of
 from palpate.data.texts import decoded
 
 TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
-Row = dict[str, Any]
-_Cells = dict[str, list[Cell]]
-_Load = Callable[[Sequence[str]], tuple[list[int], _Cells]]
+#: A column of every table that was read: the line of each row.
+LINE = "palpate_line"
+#: Signs that no cell can hold: bytes that were not UTF-8, the zero character, halves of characters.
+UNFIT = re.compile("[\ufffd\x00\ud800-\udfff]")
+#: Where a row was read, and its cells by number of the requested column.
+Record = tuple[int, Sequence[Any]]
+_Records = Callable[[Sequence[str]], Iterable[Record]]
 
 
 @dataclass
 class Table:
-    """A table whose columns are known and whose cells are read when they are asked for.
+    """A table whose columns are known and whose rows are read on request.
 
     Attributes:
-        path: the file.
+        name: the file, or how an in-memory table is called in messages.
         names: its columns.
         problems: what is wrong with its rows; complete after :meth:`read`.
+        records: from the requested columns to (line, cells).
         lines: (rows,) line of each row that was read.
-        cells: column -> (rows,) texts, None where empty.
     """
 
-    path: Path
+    name: str
     names: list[str]
     problems: list[Problem]
-    load: _Load
-    lines: list[int]
-    cells: _Cells
+    records: _Records
+    lines: list[int] = field(default_factory=list)
 
-    def read(self, needed: Sequence[str]) -> Table:
-        """Reads the rows, keeping the columns in ``needed``.
+    def read(self, columns: Sequence[str]) -> pl.DataFrame:
+        """Read the rows.
+
+        Returns:
+            (rows) with the requested columns as texts, null where empty, and the column ``LINE``. Bad rows are skipped and
+            join ``problems``.
 
         Raises:
-            PalpateError: if one of them stands twice in the header, or holds no texts and numbers.
+            PalpateError: if a column occurs twice in the header, or does not hold texts and numbers.
         """
-        if twice := [name for name in needed if self.names.count(name) > 1]:
+        if double := [name for name in columns if self.names.count(name) > 1]:
             raise PalpateError(
-                f"A column of {self.path} must stand once",
-                f"{twice[0]} twice or more",
+                f"Columns of {self.name} must have different names",
+                f"{double[0]} twice or more",
                 "Rename one of them",
             )
-        self.lines, self.cells = self.load(list(dict.fromkeys(needed)))
-        return self
+        stores: list[list[str | None]] = [[] for _ in columns]
+        self.lines = []
+        for line, cells in self.records(columns):
+            if problem := _unfit(cells, columns):
+                self.problems.append(Problem(f"{self.name}:{line}", *problem))
+                continue
+            self.lines.append(line)
+            for cell, store in zip(cells, stores, strict=True):
+                store.append(text_of(cell))
+        texts = {
+            name: pl.Series(s, dtype=pl.String) for name, s in zip(columns, stores, strict=True)
+        }
+        return pl.DataFrame({LINE: self.lines, **texts})
 
     def where(self, k: int) -> str:
         """``file:line`` of row ``k``."""
-        return f"{self.path}:{self.lines[k]}"
+        return f"{self.name}:{self.lines[k]}"
 
 
 def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
-    """Opens a table and finds out its columns.
+    """Open a table file.
 
     Args:
         path: the file.
@@ -79,28 +98,42 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
         PalpateError: if the file is missing, or of another form.
     """
     path = Path(path)
+    suffix = path.suffix.lower()
     if not path.is_file():
         raise PalpateError("The table must be a file", f"no file {path}", "Check the path")
-    suffix = path.suffix.lower()
     if names and suffix in (".jsonl", ".json", ".parquet"):
         raise PalpateError(
-            "Only CSV and TSV files can be without names of columns", path.name, "Leave names out"
+            "must be left out for tables that name their columns", path.name, "", argument="names"
         )
-    opener: Callable[[Path, list[Problem]], tuple[list[str], _Load]] | None = {
-        ".jsonl": _json_lines,
-        ".json": _json_array,
-        ".parquet": _parquet,
-    }.get(suffix)
-    problems: list[Problem] = []
-    if opener is not None:
-        header, load = opener(path, problems)
-    elif names or suffix in TABLES:
-        header, load = _csv(path, problems, list(names) if names else None)
-    else:
-        raise PalpateError(
-            f"A table must be one of {', '.join(TABLES)}", path.name, "Convert it, or rename it"
-        )
-    return Table(path, header, problems, load, [], {})
+    if suffix in (".jsonl", ".json"):
+        return _json(path)
+    if suffix == ".parquet":
+        return _parquet(path)
+    if names or suffix in TABLES:
+        return _csv(path, list(names) if names else None)
+    raise PalpateError(
+        f"A table must be one of {', '.join(TABLES)}", path.name, "Convert it, or rename it"
+    )
+
+
+def table_of(data: Any, name: str = "row") -> Table:
+    """A polars or pandas frame, or dictionaries, as a table; its rows are called ``row:1``, ``row:2`` ...
+
+    Raises:
+        PalpateError: if the data is of another type.
+    """
+    if isinstance(data, pl.DataFrame):
+        return Table(name, data.columns, [], _frame_records(name, data.schema, data.select))
+    if hasattr(data, "to_dict") and hasattr(data, "columns"):  # pandas, which is not a dependency
+        data = data.to_dict("records")
+    if isinstance(data, Sequence) and all(isinstance(row, Mapping) for row in data):
+        return _of_objects(name, list(enumerate(data, 1)), [])
+    raise PalpateError(
+        "must be a path, a polars or pandas frame, or a list of dictionaries",
+        type(data).__name__,
+        "Pass one of these",
+        argument="source",
+    )
 
 
 def header_of(path: Path) -> list[str]:
@@ -112,24 +145,15 @@ def header_of(path: Path) -> list[str]:
         with open(path, "rb") as file:
             head = decoded(file.read(1 << 16))
         if suffix in (".csv", ".tsv"):
-            return next(
-                (
-                    [c.strip() for c in cells]
-                    for cells in csv.reader(
-                        io.StringIO(head, newline=""), delimiter=sign_of(path, head)
-                    )
-                    if any(cells)
-                ),
-                [],
-            )
-        start = head.find("{") if suffix in (".jsonl", ".json") else -1
-        first = json.JSONDecoder().raw_decode(head, start)[0] if start >= 0 else {}
-        return [str(name) for name in first] if isinstance(first, dict) else []
+            lines = csv.reader(io.StringIO(head, newline=""), delimiter=delimiter_of(path, head))
+            return [cell.strip() for cell in next(cells for cells in lines if any(cells))]
+        first = json.JSONDecoder().raw_decode(head, head.index("{"))[0]
+        return [str(name) for name in first] if suffix in TABLES else []
     except Exception:  # whatever the file is, it is not a table
         return []
 
 
-def sign_of(path: Path, text: str) -> str:
+def delimiter_of(path: Path, text: str) -> str:
     """What separates the cells of a CSV file."""
     if path.suffix.lower() == ".tsv":
         return "\t"
@@ -137,52 +161,35 @@ def sign_of(path: Path, text: str) -> str:
     return next((sign for sign in ",;\t" if sign in head), ",")
 
 
-def _unfit(text: str) -> bool:
-    """Whether a text can be no cell: bytes that were not UTF-8, halves of characters, the zero character."""
-    return "\ufffd" in text or "\x00" in text or re.search("[\ud800-\udfff]", text) is not None
+def _unfit(cells: Sequence[Any], columns: Sequence[str]) -> tuple[str, str] | None:
+    """What is wrong with a row as (kind, text)."""
+    for name, cell in zip(columns, cells, strict=True):
+        if isinstance(cell, str) and UNFIT.search(cell):
+            return "bad-encoding", "the row holds bytes that are not UTF-8, or a zero character"
+        if isinstance(cell, (list, dict, bytes)):
+            return "bad-row", f"{name} holds a {type(cell).__name__} instead of a text or number"
+    return None
 
 
-def _csv(path: Path, problems: list[Problem], names: list[str] | None) -> tuple[list[str], _Load]:
-    text = decoded(path.read_bytes())
-    odd = "\ufffd" in text or "\x00" in text
-    records = _records(path, text, problems)
-    header = names or [cell.strip() for cell in next(records, (0, []))[1]]
+def _csv(path: Path, names: list[str] | None) -> Table:
+    problems: list[Problem] = []
+    rows = _csv_rows(path, decoded(path.read_bytes()), problems)
+    header = names or [cell.strip() for cell in next(rows, (0, []))[1]]
 
-    def load(needed: Sequence[str]) -> tuple[list[int], _Cells]:
-        stores: list[list[Cell]] = [[] for _ in needed]
-        places = [(header.index(name), store) for name, store in zip(needed, stores, strict=True)]
-        lines: list[int] = []
-        for line, cells in records:
-            if len(cells) != len(header):
-                problems.append(
-                    Problem(
-                        f"{path}:{line}",
-                        "bad-row",
-                        f"{len(cells)} cells under {len(header)} columns",
-                    )
-                )
-            elif odd and any(map(_unfit, cells)):
-                problems.append(
-                    Problem(
-                        f"{path}:{line}",
-                        "bad-encoding",
-                        "the row holds bytes that are not UTF-8, or a zero byte",
-                    )
-                )
+    def records(columns: Sequence[str]) -> Iterator[Record]:
+        places = [header.index(name) for name in columns]
+        for line, cells in rows:
+            if len(cells) == len(header):
+                yield line, [cells[k] for k in places]
             else:
-                lines.append(line)
-                for i, store in places:
-                    cell = text_of(cells[i])
-                    store.append(
-                        store[-1] if store and store[-1] == cell else cell
-                    )  # one copy of what repeats
-        return lines, dict(zip(needed, stores, strict=True))
+                text = f"{len(cells)} cells under {len(header)} columns"
+                problems.append(Problem(f"{path}:{line}", "bad-row", text))
 
-    return header, load
+    return Table(str(path), header, problems, records)
 
 
-def _records(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[int, list[str]]]:
-    """(first line, cells) of each record that is not blank."""
+def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[int, list[str]]]:
+    """(first line, cells) of each row that is not blank."""
     quotes = 0
 
     def lines() -> Iterator[str]:
@@ -191,146 +198,57 @@ def _records(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[i
             quotes += line.count('"')
             yield line
 
-    reader = csv.reader(lines(), delimiter=sign_of(path, text))
+    reader = csv.reader(lines(), delimiter=delimiter_of(path, text))
     start = 1
     try:
         for cells in reader:
             first, start = start, reader.line_num + 1
-            # A mark that stays open takes in all that follows it.
-            if reader.line_num > first and quotes % 2:
-                problems.append(
-                    Problem(
-                        f"{path}:{first}",
-                        "open-quote",
-                        f"a quotation mark stays open up to line {reader.line_num}",
-                    )
-                )
+            if reader.line_num > first and quotes % 2:  # the cell swallowed all lines after it
+                swallowed = f"a quotation mark stays open up to line {reader.line_num}"
+                problems.append(Problem(f"{path}:{first}", "open-quote", swallowed))
             elif any(cell.strip() for cell in cells):
                 yield first, cells
             quotes = 0
     except csv.Error as error:
-        problems.append(
-            Problem(
-                f"{path}:{start}",
-                "bad-row",
-                f"{error}; is a quotation mark open? No row after it was read",
-            )
-        )
+        broken = f"{error}; is a quotation mark open? No row after it was read"
+        problems.append(Problem(f"{path}:{start}", "bad-row", broken))
 
 
-def _json_lines(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
-    def items() -> Iterator[tuple[int, Any]]:
-        for number, line in enumerate(decoded(path.read_bytes()).split("\n"), 1):
-            if line.strip():
-                try:
-                    yield number, json.loads(line)
-                except (json.JSONDecodeError, RecursionError) as error:
-                    problems.append(
-                        Problem(f"{path}:{number}", "bad-row", f"not JSON: {_said(error)}")
-                    )
-
-    return _of_objects(path, items(), problems)
-
-
-def _json_array(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
-    """A list of objects; each is decoded by itself, so that its line is known."""
-    text = decoded(path.read_bytes())
-
-    def items() -> Iterator[tuple[int, Any]]:
-        decoder = json.JSONDecoder()
-        at, line, counted = len(text) - len(text.lstrip()), 1, 0
-        if not text.startswith("[", at):
+def _json(path: Path) -> Table:
+    """JSON lines, or a JSON array of objects, by the suffix."""
+    text, problems = decoded(path.read_bytes()), list[Problem]()
+    rows: list[tuple[int, Any]] = []
+    lines = [text] if path.suffix.lower() == ".json" else text.split("\n")
+    for number, line in enumerate(lines, 1):
+        if line.strip():
+            try:
+                rows.append((number, json.loads(line)))
+            except (ValueError, RecursionError) as error:
+                at = number + getattr(error, "lineno", 1) - 1
+                reason = f"not JSON: {getattr(error, 'msg', 'nested too deep')}"
+                problems.append(Problem(f"{path}:{at}", "bad-row", reason))
+    if path.suffix.lower() == ".json" and rows:
+        if not isinstance(rows[0][1], list):
             raise PalpateError(
                 f"{path} must hold a JSON list of objects",
-                repr(text[at : at + 20]),
+                repr(text.strip()[:20]),
                 "Write [{...}, {...}], or JSON lines",
             )
-        while True:
-            at = _past(text, at + 1)
-            line, counted = line + text.count("\n", counted, at), at
-            if text.startswith("]", at):
-                return
-            try:
-                item, at = decoder.raw_decode(text, at)
-            except (json.JSONDecodeError, RecursionError) as error:
-                problems.append(
-                    Problem(
-                        f"{path}:{line}",
-                        "bad-row",
-                        f"not JSON: {_said(error)}; no row after it was read",
-                    )
-                )
-                return
-            yield line, item
-            at = _past(text, at)
-            if not text.startswith((",", "]"), at):
-                problems.append(
-                    Problem(
-                        f"{path}:{line}",
-                        "bad-row",
-                        "no comma or bracket after the object; no row after it was read",
-                    )
-                )
-                return
-            at -= text.startswith("]", at)
-
-    return _of_objects(path, items(), problems)
+        rows = list(enumerate(rows[0][1], 1))
+    return _of_objects(str(path), rows, problems)
 
 
-def _past(text: str, at: int) -> int:
-    """The place of the next sign that is not space."""
-    found = re.compile(r"\s*").match(text, at)
-    return found.end() if found else at
-
-
-def _said(error: Exception) -> str:
-    return error.msg if isinstance(error, json.JSONDecodeError) else "nested too deep"
-
-
-def _of_objects(
-    path: Path, items: Iterator[tuple[int, Any]], problems: list[Problem]
-) -> tuple[list[str], _Load]:
-    rows: list[tuple[int, Row]] = []
-    names: dict[str, None] = {}
-    for line, item in items:
-        if isinstance(item, dict):
-            rows.append((line, item))
-            names.update(dict.fromkeys(item))
-        else:
-            problems.append(Problem(f"{path}:{line}", "bad-row", "not a JSON object"))
-
-    def load(needed: Sequence[str]) -> tuple[list[int], _Cells]:
-        stores: list[list[Cell]] = [[] for _ in needed]
-        lines: list[int] = []
-        for line, row in rows:
-            cells = [row.get(name) for name in needed]
-            if nested := [
-                name
-                for name, cell in zip(needed, cells, strict=True)
-                if isinstance(cell, (list, dict))
-            ]:
-                problems.append(
-                    Problem(
-                        f"{path}:{line}",
-                        "bad-row",
-                        f"{nested[0]} is a list or an object, where a text or number must stand",
-                    )
-                )
-            elif any(isinstance(cell, str) and _unfit(cell) for cell in cells):
-                problems.append(
-                    Problem(
-                        f"{path}:{line}",
-                        "bad-encoding",
-                        "the row holds bytes that are not UTF-8, or a zero character",
-                    )
-                )
-            else:
-                lines.append(line)
-                for cell, store in zip(cells, stores, strict=True):
-                    store.append(text_of(cell))
-        return lines, dict(zip(needed, stores, strict=True))
-
-    return list(names), load
+def _of_objects(name: str, rows: Sequence[tuple[int, Any]], problems: list[Problem]) -> Table:
+    wrong = [line for line, row in rows if not isinstance(row, Mapping)]
+    problems += [Problem(f"{name}:{line}", "bad-row", "not a JSON object") for line in wrong]
+    objects = [(line, row) for line, row in rows if isinstance(row, Mapping)]
+    names = list(dict.fromkeys(str(key) for _, row in objects for key in row))
+    return Table(
+        name,
+        names,
+        problems,
+        lambda columns: ((line, [row.get(c) for c in columns]) for line, row in objects),
+    )
 
 
 def _schema(path: Path) -> dict[str, pl.DataType]:
@@ -339,50 +257,32 @@ def _schema(path: Path) -> dict[str, pl.DataType]:
         return dict(pl.read_parquet_schema(file))
 
 
-def _parquet(path: Path, problems: list[Problem]) -> tuple[list[str], _Load]:
+def _parquet(path: Path) -> Table:
     try:
         schema = _schema(path)
+        pl.read_parquet(path, n_rows=1, glob=False)
     except Exception as error:  # polars raises several kinds for a file that is not Parquet
-        problems.append(
-            Problem(str(path), "bad-table", f"not Parquet: {str(error).splitlines()[0]}")
-        )
-        return [], lambda needed: ([], {name: [] for name in needed})
+        reason = f"not Parquet: {str(error).splitlines()[0]}"
+        return Table(str(path), [], [Problem(str(path), "bad-table", reason)], lambda columns: [])
 
-    def load(needed: Sequence[str]) -> tuple[list[int], _Cells]:
-        if unfit := [
-            name
-            for name in needed
-            if schema[name].is_nested() or schema[name].base_type() in (pl.Binary, pl.Object)
-        ]:
-            got = f"{unfit[0]} of type {schema[unfit[0]]}"
-            raise PalpateError(
-                f"Columns of {path} must hold texts or numbers",
-                got,
-                "For images inside the table: --format hf on its folder",
-            )
-        try:
-            table = pl.read_parquet(path, columns=list(needed), glob=False)
-        except Exception as error:
-            problems.append(
-                Problem(str(path), "bad-table", f"not Parquet: {str(error).splitlines()[0]}")
-            )
-            return [], {name: [] for name in needed}
-        cells = {name: [text_of(cell) for cell in table[name].to_list()] for name in needed}
-        odd = frozenset(
-            {
-                k
-                for column in cells.values()
-                for k, cell in enumerate(column)
-                if cell is not None and "\x00" in cell
-            }
-        )
-        problems.extend(
-            Problem(f"{path}:{k + 1}", "bad-encoding", "the row holds a zero character")
-            for k in sorted(odd)
-        )
-        keep = [k for k in range(table.height) if k not in odd]
-        return [k + 1 for k in keep], {
-            name: [column[k] for k in keep] for name, column in cells.items()
-        } if odd else cells
+    def read(columns: Sequence[str]) -> pl.DataFrame:
+        return pl.read_parquet(path, columns=list(columns), glob=False)
 
-    return list(schema), load
+    return Table(str(path), list(schema), [], _frame_records(str(path), schema, read))
+
+
+def _frame_records(
+    name: str, schema: Mapping[str, pl.DataType], read: Callable[[Sequence[str]], pl.DataFrame]
+) -> _Records:
+    def records(columns: Sequence[str]) -> Iterator[Record]:
+        for column in columns:
+            kind = schema[column]
+            if kind.is_nested() or kind.base_type() in (pl.Binary, pl.Object):
+                raise PalpateError(
+                    f"Columns of {name} must hold texts or numbers",
+                    f"{column} of type {kind}",
+                    "For images inside the table use the format hf on its folder",
+                )
+        yield from enumerate(read(columns).iter_rows(), 1)
+
+    return records

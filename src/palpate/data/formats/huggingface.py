@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 from PIL import Image
 
 from palpate.core import PalpateError, Problem, Progress, atomic_path, inside, quiet
@@ -30,8 +31,9 @@ from palpate.data.images import BROKEN, Check
 from palpate.data.imported import Imported, removing_on_error
 from palpate.data.listing import INCONCLUSIVE
 from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS, SCHEMA
-from palpate.data.mapping import Cell, Expression, compile_maps, text_of
+from palpate.data.mapping import ColumnMaps, compile_maps, text_of
 from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classes
+from palpate.data.tables import LINE
 
 LOOKED_FOR = "a folder written by datasets' save_to_disk, or of Parquet shards; a name on the hub with --format hf"
 FACTS = Facts(
@@ -205,7 +207,7 @@ def _scan(
 ) -> Scan:
     """Reads all rows, putting their images where ``pictures`` does."""
     expressions = compile_maps(columns or {}, source.names, list(SCHEMA))
-    sides = [side for side in IMAGE_COLUMNS[:2] if side in expressions]
+    sides = [side for side in IMAGE_COLUMNS[:2] if side in expressions.expressions]
     if not sides:
         got = f"no vision and no tactile among {', '.join(source.names) or 'no columns'}"
         raise PalpateError(
@@ -273,7 +275,7 @@ def _batches(source: Source) -> Iterator[tuple[str, int, Mapping[str, list[Any]]
 
 def _batch_rows(
     source: Source,
-    expressions: Mapping[str, Expression],
+    maps: ColumnMaps,
     split: str,
     first: int,
     batch: Mapping[str, list[Any]],
@@ -285,14 +287,18 @@ def _batch_rows(
     count = len(next(iter(batch.values())))
     where = lambda k: f"{source.name}/{split}:{first + k}".replace("/:", ":")  # noqa: E731
     inner = {
-        target: e.column
-        for target, e in expressions.items()
-        if target in IMAGE_COLUMNS and e.column in source.images
+        target: column
+        for target in IMAGE_COLUMNS
+        if (column := maps.source(target)) is not None and column in source.images
     }
-    plain = {target: e for target, e in expressions.items() if target not in inner}
-    cells = {name: _texts(source, name, batch[name]) for e in plain.values() for name in e.inputs}
+    plain = maps.without(list(inner))
+    texts = {
+        name: pl.Series(_texts(source, name, batch[name]), dtype=pl.String)
+        for name in plain.columns
+    }
+    cells = plain.apply(pl.DataFrame({LINE: range(first, first + count), **texts}))
     told: list[Problem] = []
-    rows, unclear = manifest_rows(plain, cells.__getitem__, count, where, classes, told)
+    rows, unclear = manifest_rows(cells, count, where, classes, told)
     inconclusive, unknown = _labels(source, plain, batch)
     left = {where(k) for k in inconclusive | unknown.keys()}
     problems += [p for p in told if p.where not in left]
@@ -308,7 +314,7 @@ def _batch_rows(
             if "video" in row and "frame" in row
             else f"{split}/{first + k:08d}".lstrip("/"),
         )
-        for target in (t for t in IMAGE_COLUMNS if t in expressions):
+        for target in (t for t in IMAGE_COLUMNS if t in maps.expressions):
             column = inner.get(target)
             data = _bytes(source, row.get(target) if column is None else batch[column][k])
             if isinstance(data, bytes):
@@ -332,13 +338,16 @@ def _batch_rows(
 
 
 def _labels(
-    source: Source, plain: Mapping[str, Expression], batch: Mapping[str, list[Any]]
+    source: Source, plain: ColumnMaps, batch: Mapping[str, list[Any]]
 ) -> tuple[set[int], dict[int, str]]:
     """Rows whose material is the class -1, which is inconclusive, and row -> what is wrong with its number of a class."""
     inconclusive: set[int] = set()
     unknown: dict[int, str] = {}
     for target, name in (
-        (target, name) for target, e in plain.items() for name in e.inputs if name in source.labels
+        (target, name)
+        for target, expression in plain.expressions.items()
+        for name in expression.meta.root_names()
+        if name in source.labels
     ):
         count = len(source.labels[name])
         for k, v in enumerate(batch[name]):
@@ -351,7 +360,7 @@ def _labels(
     return inconclusive - unknown.keys(), unknown
 
 
-def _texts(source: Source, name: str, values: Sequence[Any]) -> list[Cell]:
+def _texts(source: Source, name: str, values: Sequence[Any]) -> list[str | None]:
     """Cells as texts: an image is its file name, a class label its name.
 
     Raises:

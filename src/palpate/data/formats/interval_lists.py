@@ -54,31 +54,25 @@ def read_intervals(
     for target, synonyms in NAMES.items():
         theirs = next((name for name in table.names if name.lower() in synonyms), None)
         if target not in maps and target not in table.names and theirs is not None:
-            maps[target] = '"' + theirs.replace('"', '""') + '"'
+            maps[target] = theirs
     expressions = compile_maps(maps, table.names, list(NAMES))
-    if (absent := [name for name in NEEDED if name not in expressions]) and not table.problems:
+    if (
+        absent := [name for name in NEEDED if name not in expressions.expressions]
+    ) and not table.problems:
         got = f"no {', '.join(absent)} among {', '.join(table.names) or 'no columns'}"
         raise PalpateError(
             f"{path} must have the columns {', '.join(NEEDED)}",
             got,
             "Map them: --map start=YOUR_COLUMN",
         )
-    table.read([name for expression in expressions.values() for name in expression.inputs])
+    cells = expressions.apply(table.read(expressions.columns))
     problems += table.problems
     known = None if classes is None else read_classes(Path(classes))
-    # An inconclusive touch is contact all the same, so -1 is told apart here and not left out with the row.
-    labels = expressions.pop("material", None)
-    said, failed = (
-        ([None] * len(table.lines), {})
-        if labels is None
-        else labels.values(table.cells.__getitem__, len(table.lines))
-    )
-    found, _ = manifest_rows(
-        expressions, table.cells.__getitem__, len(table.lines), table.where, None, problems
-    )
+    # Without classes, as an inconclusive contact (-1) is contact all the same.
+    found, _ = manifest_rows(cells, len(table.lines), table.where, None, problems)
     intervals: list[Interval] = []
     for k, row in found:
-        where, label = table.where(k), said[k]
+        where, label = table.where(k), row.get("material")
         last = row.get("end", -1) - half_open
         background = row.pop("background", None)
         wrong: tuple[str, str] | None = None
@@ -91,8 +85,6 @@ def read_intervals(
             )
         elif background is not None and not background.isdecimal():
             wrong = "bad-frame", f"the background {background!r} is not a whole number from 0"
-        elif k in failed:
-            wrong = "bad-map", f"material has no value: {failed[k]}"
         elif known is not None and label not in (None, "-1", *known.values()):
             name = known.get(int(label)) if str(label).isdecimal() else None
             wrong = (

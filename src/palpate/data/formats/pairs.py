@@ -22,6 +22,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal
 
+import polars as pl
+
 from palpate.core import PalpateError, Problem, Progress, quiet
 from palpate.data.formats.base import Facts, Found, Scan
 from palpate.data.images import SUFFIXES
@@ -150,10 +152,10 @@ def _table_rows(
 ) -> tuple[list[Found], int]:
     """(place, manifest row) of each usable row of a table, and how many rows are inconclusive."""
     table = open_table(path, None if names is None else [name.strip() for name in names.split(",")])
-    expressions = (
-        compile_maps(maps, table.names, TARGETS) if table.names or not table.problems else {}
-    )
-    sides = [side for side, _ in SIDES if side in expressions]
+    if not table.names:
+        maps = {} if table.problems else maps
+    expressions = compile_maps(maps, table.names, TARGETS)
+    sides = [side for side, _ in SIDES if side in expressions.expressions]
     if not sides and not table.problems:
         got = (
             f"no tactile among {', '.join(table.names)}, and no vision"
@@ -165,11 +167,9 @@ def _table_rows(
             got,
             "Map it: --map vision=YOUR_COLUMN",
         )
-    table.read([name for expression in expressions.values() for name in expression.inputs])
+    cells = expressions.apply(table.read(expressions.columns))
     problems += table.problems
-    found, inconclusive = manifest_rows(
-        expressions, table.cells.__getitem__, len(table.lines), table.where, classes, problems
-    )
+    found, inconclusive = manifest_rows(cells, len(table.lines), table.where, classes, problems)
     rows: list[Found] = []
     for k, row in found:
         if lacking := [side for side in sides if side not in row]:
@@ -208,14 +208,11 @@ def _file_rows(
         **{side: [row[side] for _, row in files] for side in sides},
     }
     where = lambda k: str(files[k][1].get("tactile") or files[k][1]["vision"])  # noqa: E731
-    expressions = {
-        target: e
-        for target, e in compile_maps(maps, list(cells), TARGETS).items()
-        if target in maps
-    }
-    found, inconclusive = manifest_rows(
-        expressions, cells.__getitem__, len(files), where, classes, problems
+    expressions = compile_maps(maps, list(cells), TARGETS).without(
+        [t for t in TARGETS if t not in maps]
     )
+    mapped = expressions.apply(pl.DataFrame(cells, schema=dict.fromkeys(cells, pl.String)))
+    found, inconclusive = manifest_rows(mapped, len(files), where, classes, problems)
     rows: list[Found] = []
     for k, row in found:
         path, images = files[k]
