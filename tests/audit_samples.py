@@ -6,7 +6,7 @@ import os
 import numpy as np
 from PIL import Image
 
-from palpate.core import SampleRef
+from palpate.core import Note, SampleRef
 from palpate.report.results import Audit, Impact, ImpactRow, LeakPair, Signal
 
 #: Gaps of Touch and Go's own split, as `palpate audit` finds them.
@@ -17,6 +17,10 @@ GAPS = {
     "gap_edges": [0, 1, 3, 10, 30, 60, 90, 150, 300, 600, 900, 1800, 2486],
     "gap_counts": [0, 0, 0, 0, 2400, 2210, 3500, 6590, 9012, 3001, 2115, 769],
 }
+
+
+def text_note(text):
+    return Note("text", {"text": text})
 
 
 def relief(rng, side):
@@ -92,7 +96,7 @@ def signals(names=(), worst=8):
             40,
             1.0,
             worst=pairs(names, min(worst, 4), start=400, gap=False, score=1.0),
-            notes=["4 pictures could not be read."],
+            notes=[text_note("4 pictures could not be read.")],
         ),
         Signal("shared video", n, 29597, 1.0),
         Signal(
@@ -101,7 +105,7 @@ def signals(names=(), worst=8):
             4610,
             0.5,
             worst=pairs(names, worst, start=100, score=0.49),
-            notes=["Flagged within 30 frames of a train frame."],
+            notes=[text_note("Flagged within 30 frames of a train frame.")],
         ),
         Signal(
             "near-duplicate vision",
@@ -128,7 +132,7 @@ def signals(names=(), worst=8):
                 gap=False,
                 causes=("content", "content", "nothing touched", "sensor drift"),
             ),
-            ["Calibrated on 12,000 pairs of different videos."],
+            [text_note("Calibrated on 12,000 pairs of different videos.")],
         ),
     ]
 
@@ -167,7 +171,7 @@ def impact():
         "video",
         ["c0" * 32, "c1" * 32],
         {"size": 32, "seeds": [0, 1]},
-        ["Nothing is whitened."],
+        [text_note("Nothing is whitened.")],
     )
 
 
@@ -208,7 +212,7 @@ def full_audit(names=(), **changes):
             {"material": m, "train": 4600, "test": 1500, "groups_train": 9, "groups_test": 7}
             for m in ("brick", "grass", "wood")
         ],
-        notes=["2 test samples have no video."],
+        notes=[text_note("2 test samples have no video.")],
         split="9f" * 32,
         signals=signals(names),
         leaking_samples=29611,

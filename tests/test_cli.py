@@ -98,7 +98,7 @@ def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(
         '{"format": "palpate-split/1", "rule": {}, "digest": "x", "parts": {"train": 3}}'
     )
     (tmp_path / "scores.json").write_text(
-        '{"format": "palpate-results/1", "title": "t", "scores": [{"metric": "m", "subject": "s", "value": "high"}]}'
+        '{"format": "palpate-results/2", "title": "t", "scores": [{"metric": "m", "subject": "s", "value": "high"}]}'
     )
     for args, word in (
         (["audit", *lists, "-o", tmp_path / "m"], f"{tmp_path / 'm'} must be writable"),
@@ -162,7 +162,7 @@ def test_no_output_replaces_an_input_or_a_foreign_file(capsys, lists, small_mani
 def test_a_page_whose_audit_is_of_another_split_says_so(capsys, lists, tmp_path):
     score = {"metric": "TMMD", "subject": "x", "value": 1.0, "split": "b" * 64}
     (tmp_path / "r.json").write_text(
-        json.dumps({"format": "palpate-results/1", "title": "t", "scores": [score]})
+        json.dumps({"format": "palpate-results/2", "title": "t", "scores": [score]})
     )
     assert call(capsys, "audit", *lists, "-o", tmp_path / "a.json")[0] == 0
     assert (
@@ -257,7 +257,7 @@ def test_report_refuses_foreign_json(capsys, tmp_path):
         "must hold results of palpate"
         in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
     )
-    (tmp_path / "x.json").write_text('{"format": "palpate-audit/1", "name": "x"}')
+    (tmp_path / "x.json").write_text('{"format": "palpate-audit/2", "name": "x"}')
     assert (
         "missing or unknown field"
         in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]

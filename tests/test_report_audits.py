@@ -172,11 +172,11 @@ def test_two_histograms_stand_on_one_axis_with_the_threshold():
 
 def test_histograms_of_nothing_or_of_a_wrong_shape_are_not_drawn():
     wrong = (
-        calibrated(edges=(), unrelated=(), found=()),
-        calibrated(found=(1, 2)),
+        calibrated(edges=(), unrelated=(), matches=()),
+        calibrated(matches=(1, 2)),
         calibrated(unrelated=(1,)),
         calibrated(edges=(0, 0.25, 0.25, 0.75, 1)),
-        calibrated(unrelated=(0,) * 4, found=(0,) * 4),
+        calibrated(unrelated=(0,) * 4, matches=(0,) * 4),
         calibrated(edges=(0, 1, 2, 3, float("nan"))),
         calibrated(threshold=float("nan")),
     )
@@ -199,22 +199,22 @@ def test_bins_are_joined_evenly_and_lose_nothing(size):
     unrelated = rng.integers(0, 5, size) * (edges[1:] > 0.2)
     bins = bins_of(
         calibrated(
-            edges=edges.tolist(), found=found.tolist(), unrelated=unrelated.tolist(), threshold=0.9
+            edges=edges.tolist(), matches=found.tolist(), unrelated=unrelated.tolist(), threshold=0.9
         )
     )
-    assert len(bins.found) <= BARS
-    assert (sum(bins.found), sum(bins.unrelated)) == (found.sum(), unrelated.sum())
+    assert len(bins.matches) <= BARS
+    assert (sum(bins.matches), sum(bins.unrelated)) == (found.sum(), unrelated.sum())
     assert bins.even
     again = [
         int(found[(edges[:-1] >= a - 1e-9) & (edges[1:] <= b + 1e-9)].sum())
         for a, b in zip(bins.edges, bins.edges[1:], strict=False)
     ]
-    assert again == list(bins.found)
+    assert again == list(bins.matches)
 
 
 def test_uneven_bins_are_drawn_by_area():
     signal = calibrated(
-        edges=(0.0, 0.5, 0.6, 1.0), unrelated=(0, 0, 0), found=(50, 10, 40), threshold=0.5
+        edges=(0.0, 0.5, 0.6, 1.0), unrelated=(0, 0, 0), matches=(50, 10, 40), threshold=0.5
     )
     root = svg(score_histogram(signal, ""))
     heights = [float(e.get("height")) for e in root if e.get("class") in ("below", "column")]
@@ -240,7 +240,7 @@ def test_quantiles_of_a_histogram_match_the_samples():
     edges = np.linspace(0, 1, 41)
     counts = np.histogram(scores, edges)[0].tolist()
     view = signal_view(
-        calibrated(edges=edges.tolist(), unrelated=counts, found=counts), full_audit()
+        calibrated(edges=edges.tolist(), unrelated=counts, matches=counts), full_audit()
     )
     label = svg(view.histogram).get("aria-label")
     low, high = map(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from palpate.core import PalpateError, SampleRef, Score
+from palpate.core import Note, PalpateError, SampleRef, Score
 from palpate.report import summary_lines, write_report
 from palpate.report.page import in_turns
 from palpate.report.results import Audit, GalleryItem, LeakPair, Results
@@ -96,7 +96,7 @@ def an_audit(worst=(), **changes):
         [10, 40, 30],
         worst,
         [{"material": "wood", "train": 500, "test": 60, "groups_train": 6, "groups_test": 3}],
-        ["A remark."],
+        [Note("text", {"text": "A remark."})],
         "ab" * 32,
     )
     return dataclasses.replace(audit, **changes)
@@ -156,7 +156,7 @@ def full(folder, n=6, side=64):
         scores,
         gallery,
         settings,
-        ["Synthetic data."],
+        [Note("text", {"text": "Synthetic data."})],
         ["palpate audit x"],
     )
 

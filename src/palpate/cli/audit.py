@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import shutil
 from collections.abc import Sequence
@@ -24,6 +23,7 @@ from palpate.core import (
     write_json,
     write_text,
 )
+from palpate.report.notes import sentence
 from palpate.report.results import Audit, Impact, ImpactRow, Results
 
 if TYPE_CHECKING:
@@ -120,9 +120,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         audit = replace(audit, commands=_next(options, audit))
     skipped = [str(p) for p in sides.skipped]
     data = {
-        "format": "palpate-audit/1",
-        **dataclasses.asdict(audit),
-        "others": [dataclasses.asdict(a) for a in others],
+        **replace(audit, others=others).to_json(),
         "skipped": skipped,
     }
     _write(options, [audit, *others], found, data, _digests(sides), terminal)
@@ -494,7 +492,7 @@ def show(audit: Audit, terminal: Terminal) -> None:
         facts[s.kind] = f"{s.flagged} of {s.checked} test samples ({s.fraction:.2%}){at}{causes}"
     if facts:
         terminal.facts("Signals", facts)
-    for note in (*audit.notes, *(f"{s.kind}: {note}" for s in audit.signals for note in s.notes)):
+    for note in (*map(sentence, audit.notes), *(f"{s.kind}: {sentence(note)}" for s in audit.signals for note in s.notes)):
         terminal.say(f"Note: {note}")
     if audit.impact is not None:
         terminal.facts(
@@ -503,7 +501,7 @@ def show(audit: Audit, terminal: Terminal) -> None:
         )
         terminal.print(audit.impact.headline)
         for note in audit.impact.notes:
-            terminal.say(f"Note: {note}")
+            terminal.say(f"Note: {sentence(note)}")
     other = "train" if audit.against == "train" else "the pretraining data"
     if audit.leaked_fraction > 0 or audit.leaking_samples:
         share = audit.leaking_samples / audit.test_samples

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
-from palpate.core import PalpateError, read_json
-from palpate.report.results import Audit, Results
+from palpate.core import Note, PalpateError, read_json
+from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     merged = Results(title=options.title)
     for path in options.results:
         merged = _join(merged, _read(path))
-    merged = replace(merged, notes=[*merged.notes, *_mismatch(merged)])
+    mismatch = [Note("text", {"text": text}) for text in _mismatch(merged)]
+    merged = replace(merged, notes=[*merged.notes, *mismatch])
     with terminal.progress() as progress:
         files = write_report(merged, options.output, progress=progress)
     paths = {"page": str(files.page), "json": str(files.json), "markdown": str(files.markdown)}
@@ -58,25 +59,22 @@ def _read(path: Path) -> Results:
     Raises:
         PalpateError: if it is missing, not ours, or incomplete.
     """
-    from palpate.report import check_results, with_paths
+    from palpate.report import with_paths
 
     data = read_json(path, "results file")
     kind = data.get("format") if isinstance(data, dict) else None
     try:
         match kind:
-            case "palpate-audit/1":
-                results = Results(title="", audits=_audits(data))
-            case "palpate-results/1":
-                results = Results.from_json(
-                    {k: v for k, v in data.items() if k not in ("skipped", "failed")}
-                )
+            case _ if kind in AUDIT_FORMATS:
+                results = replace(Audit.from_json(data).to_results(), title="")
+            case _ if kind in RESULTS_FORMATS:
+                results = Results.from_json(data)
             case _:
                 raise PalpateError(
                     f"{path} must hold results of palpate",
                     f"format {kind!r}",
                     "Pass the JSON of audit -o, score -o, or of a page",
                 )
-        check_results(results)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise PalpateError(
             f"{path} must hold complete results",
@@ -84,12 +82,6 @@ def _read(path: Path) -> Results:
             "Write it again with palpate",
         ) from None
     return with_paths(results, lambda name: str((path.parent / name).resolve()))
-
-
-def _audits(data: dict[str, Any]) -> list[Audit]:
-    """The audit of an audit file and, under ``others``, further ones of the same test part (against pretraining data)."""
-    fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed", "others")}
-    return [Audit.from_json(fields), *(Audit.from_json(other) for other in data.get("others", ()))]
 
 
 def _mismatch(results: Results) -> list[str]:

@@ -19,6 +19,7 @@ from palpate.cli.terminal import Terminal
 from palpate.core import Score
 from palpate.core.score import ARROWS
 from palpate.evaluation.comparing import confidence, percent
+from palpate.report.notes import COMMAND_LINE, sentence
 from palpate.report.remarks import INDEPENDENT, Footnotes, no_floor, reason, remarks
 from palpate.report.results import Results
 from palpate.report.sides import TAIL
@@ -50,7 +51,7 @@ def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None
     differences = [s for s in results.scores if s.metric.endswith(TAIL) and s.value is not None]
     known = {_column(s) for s in scores if s.value is not None}
     listed = [s for s in scores if _column(s) in known]
-    notes, told = Footnotes(), set(results.notes)
+    notes, told = Footnotes(), {sentence(n, COMMAND_LINE) for n in results.notes}
     if known:
         _draw(_scores(listed, notes, told), terminal)
     if differences:
@@ -79,7 +80,7 @@ def show(results: Results, terminal: Terminal, said: Sequence[str] = ()) -> None
             )
     for text, metrics in why.items():
         terminal.print(f"{', '.join(dict.fromkeys(metrics))}: {text}")
-    for remark in (r for r in results.notes if r not in said):
+    for remark in (r for r in (sentence(n, COMMAND_LINE) for n in results.notes) if r not in said):
         terminal.print(remark)  # part of the result: -q leaves it
 
 

@@ -141,7 +141,7 @@ class Score:
             k: tuple(data[k]) if data.get(k) is not None else None for k in ("interval", "null")
         }
         fields: dict[str, Any] = {**data, **pairs}
-        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
+        fields["notes"] = tuple(Note.from_json(note) for note in data.get("notes", ()))
         if not isinstance(fields.get("value"), int | float | None):
             raise TypeError(f"the value of a score must be a number, got {fields['value']!r}")
         return cls(**fields)

@@ -3,22 +3,24 @@
 The file is JSON::
 
     {"format": "palpate-split/1", "digest": "<sha256>", "rule": {...}, "manifest": "<sha256>",
-     "parts": {"train": [ids], "val": [ids], "test": [ids]}}
+     "parts": {"train": [ids], "val": [ids], "test": [ids]}, "notes": [...]}
 
 The digest is SHA-256 over the lines ``id TAB part``, sorted by id: it names the assignment, not the rule.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from palpate.core.digest import digest_lines
+from palpate.core.digest import digest_lines, short
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
+from palpate.core.notes import Note
 
 PARTS = ("train", "val", "test")
 FORMAT = "palpate-split/1"
@@ -32,6 +34,7 @@ class Split:
         parts: id -> ``"train"``, ``"val"`` or ``"test"``.
         rule: how it was made (method, group, ratios, seed, source files); any JSON object.
         manifest: digest of the manifest it was made on, or None.
+        notes: what a reader must know.
 
     Raises:
         PalpateError: on an unknown part.
@@ -40,6 +43,24 @@ class Split:
     parts: Mapping[str, str]
     rule: Mapping[str, Any] = field(default_factory=dict)
     manifest: str | None = None
+    notes: Sequence[Note] = ()
+
+    def __len__(self) -> int:
+        """The number of samples."""
+        return len(self.parts)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __str__(self) -> str:
+        """One line: rule, samples by part, digest."""
+        name = str(self.rule.get("name", "split"))
+        counts = ", ".join(f"{part} {n:,}" for part, n in self.counts().items())
+        return f"{name}: {counts or 'no samples'} (digest {short(self.digest)})"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the same as :meth:`__str__`."""
+        return f"<div>{html.escape(str(self))}</div>"
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.parts.values()) - set(PARTS))
@@ -86,28 +107,27 @@ class Split:
                 table[i] = part
         return cls(table, rule or {}, manifest)
 
-    def save(self, path: Path) -> None:
-        """Writes the split file atomically."""
-        parts = {part: self.ids(part) for part in PARTS if part in self.counts()}
-        write_json(
-            path,
-            {
-                "format": FORMAT,
-                "digest": self.digest,
-                "rule": dict(self.rule),
-                "manifest": self.manifest,
-                "parts": parts,
-            },
-        )
+    def save(self, path: str | Path) -> None:
+        """Write the split file atomically."""
+        data: dict[str, Any] = {
+            "format": FORMAT,
+            "digest": self.digest,
+            "rule": dict(self.rule),
+            "manifest": self.manifest,
+            "parts": {part: self.ids(part) for part in self.counts()},
+        }
+        if self.notes:
+            data["notes"] = [note.to_json() for note in self.notes]
+        write_json(Path(path), data)
 
     @classmethod
-    def load(cls, path: Path) -> Split:
+    def load(cls, path: str | Path) -> Split:
         """Reads a split file and checks its digest.
 
         Raises:
             PalpateError: if the file is missing, of another format, or its digest does not match its content.
         """
-        data = read_json(path, "split file")
+        data = read_json(Path(path), "split file")
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise PalpateError(
                 f"{path} must be a split file ({FORMAT})",
@@ -134,4 +154,4 @@ class Split:
                 "a split that was edited by hand",
                 "Write it again with: palpate split",
             )
-        return split
+        return replace(split, notes=[Note.from_json(note) for note in data.get("notes", ())])

@@ -10,6 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from palpate.report import plots
+from palpate.report.notes import sentence
 from palpate.report.pictures import Picture, Wanted
 from palpate.report.results import MATRIX_ROWS, Audit, Impact, ImpactRow, LeakPair, Signal
 from palpate.report.sentences import (
@@ -189,7 +190,7 @@ def signal_view(signal: Signal, audit: Audit) -> SignalView:
         threshold_text(signal),
         percent(rate) if rate is not None else "–",
         cause_texts(signal),
-        [*cause_notes(signal), *signal.notes],
+        [*cause_notes(signal), *map(sentence, signal.notes)],
         plots.score_histogram(signal, said, there(audit)),
         line if bins else "",
         _bin_rows(bins) if bins else [],
@@ -199,7 +200,7 @@ def signal_view(signal: Signal, audit: Audit) -> SignalView:
 def _middles(bins: plots.Bins) -> str:
     """Between which scores the middle half of each histogram lies, for the drawing in words."""
     said = ""
-    for name, counts in (("unrelated samples", bins.unrelated), ("test samples", bins.found)):
+    for name, counts in (("unrelated samples", bins.unrelated), ("test samples", bins.matches)):
         if sum(counts):
             low, high = (_quantile(bins.edges, counts, share) for share in (0.25, 0.75))
             said += (
@@ -219,10 +220,10 @@ def _quantile(edges: Sequence[float], counts: Sequence[int], share: float) -> fl
 
 
 def _bin_rows(bins: plots.Bins) -> list[tuple[str, str, str]]:
-    unrelated = list(bins.unrelated) or [None] * len(bins.found)
+    unrelated = list(bins.unrelated) or [None] * len(bins.matches)
     return [
         (f"{score_text(a)} to {score_text(b)}", count(m), count(n))
-        for (a, b), m, n in zip(pairwise(bins.edges), unrelated, bins.found, strict=True)
+        for (a, b), m, n in zip(pairwise(bins.edges), unrelated, bins.matches, strict=True)
     ]
 
 

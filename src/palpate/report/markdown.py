@@ -18,6 +18,7 @@ from palpate.report.audits import (
     signal_row,
     signal_view,
 )
+from palpate.report.notes import sentence
 from palpate.report.page import in_turns, material_of
 from palpate.report.results import Audit, Impact, LeakPair, Results
 from palpate.report.sentences import leak_line, purpose, summary_lines, there, where
@@ -157,7 +158,7 @@ def _impact(impact: Impact) -> list[str]:
     lines = ["#### What the leak costs", "", esc(impact.headline), "", *pipe_table(head, rows)]
     lines += [
         f"- 95 % intervals by leaving out whole groups ({esc(impact.group)})",
-        *(f"- {esc(note)}" for note in impact.notes),
+        *(f"- {esc(sentence(note))}" for note in impact.notes),
     ]
     lines += (
         [f"- leak-free splits: {', '.join(map(code, impact.clean_splits))}"]
@@ -212,7 +213,7 @@ def _finding(audit: Audit) -> list[str]:
         lines.append(
             f"- frames to the nearest {other} frame: least {count(audit.gap_min)}, median {number(audit.gap_median, 0)}, most {count(audit.gap_max)}"
         )
-    return [*lines, *(f"- {esc(note)}" for note in audit.notes), ""]
+    return [*lines, *(f"- {esc(sentence(note))}" for note in audit.notes), ""]
 
 
 def _audit(audit: Audit) -> list[str]:
@@ -277,7 +278,7 @@ def render_markdown(results: Results) -> str:
         "",
     ]
     if results.notes:
-        lines += ["## Read this first", "", *(f"- {esc(n)}" for n in results.notes), ""]
+        lines += ["## Read this first", "", *(f"- {esc(sentence(n))}" for n in results.notes), ""]
     lines += ["## Gallery", ""]
     items = in_turns(results.gallery)[:LISTED]
     if items:

@@ -33,6 +33,7 @@ from palpate.report.audits import (
     pair_pictures,
     side_of,
 )
+from palpate.report.notes import sentence
 from palpate.report.pictures import Album, Darkroom, Picture, Wanted
 from palpate.report.results import GalleryItem, LeakPair, Results
 from palpate.report.sentences import purpose, summary_lines, where
@@ -239,6 +240,7 @@ def environment() -> Environment:
         "emphasise": _emphasise,
         "leaf": _leaf,
         "plain": plain,
+        "sentence": sentence,
         "unbroken": _unbroken,
     }
     env.globals.update(functions)
@@ -316,7 +318,7 @@ def render_page(
 
     def draw(album: Album) -> str:
         folds, audits = plan.views(results, album)
-        notes = [*results.notes, *_told(album, len(rows))]
+        notes = [*map(sentence, results.notes), *_told(album, len(rows))]
         return (
             environment()
             .get_template("page.html.j2")

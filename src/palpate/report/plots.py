@@ -243,12 +243,12 @@ class Bins:
 
     Attributes:
         edges: ascending scores, one more than there are bins.
-        unrelated, found: counts of unrelated matches and of test samples; ``unrelated`` may be empty.
+        unrelated, matches: counts of unrelated matches and of test samples; ``unrelated`` may be empty.
     """
 
     edges: Sequence[float]
     unrelated: Sequence[int]
-    found: Sequence[int]
+    matches: Sequence[int]
 
     @property
     def even(self) -> bool:
@@ -262,7 +262,7 @@ def bins_of(signal: Signal) -> Bins | None:
 
     Neighboring bins are joined where there are too many; the bin of the threshold is always kept.
     """
-    edges, unrelated, found = list(signal.edges), list(signal.unrelated), list(signal.found)
+    edges, unrelated, found = list(signal.edges), list(signal.unrelated), list(signal.matches)
     fits = (
         len(edges) == len(found) + 1
         and len(unrelated) in (0, len(found))
@@ -303,7 +303,7 @@ def score_histogram(signal: Signal, said: str, other: str = "train") -> Markup:
     that the threshold cuts is drawn in both strengths.
 
     Args:
-        signal: ``edges`` (scores), ``unrelated`` and ``found`` (counts), ``threshold``.
+        signal: ``edges`` (scores), ``unrelated`` and ``matches`` (counts), ``threshold``.
         said: the drawing in words, for those who do not see it.
         other: what the test samples were compared with.
     """
@@ -313,7 +313,7 @@ def score_histogram(signal: Signal, said: str, other: str = "train") -> Markup:
     low, high = bins.edges[0], bins.edges[-1]
     at = lambda v: _LEFT + (min(max(v, low), high) - low) / (high - low) * (_RIGHT - _LEFT)  # noqa: E731
     panels = [("unrelated samples", "apart", bins.unrelated)] if bins.unrelated else []
-    panels.append((f"test against {other}", "found", bins.found))
+    panels.append((f"test against {other}", "found", bins.matches))
     parts: list[str] = []
     bottom = _TOP
     for k, (name, kind, counts) in enumerate(panels):

@@ -1,29 +1,44 @@
-"""Results: what the stages find, as plain data that the report draws and that JSON can hold."""
+"""What the verbs return: plain data that pages, tables and JSON files are written from.
+
+:class:`Results` holds scores and audits, :class:`Audit` the leaks of one split. Both show themselves:
+``print(results)``, ``results.to_html("page.html")``, ``results.to_latex()``, ``results.to_frame()``.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
-from palpate.core.files import read_json, write_json
+from palpate.core.errors import PalpateError
+from palpate.core.files import read_record, write_json
+from palpate.core.notes import Note
+from palpate.core.plain import plain
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score
 
+if TYPE_CHECKING:
+    import polars as pl
+
+RESULTS_FORMAT, AUDIT_FORMAT = "palpate-results/2", "palpate-audit/2"
+#: Every format that is read, newest first.
+RESULTS_FORMATS = (RESULTS_FORMAT, "palpate-results/1")
+AUDIT_FORMATS = (AUDIT_FORMAT, "palpate-audit/1")
 #: Rows of the group-by-part matrix that an audit keeps.
 MATRIX_ROWS = 60
+#: Why two images look alike. Only ``content`` is a leak.
+CAUSES = ("content", "nothing touched", "sensor drift")
 
 
 @dataclass(frozen=True)
 class LeakPair:
-    """A test sample beside the train sample that it leaks from.
+    """A test sample and the train sample that it leaks from.
 
     Attributes:
         gap: distance in frames, if both lie in one video; else None.
         score: strength of the signal in [0, 1]; None where only the gap is known.
-        cause: for pictures that look alike, why (one of ``CAUSES``).
+        cause: why two images look alike (one of ``CAUSES``).
     """
 
     test: SampleRef
@@ -32,29 +47,31 @@ class LeakPair:
     score: float | None = None
     cause: str = ""
 
-
-#: Why two pictures look alike. Only ``content`` is a leak.
-CAUSES = ("content", "nothing touched", "sensor drift")
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> LeakPair:
+        """The inverse of ``dataclasses.asdict``."""
+        samples = {name: SampleRef(**data[name]) for name in ("test", "train")}
+        return cls(**{**data, **samples})
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One kind of leak, over all test samples: what was looked at, and what was found.
+    """One kind of leak, over all test samples.
 
     Attributes:
         kind: ``identical sample``, ``identical bytes``, ``shared video`` (or ``object``, ``session`` ...), ``time gap``,
-            ``near-duplicate vision`` or ``near-duplicate touch``.
-        checked: test samples that could be looked at (a null or unreadable one cannot).
+            ``near-duplicate vision`` or ``near-duplicate tactile``.
+        checked: test samples that could be checked (a null or unreadable one cannot).
         flagged: test samples that leak by this signal.
         threshold: the score from which a sample is flagged.
         false_positives: the rate at which unrelated samples would be flagged, which the threshold was calibrated to; None where
             the signal is exact.
-        edges, unrelated, found: histograms of scores over the same bins, of unrelated pairs and of test samples against train
-            (counts; ``len(edges) == len(found) + 1``); empty where nothing was calibrated.
+        edges, unrelated, matches: histograms of scores over the same bins, of unrelated pairs and of test samples against train
+            (counts; ``len(edges) == len(matches) + 1``); empty where nothing was calibrated.
         causes: test samples at or over the threshold by cause (``CAUSES``); empty where the signal has one cause.
         worst: the strongest pairs.
-        notes: sentences for people.
-        counts: whether flagged samples count as leaking; a shared group that the audit was not asked about is told but not counted.
+        notes: what a reader must know.
+        counts: whether flagged samples count as leaking; a shared group other than the audit's is reported but not counted.
     """
 
     kind: str
@@ -64,16 +81,24 @@ class Signal:
     false_positives: float | None = None
     edges: Sequence[float] = ()
     unrelated: Sequence[int] = ()
-    found: Sequence[int] = ()
+    matches: Sequence[int] = ()
     causes: Mapping[str, int] = field(default_factory=dict)
     worst: Sequence[LeakPair] = ()
-    notes: Sequence[str] = ()
+    notes: Sequence[Note] = ()
     counts: bool = True
 
     @property
     def fraction(self) -> float:
-        """Flagged share of the samples that could be looked at; 0 if there are none."""
+        """Flagged share of the samples that could be checked; 0 if there are none."""
         return self.flagged / self.checked if self.checked else 0.0
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Signal:
+        """The inverse of ``dataclasses.asdict``; format 1 called ``matches`` ``found``."""
+        fields = {("matches" if name == "found" else name): value for name, value in data.items()}
+        fields["worst"] = [LeakPair.from_json(pair) for pair in data.get("worst", ())]
+        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
+        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -81,11 +106,11 @@ class ImpactRow:
     """What leaking costs, for one kind of feature and one classifier: material accuracy, in [0, 1].
 
     Attributes:
-        features: e.g. ``touch pixels`` or an encoder's name.
+        features: e.g. ``tactile pixels`` or an encoder's name.
         classifier: ``1-NN`` or ``linear probe``.
         given, clean: accuracy on the test part of the given split and of the leak-free one.
         cost: ``given - clean``.
-        given_interval, clean_interval, cost_interval: 95 % by leaving out whole groups; None with fewer than two.
+        given_interval, clean_interval, cost_interval: 95 %, leaving out whole groups; None with fewer than two.
         chance: 1 / materials.
     """
 
@@ -99,6 +124,11 @@ class ImpactRow:
     cost_interval: tuple[float, float] | None
     chance: float
 
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> ImpactRow:
+        """The inverse of ``dataclasses.asdict``."""
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
 
 @dataclass(frozen=True)
 class Impact:
@@ -106,11 +136,11 @@ class Impact:
 
     Attributes:
         rows: one for each kind of features and classifier.
-        headline: one sentence with the number that a user can put in a paper.
+        headline: one sentence with the number to put in a paper.
         group: the column kept whole by the leak-free splits and left out for the intervals.
         clean_splits: digests of the leak-free splits that ``clean`` averages over.
         settings: seeds, sizes, penalties and digests of features.
-        notes: sentences for people.
+        notes: what a reader must know.
     """
 
     rows: Sequence[ImpactRow]
@@ -118,41 +148,39 @@ class Impact:
     group: str
     clean_splits: Sequence[str]
     settings: Mapping[str, Any] = field(default_factory=dict)
-    notes: Sequence[str] = ()
+    notes: Sequence[Note] = ()
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Impact:
         """The inverse of ``dataclasses.asdict``."""
-        rows = [_impact_row(row) for row in data["rows"]]
-        splits, settings, notes = (
-            data["clean_splits"],
-            data.get("settings", {}),
-            data.get("notes", ()),
-        )
-        return cls(rows, data["headline"], data["group"], splits, settings, notes)
+        rows = [ImpactRow.from_json(row) for row in data["rows"]]
+        notes = [Note.from_json(note) for note in data.get("notes", ())]
+        return cls(**{**data, "rows": rows, "notes": notes})
 
 
 @dataclass(frozen=True)
 class Audit:
-    """What the audit of one split found. Counts are samples; gaps are frames; fractions lie in [0, 1].
+    """The leaks of one split. Counts are samples; gaps are frames; fractions lie in [0, 1].
 
     Attributes:
         name: ``"Orig"``, ``"NoLeak"`` or a file name.
-        group: the column that must not be shared (``video``, ``touch``, ``object`` ...).
+        group: the column that must not be shared (``video``, ``contact``, ``object`` ...).
         leaked_fraction: test samples in shared groups / test samples.
         gap_min, gap_median, gap_max: distance to the nearest train frame of the same video, over test samples that have one; else None.
         gap_edges, gap_counts: histogram of those distances; ``len(edges) == len(counts) + 1``.
         identical_samples: test samples whose id, or whose video and frame, are in train as well.
         worst: pairs with the smallest gaps, at most one a group first.
         materials: rows ``{"material", "train", "test", "groups_train", "groups_test"}``.
-        notes: sentences for people (fallbacks, exclusions).
+        notes: what a reader must know (fallbacks, exclusions).
         against: what the test part was compared with: ``train``, or ``pretraining`` where a third list was given.
-        signals: every kind of leak that was looked for, strongest evidence first.
+        signals: every kind of leak that was checked, strongest evidence first.
         leaking_samples: test samples that any signal flags.
         matrix: rows ``{"group", "train", "val", "test", "leaking"}`` (counts of samples), shared groups with most test samples first; at
-            most ``MATRIX_ROWS``, ``groups_in_all`` tells how many there are.
-        impact: what the leak does to scores, if it was asked for.
+            most ``MATRIX_ROWS`` of ``groups_in_all``.
+        impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
+        others: audits of the same test part against other data (an encoder's pretraining list).
+        table: a polars frame with every signal of every test sample; not in the JSON.
     """
 
     name: str
@@ -172,7 +200,7 @@ class Audit:
     gap_counts: Sequence[int] = ()
     worst: Sequence[LeakPair] = ()
     materials: Sequence[Mapping[str, Any]] = ()
-    notes: Sequence[str] = ()
+    notes: Sequence[Note] = ()
     split: str | None = None
     against: str = "train"
     signals: Sequence[Signal] = ()
@@ -181,49 +209,80 @@ class Audit:
     groups_in_all: int = 0
     impact: Impact | None = None
     commands: Sequence[str] = ()
+    others: Sequence[Audit] = ()
+    table: Any = field(default=None, compare=False, repr=False)
+
+    @property
+    def fraction(self) -> float:
+        """Leaking share of the test samples: by any signal, or by shared groups where none was checked."""
+        if not self.signals:
+            return self.leaked_fraction
+        return self.leaking_samples / self.test_samples if self.test_samples else 0.0
+
+    def __str__(self) -> str:
+        """The finding, the signals, and the notes: a few lines."""
+        from palpate.report.terminal import audit_text
+
+        return audit_text(self)
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the same as :meth:`__str__`."""
+        return _preformatted(str(self))
+
+    def to_html(self, path: str | Path) -> None:
+        """Write a self-contained page, with images of the strongest pairs."""
+        self.to_results().to_html(path)
+
+    def to_results(self) -> Results:
+        """This audit, with :attr:`others`, as the results of a page."""
+        return Results(title=f"Audit of {self.name}", audits=[self, *self.others])
+
+    def to_frame(self) -> pl.DataFrame:
+        """Every signal of every test sample, one row each.
+
+        Raises:
+            PalpateError: if the audit was read from a file, which holds no table.
+        """
+        if self.table is None:
+            raise PalpateError(
+                "The table of an audit must be of an audit that has just run",
+                "an audit read from a file",
+                "Run the audit again",
+            )
+        return self.table
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object with ``format: palpate-audit/2``."""
+        return {"format": AUDIT_FORMAT, **plain(self)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Audit:
-        """The inverse of ``dataclasses.asdict``."""
-        signals = [_signal(s) for s in data.get("signals", ())]
-        impact = Impact.from_json(data["impact"]) if data.get("impact") else None
-        fields: dict[str, Any] = {
-            **data,
-            "worst": _pairs(data.get("worst", ())),
-            "signals": signals or (),
-            "impact": impact,
-        }
-        for name in ("matrix", "commands"):  # an empty list reads as the default does
-            fields[name] = fields.get(name) or ()
+        """The inverse of :meth:`to_json`; keys that a command adds (``skipped``, ``failed``) are ignored."""
+        fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")}
+        fields["worst"] = [LeakPair.from_json(pair) for pair in data.get("worst", ())]
+        fields["signals"] = [Signal.from_json(signal) for signal in data.get("signals", ())]
+        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
+        fields["impact"] = Impact.from_json(data["impact"]) if data.get("impact") else None
+        fields["others"] = [cls.from_json(other) for other in data.get("others", ())]
         return cls(**fields)
 
+    def save(self, path: str | Path) -> None:
+        """Write the audit as JSON, atomically."""
+        write_json(Path(path), self.to_json())
 
-def _impact_row(data: Mapping[str, Any]) -> ImpactRow:
-    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-    return ImpactRow(**fields)
+    @classmethod
+    def load(cls, path: str | Path) -> Audit:
+        """Read an audit file.
 
-
-def _signal(data: Mapping[str, Any]) -> Signal:
-    fields: dict[str, Any] = {**data, "worst": _pairs(data.get("worst", ()))}
-    return Signal(**fields)
-
-
-def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[LeakPair]:
-    return [
-        LeakPair(
-            SampleRef(**r["test"]),
-            SampleRef(**r["train"]),
-            r["gap"],
-            r.get("score"),
-            r.get("cause", ""),
-        )
-        for r in rows
-    ]
+        Raises:
+            PalpateError: if it is missing, or no audit.
+        """
+        return cls.from_json(read_record(Path(path), "audit file", form=AUDIT_FORMATS))
 
 
 @dataclass(frozen=True)
 class GalleryItem:
-    """One row of the gallery: the photo, the real touch, the generated touch."""
+    """One row of the gallery: the photo, the real tactile image, the generated one."""
 
     sample: SampleRef
     generated: str
@@ -232,14 +291,17 @@ class GalleryItem:
 
 @dataclass(frozen=True)
 class Results:
-    """Everything a page shows.
+    """Scores, audits and images of a run: a table of scores that can also be drawn as a page.
+
+    Iterates over its scores; ``results["TMMD"]`` lists those of a metric, ``results["TMMD", "a"]`` is that of
+    generator ``a`` (of several presets the first; ``results["TMMD", "a", "paper"]`` names one).
 
     Attributes:
         title: heading of the page.
         facts: the headline facts, one sentence each.
-        audits, scores, gallery: see there.
+        audits, scores, gallery: what the page shows.
         settings: nested JSON of settings, digests, seeds, versions and times; the page prints it whole.
-        notes: warnings that a reader must see (synthetic data, fallbacks, skipped inputs).
+        notes: what a reader must see first (synthetic data, fallbacks, skipped inputs).
         commands: command lines that reproduce the run or say what to do next.
     """
 
@@ -249,32 +311,136 @@ class Results:
     scores: Sequence[Score] = ()
     gallery: Sequence[GalleryItem] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
-    notes: Sequence[str] = ()
+    notes: Sequence[Note] = ()
     commands: Sequence[str] = ()
 
+    def __iter__(self) -> Iterator[Score]:
+        return iter(self.scores)
+
+    def __len__(self) -> int:
+        """The number of scores."""
+        return len(self.scores)
+
+    def __bool__(self) -> bool:
+        return True
+
+    @overload
+    def __getitem__(self, key: str) -> list[Score]: ...
+    @overload
+    def __getitem__(self, key: tuple[str, ...]) -> Score: ...
+    def __getitem__(self, key: str | tuple[str, ...]) -> list[Score] | Score:
+        """The scores of a metric, or the score of (metric, subject) or (metric, subject, preset).
+
+        Raises:
+            KeyError: if there is none; lists what there is.
+        """
+        names = (key,) if isinstance(key, str) else key
+        matches = [score for score in self.scores if _key(score)[: len(names)] == names]
+        if not matches:
+            known = dict.fromkeys(_key(score)[: len(names)] for score in self.scores)
+            raise KeyError(f"no score of {names}; there is {', '.join(map(str, known)) or 'none'}")
+        return matches if isinstance(key, str) else matches[0]
+
+    def __str__(self) -> str:
+        """The tables of scores, as in the terminal."""
+        from palpate.report.terminal import results_text
+
+        return results_text(self)
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the tables of scores."""
+        return _preformatted(str(self))
+
+    def to_html(self, path: str | Path) -> None:
+        """Write a self-contained page; relative image paths start from the folder of ``path``.
+
+        Raises:
+            PalpateError: if ``path`` does not end in ``.html`` or scores of different settings would share a column.
+        """
+        from palpate.report import write_report
+
+        write_report(self, Path(path))
+
+    def to_markdown(self) -> str:
+        """Everything as Markdown, with paths in place of images."""
+        from palpate.report.markdown import render_markdown
+
+        return render_markdown(self)
+
+    def to_latex(self) -> str:
+        """The scores as LaTeX tables (booktabs)."""
+        from palpate.report.latex import latex_tables
+
+        return latex_tables(self)
+
+    def to_frame(self) -> pl.DataFrame:
+        """A polars frame, one row a score, with its interval, null and settings."""
+        import polars as pl
+
+        from palpate.report.notes import sentence
+
+        names = (
+            "metric",
+            "subject",
+            "value",
+            "interval",
+            "level",
+            "interval_method",
+            "null",
+            "floor",
+        )
+        names += ("estimator", "bandwidth", "scale", "n", "m", "seed", "higher_is_better")
+        names += ("encoder", "reference", "split")
+        rows: list[dict[str, Any]] = []
+        for score in self.scores:
+            row: dict[str, Any] = {}
+            for name in names:
+                value = getattr(score, name)
+                if name in ("interval", "null"):
+                    low, high = value or (None, None)
+                    row |= {f"{name}_low": low, f"{name}_high": high}
+                else:
+                    row[name] = value
+            preset = score.settings.get("preset")
+            rows.append(row | {"preset": preset, "notes": [sentence(note) for note in score.notes]})
+        return pl.DataFrame(rows, infer_schema_length=None)
+
     def to_json(self) -> dict[str, Any]:
-        """A JSON object with ``format: palpate-results/1``."""
-        data = dataclasses.asdict(self)
-        data["scores"] = [s.to_json() for s in self.scores]
-        return {"format": "palpate-results/1", **data}
+        """A JSON object with ``format: palpate-results/2``."""
+        return {"format": RESULTS_FORMAT, **plain(self)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Results:
-        """The inverse of :meth:`to_json`."""
-        data = {k: v for k, v in data.items() if k != "format"}
-        data["audits"] = [Audit.from_json(a) for a in data.get("audits", ())]
-        data["scores"] = [Score.from_json(s) for s in data.get("scores", ())]
-        data["gallery"] = [
-            GalleryItem(SampleRef(**g["sample"]), g["generated"], g.get("background"))
-            for g in data.get("gallery", ())
+        """The inverse of :meth:`to_json`; notes of format 1, which were sentences, become notes of code ``text``."""
+        fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")}
+        fields["audits"] = [Audit.from_json(audit) for audit in data.get("audits", ())]
+        fields["scores"] = [Score.from_json(score) for score in data.get("scores", ())]
+        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
+        fields["gallery"] = [
+            GalleryItem(SampleRef(**row["sample"]), row["generated"], row.get("background"))
+            for row in data.get("gallery", ())
         ]
-        return cls(**data)
+        return cls(**fields)
 
-    def save(self, path: Path) -> None:
-        """Writes the results as JSON, atomically."""
-        write_json(path, self.to_json())
+    def save(self, path: str | Path) -> None:
+        """Write the results as JSON, atomically."""
+        write_json(Path(path), self.to_json())
 
     @classmethod
-    def load(cls, path: Path) -> Results:
-        """Reads a results file; raises :class:`~palpate.core.errors.PalpateError` if it is missing or not JSON."""
-        return cls.from_json(read_json(path, "results file"))
+    def load(cls, path: str | Path) -> Results:
+        """Read a results file.
+
+        Raises:
+            PalpateError: if it is missing, or holds no results.
+        """
+        return cls.from_json(read_record(Path(path), "results file", form=RESULTS_FORMATS))
+
+
+def _key(score: Score) -> tuple[str, str, str]:
+    return score.metric, score.subject, str(score.settings.get("preset", ""))
+
+
+def _preformatted(text: str) -> str:
+    import html
+
+    return f'<pre style="line-height: 1.3">{html.escape(text)}</pre>'

@@ -49,7 +49,7 @@ KINDS: tuple[tuple[str, str, str], ...] = (
         "have a near-duplicate photo in {there}",
     ),
     (
-        "near-duplicate touch",
+        "near-duplicate t",  # tactile; format 1 called it touch
         "Its touch, without the sensor's own look, can hardly be told from one of {there}.",
         "have a near-duplicate touch in {there}",
     ),
