@@ -75,7 +75,7 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
         "--set",
         "seed=3",
         "image_format=png",
-        "--max-per-touch",
+        "--max-per-contact",
         "1",
         "--json",
     ]

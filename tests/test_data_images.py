@@ -163,7 +163,9 @@ def test_write_png_is_exact_whole_and_strict(tmp_path):
 
 
 def test_in_threads_gives_every_result_and_stops_at_an_error():
-    assert sorted(in_threads(lambda k: k * k, range(100), 3)) == [(k, k * k) for k in range(100)]
+    assert sorted(in_threads(lambda k: k * k, range(100), threads=3)) == [
+        (k, k * k) for k in range(100)
+    ]
     ran = []
 
     def fail(k):
@@ -173,5 +175,5 @@ def test_in_threads_gives_every_result_and_stops_at_an_error():
         return k
 
     with pytest.raises(RuntimeError):
-        list(in_threads(fail, range(10_000), 2))
+        list(in_threads(fail, range(10_000), threads=2))
     assert len(ran) < 100

@@ -8,11 +8,11 @@ import pytest
 
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.listing import (
+    contact_names,
     read_categories,
     read_frame_table,
     read_list,
     read_lists,
-    touches,
     write_list,
 )
 from palpate.data.reading import is_list
@@ -23,7 +23,7 @@ def write(path, text):
     return path
 
 
-def slow_touches(videos, frames, labels):
+def slow_contacts(videos, frames, labels):
     """One by one, by looking for the row of the frame before."""
     at = {(v, f): label for v, f, label in zip(videos, frames, labels, strict=True)}
     names = {}
@@ -143,12 +143,12 @@ def test_joined_lists_find_a_frame_that_stands_in_both(tmp_path):
         (f"{b}:1", "duplicate-row"),
         (f"{b}:2", "two-labels"),
     ]
-    assert found.manifest.column("touch") == ["v#0001", "v#0001"]
+    assert found.manifest.column("contact") == ["v#0001", "v#0001"]
 
 
 def test_touches_by_hand_and_against_a_slow_count():
     videos, frames, labels = list("bbbaabba"), [5, 4, 9, 1, 2, 6, 7, 4], [0, 0, 0, 1, 1, 2, 2, 1]
-    assert touches(videos, frames, labels) == [
+    assert contact_names(videos, frames, labels) == [
         "b#0001",
         "b#0001",
         "b#0003",
@@ -158,15 +158,15 @@ def test_touches_by_hand_and_against_a_slow_count():
         "b#0002",
         "a#0002",
     ]
-    assert touches(videos, frames, None)[5] == "b#0001"
+    assert contact_names(videos, frames, None)[5] == "b#0001"
     import numpy as np
 
     rng = np.random.default_rng(0)
     cells = rng.permutation([(v, f) for v in range(3) for f in range(200) if rng.random() < 0.8])
     videos, frames = [f"v{v}" for v, _ in cells], [int(f) for _, f in cells]
     labels = [int(f // 17) for f in frames]
-    assert touches(videos, frames, labels) == slow_touches(videos, frames, labels)
-    assert touches([], [], []) == []
+    assert contact_names(videos, frames, labels) == slow_contacts(videos, frames, labels)
+    assert contact_names([], [], []) == []
 
 
 def test_write_list_can_be_read_back_and_refuses_what_could_not(tmp_path):
@@ -244,16 +244,16 @@ def test_facts_of_the_official_lists(real_data):
     start = time.perf_counter()
     both = read_lists([folder / "train.txt", folder / "test.txt"], root=folder)
     assert time.perf_counter() - start < 2  # some 0.25 s on an idle core
-    runs = [f.manifest.table["touch"].n_unique() for f in (train, test, both)]
+    runs = [f.manifest.table["contact"].n_unique() for f in (train, test, both)]
     assert [len(f.manifest) for f in (train, test, both)] == [91_982, 29_879, 121_861]
     assert runs == [3_378, 1_113, 4_491]
-    by_touch = (
-        both.manifest.table.with_columns(source=both.rows["source"]).group_by("touch").n_unique()
+    by_contact = (
+        both.manifest.table.with_columns(source=both.rows["source"]).group_by("contact").n_unique()
     )
-    assert by_touch["source"].max() == 1
-    assert by_touch["material"].max() == 1
+    assert by_contact["source"].max() == 1
+    assert by_contact["material"].max() == 1
     assert train.manifest.table["video"].n_unique() == 120
     assert both.manifest.table["video"].n_unique() == 126
     assert both.manifest.table["material"].n_unique() == 19
-    lengths = both.manifest.table["touch"].value_counts()["count"]
+    lengths = both.manifest.table["contact"].value_counts()["count"]
     assert (lengths.median(), lengths.max()) == (27, 86)

@@ -213,7 +213,7 @@ def test_formats_are_found_by_look_or_what_was_looked_for_is_listed(tmp_path):
     assert (
         len(
             import_dataset(
-                tmp_path / "tag", tmp_path / "out", max_per_touch=1, columns=None
+                tmp_path / "tag", tmp_path / "out", max_per_contact=1, columns=None
             ).manifest
         )
         == 1

@@ -66,7 +66,7 @@ def test_a_stray_number_costs_nothing_and_what_looks_wrong_reaches_the_user(tmp_
     assert found.suspicious == list(looked.suspicious)
 
 
-def test_untouched_frames_are_those_of_a_slow_search(tmp_path):
+def test_without_contact_frames_are_those_of_a_slow_search(tmp_path):
     rng = np.random.default_rng(0)
     for trial in range(20):
         root = tmp_path / str(trial)
@@ -76,11 +76,11 @@ def test_untouched_frames_are_those_of_a_slow_search(tmp_path):
             (root / "t").mkdir(parents=True, exist_ok=True)
             (root / "t" / f"{k}.jpg").write_bytes(b"")
         work = recordings.Recordings(root, root, {}, {"a": contact}, "jpg", None, [])
-        work.sides["a"] = {"tactile": recordings.FolderFrames(root / "t", root)}
+        work.frames["a"] = {"tactile": recordings.FolderFrames(root / "t", root)}
         far = [k for k in there if not any(abs(k - c) <= 4 for c in contact)] or [
             k for k in there if k not in contact
         ]
-        found = work._untouched("a")
+        found = work._without_contact("a")
         assert set(found) <= set(far)
         assert len(found) == min(len(far), 15)
         assert found[:1] == far[:1]

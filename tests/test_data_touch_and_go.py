@@ -131,7 +131,7 @@ def spoil(root):
         (root / "label.txt", 11, "bad-image", "0000000013.jpg"),
         (root / "label.txt", 13, "beyond-end", "90"),
         (root / "label.txt", 14, "unknown-label", "77"),
-        (root / "label.txt", 16, "missing-video", "no tactile side"),
+        (root / "label.txt", 16, "missing-video", "no tactile frames"),
         (root / "label.txt", 17, "bad-path", "good"),
         (root / "label.txt", 19, "beyond-end", "frame 40"),
     ]
@@ -298,18 +298,18 @@ def test_official_split_captions_and_objects(tmp_path):
     assert found.splits["Orig"].counts() == {"train": 1, "test": 2}
 
 
-def test_max_per_touch_takes_evenly_spaced_frames(tmp_path):
+def test_max_per_contact_takes_evenly_spaced_frames(tmp_path):
     lines = [f"a/{k:010d}.jpg,3" for k in range(10, 30)] + ["a/0000000035.jpg,3"]
     root = forge(tmp_path / "tag", extracted=("a",), lines=lines)
     take = lambda **kw: import_touch_and_go(root, tmp_path / "out", **kw).manifest.column("frame")  # noqa: E731
-    assert take(max_per_touch=1) == [20, 35]
-    assert take(max_per_touch=4) == [12, 17, 22, 27, 35]
-    assert take(max_per_touch=100) == [*range(10, 30), 35]
-    other = take(max_per_touch=4, seed=5)
-    assert other == take(max_per_touch=4, seed=5)
+    assert take(max_per_contact=1) == [20, 35]
+    assert take(max_per_contact=4) == [12, 17, 22, 27, 35]
+    assert take(max_per_contact=100) == [*range(10, 30), 35]
+    other = take(max_per_contact=4, seed=5)
+    assert other == take(max_per_contact=4, seed=5)
     assert np.diff(other[:4]).tolist() == [5, 5, 5]
     with pytest.raises(PalpateError, match="at least 1"):
-        take(max_per_touch=0)
+        take(max_per_contact=0)
 
 
 def test_missing_root_list_and_recordings_are_named(tmp_path):

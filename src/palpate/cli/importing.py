@@ -24,7 +24,7 @@ FLAGS = {
     "side": "--as",
     "classes": "--classes",
     "size": "--size",
-    "max_per_touch": "--max-per-touch",
+    "max_per_contact": "--max-per-contact",
     "check": "--check",
     "skip_bad": "--skip-bad",
     "progress": "--quiet",
@@ -78,8 +78,8 @@ class Options(SourceOptions):
     """Folder for manifest.parquet, the data set's own splits and decoded frames."""
     size: int | None = None
     """Shorter side of frames that are decoded from videos (default: as they are)."""
-    max_per_touch: int | None = None
-    """Keep at most this many evenly spaced frames of each touch (Touch and Go)."""
+    max_per_contact: int | None = None
+    """Keep at most this many evenly spaced frames of each contact (Touch and Go)."""
     skip_bad: bool = False
     """Leave out bad rows and files and list them, instead of refusing."""
 
@@ -90,7 +90,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
 
     given = source_options(options, options.source) | {
         "size": options.size,
-        "max_per_touch": options.max_per_touch,
+        "max_per_contact": options.max_per_contact,
     }
     strange = (
         {p.name for p in options.output.iterdir()} - IMPORT_FILES

@@ -1,9 +1,9 @@
-"""Images: one way in (8-bit RGB, whole or refused) and one way out (8-bit PNG, fixed range).
+"""Images: one reader (8-bit RGB, whole or rejected) and one writer (8-bit PNG, fixed range).
 
-Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit gray ``v`` becomes
-``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of an animation the first picture counts.
-A batch for a network is the center square, resized by Pillow's antialiased bicubic filter. No step depends on the
-content of other images: the range is never stretched.
+Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit gray
+``v`` becomes ``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of an
+animation the first image counts. A batch for a network is the center square, resized by Pillow's
+antialiased bicubic filter. No step depends on the content of other images: the range is never stretched.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from itertools import islice
 from pathlib import Path
 from threading import Event
@@ -49,13 +49,13 @@ BROKEN = (
     Image.DecompressionBombError,
 )
 #: What to do about unreadable files that are not being imported now.
-REFETCH = "Fetch these files again, or leave them out (palpate import does, with --skip-bad)"
+REFETCH = "Fetch these files again, or skip the bad ones with: palpate import"
 T = TypeVar("T")
 R = TypeVar("R")
 
 
 def read_image(path: Path) -> Image.Image:
-    """One image file as 8-bit RGB.
+    """Read one image file as 8-bit RGB.
 
     Raises:
         PalpateError: if the file is missing, empty, truncated, or no image.
@@ -74,12 +74,12 @@ def read_image(path: Path) -> Image.Image:
 
 
 def check_image(path: Path, how: Check = "decode") -> str | None:
-    """Why an image file is unusable, or None.
+    """Return why an image file is unusable, or None.
 
     Args:
         path: the file.
-        how: ``decode`` reads every byte (a JPEG at an eighth of its size, which finds truncation all the same),
-            ``header`` reads the first bytes only, ``none`` asks only whether the file exists.
+        how: ``decode`` reads every byte (a JPEG at an eighth of its size, which detects truncation
+            as well), ``header`` reads the first bytes only, ``none`` checks that the file exists.
     """
     path = Path(path)
     if how == "none":
@@ -97,12 +97,12 @@ def check_image(path: Path, how: Check = "decode") -> str | None:
 def load_images(
     paths: Sequence[Path], size: int, *, progress: Progress = quiet
 ) -> NDArray[np.uint8]:
-    """Images as one array; a path that stands twice is decoded once.
+    """Load images as one array; a path that occurs twice is decoded once.
 
     Args:
         paths: (n,) files.
         size: side of the squares, in pixels.
-        progress: told how many files are decoded.
+        progress: progress callback.
 
     Returns:
         (n, size, size, 3), 0 to 255.
@@ -110,9 +110,9 @@ def load_images(
     Raises:
         ProblemsError: naming every unreadable file.
     """
-    out = np.empty((len(paths), size, size, 3), np.uint8)
-    _fill(out, paths, progress)
-    return out
+    images = np.empty((len(paths), size, size, 3), np.uint8)
+    _fill(images, paths, progress)
+    return images
 
 
 def cached_images(
@@ -122,15 +122,15 @@ def cached_images(
     cache: Path | None = None,
     progress: Progress = quiet,
 ) -> NDArray[np.uint8]:
-    """One image column of a manifest as an array, decoded once and then mapped from a file.
+    """Load one image column of a manifest; with a cache, decode once and map the file afterwards.
 
     Args:
         manifest: the samples.
         column: ``vision``, ``tactile`` or ``background``.
         size: side of the squares, in pixels.
-        cache: folder for ``<column>-<size>-<digest>.npy``; None keeps the array in memory. The digest covers the paths,
-            file sizes, modification times, ``size`` and ``column``, so a changed file is decoded again.
-        progress: told how many files are decoded.
+        cache: folder for ``<column>-<size>-<digest>.npy``; None keeps the array in memory. The digest covers
+            paths, file sizes, modification times, ``size`` and ``column``, so a changed file is decoded again.
+        progress: progress callback.
 
     Returns:
         (n, size, size, 3), 0 to 255, in row order; read-only if it is mapped.
@@ -142,41 +142,35 @@ def cached_images(
     paths = manifest.paths(column)
     if cache is None:
         return load_images(paths, size, progress=progress)
-    file = (
-        Path(cache)
-        / f"{column}-{size}-{short(digest_json([2, size, image_stamp(manifest, column)]))}.npy"
-    )
+    key = short(digest_json([2, size, image_stamp(manifest, column)]))
+    file = Path(cache) / f"{column}-{size}-{key}.npy"
     shape = (len(paths), size, size, 3)
     if (mapped := _mapped(file, shape)) is not None:
         return mapped
     with atomic_path(file) as part:
-        out = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
-        _fill(out, paths, progress)
-        out.flush()
-        del out
+        images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
+        _fill(images, paths, progress)
+        images.flush()
+        del images
     return np.load(file, mmap_mode="r", allow_pickle=False)
 
 
 def image_stamp(manifest: Manifest, column: str) -> str:
-    """Digest of the paths, file sizes and modification times of one image column: changes when a file does.
+    """Digest of the paths, file sizes and modification times of one image column.
 
-    For keys of caches and checkpoints, which must not outlive the pictures they were made from.
+    For keys of caches and checkpoints, which must not outlive the images they were made from.
 
     Raises:
         PalpateError: if a row has no such image.
     """
     paths = manifest.paths(column)
     stamps = {path: file_stamp(path) for path in dict.fromkeys(paths)}
-    return digest_json(
-        [
-            column,
-            [[name, *stamps[p]] for name, p in zip(manifest.column(column), paths, strict=True)],
-        ]
-    )
+    names = manifest.column(column)
+    return digest_json([column, [[n, *stamps[p]] for n, p in zip(names, paths, strict=True)]])
 
 
 def write_png(path: Path, array: NDArray[np.uint8]) -> None:
-    """Writes (h, w, 3) or (h, w) as an 8-bit PNG, atomically and without stretching its range.
+    """Write (h, w, 3) or (h, w) as an 8-bit PNG, atomically and without stretching its range.
 
     Raises:
         PalpateError: if the array is not of that type and shape.
@@ -207,26 +201,37 @@ def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
 
 def in_threads(
     function: Callable[[T], R],
-    items: Iterable[T],
+    items: Collection[T],
+    what: str = "",
+    progress: Progress = quiet,
+    *,
     threads: int | None = None,
     stop: Event | None = None,
 ) -> Iterator[tuple[T, R]]:
-    """Yields ``(item, function(item))`` as they finish; few are in flight, so that Ctrl-C and errors end it soon.
+    """Yield ``(item, function(item))`` as they finish; few are in flight, so that Ctrl-C and errors end it soon.
 
-    ``stop`` is set when the caller leaves early, for functions that run long and look at it.
+    Args:
+        function: the work.
+        items: what to work on.
+        what: name of the work for ``progress``.
+        progress: progress callback.
+        threads: how many; default: the number of cores, 16 at most.
+        stop: set when the caller leaves early, for functions that run long and look at it.
     """
     threads = threads or min(16, os.cpu_count() or 1)
-    source = iter(items)
+    remaining = iter(items)
+    progress(what, 0, len(items))
     with ThreadPoolExecutor(threads) as pool:
-        running: dict[Future[R], T] = {
-            pool.submit(function, item): item for item in islice(source, 4 * threads)
-        }
+        running = {pool.submit(function, item): item for item in islice(remaining, 4 * threads)}
+        done = 0
         try:
             while running:
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     item = running.pop(future)
                     yield item, future.result()
-                    for following in islice(source, 1):
+                    done += 1
+                    progress(what, done, len(items))
+                    for following in islice(remaining, 1):
                         running[pool.submit(function, following)] = following
         finally:
             if stop is not None:
@@ -234,31 +239,28 @@ def in_threads(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _fill(out: NDArray[np.uint8], paths: Sequence[Path], progress: Progress) -> None:
-    """Decodes every distinct path once and writes it to all its rows; raises all unreadable files at once."""
-    size = out.shape[1]
+def _fill(images: NDArray[np.uint8], paths: Sequence[Path], progress: Progress) -> None:
+    """Decode every distinct path once into all its rows; raise all unreadable files at once."""
+    size = images.shape[1]
     rows: dict[Path, list[int]] = {}
     for k, path in enumerate(paths):
         rows.setdefault(Path(path), []).append(k)
 
-    def decode(path: Path) -> Problem | None:
+    def decode(path: Path) -> str | None:
         try:
-            out[rows[path]] = square(read_image(path), size)
+            images[rows[path]] = square(read_image(path), size)
         except PalpateError as error:
-            return Problem(str(path), "bad-image", error.got)
+            return error.got
         return None
 
-    problems: list[Problem] = []
-    progress("decoding images", 0, len(rows))
-    for done, (_, problem) in enumerate(in_threads(decode, rows), 1):
-        problems += [problem] if problem else []
-        progress("decoding images", done, len(rows))
+    decoded = in_threads(decode, rows, "decoding images", progress)
+    problems = [Problem(str(path), "bad-image", reason) for path, reason in decoded if reason]
     if problems:
         raise ProblemsError(sorted(problems, key=lambda p: p.where), REFETCH)
 
 
 def _mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
-    """The cached array if the file is there and has the right type and shape."""
+    """The cached array, if the file exists and has the right type and shape."""
     try:
         array = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception:  # a damaged header is parsed as Python, and fails in many ways
@@ -267,12 +269,12 @@ def _mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
 
 
 def file_stamp(path: Path) -> tuple[int, int]:
-    """Size in bytes and modification time in nanoseconds; (-1, -1) if the file is missing, which decoding will report."""
+    """Size in bytes and modification time in nanoseconds; (-1, -1) if the file is missing."""
     try:
-        found = path.stat()
+        stat = path.stat()
     except OSError:
         return (-1, -1)
-    return (found.st_size, found.st_mtime_ns)
+    return (stat.st_size, stat.st_mtime_ns)
 
 
 def _rgb(image: Image.Image) -> Image.Image:
@@ -291,7 +293,7 @@ def _rgb(image: Image.Image) -> Image.Image:
 
 
 def _reason(path: Path, error: BaseException) -> str:
-    """One plain sentence for what Pillow raised."""
+    """What Pillow raised, in plain words."""
     if not path.exists():
         return "no such file"
     if path.is_dir():

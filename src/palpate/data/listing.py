@@ -1,11 +1,12 @@
-"""Frame lists: one ``video/frame.ext,label`` a line, as Touch and Go and its derivatives ship them.
+"""Frame lists: one ``video/frame.ext,label`` per line, as Touch and Go and its derivatives ship them.
 
-No header; the order is free; UTF-8, or UTF-16 with a byte-order mark; any line ends; the last line may lack its own. The label is an integer: -1 is inconclusive,
-others are classes. The line is split at its last comma, so a video's name may hold commas and spaces. The frame
-is the integer value of the file's stem; ``video/33.jpg`` and ``video/0000000033.png`` name the same frame.
+No header; the order is free; UTF-8, or UTF-16 with a byte-order mark; any line ends; the last line may
+lack one. The label is an integer: -1 is inconclusive, others are classes. The line is split at its last
+comma, so the name of a video may hold commas and spaces. The frame is the integer value of the file's
+stem; ``video/33.jpg`` and ``video/0000000033.png`` name the same frame.
 
-A **touch** is a maximal run of consecutive frames of one video with one label; touch ``k`` of a video, counted
-from 1 in the order of frames, is called ``video#000k``.
+A **contact** is a maximal run of consecutive frames of one video with one label; contact ``k`` of a
+video, counted from 1 in the order of frames, is called ``video#000k``.
 """
 
 from __future__ import annotations
@@ -28,21 +29,22 @@ PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
 LINE = r"^(?P<video>[^/\\]+)/(?P<stem>[0-9]{1,18})\.(?P<suffix>[A-Za-z0-9]+)\s*,\s*(?P<label>[+-]?[0-9]{1,18})$"
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)|^\.[/\\]"
-FIX = "Mend the lines, or read the list with --skip-bad to leave them out"
+FIX = "Correct the lines, or skip the bad ones"
 #: Names that the published category table misspells.
 SPELLING = {"Ruber": "Rubber"}
 
 
 @dataclass(frozen=True)
 class FrameList:
-    """What a list (or several, joined) holds.
+    """The rows of a list, or of several as one.
 
     Attributes:
         manifest: the usable rows in list order; image columns are null.
-        skipped: rows that were left out because they are bad.
-        inconclusive: number of rows with the label -1, left out as well.
-        rows: the usable rows as a table ``source, line, id, video, frame, label, suffix``, in the order of the manifest.
-        contact: table ``video, frame`` of every readable row, inconclusive ones included: where the sensor touches something.
+        skipped: bad rows that were skipped.
+        inconclusive: number of rows with the label -1, skipped as well.
+        rows: the usable rows as a table ``source, line, id, video, frame, label, suffix``, in the order of
+            the manifest.
+        contact: table ``video, frame`` of every readable row, inconclusive ones included: all frames in contact.
     """
 
     manifest: Manifest
@@ -55,13 +57,13 @@ class FrameList:
 def read_list(
     path: Path, *, skip_bad: bool = False, categories: Mapping[int, str] | None = None
 ) -> FrameList:
-    """Reads one frame list.
+    """Read one frame list.
 
     Args:
         path: the list; its folder becomes the manifest's root.
-        skip_bad: leave bad rows out and list them, instead of raising. Of a frame with two labels every row is left out.
-        categories: label -> class name. Default: ``category_reference.txt`` beside the list if there is one, else a
-            label stays its own name (``"3"``). With a table, a label that it lacks is a problem.
+        skip_bad: skip and list bad rows instead of raising. Of a frame with two labels every row is bad.
+        categories: label -> class name. Default: ``category_reference.txt`` next to the list if there is
+            one, else a label stays as it is (``"3"``). With a table, a label that it lacks is a problem.
 
     Raises:
         PalpateError: if there is no such file.
@@ -81,7 +83,7 @@ def read_lists(
     skip_bad: bool = False,
     categories: Mapping[int, str] | None = None,
 ) -> FrameList:
-    """Reads several lists as one, so that frames which stand in two of them are found and touches are numbered together.
+    """Read several lists as one, so that frames in two of them are detected and contacts are numbered together.
 
     Args:
         paths: the lists, in order.
@@ -94,125 +96,98 @@ def read_lists(
         ProblemsError: unless ``skip_bad``.
     """
     parsed = [_parse(Path(p)) for p in paths]
-    problems = [problem for _, found in parsed for problem in found]
+    problems = [problem for _, bad in parsed for problem in bad]
     rows = pl.concat([table for table, _ in parsed])
     contact = rows.select("video", "frame")
-    count = rows.height
-    rows = rows.filter(pl.col("label") != INCONCLUSIVE)
-    inconclusive = count - rows.height
-    rows, found = _unknown_labels(rows, categories)
-    problems += found
-    rows, found = _duplicates(rows)
-    problems += found
+    conclusive = rows.filter(pl.col("label") != INCONCLUSIVE)
+    inconclusive = rows.height - conclusive.height
+    rows, unknown = _unknown_labels(conclusive, categories)
+    rows, doubled = _duplicates(rows)
+    problems = _in_order([*problems, *unknown, *doubled], paths)
     if problems and not skip_bad:
-        raise ProblemsError(_in_order(problems, paths), FIX)
+        raise ProblemsError(problems, FIX)
     labels = rows["label"]
-    names = (
-        {label: str(label) for label in labels.unique()} if categories is None else dict(categories)
-    )
+    names = {k: str(k) for k in labels.unique()} if categories is None else dict(categories)
     table = rows.select("id", "video", "frame").with_columns(
-        contact=pl.Series(touches(rows["video"], rows["frame"], labels), dtype=pl.String),
+        contact=pl.Series(contact_names(rows["video"], rows["frame"], labels), dtype=pl.String),
         material=labels.replace_strict(names, return_dtype=pl.String)
         if rows.height
         else pl.Series([], dtype=pl.String),
     )
-    empty = [
-        pl.lit(None, dtype=kind).alias(name)
-        for name, kind in SCHEMA.items()
-        if name not in table.columns
-    ]
+    empty = (pl.lit(None, kind).alias(c) for c, kind in SCHEMA.items() if c not in table.columns)
     table = table.with_columns(empty).select(list(SCHEMA))
     facts = {"source": ", ".join(Path(p).name for p in paths)}
-    return FrameList(
-        Manifest(table, Path(root), facts), _in_order(problems, paths), inconclusive, rows, contact
-    )
+    return FrameList(Manifest(table, Path(root), facts), problems, inconclusive, rows, contact)
 
 
-def touches(
+def contact_names(
     videos: Sequence[str] | pl.Series,
     frames: Sequence[int] | pl.Series,
     labels: Sequence[object] | pl.Series | None,
 ) -> list[str]:
-    """The touch that each frame belongs to, in the order given.
+    """The contact that each frame belongs to, in the order given.
 
     Args:
         videos: (n,) names.
         frames: (n,) integers, in any order.
-        labels: (n,) classes that a touch must not mix, or None.
+        labels: (n,) classes that a contact must not mix, or None.
 
     Returns:
-        ``n`` names ``video#0001``; the numbers count a video's touches from 1 in the order of frames.
+        ``n`` names ``video#0001``; the numbers count the contacts of a video from 1 in the order of frames.
     """
-    table = pl.DataFrame(
-        {"video": pl.Series(videos, dtype=pl.String), "frame": pl.Series(frames, dtype=pl.Int64)}
-    ).with_row_index("row")
-    table = table.with_columns(label=pl.lit(0) if labels is None else pl.Series(labels)).sort(
-        "video", "frame", maintain_order=True
-    )
-    other = (pl.col("video") != pl.col("video").shift(1)) | (
-        pl.col("label") != pl.col("label").shift(1)
-    )
-    opens = (other | (pl.col("frame").diff() > 1)).fill_null(True)
-    table = table.with_columns(number=opens.cast(pl.Int64).cum_sum().over("video")).sort("row")
-    return (
-        table.select(pl.format("{}#{}", "video", pl.col("number").cast(pl.String).str.zfill(4)))
-        .to_series()
-        .to_list()
-    )
+    video, label = pl.col("video"), pl.col("label")
+    columns = {
+        "video": pl.Series(videos, dtype=pl.String),
+        "frame": pl.Series(frames, dtype=pl.Int64),
+    }
+    table = pl.DataFrame(columns).with_row_index("row")
+    table = table.with_columns(label=pl.lit(0) if labels is None else pl.Series(labels))
+    table = table.sort("video", "frame", maintain_order=True)
+    first = (video != video.shift(1)) | (label != label.shift(1)) | (pl.col("frame").diff() > 1)
+    number = first.fill_null(True).cast(pl.Int64).cum_sum().over("video")
+    table = table.with_columns(number=number.cast(pl.String).str.zfill(4)).sort("row")
+    return table.select(pl.format("{}#{}", "video", "number")).to_series().to_list()
 
 
 def number_together(*manifests: Manifest) -> list[Manifest]:
-    """Manifests of lists that were read apart, with their touches numbered over all of them, so that one name means one touch.
+    """Number the contacts of lists that were read separately together, so that one name means one contact.
 
     Manifests with a row that has no video or frame stay as they are.
     """
     if any(m.table["video"].null_count() or m.table["frame"].null_count() for m in manifests):
         return list(manifests)
-    whole = pl.concat([m.table.select("video", "frame", "material") for m in manifests])
-    # A frame that stands in two lists belongs to one touch there and here.
-    alone = whole.unique(["video", "frame"], maintain_order=True)
-    names = alone.with_columns(
-        contact=pl.Series(
-            touches(alone["video"], alone["frame"], alone["material"]), dtype=pl.String
-        )
-    )
-    found = whole.join(names, on=["video", "frame"], how="left", maintain_order="left")["contact"]
-    out: list[Manifest] = []
+    rows = pl.concat([m.table.select("video", "frame", "material") for m in manifests])
+    # A frame in two lists belongs to one contact.
+    distinct = rows.unique(["video", "frame"], maintain_order=True)
+    names = contact_names(distinct["video"], distinct["frame"], distinct["material"])
+    distinct = distinct.with_columns(contact=pl.Series(names, dtype=pl.String))
+    joined = rows.join(distinct, on=["video", "frame"], how="left", maintain_order="left")
+    numbered: list[Manifest] = []
+    start = 0
     for m in manifests:
-        out.append(
-            Manifest(
-                m.table.with_columns(contact=found.slice(sum(len(o) for o in out), len(m))),
-                m.root,
-                m.facts,
-            )
-        )
-    return out
+        contact = joined["contact"].slice(start, len(m))
+        numbered.append(Manifest(m.table.with_columns(contact=contact), m.root, m.facts))
+        start += len(m)
+    return numbered
 
 
 def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
-    """Writes a frame list, atomically.
+    """Write a frame list, atomically.
 
     Args:
         path: the file.
         rows: (sample id or path, label); an id without a suffix gets ``.jpg``.
 
     Raises:
-        ProblemsError: if a row could not be read back.
+        ProblemsError: if a row could not be read again.
     """
     lines: list[str] = []
     problems: list[Problem] = []
     for number, (name, label) in enumerate(rows, 1):
         name = name if re.search(r"\.[A-Za-z][A-Za-z0-9]*$", name) else f"{name}.jpg"
-        match = re.match(PATH, name)
-        if (
-            match is None
-            or not match["stem"].isdecimal()
-            or re.search(CLIMBS, name)
-            or "\n" in name
-        ):
-            problems.append(
-                Problem(f"row {number}", "bad-path", f"{name!r} is not video/frame.ext")
-            )
+        if _frame_of(name) is None or "\n" in name:
+            text = f"{name!r} is not video/frame.ext"
+            problems.append(Problem(f"row {number}", "bad-path", text))
         lines.append(f"{name},{int(label)}\n")
     if problems:
         raise ProblemsError(problems, "Name samples video/frame, with an integer frame")
@@ -220,42 +195,35 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
 
 
 def write_table(path: Path, manifest: Manifest) -> Path:
-    """Writes a manifest's rows as CSV, without its empty columns, atomically; paths stay relative to its root."""
-    table = manifest.table.select(
-        name for name in SCHEMA if manifest.table[name].null_count() < len(manifest)
-    )
-    write_text(Path(path), table.write_csv())
+    """Write the rows of a manifest as CSV, without its empty columns; paths stay relative to its root."""
+    write_text(Path(path), manifest.filled().write_csv())
     return Path(path)
 
 
 def read_categories(path: Path) -> dict[int, str]:
-    """Reads a category table, ``Name: id`` a line, with uneven spaces, optional quotes and optional remarks in brackets.
+    """Read a category table: ``Name: id`` per line, with uneven spaces, optional quotes and remarks in brackets.
 
     Returns:
-        id -> name, the inconclusive class (-1) included if it is listed; known misspellings are mended.
+        id -> name, the inconclusive class (-1) included if it is listed; known misspellings are corrected.
 
     Raises:
-        PalpateError: if the file is missing.
-        ProblemsError: on lines of another form and on ids that stand twice.
+        PalpateError: if the file is missing or empty.
+        ProblemsError: on lines of another form and on ids that occur twice.
     """
     path = Path(path)
     names: dict[int, str] = {}
     problems: list[Problem] = []
     for number, line in enumerate(_text(path).splitlines(), 1):
         line = re.sub(r"\([^)]*\)|[\"'“”‘’]", "", line).strip().rstrip(",").strip()
-        if not line:
-            continue
         match = re.fullmatch(r"(.*\S)\s*:\s*([+-]?\d+)", line)
         if match is None:
-            problems.append(Problem(f"{path}:{number}", "bad-line", f"{line!r} is not 'Name: id'"))
-        elif (label := int(match[2])) in names:
-            problems.append(
-                Problem(
-                    f"{path}:{number}",
-                    "duplicate-id",
-                    f"the id {label} names {names[label]!r} already",
+            if line:
+                problems.append(
+                    Problem(f"{path}:{number}", "bad-line", f"{line!r} is not 'Name: id'")
                 )
-            )
+        elif (label := int(match[2])) in names:
+            text = f"the id {label} names {names[label]!r} already"
+            problems.append(Problem(f"{path}:{number}", "duplicate-id", text))
         else:
             name = " ".join(match[1].split())
             names[label] = SPELLING.get(name, name)
@@ -279,7 +247,7 @@ class FrameTable:
 
 
 def read_frame_table(path: Path) -> FrameTable:
-    """Reads ``video/frame.jpg,words`` lines (CSV, with an optional header ``frame,...``); words may hold commas, quoted or not.
+    """Read ``video/frame.jpg,words`` lines, with an optional header ``frame,...``; words may hold commas, quoted or not.
 
     Raises:
         PalpateError: if the file is missing.
@@ -287,64 +255,65 @@ def read_frame_table(path: Path) -> FrameTable:
     path = Path(path)
     values: dict[tuple[str, int], str] = {}
     skipped: list[Problem] = []
-    reader = csv.reader(_text(path).splitlines())
-    for fields in reader:
-        where = f"{path}:{reader.line_num}"
-        if not any(field.strip() for field in fields) or (
-            reader.line_num == 1 and fields[0].strip().lower() == "frame"
-        ):
+    for number, line in enumerate(lines_of(_text(path)), 1):
+        if not line.strip() or (number == 1 and line.lower().startswith("frame,")):
             continue
-        match = re.match(PATH, fields[0].strip())
-        words = ",".join(fields[1:]).strip()
-        if match is None or not match["stem"].isdecimal() or re.search(CLIMBS, fields[0].strip()):
-            skipped.append(Problem(where, "bad-path", f"{fields[0]!r} is not video/frame.ext"))
+        name, *fields = next(csv.reader([line]))  # line by line: an open quote costs one line
+        frame, words = _frame_of(name.strip()), ",".join(fields).strip()
+        if frame is None:
+            problem = "bad-path", f"{name!r} is not video/frame.ext"
         elif not words:
-            skipped.append(Problem(where, "bad-line", f"{fields[0]!r} has no words"))
-        elif values.setdefault((match["video"], int(match["stem"])), words) != words:
-            skipped.append(
-                Problem(where, "two-labels", f"{fields[0]!r} has other words on an earlier line")
-            )
+            problem = "bad-line", f"{name!r} has no words"
+        elif values.setdefault(frame, words) != words:
+            problem = "two-labels", f"{name!r} has other words on an earlier line"
+        else:
+            continue
+        skipped.append(Problem(f"{path}:{number}", *problem))
     return FrameTable(values, skipped)
 
 
+def _frame_of(name: str) -> tuple[str, int] | None:
+    """(video, frame) of ``video/frame.ext``, or None for other paths and those that leave the data set."""
+    match = re.match(PATH, name)
+    if match is None or not match["stem"].isdecimal() or re.search(CLIMBS, name):
+        return None
+    return match["video"], int(match["stem"])
+
+
 def _text(path: Path) -> str:
-    """The file as text; bytes that are no UTF-8, or UTF-16 with a byte-order mark, become U+FFFD."""
-    try:
-        return decoded(path.read_bytes())
-    except FileNotFoundError:
-        raise PalpateError("The list must exist", f"no file {path}", "Check the path") from None
-    except IsADirectoryError:
-        raise PalpateError(
-            "The list must be a file", f"the folder {path}", "Name the file itself"
-        ) from None
+    """The file as text; bytes that are neither UTF-8 nor UTF-16 with a byte-order mark become U+FFFD."""
+    if not path.is_file():
+        got = f"the folder {path}" if path.is_dir() else f"no file {path}"
+        raise PalpateError("The list must be a file", got, "Check the path")
+    return decoded(path.read_bytes())
 
 
 def _parse(path: Path) -> tuple[pl.DataFrame, list[Problem]]:
     """The well-formed rows of one list, and a problem for each other line."""
-    lines = pl.DataFrame(
-        {"text": pl.Series(lines_of(_text(path)), dtype=pl.String)}
-    ).with_row_index("line", offset=1)
-    lines = lines.with_columns(pl.col("text").str.strip_chars()).filter(pl.col("text") != "")
-    table = lines.with_columns(pl.col("text").str.extract_groups(LINE).alias("parts")).unnest(
-        "parts"
+    text = pl.col("text")
+    lines = pl.DataFrame({"text": pl.Series(lines_of(_text(path)), dtype=pl.String)})
+    lines = lines.with_row_index("line", offset=1)
+    lines = lines.with_columns(text.str.strip_chars()).filter(text != "")
+    table = lines.with_columns(text.str.extract_groups(LINE).alias("parts")).unnest("parts")
+    good = (
+        pl.col("label").is_not_null()
+        & ~text.str.contains(CLIMBS)
+        & ~text.str.contains("\ufffd", literal=True)
     )
-    table = table.with_columns(
-        source=pl.lit(str(path)),
-        id=pl.format("{}/{}", "video", "stem"),
-        frame=pl.col("stem").cast(pl.Int64, strict=False),
-        label=pl.col("label").cast(pl.Int64, strict=False),
-        odd=pl.col("text").str.contains(CLIMBS)
-        | pl.col("text").str.contains("\ufffd", literal=True),
-    )
-    bad = table.filter(pl.col("odd") | pl.col("frame").is_null() | pl.col("label").is_null())
     problems = [
-        Problem(f"{path}:{line}", *_reason(text))
-        for line, text in bad.select("line", "text").iter_rows()
-    ]
-    if not table.height:
-        problems = [Problem(str(path), "empty-list", "the list has no lines")]
-    table = table if not bad.height else table.filter(~pl.col("line").is_in(bad["line"].to_list()))
-    return table.select("source", "line", "id", "video", "frame", "label", "suffix"), problems
+        Problem(f"{path}:{line}", *_reason(bad))
+        for line, bad in table.filter(~good).select("line", "text").iter_rows()
+    ] or ([] if table.height else [Problem(str(path), "empty-list", "the list has no lines")])
+    rows = table.filter(good).select(
+        pl.lit(str(path)).alias("source"),
+        "line",
+        pl.format("{}/{}", "video", "stem").alias("id"),
+        "video",
+        pl.col("stem").cast(pl.Int64).alias("frame"),
+        pl.col("label").cast(pl.Int64),
+        "suffix",
+    )
+    return rows, problems
 
 
 def _reason(line: str) -> tuple[str, str]:
@@ -367,27 +336,20 @@ def _reason(line: str) -> tuple[str, str]:
 def _unknown_labels(
     rows: pl.DataFrame, categories: Mapping[int, str] | None
 ) -> tuple[pl.DataFrame, list[Problem]]:
-    known = (
-        pl.col("label") >= 0
-        if categories is None
-        else pl.col("label").is_in([k for k in categories if k != INCONCLUSIVE])
-    )
-    bad = rows.filter(~known)
-    what = (
-        "is negative, but not -1 (inconclusive)"
-        if categories is None
-        else "is not in the category table"
-    )
+    label = pl.col("label")
+    if categories is None:
+        known, what = label >= 0, "is negative, but not -1 (inconclusive)"
+    else:
+        known = label.is_in([k for k in categories if k != INCONCLUSIVE])
+        what = "is not in the category table"
     return rows.filter(known), [
-        Problem(
-            f"{row['source']}:{row['line']}", "unknown-label", f"the label {row['label']} {what}"
-        )
-        for row in bad.iter_rows(named=True)
+        Problem(f"{source}:{line}", "unknown-label", f"the label {value} {what}")
+        for source, line, value in rows.filter(~known).select("source", "line", "label").iter_rows()
     ]
 
 
 def _duplicates(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[Problem]]:
-    """Drops every row of a frame with two labels, and all but the first of equal rows."""
+    """Drop every row of a frame with two labels, and all but the first of equal rows."""
     again = rows.select("video", "frame").is_duplicated()
     if not again.any():
         return rows, []
@@ -395,28 +357,18 @@ def _duplicates(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[Problem]]:
     problems: list[Problem] = []
     drop: list[int] = []
     for (video, frame), group in rows.filter(again).group_by("video", "frame", maintain_order=True):
-        same = list(group.iter_rows(named=True))
-        places = [f"{row['source']}:{row['line']}" for row in same]
-        if group["label"].n_unique() > 1:
-            for place, row in zip(places, same, strict=True):
-                others = ", ".join(
-                    f"{o['label']} at {p}"
-                    for o, p in zip(same, places, strict=True)
-                    if o["label"] != row["label"]
-                )
-                text = f"frame {frame} of {video!r} has two labels: {row['label']} here, {others}"
-                problems.append(Problem(place, "two-labels", text))
-            drop += group["row"].to_list()
-        else:
-            for place in places[1:]:
-                problems.append(
-                    Problem(
-                        place,
-                        "duplicate-row",
-                        f"frame {frame} of {video!r} is listed at {places[0]} already",
-                    )
-                )
-            drop += group["row"].to_list()[1:]
+        places = [f"{source}:{line}" for source, line in group.select("source", "line").iter_rows()]
+        labels = group["label"].to_list()
+        two = len(set(labels)) > 1
+        for place, label in list(zip(places, labels, strict=True))[not two :]:
+            others = (f"{o} at {p}" for o, p in zip(labels, places, strict=True) if o != label)
+            text = f"frame {frame} of {video!r} " + (
+                f"has two labels: {label} here, {', '.join(others)}"
+                if two
+                else f"is listed at {places[0]} already"
+            )
+            problems.append(Problem(place, "two-labels" if two else "duplicate-row", text))
+        drop += group["row"].to_list()[not two :]
     return rows.filter(~pl.col("row").is_in(drop)).drop("row"), problems
 
 

@@ -146,6 +146,11 @@ class Manifest:
         )
         return digest_lines(text.to_series().to_list())
 
+    def filled(self) -> pl.DataFrame:
+        """The table without the columns that are all null."""
+        names = [name for name in SCHEMA if self.table[name].null_count() < len(self)]
+        return self.table.select(names)
+
     def path(self, relative: str) -> Path:
         """The absolute path of an image named in the table."""
         return self.root / relative

@@ -1,7 +1,7 @@
-"""From listed frames of two-sided recordings to manifest rows: open, choose backgrounds, check, extract.
+"""From listed frames of recordings with two modalities to manifest rows: open, choose backgrounds, check, extract.
 
-Every step drops the rows that it cannot use and says why in ``problems``; nothing is raised in between, so that a user
-sees everything that is wrong with a data set at once. Rows of one recording share their fate where the recording is bad.
+Every step drops the rows that it cannot use and adds the reason to ``problems``, so that a user sees
+everything that is wrong with a data set at once.
 """
 
 from __future__ import annotations
@@ -14,41 +14,34 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import numpy as np
+import polars as pl
 
-from palpate.core import (
-    PalpateError,
-    Problem,
-    Progress,
-    atomic_path,
-    inside,
-    read_json,
-    rng_for,
-    write_json,
-)
+from palpate.core import PalpateError, Problem, Progress, inside, read_json, rng_for, write_json
 from palpate.data.frames import (
     FolderFrames,
     Frames,
     ImageFormat,
     VideoFrames,
     nearest_to_median,
-    save_picture,
+    save_frame,
 )
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.listing import FrameList, FrameTable
 from palpate.data.manifest import Manifest
 
-#: The background is this many frames before the touch.
+#: The background is this many frames before the contact.
 BACKGROUND_BEFORE = 4
-#: From at most so many frames is a recording's typical frame chosen.
+#: The typical frame of a recording is chosen from at most so many frames.
 MEDIAN_OF = 15
-SIDES = ("vision", "tactile")
+MODALITIES = ("vision", "tactile")
 
 
 @dataclass(frozen=True)
 class VideoFiles:
-    """One recording: each side is a folder of frames, a video file, or None where it is missing."""
+    """One recording: each modality is a folder of frames, a video file, or None where it is missing."""
 
     name: str
     vision: Path | None
@@ -57,70 +50,66 @@ class VideoFiles:
 
 @dataclass(frozen=True)
 class Row:
-    """A labeled frame on its way into the manifest; ``where`` is ``list:line``."""
+    """A labeled frame; ``where`` is ``list:line``."""
 
     where: str
     id: str
     video: str
     frame: int
-    touch: str
+    contact: str
     material: str
 
 
 @dataclass(frozen=True)
 class _Job:
-    """The wanted frames of one side of a recording, or (``resting``) its typical frame in no touch."""
+    """The needed frames of one modality of a recording; without ``frames`` its typical frame."""
 
     video: str
-    side: str
-    resting: bool
+    modality: str
+    frames: frozenset[int] | None
 
 
 def rows_of(listed: FrameList) -> list[Row]:
     """The rows of a list, sorted by video and frame."""
-    table = listed.rows.with_columns(
-        listed.manifest.table["contact"], listed.manifest.table["material"]
-    ).sort("video", "frame")
+    cells = listed.manifest.table.select("contact", "material")
+    table = pl.concat([listed.rows, cells], how="horizontal").sort("video", "frame")
+    names = ("id", "video", "frame", "contact", "material")
     return [
-        Row(
-            f"{r['source']}:{r['line']}",
-            r["id"],
-            r["video"],
-            r["frame"],
-            r["contact"],
-            r["material"],
-        )
+        Row(f"{r['source']}:{r['line']}", *(r[name] for name in names))
         for r in table.iter_rows(named=True)
     ]
 
 
 def first_frames(rows: Iterable[Row]) -> dict[str, int]:
-    """Touch -> its first frame."""
-    found: dict[str, int] = {}
+    """Contact -> its first frame."""
+    first: dict[str, int] = {}
     for row in rows:
-        found[row.touch] = min(row.frame, found.get(row.touch, row.frame))
-    return found
+        first[row.contact] = min(row.frame, first.get(row.contact, row.frame))
+    return first
 
 
 def thin(rows: Sequence[Row], most: int | None, seed: int) -> list[Row]:
-    """At most ``most`` rows a touch, one from each of that many equal stretches.
+    """At most ``most`` rows per contact, one from each of that many equal stretches.
 
-    Of a touch of n rows, row ``floor((i + u) n / most)`` is taken for i = 0, 1, ...; u = 1/2 for seed 0, otherwise drawn in
-    [0, 1) for each touch.
+    Of a contact of n rows, row ``floor((i + u) n / most)`` is taken for i = 0, 1, ...; u = 1/2 for
+    seed 0, otherwise drawn in [0, 1) for each contact.
     """
     if most is None:
         return list(rows)
     groups: dict[str, list[Row]] = {}
     for row in rows:
-        groups.setdefault(row.touch, []).append(row)
+        groups.setdefault(row.contact, []).append(row)
     taken: list[Row] = []
-    for touch, group in groups.items():
+    for contact, group in groups.items():
         count = len(group)
-        if count <= most:
-            taken += group
-            continue
-        phase = 0.5 if seed == 0 else rng_for(seed, "frames of a touch", touch).random()
-        taken += [group[int((i + phase) * count / most)] for i in range(most)]
+        # The name of the stream is part of every thinned import so far.
+        phase = 0.5 if seed == 0 else rng_for(seed, "frames of a touch", contact).random()
+        places = (
+            range(count)
+            if count <= most
+            else (int((i + phase) * count / most) for i in range(most))
+        )
+        taken += [group[k] for k in places]
     return taken
 
 
@@ -130,332 +119,348 @@ class Recordings:
 
     Attributes:
         root: the data set.
-        out: where cached frames go.
+        out: where extracted frames go.
         videos: recordings on disk, by name.
-        contact: frames of each recording in which the sensor touches something.
-        image_format, size: of cached frames.
-        created: every new file is entered here.
+        in_contact: frames of each recording in which the sensor is in contact.
+        image_format, size: of extracted frames.
+        created: every new file is added here.
         problems: what is wrong so far.
         suspicious: what looks wrong, but can be used.
-        sides: recording -> side -> frames, for those that could be opened.
-        background: touch -> background picture.
-        background_frames: touch -> the frame before it that is its background, where there is one.
-        resting: touches without such a frame -> their recording.
-        moved: extracted picture -> its place below ``out``, where some recordings are raw and others are not.
+        frames: recording -> modality -> frames, for those that could be opened.
+        backgrounds: contact -> background image.
+        background_frames: contact -> the frame before it that is its background, where there is one.
+        typical_of: contacts without such a frame -> their recording.
+        moved: image -> its copy below ``out``, where some recordings are videos and others folders.
     """
 
     root: Path
     out: Path
     videos: Mapping[str, VideoFiles]
-    contact: Mapping[str, set[int]]
+    in_contact: Mapping[str, set[int]]
     image_format: ImageFormat
     size: int | None
     created: list[Path]
     problems: list[Problem] = field(default_factory=list)
     suspicious: list[Problem] = field(default_factory=list)
-    sides: dict[str, dict[str, Frames]] = field(default_factory=dict)
-    background: dict[str, Path] = field(default_factory=dict)
+    frames: dict[str, dict[str, Frames]] = field(default_factory=dict)
+    backgrounds: dict[str, Path] = field(default_factory=dict)
     background_frames: dict[str, int] = field(default_factory=dict)
-    resting: dict[str, str] = field(default_factory=dict)
+    typical_of: dict[str, str] = field(default_factory=dict)
     moved: dict[Path, Path] = field(default_factory=dict)
 
     def open(self, rows: Sequence[Row], progress: Progress) -> list[Row]:
-        """Opens both sides of every recording in use; keeps the rows whose frame is there on both."""
-        first: dict[str, Row] = {}
-        count: Counter[str] = Counter()
-        for row in rows:
-            first.setdefault(row.video, row)
-            count[row.video] += 1
-        progress("reading recordings", 0, len(first))
-        for done, (name, found) in enumerate(in_threads(self._open_one, sorted(first)), 1):
-            if isinstance(found, dict):
-                self.sides[name] = found
-                for frames in (
-                    frames for frames in found.values() if isinstance(frames, FolderFrames)
-                ):
-                    self.suspicious += [
-                        Problem(
-                            str(frames.source / other),
-                            "duplicate-frame",
-                            f"{read} has the same number, and is read",
-                        )
-                        for other, read in frames.doubled
-                    ]
-            else:
-                kind, text = found
-                self.problems.append(
-                    Problem(
-                        first[name].where, kind, f"{text} ({_rows(count[name])} of this recording)"
-                    )
+        """Open both modalities of every recording in use; keep the rows that have both images."""
+        first = {row.video: row for row in reversed(rows)}
+        count = Counter(row.video for row in rows)
+        names = sorted(first)
+        for name, opened in in_threads(self._open_one, names, "reading recordings", progress):
+            if isinstance(opened, str):
+                kind, _, text = opened.partition(": ")
+                lost = f"{text} ({count[name]} row{'s' * (count[name] != 1)} of this recording)"
+                self.problems.append(Problem(first[name].where, kind, lost))
+                continue
+            self.frames[name] = opened
+            self.suspicious += [
+                Problem(
+                    str(frames.source / duplicate),
+                    "duplicate-frame",
+                    f"{read} has the same number, and is read",
                 )
-            progress("reading recordings", done, len(first))
-        return [row for row in rows if row.video in self.sides and self._has(row)]
+                for frames in opened.values()
+                if isinstance(frames, FolderFrames)
+                for duplicate, read in frames.duplicates
+            ]
+        return [row for row in rows if row.video in self.frames and self._has(row)]
 
-    def _open_one(self, name: str) -> dict[str, Frames] | tuple[str, str]:
-        """Both sides of a recording, or what is wrong as (kind, text)."""
+    def _open_one(self, name: str) -> dict[str, Frames] | str:
+        """Both modalities of a recording, or ``kind: text`` of what is wrong."""
         files = self.videos.get(name)
         if files is None:
-            return "missing-video", f"the recording {name!r} is not in the data set"
-        sides: dict[str, Frames] = {}
-        for side in SIDES:
-            source: Path | None = getattr(files, side)
+            return f"missing-video: the recording {name!r} is not in the data set"
+        opened: dict[str, Frames] = {}
+        for modality in MODALITIES:
+            source: Path | None = getattr(files, modality)
             if source is None:
-                return "missing-video", f"the recording {name!r} has no {side} side"
-            if source.is_dir():
-                if inside(self.root, os.path.relpath(source, self.root)) is None:
-                    return (
-                        "outside-root",
-                        f"{source} is a link that leaves the data set; import from the folder that really holds it",
-                    )
-                sides[side] = FolderFrames(source, self.root)
-                continue
-            try:
-                sides[side] = VideoFrames(
-                    source, self.out / "images" / name / side, self.image_format, self.size
-                )
-            except PalpateError as error:
-                return "bad-video", f"{source}: {error.got}"
-        return sides
+                return f"missing-video: the recording {name!r} has no {modality} frames"
+            if not source.is_dir():
+                cache = self.out / "images" / name / modality
+                try:
+                    opened[modality] = VideoFrames(source, cache, self.image_format, self.size)
+                except PalpateError as error:
+                    return f"bad-video: {source}: {error.got}"
+            elif inside(self.root, os.path.relpath(source, self.root)) is None:
+                return f"outside-root: {source} is a link that leaves the data set; import from the folder that really holds it"
+            else:
+                opened[modality] = FolderFrames(source, self.root)
+        return opened
 
     def _has(self, row: Row) -> bool:
-        """Whether the frame is there on both sides; says so if not."""
-        sides = self.sides[row.video]
-        length = min(len(frames) for frames in sides.values())
+        """Whether both modalities have the frame; if not, it is a problem."""
+        opened = self.frames[row.video]
+        length = min(map(len, opened.values()))
         if row.frame >= length:
-            text = f"frame {row.frame} lies behind the end of {row.video!r}, whose sides have {length} frames in common, counted from 0"
+            text = f"frame {row.frame} is beyond the end of {row.video!r}: both modalities have {length} frames, counted from 0"
             self.problems.append(Problem(row.where, "beyond-end", text))
             return False
-        missing = [side for side, frames in sides.items() if not frames.has(row.frame)]
-        for side in missing:
-            source = sides[side]
-            if isinstance(source, FolderFrames) and row.frame in source.leaving:
-                self.problems.append(
-                    Problem(
-                        row.where,
-                        "outside-root",
-                        f"{source.path(row.frame)} is a link that leaves the data set",
-                    )
-                )
+        missing = [frames for frames in opened.values() if not frames.has(row.frame)]
+        for frames in missing:
+            if isinstance(frames, FolderFrames) and row.frame in frames.leaving:
+                text = f"{frames.path(row.frame)} is a link that leaves the data set"
+                self.problems.append(Problem(row.where, "outside-root", text))
             else:
-                self.problems.append(
-                    Problem(
-                        row.where,
-                        "missing-file",
-                        f"no picture of frame {row.frame} in {source.source}",
-                    )
-                )
+                text = f"no image of frame {row.frame} in {frames.source}"
+                self.problems.append(Problem(row.where, "missing-file", text))
         return not missing
 
     def choose_backgrounds(self, rows: Sequence[Row], starts: Mapping[str, int]) -> None:
-        """The background of every touch: 4 frames before it, else further back, else (in ``extract``) a typical frame in no touch, else none."""
-        for touch, row in {row.touch: row for row in reversed(rows)}.items():
-            frames, contact = self.sides[row.video]["tactile"], self.contact.get(row.video, set())
-            there = frames.numbers
-            before = bisect_right(there, starts[touch] - BACKGROUND_BEFORE)
-            k = next((there[i] for i in range(before - 1, -1, -1) if there[i] not in contact), None)
-            if k is not None:
-                self.background_frames[touch] = k
-                self.background[touch] = frames.path(k)
-            elif self._untouched(row.video):
-                self.resting[touch] = row.video
+        """Choose the background of every contact.
 
-    def _untouched(self, video: str) -> list[int]:
-        """Up to 15 evenly spaced frames in no touch; a margin of 4 frames around touches is kept where that leaves any."""
-        there = np.asarray(self.sides[video]["tactile"].numbers, np.int64)
-        contact = np.array(sorted(self.contact.get(video, set())), np.int64)
+        It is the frame 4 before the contact; else the nearest earlier one without contact; else (in
+        ``extract``) a typical frame without contact; else none.
+        """
+        for contact, video in {row.contact: row.video for row in rows}.items():
+            frames = self.frames[video]["tactile"]
+            numbers, touched = frames.numbers, self.in_contact.get(video, set())
+            before = bisect_right(numbers, starts[contact] - BACKGROUND_BEFORE)
+            earlier = (numbers[i] for i in range(before - 1, -1, -1))
+            k = next((k for k in earlier if k not in touched), None)
+            if k is not None:
+                self.background_frames[contact] = k
+                self.backgrounds[contact] = frames.path(k)
+            elif self._without_contact(video):
+                self.typical_of[contact] = video
+
+    def _without_contact(self, video: str) -> list[int]:
+        """Up to 15 evenly spaced frames without contact, 4 frames away from any where that leaves some."""
+        numbers = np.asarray(self.frames[video]["tactile"].numbers, np.int64)
+        contact = np.array(sorted(self.in_contact.get(video, set())), np.int64)
         for margin in (BACKGROUND_BEFORE, 0):
-            # A frame is near a touch if some frame of contact lies between it less and it plus the margin.
-            near = np.searchsorted(contact, there - margin, "left") < np.searchsorted(
-                contact, there + margin, "right"
-            )
-            free = there[~near].tolist()
-            if free:
-                return [
-                    free[i]
-                    for i in sorted(
-                        {
-                            int(p)
-                            for p in np.linspace(
-                                0, len(free) - 1, min(MEDIAN_OF, len(free))
-                            ).round()
-                        }
-                    )
-                ]
+            # A frame is near a contact if a frame in contact lies within the margin.
+            low = np.searchsorted(contact, numbers - margin, "left")
+            free = numbers[low == np.searchsorted(contact, numbers + margin, "right")]
+            if len(free):
+                places = np.linspace(0, len(free) - 1, min(MEDIAN_OF, len(free))).round()
+                return free[np.unique(places.astype(int))].tolist()
         return []
 
     def check(self, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
-        """Checks every extracted picture in use once; keeps the rows whose pictures are whole."""
+        """Check every image of folders in use once; keep the rows whose images are whole."""
         first: dict[Path, Row] = {}
         for row in rows:
-            for side, frames in self.sides[row.video].items():
-                if not frames.raw:
-                    first.setdefault(frames.path(row.frame), row)
-                    if side == "tactile" and row.touch in self.background_frames:
-                        first.setdefault(self.background[row.touch], row)
+            for path in self._folder_images(row):
+                first.setdefault(path, row)
         bad: set[Path] = set()
-        if how != "none":
-            progress("checking images", 0, len(first))
-            for done, (path, reason) in enumerate(
-                in_threads(lambda p: check_image(p, how), first), 1
-            ):
-                if reason:
-                    bad.add(path)
-                    self.problems.append(
-                        Problem(first[path].where, "bad-image", f"{path}: {reason}")
-                    )
-                progress("checking images", done, len(first))
-        self.background = {
-            touch: path for touch, path in self.background.items() if path not in bad
-        }
-        self.problems.sort(key=lambda p: _place(p.where))
-        return [
-            row
-            for row in rows
-            if not any(frames.path(row.frame) in bad for frames in self.sides[row.video].values())
-        ]
+        paths = () if how == "none" else first
+        for path, reason in in_threads(
+            lambda p: check_image(p, how), paths, "checking images", progress
+        ):
+            if reason:
+                bad.add(path)
+                self.problems.append(Problem(first[path].where, "bad-image", f"{path}: {reason}"))
+        self.backgrounds = {c: path for c, path in self.backgrounds.items() if path not in bad}
+        self.problems.sort(key=place_of)
+        # A bad background costs no row.
+        return [row for row in rows if bad.isdisjoint(self._folder_images(row, backgrounds=False))]
+
+    def _folder_images(self, row: Row, *, backgrounds: bool = True) -> list[Path]:
+        """The images of a row that are not extracted from videos."""
+        folders = {m: f for m, f in self.frames[row.video].items() if isinstance(f, FolderFrames)}
+        paths = [frames.path(row.frame) for frames in folders.values()]
+        if backgrounds and "tactile" in folders and row.contact in self.backgrounds:
+            paths.append(self.backgrounds[row.contact])
+        return paths
 
     def decode(self, rows: list[Row], progress: Progress) -> list[Row]:
-        """Decodes what ``extract`` would cache, and writes nothing; keeps the rows whose pictures are whole."""
-        wanted = self._wanted(rows)
-        whole: dict[tuple[str, str], set[int]] = {key: set() for key in wanted}
+        """Decode what ``extract`` would, and write nothing; keep the rows whose images are whole."""
+        whole: set[tuple[str, str, int]] = set()
 
         def work(job: _Job, stop: Event) -> None:
-            frames = self.sides[job.video][job.side]
-            if job.resting:
-                nearest_to_median(frames, self._untouched(job.video))
-            elif isinstance(frames, VideoFrames):
-                frames.decode(wanted[job.video, job.side], whole[job.video, job.side], stop)
+            frames = self.frames[job.video][job.modality]
+            if job.frames is None:
+                nearest_to_median(frames, self._without_contact(job.video))
+            for k, _ in frames.read(sorted(job.frames or ())) if job.frames else ():
+                if stop.is_set():
+                    return
+                whole.add((job.video, job.modality, k))
 
-        self._do("decoding frames", rows, wanted, work, progress)
+        self._run("decoding frames", self._jobs(rows), work, rows, progress)
         return [
             row
             for row in rows
-            if all(
-                not f.raw or row.frame in whole[row.video, s]
-                for s, f in self.sides[row.video].items()
-            )
+            if all((row.video, m, row.frame) in whole for m in self._of_videos(row))
         ]
 
     def extract(self, rows: list[Row], progress: Progress) -> list[Row]:
-        """Caches the needed frames of raw videos and the medians; keeps the rows whose pictures are there."""
-        wanted = self._wanted(rows)
-        if wanted:
-            self._require_same_settings(wanted)
+        """Extract the needed frames of videos; keep the rows whose images are there."""
+        jobs = self._jobs(rows)
+        self._require_same_settings([job for job in jobs if job.frames])
         typical: dict[str, Path] = {}
 
         def work(job: _Job, stop: Event) -> None:
-            frames = self.sides[job.video][job.side]
-            if job.resting:
-                k, picture = nearest_to_median(frames, self._untouched(job.video))
-                typical[job.video] = frames.path(k)
-                if frames.raw and not typical[job.video].is_file():
-                    self.created.append(typical[job.video])
-                    save_picture(typical[job.video], picture, self.size)
-            elif isinstance(frames, VideoFrames):
-                frames.extract(wanted[job.video, job.side], self.created, stop)
+            frames = self.frames[job.video][job.modality]
+            if job.frames is not None:
+                assert isinstance(frames, VideoFrames)
+                frames.extract(set(job.frames), self.created, stop)
+                return
+            k, image = nearest_to_median(frames, self._without_contact(job.video))
+            path = typical[job.video] = frames.path(k)
+            if not path.is_file():
+                self.created.append(path)
+                save_frame(path, image, self.size)
 
-        self._do("extracting frames", rows, wanted, work, progress)
-        self.background |= {
-            touch: typical[video] for touch, video in self.resting.items() if video in typical
-        }
-        self.background = {touch: path for touch, path in self.background.items() if path.is_file()}
+        self._run("extracting frames", jobs, work, rows, progress)
+        for contact, video in self.typical_of.items():
+            if video in typical:
+                self.backgrounds[contact] = typical[video]
+        self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
         rows = [
             row
             for row in rows
-            if all(not f.raw or f.path(row.frame).is_file() for f in self.sides[row.video].values())
+            if all(
+                self.frames[row.video][m].path(row.frame).is_file() for m in self._of_videos(row)
+            )
         ]
-        if len({f.raw for row in rows for f in self.sides[row.video].values()}) > 1:
+        if self.layout(rows) == "mixed":
             self._gather(rows)
         return rows
 
-    def _wanted(self, rows: Iterable[Row]) -> dict[tuple[str, str], set[int]]:
-        """(recording, side) -> the frames of a raw video that the rows and their backgrounds need."""
-        wanted: dict[tuple[str, str], set[int]] = {}
-        for row in rows:
-            for side, frames in self.sides[row.video].items():
-                if frames.raw:
-                    wanted.setdefault((row.video, side), set()).add(row.frame)
-                    if side == "tactile" and row.touch in self.background_frames:
-                        wanted[row.video, side].add(self.background_frames[row.touch])
-        return wanted
+    def layout(self, rows: Iterable[Row]) -> str:
+        """``raw`` if the frames are those of videos, ``extracted`` if of folders, or ``mixed``."""
+        videos = {row.video for row in rows}
+        raw = {isinstance(f, VideoFrames) for v in videos for f in self.frames[v].values()}
+        return "mixed" if len(raw) > 1 else "raw" if True in raw else "extracted"
 
-    def _do(
+    def _of_videos(self, row: Row) -> list[str]:
+        """The modalities of a row that are video files."""
+        return [m for m, f in self.frames[row.video].items() if isinstance(f, VideoFrames)]
+
+    def _jobs(self, rows: Iterable[Row]) -> list[_Job]:
+        """The frames of videos that the rows and their backgrounds need, and the typical frames."""
+        needed: dict[tuple[str, str], set[int]] = {}
+        typical: set[str] = set()
+        for row in rows:
+            for modality in self._of_videos(row):
+                frames = needed.setdefault((row.video, modality), set())
+                frames.add(row.frame)
+                if modality == "tactile" and row.contact in self.background_frames:
+                    frames.add(self.background_frames[row.contact])
+            if row.contact in self.typical_of:
+                typical.add(row.video)
+        return [
+            *(_Job(video, modality, frozenset(k)) for (video, modality), k in needed.items()),
+            *(_Job(video, "tactile", None) for video in sorted(typical)),
+        ]
+
+    def _run(
         self,
         what: str,
-        rows: Sequence[Row],
-        wanted: Iterable[tuple[str, str]],
+        jobs: Sequence[_Job],
         work: Callable[[_Job, Event], None],
+        rows: Sequence[Row],
         progress: Progress,
     ) -> None:
-        """Does the work for every wanted side and for the typical frame of every resting recording; what breaks off is a problem."""
+        """Run jobs in threads; a video that breaks off becomes a problem."""
         first = {row.video: row for row in reversed(rows)}
-        touches = {row.touch for row in rows}
-        resting = sorted({video for touch, video in self.resting.items() if touch in touches})
-        jobs = [
-            *(_Job(video, side, False) for video, side in wanted),
-            *(_Job(video, "tactile", True) for video in resting),
-        ]
         stop = Event()
 
-        def told(job: _Job) -> str | None:
+        def attempt(job: _Job) -> str | None:
             try:
                 work(job, stop)
             except PalpateError as error:
-                return f"{self.sides[job.video][job.side].source}: {error.got}"
+                return f"{self.frames[job.video][job.modality].source}: {error.got}"
             return None
 
-        progress(what, 0, len(jobs))
-        for done, (job, text) in enumerate(in_threads(told, jobs, stop=stop), 1):
+        for job, text in in_threads(attempt, jobs, what, progress, stop=stop):
             if text:
                 self.problems.append(Problem(first[job.video].where, "bad-video", text))
-            progress(what, done, len(jobs), job.video)
-        self.problems.sort(key=lambda p: _place(p.where))
+        self.problems.sort(key=place_of)
 
     def _gather(self, rows: Sequence[Row]) -> None:
-        """Puts extracted pictures beside the cached ones, as hard links where the disk allows, so that one root holds all."""
+        """Link (or copy) images of folders below ``out``, so that one root holds all."""
         for row in rows:
-            for side, frames in self.sides[row.video].items():
-                if frames.raw:
+            for modality, frames in self.frames[row.video].items():
+                if isinstance(frames, VideoFrames):
                     continue
-                used = [frames.path(row.frame)]
-                if side == "tactile" and row.touch in self.background:
-                    used.append(self.background[row.touch])
-                for path in used:
-                    target = self.out / "images" / row.video / side / path.name
+                paths = [frames.path(row.frame)]
+                if modality == "tactile" and row.contact in self.backgrounds:
+                    paths.append(self.backgrounds[row.contact])
+                for path in paths:
+                    target = self.out / "images" / row.video / modality / path.name
                     if path not in self.moved and not target.is_file():
+                        target.parent.mkdir(parents=True, exist_ok=True)
                         self.created.append(target)
-                        with atomic_path(target) as part:
-                            part.unlink()
-                            try:
-                                os.link(path, part)
-                            except OSError:
-                                shutil.copyfile(path, part)
+                        try:
+                            os.link(path, target)
+                        except OSError:
+                            shutil.copyfile(path, target)
                     self.moved[path] = target
 
-    def _require_same_settings(self, wanted: Iterable[tuple[str, str]]) -> None:
-        """Refuses to mix cached frames of other settings or other videos with new ones."""
+    def _require_same_settings(self, jobs: Sequence[_Job]) -> None:
+        """Record the settings of the extracted frames; reject a folder with frames of other settings or videos."""
+        if not jobs:
+            return
         path = self.out / "images" / "settings.json"
-        now = {"format": self.image_format, "size": self.size}
+        settings = {"format": self.image_format, "size": self.size}
         videos = {
-            f"{video}/{side}": self.sides[video][side].source.stat().st_size
-            for video, side in sorted(wanted)
+            f"{job.video}/{job.modality}": self.frames[job.video][job.modality]
+            .source.stat()
+            .st_size
+            for job in sorted(jobs, key=lambda job: (job.video, job.modality))
         }
         if path.is_file():
-            then = read_json(path, "record of the cached frames")
-            before: dict[str, int] = then.pop("videos")
-            changed = [name for name, size in videos.items() if before.get(name, size) != size]
-            if then != now or changed:
-                raise PalpateError(
-                    f"The frames cached in {path.parent} must have been made from the same videos with the same settings",
+            earlier = read_json(path, "record of the extracted frames")
+            known: dict[str, int] = earlier.pop("videos")
+            changed = [name for name, size in videos.items() if known.get(name, size) != size]
+            if earlier != settings or changed:
+                got = (
                     f"other videos: {', '.join(changed)}"
                     if changed
-                    else f"{then} there, {now} here",
+                    else f"{earlier} there, {settings} here"
+                )
+                raise PalpateError(
+                    f"The frames in {path.parent} must have been made from the same videos with the same settings",
+                    got,
                     "Choose another folder, or remove that one",
                 )
-            videos = before | videos
+            videos = known | videos
         else:
             self.created.append(path)
-        write_json(path, {**now, "videos": videos})
+        write_json(path, {**settings, "videos": videos})
+
+    def cells(self, rows: Sequence[Row], root: Path) -> list[dict[str, Any]]:
+        """Manifest cells of the rows; images that are not files yet have no path.
+
+        Args:
+            rows: frames of opened recordings.
+            root: folder that the paths shall be relative to.
+        """
+        folders: dict[Path, str] = {}
+
+        def relative(path: Path | None) -> str | None:
+            if path is None:
+                return None
+            path = self.moved.get(path, path)
+            if path.parent not in folders:
+                folders[path.parent] = Path(os.path.relpath(path.parent.resolve(), root)).as_posix()
+            prefix = folders[path.parent]
+            return path.name if prefix == "." else f"{prefix}/{path.name}"
+
+        table: list[dict[str, Any]] = []
+        for row in rows:
+            opened = self.frames[row.video]
+            images = {m: relative(frames.path(row.frame)) for m, frames in opened.items()}
+            images["background"] = relative(self.backgrounds.get(row.contact))
+            table.append(
+                {
+                    "id": row.id,
+                    "video": row.video,
+                    "frame": row.frame,
+                    "contact": row.contact,
+                    "material": row.material,
+                    **images,
+                }
+            )
+        return table
 
     def manifest(
         self,
@@ -466,61 +471,31 @@ class Recordings:
     ) -> Manifest:
         """The manifest of the rows; ``words`` fills columns by (video, frame).
 
-        Its root is the data set if all recordings are extracted, else ``out``.
+        Its root is the data set if all recordings are folders of frames, else ``out``.
         """
-        raws = {f.raw for row in rows for f in self.sides[row.video].values()}
-        root = (self.out if True in raws else self.root).resolve()
-        prefix: dict[Path, str] = {}
-
-        def name(path: Path) -> str:
-            path = self.moved.get(path, path)
-            folder = path.parent
-            if folder not in prefix:
-                prefix[folder] = Path(os.path.relpath(folder.resolve(), root)).as_posix()
-            return path.name if prefix[folder] == "." else f"{prefix[folder]}/{path.name}"
-
-        table = [
-            {
-                "id": row.id,
-                "video": row.video,
-                "frame": row.frame,
-                "contact": row.touch,
-                "material": row.material,
-                "sensor": sensor,
-                "vision": name(self.sides[row.video]["vision"].path(row.frame)),
-                "tactile": name(self.sides[row.video]["tactile"].path(row.frame)),
-                "background": name(self.background[row.touch])
-                if row.touch in self.background
-                else None,
-                **{
-                    column: t.values.get((row.video, row.frame))
-                    for column, t in words.items()
-                    if t is not None
-                },
-            }
-            for row in rows
-        ]
-        layout = "mixed" if len(raws) > 1 else "raw" if True in raws else "extracted"
-        used = {row.touch: row.video for row in rows}
+        layout = self.layout(rows)
+        root = (self.root if layout == "extracted" else self.out).resolve()
+        table = self.cells(rows, root)
+        for row in table:
+            row["sensor"] = sensor
+            for column, values in words.items():
+                if values is not None:
+                    row[column] = values.values.get((row["video"], row["frame"]))
         kinds = Counter(
             "none"
-            if t not in self.background
+            if c not in self.backgrounds
             else "frame"
-            if t in self.background_frames
+            if c in self.background_frames
             else "typical"
-            for t in used
+            for c in {row.contact for row in rows}
         )
-        background = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
+        backgrounds = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
         return Manifest.from_rows(
-            table, root, {**facts, "layout": layout, "backgrounds": background}
+            table, root, {**facts, "layout": layout, "backgrounds": backgrounds}
         )
 
 
-def _rows(count: int) -> str:
-    return f"{count} row{'s' * (count != 1)}"
-
-
-def _place(where: str) -> tuple[str, int]:
-    """``file:line`` to sort by."""
-    name, _, line = where.rpartition(":")
-    return (name, int(line)) if line.isdecimal() else (where, 0)
+def place_of(problem: Problem) -> tuple[str, int]:
+    """``file:line`` to sort problems by."""
+    name, _, line = problem.where.rpartition(":")
+    return (name, int(line)) if line.isdecimal() else (problem.where, 0)

@@ -252,7 +252,7 @@ def _chunks(chunks: list[Chunk], processes: int, count: int) -> Iterator[tuple[P
             return
         except BrokenProcessPool:
             pass  # called from a script without a main guard, or a worker was killed: the threads below take what is left
-    for (place, _), decoded in in_threads(_decode_chunk_at, left.items(), processes):
+    for (place, _), decoded in in_threads(_decode_chunk_at, left.items(), threads=processes):
         yield place, decoded
 
 

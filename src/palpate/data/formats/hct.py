@@ -41,7 +41,7 @@ from palpate.data.formats.base import WORLD, Facts, Scan, world_facts
 from palpate.data.formats.hct_lists import RIG, TRAJECTORY, Reader, Row, Trajectory, located, order
 from palpate.data.frames import nearest_to_median
 from palpate.data.images import check_image
-from palpate.data.listing import touches
+from palpate.data.listing import contact_names
 from palpate.data.manifest import Manifest
 from palpate.data.recordings import MEDIAN_OF
 
@@ -228,7 +228,7 @@ def _touches(
     return dict(
         zip(
             frames,
-            touches(["/".join(t) for t, _ in frames], [k for _, k in frames], None),
+            contact_names(["/".join(t) for t, _ in frames], [k for _, k in frames], None),
             strict=True,
         )
     )

@@ -112,8 +112,8 @@ def scan(
                 "id": r.id,
                 "video": r.video,
                 "frame": r.frame,
-                "contact": r.touch,
-                **touches[r.touch].words,
+                "contact": r.contact,
+                **touches[r.contact].words,
             },
         )
         for r in rows
@@ -191,9 +191,9 @@ def run(
         words = {
             name: FrameTable(
                 {
-                    (r.video, r.frame): touches[r.touch].words[name]
+                    (r.video, r.frame): touches[r.contact].words[name]
                     for r in rows
-                    if name in touches[r.touch].words
+                    if name in touches[r.contact].words
                 },
                 [],
             )
@@ -266,11 +266,11 @@ def _prepared(
     contact: dict[str, set[int]] = {}
     for i in listed:
         contact.setdefault(i.video, set()).update(range(i.first, i.last + 1))
-    work.contact = contact
+    work.in_contact = contact
     touches = {i.touch: i for i in numbered(apart(listed, problems))}
     rows = [row for i in touches.values() for row in _frames(work, i, every)]
     work.choose_backgrounds(rows, {i.touch: i.first for i in touches.values()})
-    for name in {row.touch for row in rows}:
+    for name in {row.contact for row in rows}:
         _named_background(work, touches[name])
     rows = work.check(rows, check, progress)
     used = {touch.video for touch in touches.values()}
@@ -278,7 +278,7 @@ def _prepared(
         Problem(str(work.root), "unlisted-video", f"the recording {name!r} has no usable interval")
         for name in sorted(set(work.videos) - used)
     ]
-    bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
+    bare = sorted({r.contact for r in rows} - set(work.background_frames) - set(work.typical_of))
     work.suspicious += [
         Problem(
             touches[t].where,
@@ -294,7 +294,7 @@ def _within(work: Recordings, listed: list[Interval]) -> list[Interval]:
     """The intervals that lie within their recordings."""
     good: list[Interval] = []
     for i in listed:
-        length = min(len(frames) for frames in work.sides[i.video].values())
+        length = min(len(frames) for frames in work.frames[i.video].values())
         if max(i.last, i.background or 0) >= length:
             what = "the touch" if i.last >= length else "its background"
             text = f"{what} reaches frame {max(i.last, i.background or 0)} of {i.video!r}, whose sides have {length} frames in common, counted from 0"
@@ -309,7 +309,7 @@ def _frames(work: Recordings, touch: Interval, every: int) -> list[Row]:
     rows: list[Row] = []
     lacking: dict[str, list[int]] = {}
     for k in range(touch.first, touch.last + 1, every):
-        without = [side for side, frames in work.sides[touch.video].items() if not frames.has(k)]
+        without = [side for side, frames in work.frames[touch.video].items() if not frames.has(k)]
         for side in without:
             lacking.setdefault(side, []).append(k)
         if not without:
@@ -317,7 +317,7 @@ def _frames(work: Recordings, touch: Interval, every: int) -> list[Row]:
                 Row(touch.where, f"{touch.video}/{k:010d}", touch.video, k, touch.touch, "")
             )
     for side, missing in lacking.items():
-        source = work.sides[touch.video][side]
+        source = work.frames[touch.video][side]
         leaving = isinstance(source, FolderFrames) and any(k in source.leaving for k in missing)
         text = f"no {side} picture of {len(missing)} of the frames of {touch.touch}, the first of them {missing[0]}, in {source.source}"
         work.problems.append(
@@ -334,7 +334,7 @@ def _named_background(work: Recordings, touch: Interval) -> None:
     """Puts the background that the list names in place of the rule's."""
     if touch.background is None:
         return
-    frames = work.sides[touch.video]["tactile"]
+    frames = work.frames[touch.video]["tactile"]
     if not frames.has(touch.background):
         work.problems.append(
             Problem(
@@ -344,11 +344,11 @@ def _named_background(work: Recordings, touch: Interval) -> None:
             )
         )
         return
-    if touch.background in work.contact.get(touch.video, set()):
+    if touch.background in work.in_contact.get(touch.video, set()):
         text = (
             f"the listed background, frame {touch.background} of {touch.video!r}, lies in a touch"
         )
         work.suspicious.append(Problem(touch.where, "background-in-touch", text))
     work.background_frames[touch.touch] = touch.background
-    work.background[touch.touch] = frames.path(touch.background)
-    work.resting.pop(touch.touch, None)
+    work.backgrounds[touch.touch] = frames.path(touch.background)
+    work.typical_of.pop(touch.touch, None)

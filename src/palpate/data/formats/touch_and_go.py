@@ -123,7 +123,7 @@ def import_touch_and_go(
     image_format: ImageFormat = "jpg",
     size: int | None = None,
     check: Check = "decode",
-    max_per_touch: int | None = None,
+    max_per_contact: int | None = None,
     seed: int = 0,
     progress: Progress = quiet,
 ) -> Imported:
@@ -138,8 +138,8 @@ def import_touch_and_go(
         image_format: of the cached frames.
         size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
         check: how extracted images are checked.
-        max_per_touch: take that many evenly spaced frames of a touch.
-        seed: with ``max_per_touch``: 0 takes the middle of each of the equal stretches, any other a random place in them.
+        max_per_contact: take that many evenly spaced frames of a contact.
+        seed: with ``max_per_contact``: 0 takes the middle of each of the equal stretches, any other a random place in them.
         progress: told what is being done.
 
     Returns:
@@ -151,10 +151,10 @@ def import_touch_and_go(
         ProblemsError: with everything bad in the whole data set; nothing is left behind.
     """
     root, out = Path(root), Path(out)
-    if max_per_touch is not None and max_per_touch < 1:
+    if max_per_contact is not None and max_per_contact < 1:
         raise PalpateError(
-            "max_per_touch must be at least 1",
-            str(max_per_touch),
+            "max_per_contact must be at least 1",
+            str(max_per_contact),
             "Leave it out to take every frame",
         )
     if size is not None and size < 1:
@@ -192,7 +192,7 @@ def import_touch_and_go(
             for p in part.skipped
         ]
         starts = first_frames(rows)
-        rows = work.open(thin(rows, max_per_touch, seed), progress)
+        rows = work.open(thin(rows, max_per_contact, seed), progress)
         work.choose_backgrounds(rows, starts)
         rows = work.check(rows, check, progress)
         _look(work, rows, listed)
@@ -261,7 +261,7 @@ def scan(
                 "id": r.id,
                 "video": r.video,
                 "frame": r.frame,
-                "contact": r.touch,
+                "contact": r.contact,
                 "material": r.material,
             },
         )
@@ -324,7 +324,7 @@ def _look(work: Recordings, rows: Sequence[Row], listed: FrameList) -> None:
         Problem(str(work.root), "unlisted-video", f"the recording {name!r} is in no list")
         for name in unlisted
     ]
-    bare = sorted({r.touch for r in rows} - set(work.background_frames) - set(work.resting))
+    bare = sorted({r.contact for r in rows} - set(work.background_frames) - set(work.typical_of))
     work.suspicious += [
         Problem(touch, "no-background", "no frame of its recording shows the gel untouched")
         for touch in bare
