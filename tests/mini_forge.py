@@ -7,12 +7,12 @@ from pathlib import Path
 
 from diffusion_forge import make_pipeline
 from palpate.core import shipped
-from palpate.core.cards import write_model_cards
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.encoder_set import EncoderSet, new_touch
 from palpate.encoders.preprocess import Preprocess
 from palpate.encoders.presets import preset
+from palpate.training.cards import write_model_cards
 
 TINY = preset("tiny")
 WORLD = [{"world": "made up", "seeds": "900000-900003", "version": 2, "frames": 12}]

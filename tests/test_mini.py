@@ -16,13 +16,13 @@ from safetensors.torch import load_file
 from diffusion_forge import make_pipeline
 from mini_forge import make_encoders, write_shipped
 from palpate.core import PalpateError, digest_folder, shipped
-from palpate.core.cards import model_card, write_model_cards
 from palpate.core.shipped import PARTS, SHIPPED, is_hub_id, shipped_folder, shipped_root
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders import hub
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.half import round_to_half
+from palpate.training.cards import model_card, write_model_cards
 
 MINI = shipped_root() / "mini"
 needs_mini = pytest.mark.skipif(not MINI.is_dir(), reason="no models in src/palpate/mini yet")
@@ -331,8 +331,8 @@ def test_a_card_says_what_it_must(mini):
     )
     head, body = text.split("---\n")[1:3]
     assert head == (
-        'license: "apache-2.0"\nlibrary_name: "transformers"\npipeline_tag: "zero-shot-image-classification"\n'
-        'tags:\n- "palpate"\n- "tactile"\n- "clip"\n- "x"\n'
+        "library_name: transformers\nlicense: apache-2.0\npipeline_tag: zero-shot-image-classification\n"
+        "tags:\n- palpate\n- tactile\n- clip\n- x\n"
     )
     for line in (
         "# T",

@@ -8,21 +8,23 @@ from palpate.core.errors import (
     Problem,
     ProblemsError,
 )
+from palpate.core.features import FeatureSet
 from palpate.core.files import (
     atomic_folder,
     atomic_path,
     inside,
     read_json,
     read_record,
-    told_of,
+    reading_entry,
     write_json,
     write_text,
 )
 from palpate.core.notes import Note
+from palpate.core.plain import plain, to_numpy
 from palpate.core.progress import Progress, quiet, track
 from palpate.core.random import rng_for, seed_for
 from palpate.core.samples import SampleRef
-from palpate.core.score import FeatureSet, Score, columns, require_comparable
+from palpate.core.score import Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
 from palpate.core.stages import Run, Stage
 
@@ -49,14 +51,16 @@ __all__ = [
     "digest_json",
     "digest_lines",
     "inside",
+    "plain",
     "quiet",
     "read_json",
     "read_record",
+    "reading_entry",
     "require_comparable",
     "rng_for",
     "seed_for",
     "short",
-    "told_of",
+    "to_numpy",
     "track",
     "write_json",
     "write_text",

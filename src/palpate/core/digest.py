@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from palpate.core.plain import plain
 
 
 def canonical_json(value: Any) -> str:
-    """``value`` as JSON with sorted keys and no spaces; dataclasses and paths are accepted.
+    """Return ``value`` as JSON with sorted keys and no spaces; dataclasses and paths are accepted.
 
     Raises:
         ValueError: for NaN or infinity, which JSON cannot hold.
@@ -22,50 +21,37 @@ def canonical_json(value: Any) -> str:
         value,
         sort_keys=True,
         separators=(",", ":"),
-        default=_plain,
+        default=plain,
         allow_nan=False,
         ensure_ascii=False,
     )
 
 
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dataclasses.asdict(value)
-    if isinstance(value, Path):
-        return value.as_posix()
-    if isinstance(value, Mapping):
-        return dict(value)
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"cannot put a {type(value).__name__} into a digest")
-
-
 def digest_json(value: Any) -> str:
-    """SHA-256 (64 hex digits) of the canonical JSON of ``value``."""
+    """Return the SHA-256 (64 hex digits) of the canonical JSON of ``value``."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
 def digest_lines(lines: Iterable[str]) -> str:
-    """SHA-256 of the lines, each ended by a newline, in the order given."""
+    """Return the SHA-256 of the lines, each ended by a newline, in the order given."""
     state = hashlib.sha256()
     for line in lines:
-        state.update(line.encode())
-        state.update(b"\n")
+        state.update(f"{line}\n".encode())
     return state.hexdigest()
 
 
 def digest_file(path: Path) -> str:
-    """SHA-256 of a file's bytes."""
+    """Return the SHA-256 of a file's bytes."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_folder(folder: Path, pattern: str = "**/*") -> str:
-    """SHA-256 over names and bytes of the files in ``folder`` that match ``pattern``."""
+    """Return the SHA-256 over names and bytes of the files in ``folder`` that match ``pattern``."""
     files = sorted(p for p in folder.glob(pattern) if p.is_file())
     return digest_lines(f"{p.relative_to(folder).as_posix()} {digest_file(p)}" for p in files)
 
 
 def short(digest: str) -> str:
-    """The first 12 digits: enough for people and folder names."""
+    """Return the first 12 digits: enough for people and folder names."""
     return digest[:12]

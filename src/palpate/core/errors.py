@@ -1,6 +1,6 @@
-"""Errors for people: what must hold, what was found instead, and how to mend it.
+"""Errors for people: what must hold, what was given instead, and how to fix it.
 
-Everything that a user can get wrong is raised as a :class:`PalpateError`; the command line prints it
+Everything that a user can get wrong raises a :class:`PalpateError`; the command line prints it
 without a traceback and exits with status 2.
 """
 
@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
+
+from palpate.core.plain import plain
 
 
 class PalpateError(Exception):
@@ -49,7 +51,7 @@ class PalpateError(Exception):
         name: Callable[[str], str] = lambda argument: f"`{argument}`",
         example: Callable[[str, Any], str] = lambda argument, value: f"{argument}={value!r}",
     ) -> str:
-        """The error in one line: must, got, fix.
+        """Return the error in one line: must, got, fix.
 
         Args:
             name: how an argument is written; the command line gives its option.
@@ -61,8 +63,8 @@ class PalpateError(Exception):
             parts.append("E.g. " + " ".join(example(k, v) for k, v in self.example.items()))
         return " ".join(f"{part.rstrip('.')}." for part in parts if part)
 
-    def to_json(self) -> dict[str, object]:
-        """The error as a JSON object: ``error, must, got, fix, argument``."""
+    def to_json(self) -> dict[str, Any]:
+        """Return the error as a JSON object: ``error, must, got, fix, argument``."""
         names = ("must", "got", "fix", "argument")
         return {"error": type(self).__name__} | {name: getattr(self, name) for name in names}
 
@@ -77,7 +79,7 @@ class Problem:
 
     Attributes:
         where: ``"file:line"``, or the file alone where lines have no meaning.
-        kind: a stable word for machines, e.g. ``"missing-file"``, ``"bad-line"``, ``"duplicate-id"``.
+        kind: a stable word for machines, e.g. ``"missing-file"``, ``"bad-line"``.
         text: what is wrong, in one sentence without the place.
     """
 
@@ -90,7 +92,7 @@ class Problem:
 
 
 class ProblemsError(PalpateError):
-    """Several bad things in one input, all told at once (``.problems``).
+    """Several bad things in one input, reported together (``.problems``).
 
     Args:
         problems: what is wrong.
@@ -100,32 +102,27 @@ class ProblemsError(PalpateError):
 
     def __init__(self, problems: Sequence[Problem], fix: str, must: str = "") -> None:
         self.problems = list(problems)
-        kinds = Counter(p.kind for p in self.problems)
-        got = f"{len(self.problems)} problem{'s' * (len(self.problems) != 1)}: " + ", ".join(
-            f"{n} {kind}" for kind, n in sorted(kinds.items())
-        )
-        super().__init__(
-            must or "Every row and file of the input must be readable and consistent", got, fix
-        )
+        kinds = sorted(Counter(p.kind for p in self.problems).items())
+        count = f"{len(self.problems)} problem{'s' * (len(self.problems) != 1)}"
+        got = f"{count}: {', '.join(f'{n} {kind}' for kind, n in kinds)}"
+        must = must or "Every row and file of the input must be readable and consistent"
+        super().__init__(must, got, fix)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.problems, self.fix, self.must), self.__dict__
 
-    def to_json(self) -> dict[str, object]:
-        """The error as a JSON object, with the list ``problems``."""
-        return super().to_json() | {"problems": [asdict(p) for p in self.problems]}
+    def to_json(self) -> dict[str, Any]:
+        """Return the error as a JSON object, with the list ``problems``."""
+        return super().to_json() | {"problems": plain(self.problems)}
 
 
 class MissingExtraError(PalpateError):
-    """An optional dependency is not installed; says which ``pip install`` mends it."""
+    """An optional dependency is not installed; names the ``pip install`` that adds it."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         self._given = (package, extra, purpose)
-        super().__init__(
-            f"{purpose} needs the package {package}",
-            "no such package in this environment",
-            f"Run: pip install 'palpate[{extra}]'",
-        )
+        must, got = f"{purpose} needs the package {package}", "no such package in this environment"
+        super().__init__(must, got, f"Run: pip install 'palpate[{extra}]'")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), self._given, self.__dict__

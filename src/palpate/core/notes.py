@@ -1,7 +1,7 @@
-"""Notes: what a reader must know beside a number, as a code with parameters.
+"""Notes: what a reader must know about a number, as a code with parameters.
 
-Rooms make notes; each front end has one table from code to sentence (:mod:`palpate.report.notes`
-for pages, tables and the terminal). No program ever parses a sentence.
+Rooms make notes; :mod:`palpate.report.notes` has the sentence of each code. No program parses a
+sentence.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class Note:
     params: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """The note as a JSON object."""
+        """Return the note as a JSON object."""
         return {"code": self.code, "params": dict(self.params)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any] | str) -> Note:
-        """The inverse of :meth:`to_json`; a string, as earlier formats had it, becomes ``text``."""
+        """Return the inverse of :meth:`to_json`; a string, as format 1 had it, becomes ``text``."""
         if isinstance(data, str):
             return cls("text", {"text": data})
         return cls(data["code"], data["params"])

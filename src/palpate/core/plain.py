@@ -12,9 +12,10 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """``value`` with only the types of JSON: dataclasses, paths and arrays are converted.
+    """Return ``value`` with only the types of JSON: dataclasses, paths and arrays are converted.
 
-    NaN and infinity, which JSON has not, become null. Fields of dataclasses that are not compared are skipped.
+    NaN and infinity, which JSON has not, become null. Fields of dataclasses that are not compared
+    are skipped.
 
     Raises:
         TypeError: for any other type.
@@ -38,7 +39,7 @@ def plain(value: Any) -> Any:
 
 
 def to_numpy(values: Any) -> np.ndarray:
-    """An array, or a tensor on any device, as a NumPy array; bfloat16 becomes float32.
+    """Return an array, or a tensor on any device, as a NumPy array; bfloat16 becomes float32.
 
     Raises:
         TypeError, ValueError: if the values are no array.

@@ -1,4 +1,4 @@
-"""What worker processes have in common."""
+"""What worker processes share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from multiprocessing.connection import wait
 
 
 def follow_parent() -> None:
-    """Ends this process when its parent is gone, be it killed: nobody else would stop it. Does nothing in a process that has no such parent."""
+    """End this worker process when its parent is gone, even if that was killed.
+
+    Does nothing in a process that is no worker.
+    """
     parent = multiprocessing.parent_process()
     if parent is not None:
 

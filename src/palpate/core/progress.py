@@ -1,6 +1,7 @@
 """Progress without a terminal: the rooms count, the command line draws.
 
-A room that works for long takes ``progress: Progress = quiet`` and calls ``progress("decoding", 3, 100)``.
+A room that works for long takes ``progress: Progress = quiet`` and calls
+``progress("decoding", 3, 100)``.
 """
 
 from __future__ import annotations
@@ -12,21 +13,21 @@ T = TypeVar("T")
 
 
 class Progress(Protocol):
-    """Called with what is being done, how much of it is done, of how much (0 = unknown), and a short remark."""
+    """Called with the task, the amount done, the total (0 = unknown), and a short remark."""
 
     def __call__(self, what: str, done: int, total: int, remark: str = "") -> None:
-        """Reports once."""
+        """Report once."""
         ...
 
 
 def quiet(what: str, done: int, total: int, remark: str = "") -> None:
-    """Shows nothing."""
+    """Show nothing."""
 
 
 def track(
     items: Sequence[T] | Iterable[T], what: str, progress: Progress, total: int | None = None
 ) -> Iterator[T]:
-    """Yields ``items`` and reports after each."""
+    """Yield ``items`` and report after each."""
     count = total if total is not None else len(items) if isinstance(items, Sequence) else 0
     progress(what, 0, count)
     for done, item in enumerate(items, 1):

@@ -1,4 +1,4 @@
-"""A sample as a report needs it: its names and the places of its images."""
+"""A sample as results refer to it: its names and the places of its images."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SampleRef:
-    """A sample as the report needs it. Paths are absolute or relative to the results file; None = no picture."""
+    """A sample. Image paths are absolute or relative to the results file; None = no image."""
 
     id: str
     video: str | None = None

@@ -1,14 +1,16 @@
-"""Models that ship inside the package, found by name: no file is fetched and no network is asked.
+"""Models inside the package: no file is fetched and the network is not used.
 
 ::
 
-    palpate/mini/encoders/        vision, text and touch (the format of palpate.encoders.encoder_set); clip/ in it is a plain CLIP folder
-    palpate/mini/autoencoder/   the autoencoder of touches (palpate.diffusion.autoencoder)
-    palpate/mini/generator/     photo to touch (palpate.diffusion.pipeline); refers to the other two by name and digest
+    palpate/mini/encoders/      vision, text and tactile (:mod:`palpate.encoders.encoder_set`);
+                                clip/ in it is a plain CLIP folder
+    palpate/mini/autoencoder/   autoencoder of tactile images (:mod:`palpate.diffusion.autoencoder`)
+    palpate/mini/generator/     photo to tactile image (:mod:`palpate.diffusion.pipeline`); refers
+                                to the other two by name and digest
 
-A model is named by a *string*: one that begins with ``palpate/`` is a shipped name, whatever lies in the working directory, so
-that a script means the same everywhere; then comes a folder of that name, then a hub id. A folder ``palpate/mini`` of one's own
-is named ``./palpate/mini``, or passed as a :class:`pathlib.Path`, which is always a folder.
+A *string* that begins with ``palpate/`` is a shipped name, whatever lies in the working directory;
+then comes a folder of that name, then a hub id. A folder ``palpate/mini`` is named
+``./palpate/mini``, or passed as a :class:`pathlib.Path`, which is always a folder.
 """
 
 from __future__ import annotations
@@ -34,47 +36,41 @@ _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 
 
 def shipped_root() -> Path:
-    """The folder that holds the folders of :data:`SHIPPED`: that of the installed package."""
+    """Return the folder of the installed package, which holds the folders of :data:`SHIPPED`."""
     return Path(__file__).resolve().parents[1]
 
 
 def is_shipped(name: str | Path) -> bool:
-    """Whether ``name`` asks for a shipped model, known or not."""
+    """Return whether ``name`` refers to a shipped model, known or not."""
     return isinstance(name, str) and name.startswith(_PREFIX)
 
 
 def shipped_folder(name: str | Path, part: Part) -> Path | None:
-    """The folder of one part of a shipped model, or None where ``name`` is no shipped name.
+    """Return the folder of one part of a shipped model, or None where ``name`` is no shipped name.
 
     Args:
-        name: what the user gave: a shipped name, a folder or a hub id.
+        name: a shipped name, a folder or a hub id.
         part: which of its models.
 
     Raises:
-        PalpateError: for an unknown name that begins with ``palpate/``, or if this installation lacks the files.
+        PalpateError: for an unknown name that begins with ``palpate/``, or if the files are absent.
     """
     if not is_shipped(name):
         return None
     name = str(name)
     if name not in SHIPPED:
+        must = f"A name that begins with {_PREFIX} must be one of {', '.join(SHIPPED)}"
         fix = f"Choose one of these; a folder of that name is written ./{name}"
-        raise PalpateError(
-            f"A name that begins with {_PREFIX} must be one of {', '.join(SHIPPED)}",
-            repr(name),
-            fix,
-        )
+        raise PalpateError(must, repr(name), fix)
     folder = shipped_root() / SHIPPED[name] / PARTS[part]
     if not (folder / "palpate.json").is_file():
-        raise PalpateError(
-            f"The model {name} must lie in the installed package",
-            f"no {part} in {shipped_root()}",
-            "Install palpate again, from its wheel",
-        )
+        must, got = f"{name} must lie in the installed package", f"no {part} in {shipped_root()}"
+        raise PalpateError(must, got, "Install palpate again, from its wheel")
     return folder
 
 
 def is_hub_id(name: str | Path) -> bool:
-    """Whether ``name`` may be asked of the hub: a string ``owner/name`` that is neither shipped nor a folder here."""
+    """Return whether ``name`` is a hub id: a string ``owner/name``, not shipped, no folder here."""
     return (
         isinstance(name, str)
         and not is_shipped(name)

@@ -5,12 +5,14 @@ The file is JSON::
     {"format": "palpate-split/1", "digest": "<sha256>", "rule": {...}, "manifest": "<sha256>",
      "parts": {"train": [ids], "val": [ids], "test": [ids]}, "notes": [...]}
 
-The digest is SHA-256 over the lines ``id TAB part``, sorted by id: it names the assignment, not the rule.
+The digest is SHA-256 over the lines ``id TAB part``, sorted by id: it names the assignment, not the
+rule.
 """
 
 from __future__ import annotations
 
 import html
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,6 +23,7 @@ from palpate.core.digest import digest_lines, short
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 from palpate.core.notes import Note
+from palpate.core.plain import plain
 
 PARTS = ("train", "val", "test")
 FORMAT = "palpate-split/1"
@@ -45,29 +48,27 @@ class Split:
     manifest: str | None = None
     notes: Sequence[Note] = ()
 
+    def __post_init__(self) -> None:
+        if unknown := sorted(set(self.parts.values()) - set(PARTS)):
+            must = f"A part must be one of {', '.join(PARTS)}"
+            raise PalpateError(must, repr(unknown[0]), "Rename the part")
+
     def __len__(self) -> int:
-        """The number of samples."""
+        """Return the number of samples."""
         return len(self.parts)
 
     def __bool__(self) -> bool:
         return True
 
     def __str__(self) -> str:
-        """One line: rule, samples by part, digest."""
-        name = str(self.rule.get("name", "split"))
+        """Return one line: name, samples by part, digest."""
         counts = ", ".join(f"{part} {n:,}" for part, n in self.counts().items())
-        return f"{name}: {counts or 'no samples'} (digest {short(self.digest)})"
+        return (
+            f"{self.rule.get('name', 'split')}: {counts or 'empty'} (digest {short(self.digest)})"
+        )
 
     def _repr_html_(self) -> str:
-        """For notebooks: the same as :meth:`__str__`."""
         return f"<div>{html.escape(str(self))}</div>"
-
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.parts.values()) - set(PARTS))
-        if unknown:
-            raise PalpateError(
-                f"A part must be one of {', '.join(PARTS)}", repr(unknown[0]), "Rename the part"
-            )
 
     @cached_property
     def digest(self) -> str:
@@ -75,12 +76,13 @@ class Split:
         return digest_lines(f"{i}\t{self.parts[i]}" for i in sorted(self.parts))
 
     def ids(self, *parts: str) -> list[str]:
-        """The ids in the given parts, in the order of the split."""
+        """Return the ids in the given parts, in the order of the split."""
         return [i for i, part in self.parts.items() if part in parts]
 
     def counts(self) -> dict[str, int]:
-        """Number of samples by part; parts without samples are left out."""
-        return {part: n for part in PARTS if (n := len(self.ids(part)))}
+        """Return the number of samples by part, without empty parts."""
+        counts = Counter(self.parts.values())
+        return {part: counts[part] for part in PARTS if counts[part]}
 
     @classmethod
     def from_ids(
@@ -90,68 +92,51 @@ class Split:
         manifest: str | None = None,
         **parts: Iterable[str],
     ) -> Split:
-        """A split from ``train=[...], test=[...]``.
+        """Make a split from ``train=[...], test=[...]``.
 
         Raises:
-            PalpateError: if an id stands in two parts, or twice in one.
+            PalpateError: if an id is in two parts, or twice in one.
         """
         table: dict[str, str] = {}
         for part, ids in parts.items():
             for i in ids:
                 if i in table:
-                    raise PalpateError(
-                        "An id must stand in one part only",
-                        f"{i!r} in {table[i]} and {part}",
-                        "Remove one of the two",
-                    )
+                    got = f"{i!r} in {table[i]} and {part}"
+                    raise PalpateError("An id must be in one part only", got, "Remove it from one")
                 table[i] = part
         return cls(table, rule or {}, manifest)
 
     def save(self, path: str | Path) -> None:
         """Write the split file atomically."""
-        data: dict[str, Any] = {
+        data = {
             "format": FORMAT,
             "digest": self.digest,
-            "rule": dict(self.rule),
+            "rule": self.rule,
             "manifest": self.manifest,
             "parts": {part: self.ids(part) for part in self.counts()},
         }
-        if self.notes:
-            data["notes"] = [note.to_json() for note in self.notes]
-        write_json(Path(path), data)
+        write_json(Path(path), plain(data | ({"notes": self.notes} if self.notes else {})))
 
     @classmethod
     def load(cls, path: str | Path) -> Split:
-        """Reads a split file and checks its digest.
+        """Read a split file and check its digest.
 
         Raises:
-            PalpateError: if the file is missing, of another format, or its digest does not match its content.
+            PalpateError: if the file is missing, of another format, or was edited.
         """
         data = read_json(Path(path), "split file")
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise PalpateError(
-                f"{path} must be a split file ({FORMAT})",
-                "another kind of file",
-                "Write one with: palpate split",
-            )
-        parts: dict[str, list[str]] = (
-            data["parts"] if isinstance(data.get("parts"), dict) else {"": []}
-        )
-        rule: Any = data.get("rule")
-        whole = set(parts) <= set(PARTS) and isinstance(rule, dict)
-        if not whole or not all(
-            isinstance(ids, list) and all(isinstance(i, str) for i in ids) for ids in parts.values()
-        ):
-            raise PalpateError(
-                f"{path} must hold a rule and lists of ids by part",
-                "an incomplete split file",
-                "Write it again with: palpate split",
-            )
-        split = cls.from_ids(rule=rule, manifest=data.get("manifest"), **parts)
-        if split.digest != data.get("digest"):
-            raise PalpateError(
-                f"The digest in {path} must match its content",
-                "a split that was edited by hand",
-                "Write it again with: palpate split",
-            )
-        return replace(split, notes=[Note.from_json(note) for note in data.get("notes", ())])
+            must, fix = f"{path} must be a split file ({FORMAT})", "Write one with: palpate split"
+            raise PalpateError(must, "another kind of file", fix)
+        fix = "Write it again with: palpate split"
+        try:
+            split = cls.from_ids(rule=data["rule"], manifest=data["manifest"], **data["parts"])
+            notes = [Note.from_json(note) for note in data.get("notes", ())]
+            digest = split.digest
+        except (AttributeError, KeyError, TypeError):
+            must = f"{path} must hold a rule and lists of ids by part"
+            raise PalpateError(must, "an incomplete split file", fix) from None
+        if digest != data.get("digest"):
+            must = f"The digest in {path} must match its content"
+            raise PalpateError(must, "a split that was edited by hand", fix)
+        return replace(split, notes=notes)

@@ -1,9 +1,9 @@
 """Run folders: a pipeline as named stages, each kept under the digest of what it read.
 
-``run/NAME/stage.json`` marks a finished stage and holds its inputs, facts and time. A stage is built in
-``run/NAME.partial`` and renamed when whole, so whatever bears its name is complete. Running again with the
-same inputs uses what is there; with other inputs the stage, and so every stage that read it, is built anew.
-A killed stage finds its own partial folder again, if the inputs are the same, and may go on from there.
+``run/NAME/stage.json`` marks a finished stage and holds its inputs, facts and time. A stage is
+built in ``run/NAME.partial`` and renamed when complete. Running again with the same inputs reuses
+it; with other inputs the stage, and so every stage that read it, is built again. A killed stage
+finds its partial folder again if the inputs are the same, and may resume from there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from palpate.core.digest import canonical_json, digest_json
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 
-#: Part of every stage's digest, as is the version of palpate: other code may write other bytes from the same inputs.
+#: In every stage's digest, with the version of palpate: other code may write other bytes.
 FORMAT = "palpate-stage/1"
 
 
@@ -31,10 +31,10 @@ class Stage:
 
     Attributes:
         folder: its files.
-        digest: of its name and inputs; downstream stages put it among theirs.
+        digest: of its name and inputs; later stages have it among theirs.
         facts: what the builder returned.
-        seconds: how long the last, finishing call of the builder took.
-        reused: True if it was there already.
+        seconds: how long the last call of the builder took.
+        reused: True if it existed already.
     """
 
     folder: Path
@@ -64,57 +64,61 @@ class Run:
         inputs: Mapping[str, Any],
         build: Callable[[Path], Mapping[str, Any] | None],
     ) -> Stage:
-        """Returns the stage, building it unless it is there for the same inputs.
+        """Return the stage; build it unless it exists for the same inputs.
 
         Args:
             name: folder name, unique in the run.
-            inputs: everything that the stage reads: options, digests of files, digests of earlier stages.
+            inputs: everything that the stage reads: options, digests of files and earlier stages.
             build: fills the folder it is given and returns facts (JSON) for ``stage.json``.
 
         Raises:
             PalpateError: if the run folder cannot be used.
         """
         digest = digest_json([FORMAT, __version__, name, inputs])
-        final, part = self.folder / name, self.folder / f"{name}.partial"
-        mark = final / "stage.json"
-        if mark.is_file() and (done := read_json(mark, "stage record")).get("digest") == digest:
+        final = self.folder / name
+        done = _record(final / "stage.json")
+        if done.get("digest") == digest:
             self.say(f"{name}: already done ({done['seconds']:.0f} s then)")
             stage = Stage(final, digest, done["facts"], done["seconds"], reused=True)
         else:
-            begun = part / "inputs.json"
-            if part.exists() and (
-                not begun.is_file() or read_json(begun, "stage record").get("digest") != digest
-            ):
-                shutil.rmtree(part)
-            try:
-                part.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise PalpateError(
-                    f"The run folder {self.folder} must be writable",
-                    str(error),
-                    "Choose another folder with --out",
-                ) from None
-            if not begun.is_file():
-                write_json(begun, {"digest": digest, "inputs": json.loads(canonical_json(inputs))})
             self.say(f"{name}: ...")
-            start = time.monotonic()
-            try:
-                facts = dict(build(part) or {})
-            except (
-                PalpateError
-            ):  # a refused input leaves nothing behind, unless there is work to go on from
-                if [p.name for p in part.iterdir()] == [begun.name]:
-                    shutil.rmtree(part)
-                raise
-            seconds = time.monotonic() - start
-            write_json(
-                part / "stage.json",
-                {**read_json(begun, "stage record"), "facts": facts, "seconds": round(seconds, 2)},
-            )
-            begun.unlink()
-            shutil.rmtree(final, ignore_errors=True)
-            part.replace(final)
-            self.say(f"{name}: done in {seconds:.0f} s")
-            stage = Stage(final, digest, facts, seconds, reused=False)
+            stage = _build(final, digest, inputs, build)
+            self.say(f"{name}: done in {stage.seconds:.0f} s")
         self.stages[name] = stage
         return stage
+
+
+def _build(
+    final: Path,
+    digest: str,
+    inputs: Mapping[str, Any],
+    build: Callable[[Path], Mapping[str, Any] | None],
+) -> Stage:
+    part = final.with_name(f"{final.name}.partial")
+    begun = part / "inputs.json"
+    if _record(begun).get("digest") != digest:
+        shutil.rmtree(part, ignore_errors=True)
+    try:
+        part.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        must = f"The run folder {final.parent} must be writable"
+        raise PalpateError(must, str(error), "Choose another folder") from None
+    record = {"digest": digest, "inputs": json.loads(canonical_json(inputs))}
+    write_json(begun, record)
+    start = time.monotonic()
+    try:
+        facts = dict(build(part) or {})
+    except PalpateError:
+        if [p.name for p in part.iterdir()] == [begun.name]:  # no work to resume from
+            shutil.rmtree(part)
+        raise
+    seconds = round(time.monotonic() - start, 2)
+    write_json(part / "stage.json", {**record, "facts": facts, "seconds": seconds})
+    begun.unlink()
+    shutil.rmtree(final, ignore_errors=True)
+    part.replace(final)
+    return Stage(final, digest, facts, seconds, reused=False)
+
+
+def _record(path: Path) -> dict[str, Any]:
+    return read_json(path, "stage record") if path.is_file() else {}

@@ -24,12 +24,12 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from palpate.core import PalpateError, digest_json, read_record, write_json
-from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
 from palpate.diffusion.pixels import architecture, digest_tensors, to_bytes, to_unit
 from palpate.encoders.half import Rounding, round_to_half
 from palpate.encoders.hub import fetch
 from palpate.encoders.weights import UNREADABLE, save_weights
+from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-autoencoder/1"
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from palpate.core import PalpateError, read_record, told_of
+from palpate.core import PalpateError, read_record, reading_entry
 
 FORMAT = "palpate-pipeline/2"
 #: Format 1 called the encoders ``towers``; it is still read.
@@ -126,11 +126,11 @@ def require_sampler(
         for k, v in {"guidance": guidance, "steps": steps, "batch": batch}.items()
         if v is not None
     }
-    with told_of(note, "sampler"):
+    with reading_entry(note, "sampler"):
         options = replace(SamplerOptions(**about["sampler"]), **given)
-    with told_of(note, "schedule"):
+    with reading_entry(note, "schedule"):
         most = int(about["schedule"]["steps"])
-    with told_of(note, "condition"):
+    with reading_entry(note, "condition"):
         dropout = float(about["condition"]["dropout"])
-    with told_of(note, "sampler"):
+    with reading_entry(note, "sampler"):
         require_settings(options, most=most, dropout=dropout)

@@ -36,10 +36,9 @@ from palpate.core import (
     atomic_folder,
     digest_json,
     quiet,
-    told_of,
+    reading_entry,
     write_json,
 )
-from palpate.core.cards import write_model_cards
 from palpate.core.shipped import SHIPPED, is_shipped
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.card import FORMAT, FORMAT_1, SamplerOptions, read_card
@@ -50,6 +49,7 @@ from palpate.diffusion.sampling import build_scheduler, require_sampling, sample
 from palpate.diffusion.training import Schedule
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.hub import find_model
+from palpate.training.cards import write_model_cards
 
 SYNTHETIC = "Made by a generator that was trained on synthetic data alone (palpate's procedural world), not on a real sensor."
 #: Photos embedded at once, always: an embedding does not depend on its neighbors.
@@ -330,7 +330,7 @@ class TactilePipeline:
             place = folder / "encoders"
             place = place if place.is_dir() else folder / "towers"  # format 1
             encoders = EncoderSet.load(place) if about["encoders"] else None
-        with told_of(note, "condition"):
+        with reading_entry(note, "condition"):
             policy = ConditionPolicy(**about["condition"])
         pipeline = cls(
             autoencoder=autoencoder,
@@ -354,19 +354,19 @@ def _settings(note: Path, about: Mapping[str, Any]) -> dict[str, Any]:
         PalpateError: naming the entry that cannot be used.
     """
     settings: dict[str, Any] = {}
-    with told_of(note, "latents"):
+    with reading_entry(note, "latents"):
         stats = about["latents"]
         settings["stats"] = LatentStats(
             tuple(map(float, stats["mean"])), tuple(map(float, stats["std"])), stats["scale"]
         )
-    with told_of(note, "schedule"):
+    with reading_entry(note, "schedule"):
         settings["schedule"] = Schedule(**about["schedule"])
-    with told_of(note, "sampler"):
+    with reading_entry(note, "sampler"):
         settings["sampler"] = SamplerOptions(**about["sampler"])
         require_sampling(settings["sampler"], settings["schedule"])
-    with told_of(note, "size"):
+    with reading_entry(note, "size"):
         settings["size"] = int(about["size"])
-    with told_of(note, "training"):
+    with reading_entry(note, "training"):
         settings["training"] = dict(about["training"].items())
     return settings | {"preset": str(about["preset"])}
 

@@ -29,8 +29,14 @@ from torch import Tensor, nn
 from transformers import AutoTokenizer, CLIPModel, CLIPVisionConfig, CLIPVisionModelWithProjection
 from transformers.utils.hub import cached_file
 
-from palpate.core import PalpateError, atomic_folder, read_record, seed_for, told_of, write_json
-from palpate.core.cards import write_model_cards
+from palpate.core import (
+    PalpateError,
+    atomic_folder,
+    read_record,
+    reading_entry,
+    seed_for,
+    write_json,
+)
 from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
 from palpate.encoders.half import Rounding, round_to_half
 from palpate.encoders.hub import fetch, find_model
@@ -45,6 +51,7 @@ from palpate.encoders.weights import (
     silent,
     tokenizer_digest,
 )
+from palpate.training.cards import write_model_cards
 from palpate.training.device import require_device_name
 
 Modality = Literal["vision", "text", "tactile"]
@@ -475,7 +482,7 @@ def _card(note: Path, about: Mapping[str, Any]) -> tuple[dict[str, str], dict[st
 
 def _preprocess(path: Path, size: int) -> Preprocess:
     config = read_record(path, "image processor")
-    with told_of(path, "An entry"):
+    with reading_entry(path, "An entry"):
         return Preprocess.from_config(config, size)
 
 

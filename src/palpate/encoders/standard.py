@@ -33,7 +33,7 @@ from palpate.core import (
     digest_json,
     quiet,
     read_record,
-    told_of,
+    reading_entry,
 )
 from palpate.core.shipped import is_hub_id, shipped_folder
 from palpate.encoders.embed import _exact  # pyright: ignore[reportPrivateUsage]
@@ -277,7 +277,7 @@ def _load_clip(source: str | Path, device: torch.device) -> StandardEncoder:
         got = (str(error).splitlines() or [type(error).__name__])[0]
         raise PalpateError(f"{name} must be a CLIP with a vision encoder", got, CLIP_FIX) from None
     record = read_record(processor, "image processor")
-    with told_of(processor, "An entry"):
+    with reading_entry(processor, "An entry"):
         preprocess = Preprocess.from_config(record, int(config.image_size))
     model = model.float().eval().requires_grad_(False)
     parts = {"tower": model.vision_model, "projection": model.visual_projection}
@@ -294,7 +294,7 @@ def _load_clip(source: str | Path, device: torch.device) -> StandardEncoder:
 def _vision_config(path: Path) -> Any:
     """The configuration of the vision encoder, from that of a whole CLIP or of the encoder alone."""
     config = read_record(path, "configuration of the CLIP")
-    with told_of(path, "An entry"):
+    with reading_entry(path, "An entry"):
         if config.get("model_type") == "clip_vision_model":
             return CLIPVisionConfig(**config)
         if config.get("model_type") == "clip":

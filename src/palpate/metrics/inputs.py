@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, PalpateWarning
-from palpate.core.score import is_missing
+from palpate.core.features import is_missing
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

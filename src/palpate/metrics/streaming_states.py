@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, seed_for
-from palpate.core.score import is_missing
+from palpate.core.features import is_missing
 from palpate.metrics.arrays import is_foreign
 from palpate.metrics.inputs import Normalize, checked_features, checked_names
 from palpate.metrics.kernels import Array, Gaussian, Index

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from palpate.core import FeatureSet
-from palpate.core.score import is_missing
+from palpate.core.features import is_missing
 from palpate.metrics.engine import kernel_sums
 from palpate.metrics.halves import half_of, halves_bound, sample_units, self_distances, take_sets
 from palpate.metrics.inputs import checked_features, checked_names, checked_pair, copies_across

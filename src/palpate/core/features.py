@@ -1,0 +1,149 @@
+"""Features of samples: the arrays that scores and audits are computed from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from palpate.core.errors import PalpateError
+from palpate.core.files import atomic_path
+from palpate.core.plain import to_numpy
+
+#: Rows that are checked and hashed at a time: a memory-mapped array is never copied whole.
+BLOCK = 8192
+
+
+def is_missing(name: Any) -> bool:
+    """Return whether a label or group is none: None, an empty string, NaN, pandas' NA or NaT."""
+    return (
+        name is None
+        or type(name).__name__ in ("NAType", "NaTType")
+        or name == ""
+        or bool(name != name)
+    )
+
+
+@dataclass(frozen=True)
+class FeatureSet:
+    """Features of samples, in one order.
+
+    Attributes:
+        ids: n sample ids.
+        features: array (n, d) or tensor, which is copied to the host; encoders give L2-normalized
+            float32 rows.
+        labels: n materials, or None.
+        groups: n groups (videos, contacts), or None.
+        encoder: digest of the encoder that made them.
+
+    Raises:
+        PalpateError: on unequal lengths, a wrong shape, or values that are not finite.
+    """
+
+    ids: Sequence[str]
+    features: np.ndarray
+    labels: Sequence[str] | None = None
+    groups: Sequence[str] | None = None
+    encoder: str | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.features, np.ndarray):  # a tensor, or a list of rows
+            object.__setattr__(self, "features", _array(self.features))
+        if self.features.dtype.kind not in "fiub":
+            got = f"dtype {self.features.dtype}"
+            raise PalpateError("Features must be numbers", got, "Pass one row of numbers per id")
+        n, shape = len(self.ids), self.features.shape
+        if len(shape) != 2 or shape[0] != n:
+            must = f"Features must have shape ({n}, d), one row per id"
+            raise PalpateError(must, f"shape {shape}", "Pass one row per id")
+        for name in ("labels", "groups"):
+            column = getattr(self, name)
+            if column is not None and len(column) != n:
+                must, fix = (
+                    f"must have one entry per row ({n})",
+                    "Pass them in the order of the ids",
+                )
+                raise PalpateError(must, f"{len(column)}", fix, argument=name)
+        finite = [np.isfinite(self.features[k : k + BLOCK]).all(axis=1) for k in range(0, n, BLOCK)]
+        bad = np.flatnonzero(~np.concatenate(finite)) if finite else ()
+        if len(bad):
+            names = list(self.ids)  # a pandas column may have another index
+            rows = ", ".join(f"{k}: {names[k]!r}" for k in bad[:5]) + ", ..." * (len(bad) > 5)
+            got = f"NaN or infinity in {len(bad)} row{'s' * (len(bad) != 1)} ({rows})"
+            fix = "Check what those rows were made from"
+            raise PalpateError("Features must be finite", got, fix)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of ids and features as float32, independent of the order of rows."""
+        rows: list[tuple[str, bytes]] = []
+        for k in range(0, len(self.features), BLOCK):
+            with np.errstate(over="ignore"):
+                block = np.ascontiguousarray(self.features[k : k + BLOCK], dtype="<f4")
+            block = block + np.float32(0)  # -0 becomes 0, which it equals
+            hashes = (hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in block)
+            rows += zip(map(str, self.ids[k : k + BLOCK]), hashes, strict=True)
+        state = hashlib.sha256(str(self.features.shape[1]).encode())
+        for name, row in sorted(rows):
+            state.update(json.dumps(name).encode() + row)
+        return state.hexdigest()
+
+    def take(self, ids: Sequence[str]) -> FeatureSet:
+        """Return the rows of ``ids``, in that order.
+
+        Raises:
+            PalpateError: if an id is missing.
+        """
+        row = {name: k for k, name in enumerate(self.ids)}
+        if missing := [i for i in ids if i not in row]:
+            got = f"{len(missing)} without, first {missing[0]!r}"
+            fix = "Embed those samples as well"
+            raise PalpateError("Every requested id must have features", got, fix)
+        rows = [row[i] for i in ids]
+        labels, groups = (
+            None if column is None else [column[k] for k in rows]
+            for column in (self.labels, self.groups)
+        )
+        return FeatureSet(list(ids), self.features[rows], labels, groups, self.encoder)
+
+    def save(self, path: Path) -> None:
+        """Write an ``.npz`` of plain arrays (no pickles), atomically."""
+        arrays: dict[str, np.ndarray] = {
+            "ids": np.array(list(self.ids), dtype=str),
+            "features": self.features,
+        }
+        for name in ("labels", "groups"):
+            if (column := getattr(self, name)) is not None:
+                arrays[name] = np.array(["" if is_missing(c) else c for c in column], dtype=str)
+        if self.encoder:
+            arrays["encoder"] = np.array(self.encoder)
+        with atomic_path(Path(path)) as part, open(part, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> FeatureSet:
+        """Read what :meth:`save` wrote; never a pickle."""
+        with np.load(path, allow_pickle=False) as data:
+            names = ("ids", "labels", "groups")
+            ids, labels, groups = (data[k].tolist() if k in data else None for k in names)
+            encoder = str(data["encoder"]) if "encoder" in data else None
+            return cls(ids, data["features"], labels, groups, encoder)
+
+
+def _array(features: Any) -> np.ndarray:
+    if str(getattr(features, "dtype", "")).endswith("bfloat16"):
+        message = "bfloat16 features were widened to float32; their rounding stays"
+        warnings.warn(message, stacklevel=4)
+    try:
+        return to_numpy(features)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = str(error).splitlines()[0]
+        fix = "Pass rows of one width"
+        raise PalpateError("Features must turn into an array (n, d)", got, fix) from None

@@ -1,0 +1,193 @@
+"""Model cards (``README.md``), written from the ``palpate.json`` of a saved model.
+
+The ``card`` in that JSON may have these keys, each with its own place on the page:
+
+===========  ==================================================================================
+``title``    one line
+``summary``  what it is, what it was trained on, what it must not be used for; Markdown
+``license``  the hub's identifier; ``apache-2.0`` by default
+``tags``     in addition to those of the format
+``data``     rows (list of objects): world, seeds, version, digest, frames ...
+``recipe``   the command that makes it again
+``scores``   rows (list of objects): score, value, interval, chance, on, n ...
+``limits``   sentences
+===========  ==================================================================================
+
+Every other key is part of the training record, which is printed as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from palpate.core import PalpateError, read_json, write_text
+
+PLACED = ("title", "summary", "license", "tags", "data", "recipe", "scores", "limits")
+#: Longer entries of the record (loss curves, nested cards) are cut on the page.
+MAX_CHARACTERS = 240
+
+
+class _Format(NamedTuple):
+    title: str
+    library: str
+    task: str
+    tags: tuple[str, ...]
+    usage: str
+
+
+_FORMATS = {
+    "palpate-clip/1": _Format(
+        "Vision and text encoders",
+        "transformers",
+        "zero-shot-image-classification",
+        ("clip",),
+        'from palpate.encoders.encoder_set import load_clip\n\nclip = load_clip("{name}")',
+    ),
+    "palpate-encoders/2": _Format(
+        "Vision, text and tactile encoders",
+        "transformers",
+        "feature-extraction",
+        ("clip", "contrastive"),
+        "import palpate as pp\n\n"
+        'encoder = pp.Encoder.from_pretrained("{name}", modality="tactile")',
+    ),
+    "palpate-autoencoder/1": _Format(
+        "Autoencoder of tactile images",
+        "diffusers",
+        "image-to-image",
+        ("vq-gan", "autoencoder"),
+        "from palpate.diffusion.autoencoder import Autoencoder\n\n"
+        'autoencoder = Autoencoder.load("{name}")',
+    ),
+    "palpate-pipeline/2": _Format(
+        "From a photo to a tactile image",
+        "diffusers",
+        "image-to-image",
+        ("latent-diffusion",),
+        'import palpate as pp\n\npipeline = pp.TactilePipeline.from_pretrained("{name}")',
+    ),
+}
+
+
+def model_card(about: Mapping[str, Any]) -> str:
+    """Write the ``README.md`` of a saved model.
+
+    Args:
+        about: its ``palpate.json``: ``format``, ``card`` (``training`` of a pipeline), digests.
+
+    Returns:
+        Markdown with YAML front matter as on the Hugging Face hub.
+
+    Raises:
+        PalpateError: for another format.
+    """
+    from huggingface_hub import ModelCardData
+
+    form = _FORMATS.get(str(about.get("format")))
+    if form is None:
+        raise PalpateError(
+            f"A model card is made of one of {', '.join(_FORMATS)}",
+            repr(about.get("format")),
+            "Pass the JSON of palpate.json",
+        )
+    card = _card(about)
+    head = ModelCardData(
+        license=card.get("license", "apache-2.0"),
+        library_name=form.library,
+        pipeline_tag=form.task,
+        tags=[*dict.fromkeys(("palpate", "tactile", *form.tags, *card.get("tags", ())))],
+    )
+    name = card.get("name") or about.get("name") or "FOLDER"
+    digests = about.get("digests") or ({"model": about["digest"]} if about.get("digest") else {})
+    record = {
+        k: _cut(v) for k, v in card.items() if k not in PLACED and v not in (None, {}, [], "")
+    }
+    sections = {
+        "Scores": _table(card.get("scores")),
+        "Data": _table(card.get("data")),
+        "Limits": "\n".join(f"- {text}" for text in card.get("limits", ())),
+        "Made by": _code("sh", str(card.get("recipe", ""))),
+        "Digests": "\n".join(f"- {part}: `{digest}`" for part, digest in digests.items()),
+        "Record": record
+        and "The whole record is in `palpate.json`.\n\n"
+        + _code("json", json.dumps(record, indent=1, ensure_ascii=False)),
+    }
+    parts = [f"---\n{head.to_yaml()}\n---", f"# {card.get('title', form.title)}"]
+    parts += [str(card["summary"])] if card.get("summary") else []
+    parts += [_code("python", form.usage.format(name=name))]
+    parts += [f"## {title}\n\n{text}" for title, text in sections.items() if text]
+    return "\n\n".join(parts) + "\n"
+
+
+def write_model_cards(folder: Path) -> list[Path]:
+    """Write ``README.md`` next to every ``palpate.json`` at or below ``folder``.
+
+    A folder that only holds models gets a ``README.md`` that lists them.
+
+    Returns:
+        The files written.
+
+    Raises:
+        PalpateError: if a ``palpate.json`` is unreadable or of another format.
+    """
+    folder = Path(folder)
+    models = {
+        file.parent: read_json(file, "model card") for file in sorted(folder.rglob("palpate.json"))
+    }
+    pages = {place: model_card(about) for place, about in models.items()}
+    if pages and folder not in pages:
+        pages[folder] = _contents(folder, models)
+    for place, text in pages.items():
+        write_text(place / "README.md", text)
+    return [place / "README.md" for place in pages]
+
+
+def _contents(folder: Path, models: Mapping[Path, Mapping[str, Any]]) -> str:
+    """List the models below ``folder`` with the size of their weights."""
+    rows: list[dict[str, Any]] = []
+    for place, about in models.items():
+        name = place.relative_to(folder).as_posix()
+        size = sum(file.stat().st_size for file in place.rglob("*.safetensors"))
+        rows.append(
+            {
+                "folder": f"[{name}]({name}/README.md)",
+                "what": _card(about).get("title", _FORMATS[about["format"]].title),
+                "weights, MB": f"{size / 1e6:.1f}",
+            }
+        )
+    intro = "Apache-2.0. Each folder holds its card (`README.md`, made from `palpate.json`)."
+    return f"# Models in {folder.name}\n\n{intro}\n\n{_table(rows)}\n"
+
+
+def _card(about: Mapping[str, Any]) -> Mapping[str, Any]:
+    return about.get("card", about.get("training")) or {}
+
+
+def _code(language: str, text: str) -> str:
+    return f"```{language}\n{text}\n```" if text else ""
+
+
+def _table(rows: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None) -> str:
+    """Rows as a Markdown table over the union of their keys, in order of first use."""
+    if not rows:
+        return ""
+    rows = [rows] if isinstance(rows, Mapping) else rows
+    names = [*dict.fromkeys(key for row in rows for key in row)]
+    cells = [names, ["---"] * len(names), *([_cell(row.get(n)) for n in names] for row in rows)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in cells)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_cell, value))}]"
+    return "" if value is None else str(value).replace("|", "\\|").replace("\n", " ")
+
+
+def _cut(value: Any) -> Any:
+    text = json.dumps(value, ensure_ascii=False)
+    return value if len(text) <= MAX_CHARACTERS else f"{text[:MAX_CHARACTERS]}..."
