@@ -69,8 +69,8 @@ def make_scene(seed, encoders, materials=MATERIALS, videos=VIDEOS, size=64):
         size=size,
         materials=materials,
         objects_per_material=2 * videos,
-        touches_per_video=6,
-        frames_per_touch=2,
+        contacts_per_video=6,
+        frames_per_contact=2,
         sensors=2,
     )
     found = {name: [] for name in ("made", "real", "empty", "own", "label", "video")}
@@ -83,7 +83,7 @@ def make_scene(seed, encoders, materials=MATERIALS, videos=VIDEOS, size=64):
                 video.tactile(f) for touch in range(3) for f in contact_frames(options, touch)
             ]
             continue
-        for touch in range(0, options.touches_per_video, 2):
+        for touch in range(0, options.contacts_per_video, 2):
             pairs = zip(
                 contact_frames(options, touch), contact_frames(options, touch + 1), strict=True
             )

@@ -100,7 +100,7 @@ def without_markers(images):
 def render_video(options, plan):
     """All contact frames of one video: vision, touch, background, and per frame (material, video, touch, main object, frame)."""
     video, images, names = Video(options, plan), [], []
-    for touch in range(options.touches_per_video):
+    for touch in range(options.contacts_per_video):
         background = video.tactile(first_contact(options, touch) - BACKGROUND_OFFSET)
         for frame in contact_frames(options, touch):
             images.append((video.vision(frame), video.tactile(frame), background))

@@ -125,7 +125,7 @@ def world_touches(seeds, videos, size):
         rng = np.random.default_rng(seed)
         for index in rng.permutation(len(plans))[:videos]:
             video = Video(options, plans[index])
-            for touch in rng.permutation(options.touches_per_video)[:2]:
+            for touch in rng.permutation(options.contacts_per_video)[:2]:
                 before = first_contact(options, int(touch)) - BACKGROUND_OFFSET
                 frame = int(rng.choice(contact_frames(options, int(touch))))
                 material = plans[index].object_of(int(touch)).material

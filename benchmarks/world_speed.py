@@ -98,8 +98,8 @@ def world_for(size, objects, touches, frames, tile=None, seed=11):
         size=size,
         tile=tile or min(1024, 4 * size),
         objects_per_material=objects,
-        touches_per_video=touches,
-        frames_per_touch=frames,
+        contacts_per_video=touches,
+        frames_per_contact=frames,
         mixed=0.0,
         free_written="background",
     )
@@ -109,7 +109,7 @@ def ours(options, plan, cost):
     """One video of palpate: its object, its set-up (light and pose; the second call of the first photo is taken off the first), its frames."""
     numbers = [
         frame
-        for touch in range(options.touches_per_video)
+        for touch in range(options.contacts_per_video)
         for frame in contact_frames(options, touch)
     ]
     ref = plan.objects[0]
@@ -137,13 +137,13 @@ def theirs(prototype, sensors, options, plan, tile, cost):
         plan.index,
         thing,
         sensors[plan.sensor],
-        options.touches_per_video,
-        options.frames_per_touch,
+        options.contacts_per_video,
+        options.frames_per_contact,
         options.size,
     )
     cost.videos.append(spent)
     prototype.background(video)
-    for frame in range(options.touches_per_video * options.frames_per_touch):
+    for frame in range(options.contacts_per_video * options.frames_per_contact):
         cost.frames.append(clocked(prototype.frame, video, frame)[1])
 
 

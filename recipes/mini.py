@@ -54,7 +54,7 @@ NAME = "palpate/mini"
 #: Its table of scores is written from the cards.
 PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "mini.md"
 SEED = 0
-_BASE = replace(PRESETS["pretrain"], touches_per_video=3, frames_per_touch=2)
+_BASE = replace(PRESETS["pretrain"], contacts_per_video=3, frames_per_contact=2)
 WORLDS: dict[str, WorldOptions] = {
     "touches": replace(_BASE, seed=900_000, objects_per_material=150, sensors=8),
     "digit": replace(_BASE, seed=900_001, objects_per_material=30, sensors=4, look="digit"),

@@ -108,7 +108,7 @@ def small(image: np.ndarray, size: int) -> np.ndarray:
 def video_of(options: WorldOptions, ref: ObjectRef, index: int, sensor: int = 0) -> Video:
     """A video of the pictures' own of one object of the world."""
     return Video(
-        options, VideoPlan(index, "picture", sensor, (ref,), (0,) * options.touches_per_video)
+        options, VideoPlan(index, "picture", sensor, (ref,), (0,) * options.contacts_per_video)
     )
 
 
@@ -124,7 +124,7 @@ def first_of(options: WorldOptions, material: str, subtype: str) -> ObjectRef:
 def sheet(look: Look, names: Sequence[str]) -> Board:
     """Photo and touch in the middle of a contact; object 0 of each material, not chosen. Rendered at 128 px, shown at 96."""
     options, board, shown = WorldOptions(size=128, tile=512, look=look), Board(), 96
-    frame = first_contact(options, 0) + options.frames_per_touch // 2
+    frame = first_contact(options, 0) + options.frames_per_contact // 2
     for k, name in enumerate(names):
         video = video_of(options, ObjectRef(name, 0), 10**6 + k, k % options.sensors)
         left, top = (
@@ -134,7 +134,7 @@ def sheet(look: Look, names: Sequence[str]) -> Board:
         pair = np.concatenate(
             [small(video.vision(frame), shown), small(video.tactile(frame), shown)], 1
         )
-        board.panel(left, top, pair, f"{name} ({video.thing(0).surface.subtype})")
+        board.panel(left, top, pair, f"{name} ({video.object_of(0).surface.subtype})")
     return board
 
 
@@ -196,7 +196,7 @@ def steps(look: Look = "gelsight") -> Board:
     )
     video = video_of(options, first_of(options, "Metal", "tread plate"), 2)
     frame = first_contact(options, 0) + 1
-    state, sensor, thing = video.state(frame), video.sensor, video.thing(0)
+    state, sensor, thing = video.state(frame), video.sensor, video.object_of(0)
     relief = video.relief(state)
     load = state.load * (1.0 - 0.3 * thing.surface.softness)
     gap = gap_of(thing, sensor, relief, state.load, state.tilt)
@@ -258,8 +258,8 @@ def motion() -> Board:
     options = WorldOptions(
         size=128,
         tile=512,
-        frames_per_touch=7,
-        touches_per_video=1,
+        frames_per_contact=7,
+        contacts_per_video=1,
         slide_mm=(5.0,),
         load_mm=(0.3, 0.3),
         hand=0.95,
@@ -322,7 +322,7 @@ def subtypes(material: str = "Metal") -> Board:
     for k, kind in enumerate(MATERIALS[material].subtypes):
         video = video_of(options, first_of(options, material, kind), 20 + k)
         words = ", ".join(
-            word for word in video.thing(0).surface.words if word not in ("cold", "hard")
+            word for word in video.object_of(0).surface.words if word not in ("cold", "hard")
         )
         images = [video.vision(frame), video.tactile(frame)]
         left = GAP + k * (128 + 4 * GAP)

@@ -25,8 +25,8 @@ OPTIONS = WorldOptions(
     two_videos=0.5,
     mixed=0.3,
     sensors=2,
-    touches_per_video=3,
-    frames_per_touch=3,
+    contacts_per_video=3,
+    frames_per_contact=3,
     free_written="background",
 )
 

@@ -36,9 +36,9 @@ SMALL = [
     "16",
     "--tile",
     "64",
-    "--touches-per-video",
+    "--contacts-per-video",
     "2",
-    "--frames-per-touch",
+    "--frames-per-contact",
     "1",
     "--workers",
     "1",
@@ -159,7 +159,7 @@ def test_the_table_of_costs_is_that_of_the_presets():
     ):
         plans = plan_world(options)
         assert len(plans) * len(written_frames(options)) == int(written)
-        assert len(plans) * options.touches_per_video * options.frames_per_touch == int(contact)
+        assert len(plans) * options.contacts_per_video * options.frames_per_contact == int(contact)
         rows.append(
             f"| `{name}` | {options.size} | {options.objects_per_material} | {int(contact):,} | {int(written):,} | {seconds} | {megabytes} |"
         )

@@ -31,7 +31,7 @@ def small(mini, monkeypatch, tmp_path):
     few = {
         "materials": ("Wood", "Brick", "Grass"),
         "objects_per_material": 4,
-        "touches_per_video": 2,
+        "contacts_per_video": 2,
     }
     monkeypatch.setattr(
         mini, "WORLDS", {name: replace(options, **few) for name, options in mini.WORLDS.items()}

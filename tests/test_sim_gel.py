@@ -50,7 +50,7 @@ def test_the_press_by_hand():
 def test_a_touch_presses_with_its_load_and_the_gel_is_never_exceeded():
     for plan in plan_world(SMALL):
         video = Video(SMALL, plan)
-        for touch in range(SMALL.touches_per_video):
+        for touch in range(SMALL.contacts_per_video):
             state = video.state(first_contact(SMALL, touch) + 1)
             membrane, contact = video.membrane(state)
             assert membrane.dtype == np.float32
@@ -106,7 +106,7 @@ def test_the_background_is_the_shading_without_contact():
 
 def test_the_frame_four_before_a_contact_is_free():
     video = Video(SMALL, 0)
-    for touch in range(SMALL.touches_per_video):
+    for touch in range(SMALL.contacts_per_video):
         first = first_contact(SMALL, touch)
         assert not video.state(first - 4).contact
         assert not video.state(first - 1).contact

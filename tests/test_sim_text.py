@@ -52,8 +52,8 @@ def test_captions_use_the_words_of_the_piece_and_the_template_alone():
     named = total = 0
     for plan in plan_world(options):
         video = Video(options, plan)
-        for touch in range(options.touches_per_video):
-            text, surface = video.text(touch), video.thing(touch).surface
+        for touch in range(options.contacts_per_video):
+            text, surface = video.text(touch), video.object_of(touch).surface
             allowed = FIXED | set(words(" ".join(surface.words))) | set(words(surface.noun))
             assert set(words(text)) <= allowed, text
             assert sum(w in text.lower() for w in surface.words) >= 2
@@ -115,7 +115,7 @@ def test_no_caption_has_the_prototypes_faults():
         size=16,
         objects_per_material=6,
         named=1.0,
-        touches_per_video=3,
+        contacts_per_video=3,
         materials=("Tree", "Others", "Plants", "Metal"),
     )
     texts = {}
@@ -123,7 +123,7 @@ def test_no_caption_has_the_prototypes_faults():
         video = Video(options, plan)
         for touch in range(3):
             texts.setdefault(plan.object_of(touch).material, []).append(
-                (video.text(touch), video.thing(touch).surface)
+                (video.text(touch), video.object_of(touch).surface)
             )
     for found in texts.values():
         for text, surface in found:
@@ -151,9 +151,9 @@ def test_captions_of_hct_are_lists_of_adjectives():
     )
     ends = set()
     for plan in plan_world(options):
-        for touch in range(options.touches_per_video):
+        for touch in range(options.contacts_per_video):
             video = Video(options, plan)
-            surface, parts = video.thing(touch).surface, video.text(touch).split(", ")
+            surface, parts = video.object_of(touch).surface, video.text(touch).split(", ")
             noun = surface.noun.removeprefix("a ")
             assert set(parts) <= {*surface.words, noun}
             assert len(parts) == len(set(parts)) >= 2

@@ -1,280 +1,201 @@
-"""The tree on disk: layout, equal bytes, resumption, known leaks."""
+"""Writing a world: equal bytes, resuming, kill -9, full disks, folders that hold something else."""
 
-import csv
 import dataclasses
-import io
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from palpate.cli import main
 from palpate.core import PalpateError, digest_folder
-from palpate.sim import (
-    MATERIALS,
-    PRESETS,
-    Material,
-    Surface,
-    Video,
-    WorldOptions,
-    plan_world,
-    render_contact_sheet,
-    write_world,
-)
-from palpate.sim.plan import contact_frames
+from palpate.sim import MINI_SEEDS, PRESETS, WorldOptions, render_sheet, write_world
 
 TINY = dataclasses.replace(PRESETS["tiny"], size=16, tile=64)
+RUN = ["world", "--preset", "tiny", "--size", "16", "--tile", "64", "--workers", "1", "-q", "-o"]
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    out = tmp_path_factory.mktemp("world") / "w"
-    return out, write_world(out, TINY)
+    return write_world(tmp_path_factory.mktemp("world") / "w", TINY)
 
 
-def read_list(path):
-    text = path.read_text()
-    rows = [line.split(",") for line in text.split("\n") if line]
-    return text, [(path, int(label)) for path, label in rows]
-
-
-def test_the_tree_has_the_layout_of_touch_and_go(world):
-    out, record = world
-    assert sorted(p.name for p in out.iterdir()) == sorted(
-        [
-            "label.txt",
-            "category_reference.txt",
-            "train.txt",
-            "test.txt",
-            "captions.csv",
-            "objects.csv",
-            "world.json",
-            "dataset",
-            "manifest.parquet",
-            "splits",
-            "leak.csv",
-        ]
-    )
-    plans = plan_world(TINY)
-    assert sorted(p.name for p in (out / "dataset").iterdir()) == [plan.name for plan in plans]
-    _, label = read_list(out / "label.txt")
-    expected = [
-        (f"{plan.name}/{frame:010d}.jpg", MATERIALS[plan.object_of(touch).material].label)
-        for plan in plans
-        for touch in range(2)
-        for frame in contact_frames(TINY, touch)
-    ]
-    assert label == expected
-    listed = {}
-    for part in ("train", "test"):
-        text, rows = read_list(out / f"{part}.txt")
-        assert not text.endswith("\n")
-        listed |= dict(rows)
-        assert rows != sorted(rows)
-    assert listed == dict(label)
-    categories = dict(
-        line.split(": ") for line in (out / "category_reference.txt").read_text().splitlines()
-    )
-    assert categories["Synthetic Fabric"] == "8"
-    assert len(categories) == 20
-    assert record.counts["written_frames"] == sum(
-        1 for _ in out.glob("dataset/*/video_frame/*.jpg")
-    )
-    for kind in ("video_frame", "gelsight_frame"):
-        frames = sorted(p.name for p in (out / "dataset" / plans[0].name / kind).iterdir())
-        assert frames == [f"{f:010d}.jpg" for f in range(14)]
-
-
-def test_written_frames_are_the_frames_rendered_alone(world):
-    out, _ = world
-    for index, frame in ((0, 0), (3, 6), (7, 13)):
-        video = Video(TINY, index)
-        for kind, image in (
-            ("video_frame", video.vision(frame)),
-            ("gelsight_frame", video.tactile(frame)),
-        ):
-            path = out / "dataset" / video.plan.name / kind / f"{frame:010d}.jpg"
-            file = io.BytesIO()
-            Image.fromarray(image).save(file, "JPEG", quality=95, subsampling=0)
-            assert path.read_bytes() == file.getvalue()
-            assert np.abs(np.asarray(Image.open(path)).astype(float) - image).mean() < 5
-
-
-def test_captions_and_objects_follow_the_touched_object(tmp_path):
-    options = dataclasses.replace(TINY, mixed=1.0, touches_per_video=4)
-    write_world(tmp_path / "w", options)
-    objects, captions = (
-        dict(csv.reader((tmp_path / "w" / f"{name}.csv").read_text().splitlines()))
-        for name in ("objects", "captions")
-    )
-    assert objects.pop("frame") == "object"
-    assert captions.pop("frame") == "text"
-    label = dict(read_list(tmp_path / "w" / "label.txt")[1])
-    assert set(objects) == set(captions) == set(label)
-    slugs = {m.label: name.lower().replace(" ", "_") for name, m in MATERIALS.items()}
-    assert all(objects[frame].startswith(f"{slugs[label[frame]]}_") for frame in label)
-    by_video = {}
-    for frame, material in label.items():
-        by_video.setdefault(frame.split("/")[0], set()).add(material)
-    assert all(2 <= len(materials) <= 3 for materials in by_video.values())
-    for plan in plan_world(options):
-        assert captions[f"{plan.name}/{contact_frames(options, 3)[1]:010d}.jpg"] == Video(
-            options, plan
-        ).text(3)
-
-
-@pytest.mark.parametrize("leak", ["frame", "contact", "none"])
-def test_the_known_leak_equals_a_recount_from_the_lists(leak, tmp_path):
-    options = WorldOptions(
-        materials=4,
-        objects_per_material=3,
-        touches_per_video=3,
-        frames_per_touch=2,
-        size=16,
-        tile=64,
-        leak=leak,
-    )
-    record = write_world(tmp_path / "w", options)
-    train, test = (
-        [path for path, _ in read_list(tmp_path / "w" / f"{part}.txt")[1]]
-        for part in ("train", "test")
-    )
-    videos = {path.split("/")[0] for path in train}
-    leaked = sum(path.split("/")[0] in videos for path in test)
-    data = json.loads((tmp_path / "w" / "world.json").read_text())
-    assert (
-        data["leak"]["test_frames_in_shared_videos"]
-        == leaked
-        == record.leak["test_frames_in_shared_videos"]
-    )
-    assert data["leak"]["test_frames"] == len(test) == data["counts"]["test_frames"]
-    assert data["leak"]["leaked_fraction"] == leaked / len(test)
-    touch = lambda path: (path.split("/")[0], int(path.split("/")[1][:10]) // 7)  # noqa: E731
-    shared = {touch(p) for p in train} & {touch(p) for p in test}
-    assert data["leak"]["touches_shared"] == len(shared)
-    assert len(test) / (len(train) + len(test)) == pytest.approx(0.25, abs=0.02)
-    if leak == "none":
-        assert leaked == 0
-        assert len({label for _, label in read_list(tmp_path / "w" / "test.txt")[1]}) >= 3
-    else:
-        assert leaked > 0
-        assert bool(shared) is (leak == "frame")
-
-
-def test_two_workers_write_the_same_bytes(world, tmp_path):
-    out, record = world
-    again = write_world(tmp_path / "w", TINY, workers=2)
-    assert again.digest == record.digest
-    assert digest_folder(tmp_path / "w") == digest_folder(out)
-
-
-def test_a_killed_run_goes_on_where_it_stopped(world, tmp_path):
-    out, _ = world
-
-    def kill(what, done, total, remark=""):
-        if done == 3:
+def kill_after(videos):
+    def progress(what, done, total, remark=""):
+        if done == videos:
             raise KeyboardInterrupt
 
+    return progress
+
+
+def never(*_):
+    pytest.fail("rendered")
+
+
+@pytest.mark.parametrize("layout", ["frames", pytest.param("hct", marks=pytest.mark.slow)])
+def test_workers_and_interrupted_runs_give_the_same_bytes(layout, tmp_path):
+    options = dataclasses.replace(TINY, layout=layout)
+    whole = write_world(tmp_path / "a", options)
+    write_world(tmp_path / "b", options, workers=2)
     with pytest.raises(KeyboardInterrupt):
-        write_world(tmp_path / "w", TINY, progress=kill)
-    assert not (tmp_path / "w").exists()
-    (part,) = tmp_path.glob(".w.*.part")
-    assert len(list((part / "dataset").iterdir())) == 3
-    stray = part / "dataset" / ".20990101_000000.abc"  # what a kill -9 leaves behind
-    stray.mkdir()
-    (stray / "half.jpg").write_bytes(b"half")
-    record = write_world(tmp_path / "w", TINY)
-    assert record.rendered == 5
-    assert digest_folder(tmp_path / "w") == digest_folder(out)
+        write_world(tmp_path / "c", options, progress=kill_after(3))
+    assert not (tmp_path / "c").exists()
+    (part,) = tmp_path.glob(".c.*.part")
+    place = next(p for p in part.rglob("*_*") if p.is_dir()) if layout == "frames" else part / "hct"
+    (place.parent / ".left-by-a-kill").mkdir(exist_ok=True)
+    record = write_world(tmp_path / "c", options)
+    assert (record.rendered, record.digest) == (5, whole.digest)
+    digests = {digest_folder(tmp_path / name, "[!.]*/**/*.jpg") for name in "abc"}
+    assert len(digests) == 1
+    assert [(tmp_path / n / "leak.csv").read_bytes() for n in "ab"] == [
+        (tmp_path / "c" / "leak.csv").read_bytes()
+    ] * 2
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b", "c"]
+
+
+def test_a_finished_world_is_kept_and_another_rejected(world):
+    before = {p: p.stat().st_mtime_ns for p in world.folder.rglob("*")}
+    again = write_world(world.folder, TINY, progress=never)
+    assert (again.digest, again.rendered) == (world.digest, 0)
+    assert before == {p: p.stat().st_mtime_ns for p in world.folder.rglob("*")}
+    with pytest.raises(PalpateError, match="other options"):
+        write_world(world.folder, dataclasses.replace(TINY, seed=1))
+
+
+def test_a_world_of_another_version_is_rejected(tmp_path):
+    write_world(tmp_path / "w", TINY)
+    path = tmp_path / "w" / "world.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"version": 1}))
+    with pytest.raises(PalpateError, match="must be of version 2 of the world. Got version 1"):
+        write_world(tmp_path / "w", TINY)
+
+
+def test_folders_that_cannot_become_a_world_are_rejected_before_rendering(tmp_path, monkeypatch):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("mine")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for output, message in (
+        (tmp_path / "notes", "absent, empty"),
+        (Path(), "current folder"),
+        (Path("../here"), "current folder"),
+    ):
+        with pytest.raises(PalpateError, match=message):
+            write_world(output, TINY, progress=never)
+    one = WorldOptions(materials=1, objects_per_material=1, leak="none", size=16, tile=64)
+    with pytest.raises(PalpateError, match="at least two videos"):
+        write_world(tmp_path / "w", one, progress=never)
+    with pytest.raises(PalpateError, match="`workers` must be at least 1"):
+        write_world(tmp_path / "w", TINY, workers=0)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["here", "notes"]
+
+
+def test_a_second_run_of_the_same_world_is_rejected(tmp_path):
+    pytest.importorskip("fcntl")
+
+    def second(what, done, total, remark=""):
+        with pytest.raises(PalpateError, match="another run is writing this world"):
+            write_world(tmp_path / "w", TINY)
+
+    write_world(tmp_path / "w", TINY, progress=second)
     assert [p.name for p in tmp_path.iterdir()] == ["w"]
 
 
-def test_a_finished_world_is_left_alone_and_another_refused(world):
-    out, record = world
-    before = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
-    again = write_world(out, TINY)
-    assert (again.digest, again.rendered) == (record.digest, 0)
-    assert before == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
-    with pytest.raises(PalpateError, match="other options"):
-        write_world(out, dataclasses.replace(TINY, seed=1))
+def processes():
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, parent = stat.read_text().rsplit(")", 1)[1].split()[:2]
+        except OSError:
+            continue
+        if state != "Z":
+            yield int(stat.parent.name), int(parent)
 
 
-def test_a_folder_with_something_else_is_refused(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(PalpateError, match="absent, empty"):
-        write_world(tmp_path, TINY)
-    assert (tmp_path / "notes.txt").read_text() == "mine"
-    (tmp_path / "empty").mkdir()
-    write_world(tmp_path / "empty", TINY)
-
-
-def test_a_world_too_small_to_cut_is_refused_before_rendering(tmp_path):
-    one = WorldOptions(materials=1, objects_per_material=1, leak="none", size=16, tile=64)
-    with pytest.raises(PalpateError, match="at least two videos"):
-        write_world(tmp_path / "w", one)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_users_broken_material_is_named(tmp_path, monkeypatch):
-    def broken(tile, rng):
-        return Surface(
-            tile.zeros() * np.nan, np.ones((tile.n, tile.n, 3), np.float32), "only", ("odd", "new")
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_workers_end_with_a_killed_parent_and_the_lock_is_free(tmp_path):
+    command = [sys.executable, "-m", "palpate", "world", "-o", str(tmp_path / "w")]
+    run = subprocess.Popen([*command, "--preset", "small", "--workers", "2", "-q"])
+    try:
+        until = time.monotonic() + 120
+        while not list(tmp_path.glob(".w.*.part/dataset/2*")):
+            assert time.monotonic() < until
+            assert run.poll() is None
+            time.sleep(0.1)
+        workers = {pid for pid, parent in processes() if parent == run.pid}
+        assert len(workers) >= 2
+    finally:
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+    until = time.monotonic() + 60
+    while workers & {pid for pid, _ in processes()}:
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    with pytest.raises(KeyboardInterrupt):  # past the lock
+        write_world(
+            tmp_path / "w",
+            PRESETS["small"],
+            progress=kill_after(len(list(tmp_path.glob(".w.*.part/dataset/2*")))),
         )
 
-    monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", broken, ("only",)))
-    with pytest.raises(PalpateError, match="'Cork' must return a finite height"):
-        write_world(tmp_path / "w", dataclasses.replace(TINY, materials=("Wood", "Cork")))
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 256 KB and a function that makes it large; only where one may be mounted."""
+    place = tmp_path / "disk"
+    place.mkdir()
+
+    def mount(*options):
+        command = ["mount", *options, str(place)]
+        return subprocess.run(command, capture_output=True, check=False).returncode
+
+    if sys.platform != "linux" or os.geteuid() or mount("-t", "tmpfs", "-o", "size=256k", "tmpfs"):
+        pytest.skip("no rights to mount a small file system")
+    yield place, lambda: mount("-o", "remount,size=20m")
+    subprocess.run(["umount", str(place)], check=False)
 
 
-def test_a_users_material_enters_the_lists(tmp_path, monkeypatch):
-    def fine(tile, rng):
-        return Surface(
-            tile.noise(1.0, 8.0) * 0.1,
-            np.ones((tile.n, tile.n, 3), np.float32) * 0.5,
-            "only",
-            ("springy", "dry"),
-        )
-
-    monkeypatch.setitem(MATERIALS, "Cork", Material(20, "cork", fine, ("only",)))
-    write_world(tmp_path / "w", dataclasses.replace(TINY, materials=("Wood", "Cork")))
-    assert "Cork: 20" in (tmp_path / "w" / "category_reference.txt").read_text().splitlines()
-    assert {label for _, label in read_list(tmp_path / "w" / "label.txt")[1]} == {3, 20}
-
-
-def test_videos_hold_the_same_frames(tmp_path):
-    av = pytest.importorskip("av")
-    options = dataclasses.replace(TINY, materials=("Brick",), size=32, layout="videos")
-    write_world(tmp_path / "w", options)
-    video = Video(options, 1)
-    for name, render in (("video.mp4", video.vision), ("gelsight.mp4", video.tactile)):
-        with av.open(str(tmp_path / "w" / "dataset" / video.plan.name / name)) as file:
-            assert file.streams.video[0].average_rate == 30
-            assert file.streams.video[0].codec_context.name == "h264"
-            frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
-        assert len(frames) == options.video_length
-        for f, frame in enumerate(frames):
-            assert np.abs(frame.astype(float) - render(f)).mean() < 14
+@pytest.mark.parametrize("layout", ["frames", "hct", "videos"])
+def test_a_full_disk_is_one_line_and_the_same_command_continues(
+    layout, small_disk, tmp_path, capsys
+):
+    place, enlarge = small_disk
+    args = ["world", "--preset", "tiny", "--objects-per-material", "4", "--layout", layout, "-q"]
+    args += ["--workers", "1", "--tile", "64", "-o"]
+    assert main([*args, str(place / "w")]) == 2
+    message = capsys.readouterr().err
+    assert "No space left" in message
+    assert "Traceback" not in message
+    assert not (place / "w").exists()
+    assert enlarge() == 0
+    assert main([*args, str(place / "w")]) == 0
+    assert main([*args, str(tmp_path / "whole")]) == 0
+    assert digest_folder(place / "w") == digest_folder(tmp_path / "whole")
 
 
 def test_videos_without_pyav_say_how_to_install_it(tmp_path, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(PalpateError, match=r"palpate\[video\]"):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(PalpateError, match="video"):
         write_world(tmp_path / "w", dataclasses.replace(TINY, layout="videos"))
 
 
-def test_sparse_worlds_write_contact_and_background_frames_alone(tmp_path):
-    write_world(
-        tmp_path / "w", dataclasses.replace(TINY, materials=("Brick",), free_written="background")
-    )
-    name = plan_world(dataclasses.replace(TINY, materials=("Brick",)))[0].name
-    frames = sorted(
-        int(p.stem) for p in (tmp_path / "w" / "dataset" / name / "gelsight_frame").iterdir()
-    )
-    assert frames == [1, 5, 6, 8, 12, 13]
+def test_a_world_of_the_shipped_models_says_so(tmp_path, capsys):
+    assert main([*RUN, str(tmp_path / "w"), "--seed", str(MINI_SEEDS[3])]) == 0
+    assert "may have been trained on this world" in capsys.readouterr().out
+    record = json.loads((tmp_path / "w" / "world.json").read_text())
+    assert "trained on this world" in record["seen_by_shipped_models"]
 
 
-def test_the_contact_sheet_is_a_picture(tmp_path):
-    render_contact_sheet(WorldOptions(materials=3, size=16, tile=64), tmp_path / "sheet.png")
+def test_the_sheet_shows_every_material(tmp_path):
+    render_sheet(WorldOptions(materials=3, size=16, tile=64), tmp_path / "sheet.png")
     image = Image.open(tmp_path / "sheet.png")
     assert image.size == (2 * (104 + 6 * 16), 2 * 16)
     assert np.asarray(image)[:16, 104:200].std() > 10
+    with pytest.raises(PalpateError, match="must be a file"):
+        render_sheet(WorldOptions(), tmp_path)

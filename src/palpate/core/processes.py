@@ -1,17 +1,60 @@
-"""What worker processes share."""
+"""Worker processes: spawned, quiet on Ctrl-C, and ended with their parent."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
+from collections.abc import Callable, Generator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.connection import wait
+from typing import Any
+
+from palpate.core.errors import PalpateError
+
+
+@contextmanager
+def worker_pool(
+    workers: int, initializer: Callable[..., None] | None = None, arguments: tuple[Any, ...] = ()
+) -> Generator[ProcessPoolExecutor]:
+    """A pool of spawned processes with one thread each; a forked copy of a process with threads may
+    hang.
+
+    Args:
+        workers: how many.
+        initializer: called with ``arguments`` at the start of each.
+        arguments: must be picklable.
+
+    Raises:
+        PalpateError: if a worker dies, mostly because the calling script has no ``__main__`` guard.
+    """
+    context = multiprocessing.get_context("spawn")
+    start = (initializer, arguments)
+    with ProcessPoolExecutor(workers, context, _start_worker, start) as pool:
+        try:
+            yield pool
+        except BrokenProcessPool:
+            fix = "Use one worker, or call this under: if __name__ == '__main__'"
+            raise PalpateError("Worker processes must be able to start", "one died", fix) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _start_worker(initializer: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+    # Ignore SIGINT in workers; the parent handles it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    follow_parent()
+    if initializer is not None:
+        initializer(*arguments)
 
 
 def follow_parent() -> None:
-    """End this worker process when its parent is gone, even if that was killed.
-
-    Does nothing in a process that is no worker.
+    """End this process when its parent ends, also when that is killed; no effect without a
+    parent.
     """
     parent = multiprocessing.parent_process()
     if parent is not None:

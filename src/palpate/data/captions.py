@@ -1,7 +1,7 @@
 """Captions made from a material's name, for data that has labels but no words.
 
 ``caption`` draws three adjectives of the material and a sentence form from (seed, sample id), so a sample has one caption
-whatever the order. The words are about touch alone: no colour, no light. Such captions carry nothing but the label; a
+whatever the order. The words are about touch alone: no color, no light. Such captions carry nothing but the label; a
 score that uses them measures the label, which :data:`TEXT_FROM_TEMPLATE` says for reports.
 """
 

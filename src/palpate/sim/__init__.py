@@ -1,16 +1,16 @@
-"""The procedural visuo-tactile world: videos of a gel sensor pressed on and sliding over materials, in the layout of Touch and Go.
+"""The procedural visuo-tactile world: videos of a gel sensor pressed on and sliding over materials.
 
-Synthetic, and it says so everywhere: it shows mechanisms (leakage, background reward, guidance); its numbers are never compared with
-real data. ``write_world(out, PRESETS["demo"])`` writes a tree; ``World(PRESETS["demo"])[7]`` renders one sample without files.
+Synthetic: it shows mechanisms (leakage, background reward, guidance); its numbers are never
+    compared with real data.
+``write_world(folder, PRESETS["demo"])`` writes a tree in the layout of Touch and Go;
+``World("demo")[7]`` renders one sample without files.
 """
 
 from palpate.sim.materials import MATERIALS, Material, Surface
-from palpate.sim.options import VERSION, WorldOptions
+from palpate.sim.options import VERSION, WorldOptions, load_options
 from palpate.sim.plan import VideoPlan, plan_world
-from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, seen_by_mini
-from palpate.sim.raw import Arrays, open_arrays
-from palpate.sim.saved import load_options, save_options
-from palpate.sim.sheet import render_contact_sheet
+from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN, seen_by_mini
+from palpate.sim.sheet import render_sheet
 from palpate.sim.tile import Tile
 from palpate.sim.video import Video
 from palpate.sim.world import World
@@ -21,8 +21,8 @@ __all__ = [
     "MATERIALS",
     "MINI_SEEDS",
     "PRESETS",
+    "SEEN",
     "VERSION",
-    "Arrays",
     "Material",
     "Surface",
     "Tile",
@@ -32,10 +32,8 @@ __all__ = [
     "WorldOptions",
     "WorldRecord",
     "load_options",
-    "open_arrays",
     "plan_world",
-    "render_contact_sheet",
-    "save_options",
+    "render_sheet",
     "seen_by_mini",
     "write_world",
 ]

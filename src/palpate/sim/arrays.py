@@ -1,8 +1,9 @@
 """Array helpers of the world, all in float32.
 
-NumPy 2 keeps float32 only when the other operand is a Python number or float32 itself; one ``np.float64`` scalar (``np.cos(0.3)``,
-``array.std()`` of float64, ``rng.choice([0.1, 0.2])``) silently doubles every array behind it. So scalars here are Python floats, and
-constants become arrays through :func:`f32`.
+NumPy 2 keeps float32 only when the other operand is a Python number or float32 itself; one
+``np.float64`` scalar (``np.cos(0.3)``, ``array.std()`` of float64, ``rng.choice([0.1, 0.2])``)
+silently doubles every array behind it. So scalars here are Python floats, and constants become
+arrays through :func:`f32`.
 """
 
 from __future__ import annotations
@@ -24,18 +25,24 @@ def f32(value: object) -> Array:
 
 
 def smoothstep(x: Array, start: float, end: float) -> Array:
-    """Cubic step t²(3 - 2t) that is 0 at ``start`` and 1 at ``end``; ``end < start`` gives a falling step."""
+    """Cubic step t²(3 - 2t) that is 0 at ``start`` and 1 at ``end``; ``end < start`` gives a
+    falling step.
+    """
     t = np.clip((x - float(start)) * (1.0 / (float(end) - float(start))), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def blend(a: Array, b: Array, weight: Array) -> Array:
-    """Colors ``a`` (weight 0) to ``b`` (weight 1); ``weight`` has shape (h, w), the colors (3,) or (h, w, 3)."""
+    """Colors ``a`` (weight 0) to ``b`` (weight 1); ``weight`` has shape (h, w), the colors (3,) or
+    (h, w, 3).
+    """
     return a + (b - a) * np.clip(weight, 0.0, 1.0)[..., None]
 
 
 def over(image: Array, color: Array, weight: Array) -> Array:
-    """A planar image (3, h, w) covered by ``color``, (3,) or (3, h, w), to the degree ``weight`` in [0, 1], shape (h, w)."""
+    """A planar image (3, h, w) covered by ``color``, (3,) or (3, h, w), to the degree ``weight`` in
+    [0, 1], shape (h, w).
+    """
     if color.ndim == 1:
         color = color[:, None, None]
     return image + (color - image) * weight
@@ -59,7 +66,8 @@ def to_bytes(image: Array) -> np.ndarray:
 
 
 def smooth(field: Array, sigma: float) -> Array:
-    """Gaussian-like blur of (h, w) by ``sigma`` pixels, edges repeated: exact below 2.5 px, above it two box passes.
+    """Gaussian-like blur of (h, w) by ``sigma`` pixels, edges repeated: exact below 2.5 px, above
+    it two box passes.
 
     Two boxes of width k have variance (k² - 1) / 6, hence k = sqrt(6 sigma² + 1).
     """
@@ -77,7 +85,9 @@ def _wrapped(index: np.ndarray, n: int) -> np.ndarray:
 
 
 def sample_clipped(field: Array, y: Array, x: Array) -> Array:
-    """Bilinear lookup in (h, w) at pixel positions ``y``, ``x``; positions outside take the nearest edge."""
+    """Bilinear lookup in (h, w) at pixel positions ``y``, ``x``; positions outside take the nearest
+    edge.
+    """
     h, w = field.shape
     y, x = np.clip(y, 0.0, h - 1.0), np.clip(x, 0.0, w - 1.0)
     top, left = np.minimum(y.astype(np.intp), h - 2), np.minimum(x.astype(np.intp), w - 2)
@@ -118,9 +128,11 @@ def sample_periodic(field: Array, y: Array, x: Array) -> Array:
 
 
 def resample(field: Array, size: int) -> Array:
-    """A square field (n, n) or (n, n, k) as (size, size[, k]), each output pixel the mean over the area it covers.
+    """A square field (n, n) or (n, n, k) as (size, size[, k]), each output pixel the mean over the
+    area it covers.
 
-    The mean over [a, b] is the difference of the running integral at b and a; the integral is linear inside a source pixel.
+    The mean over [a, b] is the difference of the running integral at b and a; the integral is
+    linear inside a source pixel.
     """
     for axis in (0, 1):
         n = field.shape[axis]
@@ -140,14 +152,18 @@ def resample(field: Array, size: int) -> Array:
 
 @lru_cache(maxsize=16)
 def grid(size: int) -> tuple[Array, Array]:
-    """Pixel centers of a square image in [-1, 1]: ``y`` of shape (size, 1) and ``x`` of shape (1, size)."""
+    """Pixel centers of a square image in [-1, 1]: ``y`` of shape (size, 1) and ``x`` of shape (1,
+    size).
+    """
     at = f32((np.arange(size) + 0.5) / size * 2.0 - 1.0)
     at.flags.writeable = False
     return at[:, None], at[None]
 
 
 def slopes(field: Array, step: float) -> tuple[Array, Array]:
-    """Derivatives of (n, n) along y and x for pixels of ``step``: central differences, one-sided at the edges."""
+    """Derivatives of (n, n) along y and x for pixels of ``step``: central differences, one-sided at
+    the edges.
+    """
     down, right = np.empty_like(field), np.empty_like(field)
     np.subtract(field[2:], field[:-2], out=down[1:-1])
     np.subtract(field[:, 2:], field[:, :-2], out=right[:, 1:-1])

@@ -1,8 +1,9 @@
-"""The photo: a view of 30 to 45 mm of the object around the contact, with all that has nothing to do with touch.
+"""The photo: a view of 30 to 45 mm of the object around the contact, with what is irrelevant to
+touch.
 
-An object is lit once a video (sun, ambient light, occlusion in its pits, gloss, stains) on its tile; a frame looks that tile up in perspective,
-adds the object's edge, a cast shadow, the hand with the sensor, blur and noise. The view is at most 45 mm wide (``view_mm``), whose diagonal is
-one tile, so that the 64 mm pattern does not show its repeat.
+An object is lit once a video (sun, ambient light, occlusion in its pits, gloss, stains) on its
+tile; a frame looks that tile up in perspective, adds the object's edge, a cast shadow, the hand
+with the sensor, blur and noise.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ from scipy import ndimage
 
 from palpate.sim.arrays import Array, blend, f32, grid, hsv, over, sample_periodic, smoothstep
 from palpate.sim.motion import State
-from palpate.sim.objects import Thing
+from palpate.sim.objects import WorldObject
 from palpate.sim.options import WorldOptions
 from palpate.sim.tile import TILE_MM
 
 
 @dataclass(frozen=True)
 class Stain:
-    """A spot on the object that shows but is not felt: place and radius in mm, aspect, angle, color, opacity."""
+    """A spot on the object that shows but is not felt: place and radius in mm, aspect, angle,
+    color, opacity.
+    """
 
     place: tuple[float, float]
     radius: float
@@ -38,7 +41,8 @@ class Camera:
 
     Attributes:
         view: width of the view in mm; turn, tilt: pose.
-        sun_to: unit vector towards the sun; sun, ambient: strengths; light: RGB of the light; exposure: error of the auto-exposure.
+        sun_to: unit vector towards the sun; sun, ambient: strengths; light: RGB of the light;
+            exposure: error of the auto-exposure.
         blur: deviation in pixels at 128 px; noise: deviation.
         hand: direction it enters from, or None; skin: its color.
         shadow: direction, offset and factor of a cast shadow, or None.
@@ -64,7 +68,9 @@ class Camera:
 
 @dataclass(frozen=True)
 class Scene:
-    """An object as this video's light shows it: ``tile`` of shape (n, n, 3), and the exposure that was used."""
+    """An object as this video's light shows it: ``tile`` of shape (n, n, 3), and the exposure that
+    was used.
+    """
 
     tile: Array
     px: float
@@ -127,8 +133,8 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
     )
 
 
-def _stains(options: WorldOptions, video: int, thing: int) -> list[Stain]:
-    rng = options.rng("stains", video, thing)
+def _stains(options: WorldOptions, video: int, number: int) -> list[Stain]:
+    rng = options.rng("stains", video, number)
     count = round((0, 0, 1, 2, 5)[int(rng.integers(5))] * 2.0 * options.hard * options.stains)
     return [
         Stain(
@@ -144,10 +150,12 @@ def _stains(options: WorldOptions, video: int, thing: int) -> list[Stain]:
 
 
 def light_object(
-    options: WorldOptions, camera: Camera, thing: Thing, video: int, number: int
+    options: WorldOptions, camera: Camera, body: WorldObject, video: int, number: int
 ) -> Scene:
-    """Lights the tile of ``thing`` (object ``number`` of the video) and filters it for the camera's pixel size."""
-    height, px, n = thing.surface.height, thing.px, options.tile
+    """Lights the tile of ``body`` (object ``number`` of the video) and filters it for the camera's
+    pixel size.
+    """
+    height, px, n = body.surface.height, body.px, options.tile
     softened = ndimage.gaussian_filter(height, 0.6, mode="wrap")
     slope_y = (np.roll(softened, -1, 0) - np.roll(softened, 1, 0)) * (0.5 / px)
     slope_x = (np.roll(softened, -1, 1) - np.roll(softened, 1, 1)) * (0.5 / px)
@@ -156,7 +164,7 @@ def light_object(
     direct = np.maximum((lz - slope_x * lx - slope_y * ly) * upright, 0.0)
     pit = height - ndimage.gaussian_filter(height, 1.2 / px, mode="wrap")
     open_sky = np.clip(1.0 + 0.55 * pit * (1.0 / (0.35 + float(height.std()))), 0.35, 1.25)
-    albedo, half = thing.surface.albedo, TILE_MM / 2.0
+    albedo, half = body.surface.albedo, TILE_MM / 2.0
     at = f32(np.arange(n) * px)
     for stain in _stains(options, video, number):
         dy = (at[:, None] - stain.place[0] + half) % TILE_MM - half
@@ -173,7 +181,7 @@ def light_object(
         np.maximum(((lz + 1.0) - slope_x * lx - slope_y * ly) * upright * (1.0 / norm), 0.0) ** 60
     )
     rgb = albedo * (camera.ambient * open_sky + camera.sun * direct)[..., None] * camera.light
-    rgb += (mirror * (thing.surface.gloss * 0.55 * camera.sun))[..., None]
+    rgb += (mirror * (body.surface.gloss * 0.55 * camera.sun))[..., None]
     exposure = (
         0.40 * camera.exposure / (0.12 + float(rgb.mean()))
     ) ** 0.75  # imperfect, so that dark things stay darker
@@ -185,9 +193,10 @@ def light_object(
 
 
 def photo(
-    options: WorldOptions, camera: Camera, scene: Scene, state: State, video: int, frame: int
+    options: WorldOptions, camera: Camera, scene: Scene, state: State, at: tuple[int, int]
 ) -> Array:
-    """The photo of one frame, shape (n, n, 3), about [0, 1]; depends on no other frame."""
+    """The photo at (video, frame), shape (n, n, 3), about [0, 1]; depends on no other frame."""
+    video, frame = at
     rng = options.rng("photo", video, frame)
     size = options.size
     y, x = grid(size)
@@ -236,7 +245,9 @@ def photo(
 
 
 def _hand(image: Array, camera: Camera, exposure: float, angle: float, tip: float) -> Array:
-    """Shadow, sensor and two fingers and a back of the hand, entering along ``angle`` up to ``tip`` half widths from the middle."""
+    """Shadow, sensor and two fingers and a back of the hand, entering along ``angle`` up to ``tip``
+    half widths from the middle.
+    """
     y, x = grid(image.shape[1])
     along, across = (
         math.cos(angle) * x + math.sin(angle) * y,

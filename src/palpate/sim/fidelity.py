@@ -1,16 +1,22 @@
-"""Statistics of touch images, the same for real and rendered ones: how far is a simulated GelSight from a real one?
+"""Statistics of tactile images, the same for real and rendered ones: how far is a simulated
+GelSight from a real one?
 
-All take images of shape (n, n, 3) in gray levels 0 .. 255 and a pad of 14 mm a side, the default of the world, so that a pixel is PAD_MM / n mm.
+All take images of shape (n, n, 3) in gray levels 0 .. 255 and a pad of 14 mm a side, the default of
+the world, so that a pixel is PAD_MM / n mm.
 
-- Markers: pixels whose luma is below 0.82 of the median luma in a window of a sixth of the side (of every
-  2nd pixel from 128 px on, and so forth), joined to blobs (8-neighbors).
-- Contrast: over the pixels without marker in either image, of d = contact - background: rms and 95 % of |d| a channel. Chroma share: with m the
-  mean of d over the channels, 1 - 3 sum(m²) / sum(d²): 0 if the color never changes, 1 if the brightness never does.
-- Spectrum: d with the markers filled from around them (normalized blur), less its mean, times a Hann window w; power |FFT(d w)|² / (n² sum w²)
-  summed over the rings of each band and averaged over the channels: by Parseval the bands add up to the windowed mean square of d,
-  so their roots are gray levels. The slope is that of the log ring power against the log frequency from 0.15 to 2 cycles/mm.
-- Contact area: share of the pad where the root mean square over the channels of d, blurred by 1/48 of the side, exceeds a threshold
-  that two frames without contact seldom exceed.
+- Markers: pixels whose luma is below 0.82 of the median luma in a window of a sixth of the side (of
+  every 2nd pixel from 128 px on, and so forth), joined to blobs (8-neighbors).
+- Contrast: over the pixels without marker in either image, of d = contact - background: rms and 95
+  % of |d| a channel. Chroma share: with m the mean of d over the channels, 1 - 3 sum(m²) / sum(d²):
+  0 if the color never changes, 1 if the brightness never does.
+- Spectrum: d with the markers filled from around them (normalized blur), less its mean, times a
+  Hann window w; power |FFT(d w)|² / (n² sum w²)
+  summed over the rings of each band and averaged over the channels: by Parseval the bands add up to
+      the windowed mean square of d,
+  so their roots are gray levels. The slope is that of the log ring power against the log frequency
+  from 0.15 to 2 cycles/mm.
+- Contact area: share of the pad where the root mean square over the channels of d, blurred by 1/48
+  of the side, exceeds a threshold that two frames without contact seldom exceed.
 """
 
 from __future__ import annotations
@@ -24,12 +30,15 @@ from palpate.sim.arrays import Array, f32, resample
 
 #: Side of the pad in mm.
 PAD_MM = 14.0
-#: Edges of the bands of the spectrum in cycles/mm; a band above the Nyquist frequency n / (2 PAD_MM) is empty.
+#: Edges of the bands of the spectrum in cycles/mm; a band above the Nyquist frequency n / (2
+#: PAD_MM) is empty.
 BANDS: tuple[float, ...] = (0.05, 0.2, 0.5, 1.0, 2.2)
 
 
 def to_size(image: np.ndarray, size: int) -> Array:
-    """A square image (n, n, 3) as float32 (size, size, 3), each pixel the mean over the area it covers."""
+    """A square image (n, n, 3) as float32 (size, size, 3), each pixel the mean over the area it
+    covers.
+    """
     return resample(f32(image), size)
 
 
@@ -78,7 +87,9 @@ def difference(contact: np.ndarray, background: np.ndarray) -> tuple[Array, np.n
 
 
 def contrast(contact: np.ndarray, background: np.ndarray) -> dict[str, float]:
-    """``rms_r/g/b``, ``p95_r/g/b`` in gray levels, ``rms`` over the channels, and ``chroma``, the share of the squared difference."""
+    """``rms_r/g/b``, ``p95_r/g/b`` in gray levels, ``rms`` over the channels, and ``chroma``, the
+    share of the squared difference.
+    """
     d, keep = difference(contact, background)
     d = d[keep].astype(np.float64)
     rms, high = np.sqrt((d * d).mean(0)), np.percentile(np.abs(d), 95, axis=0)
@@ -104,7 +115,9 @@ def fill(d: Array, keep: np.ndarray) -> Array:
 
 
 def spectrum(contact: np.ndarray, background: np.ndarray) -> dict[str, float]:
-    """Root band powers ``band_0``.. in gray levels, and the log-log ``slope`` of the power density."""
+    """Root band powers ``band_0``.. in gray levels, and the log-log ``slope`` of the power
+    density.
+    """
     d, keep = difference(contact, background)
     n = d.shape[0]
     window = np.hanning(n + 2)[1:-1]
@@ -128,7 +141,9 @@ def spectrum(contact: np.ndarray, background: np.ndarray) -> dict[str, float]:
 
 
 def change(contact: np.ndarray, background: np.ndarray) -> Array:
-    """Root mean square over the channels of the blurred difference, markers filled, in gray levels, (n, n)."""
+    """Root mean square over the channels of the blurred difference, markers filled, in gray levels,
+    (n, n).
+    """
     d, keep = difference(contact, background)
     sigma = d.shape[0] / 48
     return np.sqrt((ndimage.gaussian_filter(fill(d, keep), (sigma, sigma, 0)) ** 2).mean(2))
@@ -140,9 +155,11 @@ def contact_area(contact: np.ndarray, background: np.ndarray, threshold: float) 
 
 
 def noise_level(image: np.ndarray) -> float:
-    """Deviation of what a blur of one pixel removes from the luma, markers left out, in gray levels: 1.4826 times the median of its size.
+    """Deviation of what a blur of one pixel removes from the luma, markers left out, in gray
+    levels: 1.4826 times the median of its size.
 
-    Independent noise of deviation s in each channel gives 0.58 s: 0.67 s in the luma, of which the blur leaves out 0.87.
+    Independent noise of deviation s in each channel gives 0.58 s: 0.67 s in the luma, of which the
+        blur leaves out 0.87.
     """
     gray = luma(image)
     keep = ~np.asarray(ndimage.binary_dilation(marker_mask(image), iterations=3), bool)

@@ -1,17 +1,25 @@
-"""The touch sensor: a gel pad (14 mm by default), pressed with a given force, lit by three colored lights, with or without markers.
+"""The tactile sensor: a gel pad, pressed with a given force, lit by three colored lights, with or
+without markers.
 
-- Press: a Winkler foundation. The gap between relief and gel dome is g; the approach d is solved exactly from
-  mean(max(g + d, 0)) = load (sort g, then the k largest values touch for the k at which d_k = (N load - sum of k) / k is consistent).
-- Membrane: penetration p = max(g + d, 0), held h = G tanh(p / G) for a gel of depth G, grip w = p / (p + :data:`GRIP_MM`). From m = h, each blur of
-  ``relax_mm`` gives m <- S m + w (h - S m): the gel follows what presses hard, and bridges the hollows and the rim where it is hardly
-  touched, so that a contact ends softly. The blur ``optical_mm`` follows.
-- Light: with n the normal of m + texture, I = ((ambient + sum_k color_k F_k(x, y) max(0, n . l_k)) V (1 - q m) (1 - 0.96 ink) gain)^gamma. Near
-  field F_k = 1 + a + 0.35 a² - hump_k r², a = fall_k (x, y) . azimuth_k, in units of half the pad; V = vignette times dirt; q, a unit's own
-  sign, dims or brightens what is indented, as pressing a real pad does. The background image is the same formula with m = 0.
-- Markers: a jittered grid of small squarish dots of ink, large round ones where they are worn, and dust; they move with the gel.
-- Everything of a unit is drawn on 256 x 256 points and averaged down, so that a unit looks the same at every image size.
+- Press: a Winkler foundation. The gap between relief and gel dome is g; the approach d is solved
+  exactly from mean(max(g + d, 0)) = load (sort g, then the k largest values touch for the k at
+  which d_k = (N load - sum of k) / k is consistent).
+- Membrane: penetration p = max(g + d, 0), limited to h = G tanh(p / G) for a gel of depth G, grip
+  w = p / (p + :data:`GRIP_MM`). From m = h, each blur of ``relax_mm`` gives m <- S m + w (h - S m):
+  the gel follows what presses hard, and bridges the hollows and the rim, so that a contact ends
+  softly. ``optical_mm`` follows.
+- Light: with n the normal of m + texture,
+  I = ((ambient + sum_k color_k F_k(x, y) max(0, n . l_k)) V (1 - q m) (1 - 0.96 ink) gain)^gamma.
+  Near field F_k = 1 + a + 0.35 a² - hump_k r², a = fall_k (x, y) . azimuth_k, in units of half the
+  pad; V = vignette times dirt; q, of either sign, dims or brightens what is indented. The
+  background is the same formula with m = 0.
+- Markers: a jittered grid of small squarish dots of ink, large round ones where they are worn, and
+  dust; they move with the gel.
+- A unit is drawn on 256 x 256 points and averaged down, so that it looks the same at every image
+  size.
 
-The numbers of the look ``gelsight`` are fitted to the real clips, see ``benchmarks/world_fidelity.py``.
+The numbers of the look ``gelsight`` are fitted to the real clips, see
+``benchmarks/world_fidelity.py``.
 """
 
 from __future__ import annotations
@@ -34,12 +42,13 @@ from palpate.sim.arrays import (
     smooth,
     smoothstep,
 )
-from palpate.sim.objects import Thing
+from palpate.sim.objects import WorldObject
 from palpate.sim.options import VERSION, WorldOptions
 
 #: Points a side that a unit is drawn on.
 DRAWN = 256
-#: Penetration in mm at which the gel follows the object half the way; below it, it bridges the hollows instead.
+#: Penetration in mm at which the gel follows the object half the way; below it, it bridges the
+#: hollows instead.
 GRIP_MM = 0.04
 #: The lights are green, blue and red.
 _PURE = np.eye(3)[[1, 2, 0]]
@@ -47,12 +56,16 @@ _PURE = np.eye(3)[[1, 2, 0]]
 
 @dataclass(frozen=True)
 class _Look:
-    """The optics that a family of units has in common; a tuple has one value a light: green, blue, red.
+    """The optics that a family of units has in common; a tuple has one value a light: green, blue,
+    red.
 
     Attributes:
-        azimuth: of the lights in radians, x to the right and y down; elevation: range of theirs in degrees.
-        mixed: share of white in each light; gain: brightness; fall: near-field slope; hump: loss of the light away from the middle.
-        ambient: light without direction, RGB; spread: deviation of the logarithms of mixed, gain, fall and ambient between units.
+        azimuth: of the lights in radians, x to the right and y down; elevation: range of theirs in
+            degrees.
+        mixed: share of white in each light; gain: brightness; fall: near-field slope; hump: loss of
+            the light away from the middle.
+        ambient: light without direction, RGB; spread: deviation of the logarithms of mixed, gain,
+            fall and ambient between units.
     """
 
     azimuth: tuple[float, float, float]
@@ -66,7 +79,8 @@ class _Look:
 
 
 _LOOKS = {
-    "gelsight": _Look(  # gray-pink and bright, faint lobes: teal at the top left, violet at the lower left, red on the right
+    # Gray-pink and bright, faint lobes: teal top left, violet lower left, red on the right.
+    "gelsight": _Look(
         azimuth=(-2.2, 2.4, 0.25),
         elevation=(26.0, 33.0),
         mixed=0.12,
@@ -76,7 +90,8 @@ _LOOKS = {
         ambient=(0.295, 0.325, 0.31),
         spread=(0.12, 0.03, 0.15, 0.02),
     ),
-    "digit": _Look(  # darker, three strong lobes
+    # Darker, three strong lobes.
+    "digit": _Look(
         azimuth=(-2.25, 1.94, -0.16),
         elevation=(30.0, 40.0),
         mixed=0.13,
@@ -95,10 +110,13 @@ class Sensor:
 
     Attributes:
         look, unit, size: which it is; pad: its side in mm; px: pixel size in mm.
-        field: near-field factor of each light, shape (3, n, n); color: their RGB, (3, 3); light: unit vectors towards them, (3, 3).
-        ambient: RGB, (3,); veil: vignette times dirt, (n, n); texture, dome: gel relief in mm, (n, n).
+        field: near-field factor of each light, shape (3, n, n); color: their RGB, (3, 3); light:
+            unit vectors towards them, (3, 3).
+        ambient: RGB, (3,); veil: vignette times dirt, (n, n); texture, dome: gel relief in mm, (n,
+            n).
         ink: opacity of the markers in [0, 1], (n, n), or None without markers.
-        dim: loss of light for each mm of indentation; gel: depth that can be indented, in mm; relax, optical: blurs in mm.
+        dim: loss of light for each mm of indentation; gel: depth that can be indented, in mm;
+            relax, optical: blurs in mm.
         gamma, noise: tone exponent, and deviation of the image noise.
     """
 
@@ -124,17 +142,19 @@ class Sensor:
 
 
 def make_sensor(options: WorldOptions, unit: int) -> Sensor:
-    """A unit of the family ``options.look``; the family is the same product in every world, the unit depends on the seed."""
+    """A unit of the family ``options.look``; the family is the same product in every world, the
+    unit depends on the seed.
+    """
     return _make(
         WorldOptions(
-            materials=options.materials, **{name: getattr(options, name) for name in _ASKED}
+            materials=options.materials, **{name: getattr(options, name) for name in _UNIT_OPTIONS}
         ),
         unit,
     )
 
 
 #: The options that a unit depends on.
-_ASKED = (
+_UNIT_OPTIONS = (
     "look",
     "seed",
     "size",
@@ -212,7 +232,9 @@ def _make(options: WorldOptions, unit: int) -> Sensor:
 
 
 def _dirt(rng: np.random.Generator) -> Array:
-    """Uneven coating, specks and scratches as a change of brightness around 0, on the drawn grid."""
+    """Uneven coating, specks and scratches as a change of brightness around 0, on the drawn
+    grid.
+    """
     y, x = grid(DRAWN)
     low = ndimage.gaussian_filter(
         rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), DRAWN / 7, mode="reflect"
@@ -237,10 +259,12 @@ def _dirt(rng: np.random.Generator) -> Array:
 
 
 def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
-    """Opacity of the ink, on the drawn grid: a jittered grid of small squarish dots, the worn ones among them large and round; dust.
+    """Opacity of the ink, on the drawn grid: a jittered grid of small squarish dots, the worn ones
+    among them large and round; dust.
 
-    The grid has a pitch of 0.96 pad / rows and begins anywhere, so that a unit shows ``rows`` or one more a side. A small dot has a radius of
-    0.2 mm at the pitch of 8 rows on 14 mm and shrinks with a finer pitch.
+    The grid has a pitch of 0.96 pad / rows and begins anywhere, so that a unit shows ``rows`` or
+    one more a side. A small dot has a radius of 0.2 mm at the pitch of 8 rows on 14 mm and shrinks
+    with a finer pitch.
     """
     ink = np.zeros((DRAWN, DRAWN), np.float32)
     step, mm = 2.0 * 0.96 / rows, 2.0 / pad
@@ -257,30 +281,28 @@ def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
                 -((cx - wear_x) ** 2 + (cy - wear_y) ** 2) / (2.0 * wear * wear)
             )
             radius = (rng.uniform(0.26, 0.40) if worn else rng.uniform(0.16, 0.215)) * scale
-            _dot(
-                ink,
-                (cy, cx),
-                radius,
-                rng.uniform(0.85, 1.2),
-                rng.uniform(0.93, 1.0),
-                2.0 if worn else 4.0,
-            )
+            aspect, dark = rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.0)
+            _dot(ink, (cy, cx), radius, aspect=aspect, dark=dark, power=2.0 if worn else 4.0)
     for _ in range(int(rng.integers(0, 14))):
-        _dot(
-            ink,
-            (rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0)),
-            rng.uniform(0.03, 0.09) * mm,
-            rng.uniform(0.6, 1.6),
-            rng.uniform(0.4, 0.9),
-            2.0,
-        )
+        place = (rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0))
+        radius = rng.uniform(0.03, 0.09) * mm
+        aspect, dark = rng.uniform(0.6, 1.6), rng.uniform(0.4, 0.9)
+        _dot(ink, place, radius, aspect=aspect, dark=dark, power=2.0)
     return ink
 
 
 def _dot(
-    ink: Array, place: tuple[float, float], radius: float, aspect: float, dark: float, power: float
+    ink: Array,
+    place: tuple[float, float],
+    radius: float,
+    *,
+    aspect: float,
+    dark: float,
+    power: float,
 ) -> None:
-    """Draws one dot (|x|^power + |y|^power < radius^power) of opacity ``dark`` at ``place`` (y, x) in [-1, 1]."""
+    """Draws one dot (|x|^power + |y|^power < radius^power) of opacity ``dark`` at ``place`` (y, x)
+    in [-1, 1].
+    """
     y, x = grid(DRAWN)
     reach = 1.3 * radius + 0.02
     (top, bottom), (left, right) = (
@@ -300,7 +322,8 @@ def _dot(
 def solve_approach(gap: Array, load: float) -> float:
     """The d for which mean(max(gap + d, 0)) equals ``load`` (> 0), in mm.
 
-    With the gaps sorted downwards and their running sums S_k, the k largest touch if d_k = (N load - S_k) / k lifts gap k but not gap k + 1.
+    With the gaps sorted downwards and their running sums S_k, the k largest touch if d_k = (N load
+    - S_k) / k lifts gap k but not gap k + 1.
     """
     ordered = np.sort(gap, axis=None)[::-1].astype(np.float64)
     d = (load * ordered.size - np.cumsum(ordered)) / np.arange(1, ordered.size + 1)
@@ -309,18 +332,20 @@ def solve_approach(gap: Array, load: float) -> float:
 
 
 def gap_of(
-    thing: Thing, sensor: Sensor, relief: Array, load: float, tilt: tuple[float, float]
+    body: WorldObject, sensor: Sensor, relief: Array, load: float, tilt: tuple[float, float]
 ) -> Array:
-    """Relief of the object minus the gel's dome, tilted and curved, in mm, shape (n, n); soft objects flatten under the load."""
+    """Relief of the object minus the gel's dome, tilted and curved, in mm, shape (n, n); soft
+    objects flatten under the load.
+    """
     y, x = grid(sensor.size)
     half = sensor.pad / 2.0
-    if thing.surface.softness:
-        relief = relief * (1.0 - 0.5 * thing.surface.softness * min(1.0, load / 0.3))
+    if body.surface.softness:
+        relief = relief * (1.0 - 0.5 * body.surface.softness * min(1.0, load / 0.3))
     return (
         relief
         - sensor.dome
         - (x * (half * tilt[0]) + y * (half * tilt[1]))
-        - x * x * (thing.curvature / 2.0 * half * half)
+        - x * x * (body.curvature / 2.0 * half * half)
     )
 
 
@@ -345,7 +370,9 @@ def press(sensor: Sensor, gap: Array, load: float) -> tuple[Array, Array]:
 def marker_shift(
     sensor: Sensor, membrane: Array, shear: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """Displacement (dy, dx) of the markers in pixels: dragged by ``shear`` (mm per mm of depth), pushed apart where the gel is deep."""
+    """Displacement (dy, dx) of the markers in pixels: dragged by ``shear`` (mm per mm of depth),
+    pushed apart where the gel is deep.
+    """
     depth = smooth(np.minimum(membrane, 1.0), sensor.size / 10)
     slope_y, slope_x = slopes(depth, sensor.px)
     unit = 1.0 / sensor.px

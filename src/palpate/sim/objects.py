@@ -1,4 +1,4 @@
-"""Objects: one drawn piece of a material, with the curve of the thing it covers."""
+"""Objects: one drawn piece of a material, with the curvature of the body that it covers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from palpate.sim.tile import TILE_MM
 
 
 @dataclass(frozen=True)
-class Thing:
+class WorldObject:
     """An object that can be seen and touched.
 
     Attributes:
         ref: its name.
         surface: relief, albedo, gloss, softness and words.
         px: pixel size of the tile in mm.
-        curvature: 1 / radius in 1/mm along x of the touch, positive for a bulge; 0 for flat.
+        curvature: 1 / radius in 1/mm along x of the pad, positive for a bulge; 0 for flat.
     """
 
     ref: ObjectRef
@@ -32,29 +32,25 @@ class Thing:
     curvature: float
 
 
-def make_object(options: WorldOptions, ref: ObjectRef) -> Thing:
-    """The object of that name; depends on the seed, the name, the tile size and how objects are curved, on nothing else.
+def make_object(options: WorldOptions, ref: ObjectRef) -> WorldObject:
+    """The object of that name; depends on the seed, the name, the tile size and how objects are
+    curved alone.
 
     Raises:
         PalpateError: if the material draws something invalid.
     """
-    return _make(
-        options.seed, ref, MATERIALS[ref.material], options.tile, options.curved, options.radius_mm
-    )
+    shape = (options.tile, options.curved, options.radius_mm)
+    return _make(options.seed, ref, MATERIALS[ref.material], shape)
 
 
 @lru_cache(maxsize=6)
 def _make(
-    seed: int,
-    ref: ObjectRef,
-    material: Material,
-    tile: int,
-    curved: float,
-    radius_mm: tuple[float, float],
-) -> Thing:
+    seed: int, ref: ObjectRef, material: Material, shape: tuple[int, float, tuple[float, float]]
+) -> WorldObject:
+    tile, curved, (smallest, largest) = shape
     rng: np.random.Generator = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
     surface = draw_surface(ref.material, material, tile, rng)
     flat = rng.random() >= curved
     bulge = 1.0 if rng.random() < 0.5 else -0.3
-    radius = math.exp(rng.uniform(math.log(radius_mm[0]), math.log(radius_mm[1])))
-    return Thing(ref, surface, TILE_MM / tile, 0.0 if flat else bulge / radius)
+    radius = math.exp(rng.uniform(math.log(smallest), math.log(largest)))
+    return WorldObject(ref, surface, TILE_MM / tile, 0.0 if flat else bulge / radius)

@@ -1,212 +1,237 @@
-"""What a world is made of: the options, checked against :mod:`palpate.sim.ranges` and against each other."""
+# ruff: noqa: RUF009 - the calls below are dataclasses.field with metadata
+"""What a world is made of: every option with its range and meaning, checked once.
+
+Lengths are in mm, angles in degrees. Materials live on a periodic tile of 64 mm; a view of w mm
+turned by 45 degrees is w sqrt(2) wide, so views are at most 64 / sqrt(2) = 45.25 mm wide and never
+show the repeat.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from palpate.core import PalpateError, Problem, ProblemsError, digest_json, rng_for
-from palpate.sim.materials import MATERIALS
-from palpate.sim.materials.entries import bad_entries
-from palpate.sim.ranges import (
-    BACKGROUND_OFFSET,
-    CHOICES,
-    PAIRS,
-    RANGES,
-    SERIES,
-    out_of_range,
-    shown,
-)
+from palpate.core import PalpateError, Problem, ProblemsError, digest_json, read_json, rng_for
+from palpate.sim.materials import MATERIALS, check_material
 
-__all__ = ["BACKGROUND_OFFSET", "CHOICES", "PAIRS", "RANGES", "SERIES", "VERSION", "WorldOptions"]
-
-#: Raised at every change of the pictures, texts or lists; enters every random draw and the digest.
+#: Raised at every change of the images, texts or lists; enters every random draw and the digest.
 VERSION = 2
+WORLD_FORMAT = "palpate-world/3"
+#: Format 2 called contacts touches; its options are read.
+WORLD_FORMAT_2 = "palpate-world/2"
+#: The background of a contact is the frame this many before its first.
+BACKGROUND_OFFSET = 4
 Span = tuple[float, float]
+#: Names and values of format 2, over which the digests of VERSION 2 are taken.
+_FORMAT_2 = {"contacts_per_video": "touches_per_video", "frames_per_contact": "frames_per_touch"}
+
+
+def _number(default: float, low: float, high: float, meaning: str, group: str = "amounts") -> Any:
+    """A number in [low, high]; a whole one where ``low`` is an int."""
+    limits = {"kind": "number", "low": low, "high": high, "help": meaning, "group": group}
+    return field(default=default, metadata=limits)
+
+
+def _span(default: Span, low: float, high: float, meaning: str, group: str = "physics") -> Any:
+    """A range (low, high) that values are drawn from."""
+    limits = {"kind": "span", "low": low, "high": high, "help": meaning, "group": group}
+    return field(default=default, metadata=limits)
+
+
+def _series(
+    default: tuple[float, ...], low: float, high: float, meaning: str, group: str = "physics"
+) -> Any:
+    """Up to eight numbers in [low, high]."""
+    limits = {"kind": "series", "low": low, "high": high, "help": meaning, "group": group}
+    return field(default=default, metadata=limits)
+
+
+def _choice(default: str, choices: tuple[str, ...], meaning: str, group: str = "amounts") -> Any:
+    limits = {"kind": "choice", "choices": choices, "help": meaning, "group": group}
+    return field(default=default, metadata=limits)
 
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """Everything that decides a world; equal options give equal bytes. Ranges stand in :mod:`palpate.sim.ranges`.
+    """Everything that decides a world; equal options give equal bytes.
 
-    Attributes:
-        seed: worlds of different seeds share no object, video or text.
-        size: side of the square images in pixels, 16 to 256 (even for ``layout="videos"``).
-        materials: names of ``MATERIALS``, or how many of them, spread evenly over the table; becomes a tuple of names.
-        objects_per_material: objects of each material that have videos of their own (their mean if ``balance`` is not uniform).
-        balance: ``"uniform"``, or ``"touch-and-go"``: classes as unequal as in Touch and Go, see :mod:`palpate.sim.balance`.
-        videos_per_object: videos of each object.
-        two_videos: share of the objects that have one video more.
-        touches_per_video: contacts in a video.
-        frames_per_touch: frames in contact in each touch.
-        free_frames: frames without contact before each touch, at least 5, so that the first contact frame - 4 shows the passive sensor.
-        free_written: ``"all"`` writes them all; ``"background"`` only the one that the background rule needs (frame numbers stay).
-        objects_per_video: a mixed video touches 2 to this many objects of different materials (1: no video is mixed).
-        mixed: share of the videos that are mixed; their further objects appear in no other video.
-        sensors: gel units of the sensor family; each video uses one.
-        look: ``"gelsight"`` (markers, near-field colors) or ``"digit"`` (no markers, darker, stronger colors).
-        hard: 0 to 1, scales everything in the photos that is irrelevant to touch (stains, hand, edges, shadows, light, gain drift).
-        named: share of the captions that name the thing; the others say only how it feels.
-        leak: how the world's own train and test lists are cut: random ``"frame"``, random whole ``"contact"``, or by video (``"none"``).
-        test: share of the contact frames in the test list, nearly.
-        layout: ``"frames"`` (Touch and Go as JPEG files), ``"videos"`` (Touch and Go as H.264, needs PyAV), ``"hct"`` (HCT of TVL) or ``"raw"``
-            (uint8 arrays).
-        tile: pixels a side of an object's 64 mm tile; 256 fits 64 px images, 512 fits 128 px. Another tile is another object.
-        curved: share of the objects that are curved; radius_mm: range of their radius (as dents they are 3.3 times flatter).
-        pad_mm: side of the gel pad; gel_mm: depth to which it can be indented.
-        relax_mm: blurs of the free membrane, the contact re-imposed after each; optical_mm: blur of the sensor's optics.
-        dome_mm: range of the radius of a unit's domed gel.
-        markers: rows of printed markers a side on a ``"gelsight"`` pad, 0 for none; a ``"digit"`` never has any.
-        dirt: factor on uneven coating, specks and scratches; vignette: range of the darkening at half the pad's side.
-        sensor_noise: range of a unit's deviation of the image noise, of 1.
-        load_mm: range of the peak load of a touch, as mean indentation; drawn evenly in its logarithm.
-        revisit_mm: deviation of the places that a video touches around its first; jump: share of the touches that go far away instead.
-        slide_mm: deviations, one drawn a touch, of how far the sensor slides in contact.
-        tilt: deviation of the pad's slope; shear: deviation of the drag in mm per mm of depth.
-        view_mm: range of the width of the photo, drawn evenly in its logarithm; elevation_deg: range of the sun's height.
-        hand, shadow, edge: shares of the videos at ``hard=0.5`` with a hand, a cast shadow, the edge of the object in view.
-        stains: factor on the number of stains and stickers; sway: factor on the slow drift of the camera.
-        blur_px: deviations, one drawn a video, of the photo's blur in pixels at 128 px.
+    Every field has its range, its meaning and its group in its metadata, from which the command
+    line and the documentation are made.
 
     Raises:
-        PalpateError: if an option is out of range; :class:`~palpate.core.ProblemsError` if several are.
+        PalpateError: if an option is out of range; :class:`~palpate.core.ProblemsError` if several
+            are.
     """
 
-    seed: int = 0
-    size: int = 64
-    materials: tuple[str, ...] | int = 20
-    objects_per_material: int = 5
-    balance: Literal["uniform", "touch-and-go"] = "uniform"
-    videos_per_object: int = 1
-    two_videos: float = 0.0
-    touches_per_video: int = 4
-    frames_per_touch: int = 3
-    free_frames: int = 5
-    free_written: Literal["all", "background"] = "all"
-    objects_per_video: int = 3
-    mixed: float = 0.12
-    sensors: int = 3
-    look: Literal["gelsight", "digit"] = "gelsight"
-    hard: float = 0.5
-    named: float = 0.5
-    leak: Literal["frame", "contact", "none"] = "contact"
-    test: float = 0.25
-    layout: Literal["frames", "videos", "hct", "raw"] = "frames"
-    tile: int = 256
-    curved: float = 0.4
-    radius_mm: Span = (25.0, 90.0)
-    pad_mm: float = 14.0
-    gel_mm: float = 1.6
-    relax_mm: tuple[float, ...] = (2.4, 0.9, 0.35)
-    optical_mm: float = 0.14
-    dome_mm: Span = (30.0, 80.0)
-    markers: int = 8
-    dirt: float = 1.0
-    vignette: Span = (0.03, 0.16)
-    sensor_noise: Span = (0.002, 0.006)
-    load_mm: Span = (0.09, 0.42)
-    revisit_mm: float = 3.5
-    jump: float = 0.25
-    slide_mm: tuple[float, ...] = (0.0, 1.5, 5.0)
-    tilt: float = 0.045
-    shear: float = 0.7
-    view_mm: Span = (30.0, 45.0)
-    elevation_deg: Span = (18.0, 75.0)
-    hand: float = 0.6
-    shadow: float = 0.5
-    edge: float = 0.35
-    stains: float = 1.0
-    sway: float = 1.0
-    blur_px: tuple[float, ...] = (0.35, 0.6, 1.1)
+    seed: int = _number(
+        0, 0, 2**31 - 1, "worlds of different seeds share no object, video or text", "world"
+    )
+    size: int = _number(
+        64, 16, 256, "side of the images in pixels; even for layout videos", "world"
+    )
+    materials: tuple[str, ...] | int = field(
+        default=20,
+        metadata={
+            "kind": "materials",
+            "help": "names of materials, or how many, spread over the table",
+            "group": "world",
+        },
+    )
+    look: Literal["gelsight", "digit"] = _choice(
+        "gelsight",
+        ("gelsight", "digit"),
+        "sensor family: with markers, or darker and without",
+        "world",
+    )
+    leak: Literal["frame", "contact", "none"] = _choice(
+        "contact",
+        ("frame", "contact", "none"),
+        "how train and test lists are cut: by random frame, random whole contact, or video",
+        "world",
+    )
+    layout: Literal["frames", "videos", "hct"] = _choice(
+        "frames",
+        ("frames", "videos", "hct"),
+        "Touch and Go as JPEG frames or as H.264 videos, or HCT",
+        "world",
+    )
+    test: float = _number(0.25, 0.01, 0.99, "share of the contact frames in the test list", "world")
+    tile: int = _number(
+        256,
+        64,
+        1024,
+        "pixels a side of an object's 64 mm: 256 fits 64 px images, 512 fits 128 px",
+        "world",
+    )
+    objects_per_material: int = _number(5, 1, 10_000, "objects of each material that have videos")
+    balance: Literal["uniform", "touch-and-go"] = _choice(
+        "uniform",
+        ("uniform", "touch-and-go"),
+        "equal classes, or classes as unequal as in Touch and Go",
+    )
+    videos_per_object: int = _number(1, 1, 100, "videos of each object")
+    two_videos: float = _number(0.0, 0.0, 1.0, "share of the objects with one video more")
+    contacts_per_video: int = _number(4, 1, 100, "contacts in a video")
+    frames_per_contact: int = _number(3, 1, 200, "frames of a contact")
+    free_frames: int = _number(
+        5, BACKGROUND_OFFSET + 1, 200, "frames without contact before each contact"
+    )
+    free_written: Literal["all", "background"] = _choice(
+        "all",
+        ("all", "background"),
+        "write all frames without contact, or only those that show the background",
+    )
+    objects_per_video: int = _number(3, 1, 14, "a mixed video touches 2 to this many objects")
+    mixed: float = _number(0.12, 0.0, 1.0, "share of the videos that touch several objects")
+    sensors: int = _number(3, 1, 100, "gel units; each video uses one")
+    named: float = _number(
+        0.5, 0.0, 1.0, "share of the captions that name the material; others say how it feels"
+    )
+    curved: float = _number(0.4, 0.0, 1.0, "share of the objects that are curved", "physics")
+    radius_mm: Span = _span(
+        (25.0, 90.0), 5.0, 1000.0, "range of their radius (as dents 3.3 times flatter)"
+    )
+    pad_mm: float = _number(
+        14.0, 5.0, 30.0, "side of the gel pad; at most the lower end of view_mm", "physics"
+    )
+    gel_mm: float = _number(
+        1.6, 0.5, 10.0, "depth of the gel; at least the upper end of load_mm", "physics"
+    )
+    relax_mm: tuple[float, ...] = _series(
+        (2.4, 0.9, 0.35),
+        0.01,
+        10.0,
+        "blurs of the free membrane, the contact imposed again after each",
+    )
+    optical_mm: float = _number(0.14, 0.0, 2.0, "blur of the sensor's optics", "physics")
+    dome_mm: Span = _span((30.0, 80.0), 10.0, 1000.0, "range of the radius of a unit's domed gel")
+    markers: int = _number(
+        8, 0, 40, "rows of markers a side of a gelsight pad; 0 for none", "physics"
+    )
+    dirt: float = _number(
+        1.0, 0.0, 10.0, "factor on uneven coating, specks and scratches", "physics"
+    )
+    vignette: Span = _span((0.03, 0.16), 0.0, 0.9, "range of the darkening at half the pad's side")
+    sensor_noise: Span = _span(
+        (0.002, 0.006), 0.0, 0.2, "range of a unit's image noise (deviation, of 1)"
+    )
+    load_mm: Span = _span(
+        (0.09, 0.42), 0.005, 1.5, "range of a contact's peak load as mean indentation, log-uniform"
+    )
+    revisit_mm: float = _number(
+        3.5, 0.0, 32.0, "deviation of the places that a video touches around its first", "physics"
+    )
+    jump: float = _number(
+        0.25, 0.0, 1.0, "share of the contacts that go far away instead", "physics"
+    )
+    slide_mm: tuple[float, ...] = _series(
+        (0.0, 1.5, 5.0),
+        0.0,
+        32.0,
+        "deviations, one drawn per contact, of how far the sensor slides",
+    )
+    tilt: float = _number(0.045, 0.0, 0.5, "deviation of the pad's slope", "physics")
+    shear: float = _number(0.7, 0.0, 5.0, "deviation of the drag in mm per mm of depth", "physics")
+    hard: float = _number(
+        0.5, 0.0, 1.0, "factor on all in the photos that is irrelevant to contact", "photos"
+    )
+    view_mm: Span = _span(
+        (30.0, 45.0), 15.0, 45.25, "range of the width of the photo, log-uniform", "photos"
+    )
+    elevation_deg: Span = _span((18.0, 75.0), 1.0, 89.0, "range of the sun's height", "photos")
+    hand: float = _number(
+        0.6, 0.0, 1.0, "share of the videos with a hand in view, at hard 0.5", "photos"
+    )
+    shadow: float = _number(0.5, 0.0, 1.0, "share with a cast shadow, at hard 0.5", "photos")
+    edge: float = _number(
+        0.35, 0.0, 1.0, "share with the edge of the object in view, at hard 0.5", "photos"
+    )
+    stains: float = _number(1.0, 0.0, 10.0, "factor on the number of stains and stickers", "photos")
+    sway: float = _number(1.0, 0.0, 10.0, "factor on the slow drift of the camera", "photos")
+    blur_px: tuple[float, ...] = _series(
+        (0.35, 0.6, 1.1),
+        0.0,
+        5.0,
+        "deviations, one drawn per video, of the blur in pixels at 128 px",
+        "photos",
+    )
 
     def __post_init__(self) -> None:
-        for name in ("materials", *PAIRS, *SERIES):
-            if isinstance(getattr(self, name), list):  # as JSON gives them
-                object.__setattr__(self, name, tuple(getattr(self, name)))
-        for name in (*PAIRS, *SERIES):
-            if isinstance(
-                value := getattr(self, name), tuple
-            ):  # 26 and 26.0 are one option, with one digest
-                object.__setattr__(self, name, tuple(map(_real, value)))
-        for name, (low, _) in RANGES.items():
-            if isinstance(low, float) and type(value := getattr(self, name)) is int:
-                object.__setattr__(self, name, _real(value))
-        found = [*out_of_range({f.name: getattr(self, f.name) for f in dataclasses.fields(self)})]
-        found += self._materials()
-        found += [] if found else self._inconsistent()
-        if len(found) == 1:
-            raise found[0]
-        if found:
-            problems = [Problem("WorldOptions", "bad-option", str(e)) for e in found]
-            raise ProblemsError(
-                problems,
-                str(found[0]),
-                "Every option of the world must lie in its range and fit the others",
-            )
-
-    def _materials(self) -> list[PalpateError]:
-        """Turns a count into names; what is wrong with the names."""
-        if isinstance(self.materials, int):
-            count = self.materials
-            if isinstance(count, bool) or not 1 <= count <= len(MATERIALS):
-                must = f"materials must be 1 to {len(MATERIALS)}"
-                return [PalpateError(must, shown(count), "Pass a smaller count, or names")]
-            names = list(MATERIALS)
-            object.__setattr__(
-                self, "materials", tuple(names[k * len(names) // count] for k in range(count))
-            )
-            return [*bad_entries(self.names)]
-        if not isinstance(self.materials, tuple) or not all(
-            isinstance(name, str) for name in self.materials
-        ):
-            return [
-                PalpateError(
-                    "materials must be names or a count",
-                    shown(self.materials),
-                    "Pass e.g. materials=('Wood', 'Grass')",
-                )
-            ]
-        return _unknown_materials(self.materials) or [*bad_entries(self.materials)]
+        for option in dataclasses.fields(self):
+            object.__setattr__(self, option.name, _normal(getattr(self, option.name), option))
+        errors = [e for f in dataclasses.fields(self) for e in _check(f, getattr(self, f.name))]
+        errors += [] if errors else self._inconsistent()
+        if len(errors) == 1:
+            raise errors[0]
+        if errors:
+            problems = [Problem("WorldOptions", "bad-option", str(e)) for e in errors]
+            must = "Every option of the world must lie in its range and fit the others"
+            raise ProblemsError(problems, "Correct them", must)
 
     def _inconsistent(self) -> Iterator[PalpateError]:
-        """What is wrong between options that are each in range."""
+        """Yield the errors between options that are each in range."""
         if self.layout == "videos" and self.size % 2:
-            yield PalpateError(
-                "size must be even for layout='videos'",
-                str(self.size),
-                f"Pass size={self.size + 1}",
-            )
+            must, fix = "must be even for the layout videos", "Choose an even size"
+            yield _error("size", must, self.size, fix, self.size + 1)
         if self.layout == "videos" and self.free_written != "all":
-            yield PalpateError(
-                "layout='videos' must write all free frames",
-                "free_written='background'",
-                "Leave free_written out",
-            )
+            must, fix = "must be 'all' for the layout videos", "A video holds every frame"
+            yield _error("free_written", must, self.free_written, fix)
         if self.load_mm[1] > self.gel_mm:
-            got = f"load_mm up to {self.load_mm[1]:g}, gel_mm {self.gel_mm:g}"
-            yield PalpateError(
-                "load_mm must not exceed gel_mm",
-                got,
-                f"Pass load_mm=({min(self.load_mm[0], self.gel_mm):g}, {self.gel_mm:g})",
-            )
+            fix = "Choose a smaller load or a deeper gel"
+            yield _error("load_mm", f"must not exceed the gel, {self.gel_mm:g}", self.load_mm, fix)
         if self.pad_mm > self.view_mm[0]:
-            got = f"pad_mm {self.pad_mm:g}, view_mm from {self.view_mm[0]:g}"
-            yield PalpateError(
-                "the pad must lie in the photo: pad_mm must not exceed the lower end of view_mm",
-                got,
-                "Pass a smaller pad_mm",
-            )
+            must = f"must not exceed the lower end of view_mm, {self.view_mm[0]:g}"
+            yield _error("pad_mm", must, self.pad_mm, "The pad must lie in the photo")
         if self.balance != "uniform" and self.objects_per_material < 2:
-            yield PalpateError(
-                f"balance={self.balance!r} must have 2 objects a material or more",
-                "1",
-                "Pass objects_per_material=2 or more",
-            )
+            must = f"must be 2 or more for balance {self.balance!r}"
+            yield _error("objects_per_material", must, self.objects_per_material, "", 2)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -215,52 +240,142 @@ class WorldOptions:
 
     @property
     def video_length(self) -> int:
-        """Frames of a video, the unwritten ones included."""
-        return self.touches_per_video * (self.free_frames + self.frames_per_touch)
+        """Frames of a video, including those that are not written."""
+        return self.contacts_per_video * (self.free_frames + self.frames_per_contact)
 
     @property
     def digest(self) -> str:
         """SHA-256 over the options and VERSION: names what the world will be."""
-        return digest_json({"version": VERSION, "options": dataclasses.asdict(self)})
+        return digest_json({"version": VERSION, "options": self.format_2()})
+
+    def format_2(self) -> dict[str, Any]:
+        """The options under the names of format 2, for digests that do not change with names."""
+        values = {_FORMAT_2.get(k, k): v for k, v in dataclasses.asdict(self).items()}
+        return values | {"leak": "touch" if self.leak == "contact" else self.leak}
 
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
-        """The generator for one purpose; depends on VERSION, the seed, the purpose and the ids alone."""
+        """A generator that depends on VERSION, the seed, the purpose and the ids alone."""
         return rng_for(self.seed, "world", VERSION, purpose, *ids)
 
 
-def _real(value: object) -> object:
-    """A whole number as a float if it can be one; anything else as it is."""
-    try:
-        return float(value) if type(value) is int else value
-    except OverflowError:
-        return value
+def _normal(value: Any, option: dataclasses.Field[Any]) -> Any:
+    """One form of every value: tuples for lists, floats for whole numbers, names for a count."""
+    kind, low = option.metadata["kind"], option.metadata.get("low")
+    if isinstance(value, list):
+        value = tuple(value)
+    if kind in ("span", "series") and isinstance(value, tuple):
+        return tuple(float(v) if type(v) is int else v for v in value)
+    if kind == "number" and isinstance(low, float) and type(value) is int:
+        return float(value)
+    if kind == "materials" and type(value) is int and 1 <= value <= len(MATERIALS):
+        names = list(MATERIALS)
+        return tuple(names[k * len(names) // value] for k in range(value))
+    return value
 
 
-def _unknown_materials(names: tuple[str, ...]) -> list[PalpateError]:
-    found: list[PalpateError] = []
-    if not names:
-        found.append(
-            PalpateError(
-                "materials must name at least one material",
-                "none",
-                "Pass e.g. materials=('Wood', 'Grass')",
-            )
-        )
+def _error(name: str, must: str, got: Any, fix: str, example: Any = None) -> PalpateError:
+    suggestion = {} if example is None else {name: example}
+    return PalpateError(must, repr(got)[:120], fix, argument=name, example=suggestion)
+
+
+def _check(option: dataclasses.Field[Any], value: Any) -> Iterator[PalpateError]:
+    """Yield what is wrong with one value."""
+    name, limits = option.name, option.metadata
+    kind, low, high = limits["kind"], limits.get("low"), limits.get("high")
+    if kind == "materials":
+        yield from _check_materials(value)
+    elif kind == "choice":
+        if value not in limits["choices"]:
+            must = f"must be one of {', '.join(map(repr, limits['choices']))}"
+            yield _error(name, must, value, "", limits["choices"][0])
+    elif kind == "number":
+        whole = isinstance(low, int)
+        if not _in_range(value, low, high, whole):
+            must = f"must be a {'whole ' * whole}number from {low:g} to {high:g}"
+            near = min(max(value, low), high) if _in_range(value, -math.inf, math.inf) else low
+            yield _error(name, must, value, "", round(near) if whole else near)
+    else:
+        pair = kind == "span"
+        numbers = isinstance(value, tuple) and all(_in_range(v, low, high) for v in value)
+        if not numbers or len(value) > 8 or (pair and len(value) != 2):
+            count = "two numbers" if pair else "up to eight numbers"
+            yield _error(name, f"must be {count} from {low:g} to {high:g}", value, "", (low, high))
+        elif pair and value[0] > value[1]:
+            must = "must have its lower end first"
+            yield _error(name, must, value, "", (value[1], value[0]))
+        elif not value and name != "relax_mm":
+            yield _error(name, "must hold a number", value, "", (low,))
+
+
+def _in_range(value: Any, low: float, high: float, whole: bool = False) -> bool:
+    kinds = int if whole else (int, float)
+    return isinstance(value, kinds) and not isinstance(value, bool) and low <= value <= high
+
+
+def _check_materials(names: Any) -> Iterator[PalpateError]:
+    known = f"Known: {', '.join(MATERIALS)}"
+    if not isinstance(names, tuple) or not names:
+        must = f"must be names, or a count from 1 to {len(MATERIALS)}"
+        yield _error("materials", must, names, known, ("Wood", "Grass"))
+        return
     if len(set(names)) < len(names):
-        found.append(
-            PalpateError(
-                "materials must name each material once",
-                repr(names),
-                "Leave out the repeated names",
-            )
+        yield _error(
+            "materials", "must name each material once", names, "Remove the repeated names"
         )
     for name in names:
         if name not in MATERIALS:
-            near = difflib.get_close_matches(name, MATERIALS, 1, 0.3)
-            fix = (
-                f"Did you mean {near[0]!r}? Known: {', '.join(MATERIALS)}"
-                if near
-                else f"Known: {', '.join(MATERIALS)}"
-            )
-            found.append(PalpateError("materials must be names of MATERIALS", repr(name), fix))
-    return found
+            near = difflib.get_close_matches(str(name), MATERIALS, 1, 0.3)
+            fix = f"Did you mean {near[0]!r}? {known}" if near else known
+            yield _error("materials", "must be names of materials", name, fix)
+        else:
+            yield from check_material(name)
+
+
+def load_options(path: str | Path) -> WorldOptions:
+    """Read the options of a world from its ``world.json`` or its folder.
+
+    Raises:
+        PalpateError: if the file is missing, is none of a world, is of another VERSION, or was
+            edited.
+        ProblemsError: if several options are out of range.
+    """
+    path = Path(path)
+    path = path / "world.json" if path.is_dir() else path
+    data = read_json(path, "file of a world's options")
+    options = read_world(data, str(path)).get("options")
+    if not isinstance(options, dict):
+        must = f"{path} must hold the options of a world"
+        raise PalpateError(must, "none", "Name the world.json of a finished world")
+    current = {old: new for new, old in _FORMAT_2.items()}
+    values: dict[str, Any] = {current.get(k, k): v for k, v in options.items()}
+    if values.get("leak") == "touch":
+        values["leak"] = "contact"
+    known = [f.name for f in dataclasses.fields(WorldOptions)]
+    for name in values:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            fix = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known)}"
+            raise PalpateError(f"The options in {path} must be those of a world", repr(name), fix)
+    world = WorldOptions(**values)
+    if data.get("options_digest", world.digest) != world.digest:
+        fix = "Pass changed options as arguments, or remove options_digest from a copy"
+        raise PalpateError(f"The digest in {path} must match its options", "edited options", fix)
+    return world
+
+
+def read_world(data: Any, where: str) -> Mapping[str, Any]:
+    """Check that JSON is the record of a world of this VERSION.
+
+    Raises:
+        PalpateError: if it is not. Equal options of another VERSION give other images.
+    """
+    fix = "Choose another folder, or remove it"
+    formats = (WORLD_FORMAT, WORLD_FORMAT_2)
+    if not isinstance(data, dict) or data.get("format") not in formats:
+        raise PalpateError(
+            f"{where} must be the record of a world ({WORLD_FORMAT})", "other JSON", fix
+        )
+    if data.get("version") != VERSION:
+        must = f"{where} must be of version {VERSION} of the world"
+        raise PalpateError(must, f"version {data.get('version')}", "Make the world again")
+    return data

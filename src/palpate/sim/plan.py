@@ -1,18 +1,36 @@
-"""Which videos a world has, what each touches, and how frames are numbered; known before anything is rendered.
+"""Which videos a world has, what each touches, and how frames are numbered; known before rendering.
 
-A video of T touches, F free frames and C contact frames a touch has frames 0 .. T (F + C) - 1. Touch k begins with its free frames at
-k (F + C); its contact frames are k (F + C) + F up to (k + 1)(F + C) - 1.
+A video of T contacts, F free frames and C frames of a contact has frames 0 .. T (F + C) - 1.
+Contact k begins with its free frames at k (F + C); its frames in contact are k (F + C) + F up to (k
++ 1)(F + C) - 1.
+
+Objects per material: ``balance="uniform"`` gives each the same number. ``balance="touch-and-go"``
+    makes classes
+as unequal as the frames of Touch and Go (Yang et al., 2022), whose official lists hold 121,861
+frames: 23 % of them are synthetic fabric, 0.2 % sand. A material has max(2, total * its share)
+    objects, and what the minimum of
+two adds is taken from the others in proportion.
 """
 
 from __future__ import annotations
 
 import datetime
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from palpate.core import seed_for
-from palpate.sim.balance import objects_of
-from palpate.sim.materials.entries import object_prefix
+from palpate.sim.materials import object_prefix
 from palpate.sim.options import BACKGROUND_OFFSET, VERSION, WorldOptions
+
+#: Frames of each class in both official lists together. Natural fabric has none there.
+TOUCH_AND_GO_FRAMES = {
+    **{"Concrete": 18_047, "Plastic": 6_001, "Glass": 1_458, "Wood": 21_846, "Metal": 10_633},
+    **{"Brick": 7_337, "Tile": 3_068, "Leather": 2_730, "Synthetic Fabric": 28_010},
+    **{"Natural Fabric": 0, "Rubber": 330, "Paper": 2_389, "Tree": 1_782, "Grass": 5_837},
+    **{"Soil": 1_628, "Rock": 7_787, "Gravel": 775, "Sand": 223, "Plants": 1_441, "Others": 539},
+}
+#: Objects that a material has at least, so that train and test can both have one.
+LEAST = 2
 
 
 @dataclass(frozen=True)
@@ -33,11 +51,11 @@ class VideoPlan:
     """One video.
 
     Attributes:
-        index: position in the world, the id that its random draws hang on.
+        index: position in the world; its random draws depend on it.
         name: 15 characters ``YYYYMMDD_HHMMSS``, unique in the world.
         sensor: the gel unit, 0 .. sensors - 1.
         objects: the objects touched, in order; mostly one.
-        touched: for each touch, the position of its object in ``objects``; never decreasing.
+        touched: for each contact, the position of its object in ``objects``; never decreasing.
     """
 
     index: int
@@ -46,83 +64,141 @@ class VideoPlan:
     objects: tuple[ObjectRef, ...]
     touched: tuple[int, ...]
 
-    def object_of(self, touch: int) -> ObjectRef:
-        """What touch number ``touch`` touches."""
-        return self.objects[self.touched[touch]]
+    def object_of(self, contact: int) -> ObjectRef:
+        """The object of one contact."""
+        return self.objects[self.touched[contact]]
 
 
-def first_contact(options: WorldOptions, touch: int) -> int:
-    """Frame number of the first contact frame of a touch."""
-    return touch * (options.free_frames + options.frames_per_touch) + options.free_frames
+@dataclass(frozen=True)
+class Row:
+    """A frame in contact: its video, the contact within it, and its number."""
+
+    video: VideoPlan
+    contact: int
+    frame: int
+
+    @property
+    def object(self) -> ObjectRef:
+        """The object that is touched."""
+        return self.video.object_of(self.contact)
 
 
-def contact_frames(options: WorldOptions, touch: int) -> range:
-    """Frame numbers of a touch in contact."""
-    return range(
-        first_contact(options, touch), first_contact(options, touch) + options.frames_per_touch
-    )
+def first_contact(options: WorldOptions, contact: int) -> int:
+    """Frame number of the first frame of a contact."""
+    return contact * (options.free_frames + options.frames_per_contact) + options.free_frames
+
+
+def contact_frames(options: WorldOptions, contact: int) -> range:
+    """Frame numbers of a contact."""
+    first = first_contact(options, contact)
+    return range(first, first + options.frames_per_contact)
+
+
+def contact_row(options: WorldOptions, plans: list[VideoPlan], k: int) -> Row:
+    """Contact frame number ``k`` of the world, by video and frame."""
+    video, within = divmod(k, options.contacts_per_video * options.frames_per_contact)
+    contact, step = divmod(within, options.frames_per_contact)
+    return Row(plans[video], contact, first_contact(options, contact) + step)
+
+
+def contact_rows(options: WorldOptions, plans: list[VideoPlan]) -> Iterator[Row]:
+    """Every contact frame, by video and frame: the order of the manifest."""
+    for plan in plans:
+        for contact in range(options.contacts_per_video):
+            for frame in contact_frames(options, contact):
+                yield Row(plan, contact, frame)
 
 
 def written_frames(options: WorldOptions) -> list[int]:
     """Frame numbers that are written, the same in every video."""
     if options.free_written == "all":
         return list(range(options.video_length))
-    frames: list[int] = []
-    for touch in range(options.touches_per_video):
-        frames += [
-            first_contact(options, touch) - BACKGROUND_OFFSET,
-            *contact_frames(options, touch),
-        ]
-    return frames
+    return [
+        frame
+        for contact in range(options.contacts_per_video)
+        for frame in (
+            first_contact(options, contact) - BACKGROUND_OFFSET,
+            *contact_frames(options, contact),
+        )
+    ]
 
 
-def chosen_twice(options: WorldOptions, listed: list[ObjectRef]) -> set[ObjectRef]:
-    """The share ``two_videos`` of the objects, drawn so that every material has its share, nearly."""
-    rng = options.rng("two videos")
-    order = sorted(
-        (listed[k] for k in rng.permutation(len(listed))),
-        key=lambda ref: options.names.index(ref.material),
-    )
-    return {
-        ref
-        for k, ref in enumerate(order)
-        if int((k + 1) * options.two_videos + 0.5) > int(k * options.two_videos + 0.5)
-    }
+def objects_of(options: WorldOptions) -> dict[str, int]:
+    """Material -> number of objects that have videos, in the order of ``options.names``.
+
+    A material that Touch and Go does not know has the mean share.
+    """
+    names = options.names
+    known = [TOUCH_AND_GO_FRAMES[name] for name in names if name in TOUCH_AND_GO_FRAMES]
+    if options.balance == "uniform" or not sum(known):
+        return dict.fromkeys(names, options.objects_per_material)
+    mean = sum(known) / len(known)
+    frames = {name: float(TOUCH_AND_GO_FRAMES.get(name, mean)) for name in names}
+    return _in_proportion(frames, options.objects_per_material * len(names))
+
+
+def _in_proportion(weights: dict[str, float], total: int) -> dict[str, int]:
+    """Whole numbers of at least ``LEAST`` in proportion to ``weights`` that sum to ``total``."""
+    small: set[str] = set()
+    while True:
+        large = {name: w for name, w in weights.items() if name not in small}
+        scale = (total - LEAST * len(small)) / (sum(large.values()) or 1.0)  # 1.0: all are small
+        more = {name for name, w in large.items() if w * scale < LEAST}
+        if not more:
+            break
+        small |= more
+    exact = {name: float(LEAST) if name in small else w * scale for name, w in weights.items()}
+    counts = {name: int(value) for name, value in exact.items()}
+    # The largest remainder first, ties in the given order.
+    by_remainder = sorted(exact, key=lambda name: counts[name] - exact[name])
+    for name in by_remainder[: total - sum(counts.values())]:
+        counts[name] += 1
+    return counts
+
+
+def spread(count: int, share: float) -> list[int]:
+    """Positions in 0 .. count - 1 of a share, by error diffusion: every stretch has its share."""
+    return [k for k in range(count) if int((k + 1) * share + 0.5) > int(k * share + 0.5)]
+
+
+def _with_two_videos(options: WorldOptions, objects: list[ObjectRef]) -> set[ObjectRef]:
+    """The share ``two_videos`` of the objects, so that every material has its share, nearly."""
+    order = [objects[k] for k in options.rng("two videos").permutation(len(objects))]
+    order.sort(key=lambda ref: options.names.index(ref.material))
+    return {order[k] for k in spread(len(order), options.two_videos)}
 
 
 def plan_world(options: WorldOptions) -> list[VideoPlan]:
-    """All videos of a world, in the order of their names; objects stand in random order, the videos of one object in a row."""
-    objects = objects_of(options)
-    listed = [ObjectRef(m, k) for m, count in objects.items() for k in range(count)]
-    twice = chosen_twice(options, listed)
-    own = [listed[k] for k in options.rng("order").permutation(len(listed))]
-    guests = dict(objects)
-    day = datetime.datetime(2026, 1, 1) + datetime.timedelta(
-        days=seed_for(options.seed, "world", VERSION, "date") % 3650
-    )
+    """All videos of a world in the order of their names: objects in random order, each one's videos
+    in a row.
+    """
+    counts = objects_of(options)
+    objects = [ObjectRef(m, k) for m, count in counts.items() for k in range(count)]
+    twice = _with_two_videos(options, objects)
+    guests = dict(counts)  # further objects of mixed videos, numbered behind the others
+    days = seed_for(options.seed, "world", VERSION, "date") % 3650
+    start = datetime.datetime(2026, 1, 1) + datetime.timedelta(days=days)
     plans: list[VideoPlan] = []
-    for ref in own:
-        for _ in range(options.videos_per_object + (ref in twice)):
+    for k in options.rng("order").permutation(len(objects)):
+        for _ in range(options.videos_per_object + (objects[k] in twice)):
             index = len(plans)
-            rng = options.rng("plan", index)
-            touched_objects = [ref]
-            most = min(options.objects_per_video, options.touches_per_video, len(options.names))
-            if rng.random() < options.mixed and most > 1:
-                others = [m for m in options.names if m != ref.material]
-                for k in rng.permutation(len(others))[: int(rng.integers(1, most))]:
-                    touched_objects.append(ObjectRef(others[k], guests[others[k]]))
-                    guests[others[k]] += 1
-            cuts = sorted(
-                int(c) + 1
-                for c in rng.permutation(options.touches_per_video - 1)[: len(touched_objects) - 1]
-            )
-            touched = tuple(
-                sum(touch >= cut for cut in cuts) for touch in range(options.touches_per_video)
-            )
-            name = (day + datetime.timedelta(seconds=index * 97)).strftime("%Y%m%d_%H%M%S")
-            plans.append(
-                VideoPlan(
-                    index, name, int(rng.integers(options.sensors)), tuple(touched_objects), touched
-                )
-            )
+            name = (start + datetime.timedelta(seconds=index * 97)).strftime("%Y%m%d_%H%M%S")
+            plans.append(_plan_video(options, index, name, objects[k], guests))
     return plans
+
+
+def _plan_video(
+    options: WorldOptions, index: int, name: str, main: ObjectRef, guests: dict[str, int]
+) -> VideoPlan:
+    rng = options.rng("plan", index)
+    objects = [main]
+    most = min(options.objects_per_video, options.contacts_per_video, len(options.names))
+    if rng.random() < options.mixed and most > 1:
+        others = [m for m in options.names if m != main.material]
+        for k in rng.permutation(len(others))[: int(rng.integers(1, most))]:
+            objects.append(ObjectRef(others[k], guests[others[k]]))
+            guests[others[k]] += 1
+    changes = rng.permutation(options.contacts_per_video - 1)[: len(objects) - 1]
+    cuts = sorted(int(c) + 1 for c in changes)
+    touched = tuple(sum(c >= cut for cut in cuts) for c in range(options.contacts_per_video))
+    return VideoPlan(index, name, int(rng.integers(options.sensors)), tuple(objects), touched)

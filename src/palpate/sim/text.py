@@ -1,8 +1,10 @@
-"""What a touch feels like, in words.
+"""What a contact feels like, in words.
 
-The adjectives come from the piece that was drawn (its sub-type), never from the class alone, and never say colour or light. Half of the
-captions (``named``) also name the thing; the others use adjectives alone, so that text is not just the label. In the layout of HCT a caption is, as
-there, a list of adjectives (``rugged, rough``), followed by the thing where it is named (``rugged, rough, tree bark``).
+The adjectives come from the piece that was drawn (its sub-type), never from the class alone, and
+never name color or light. A share ``named`` of the captions also names the material; the others use
+adjectives alone, so that text is not just the label. In the layout of HCT a caption is, as there, a
+list of adjectives (``rugged, rough``), followed by the noun where it is named (``rugged, rough,
+tree bark``).
 """
 
 from __future__ import annotations
@@ -17,15 +19,16 @@ from palpate.sim.options import WorldOptions
 NAMED = ("{phrase}", "this is {phrase}", "the sensor touches {phrase}", "it feels like {phrase}")
 #: ``{list}``: the adjectives, joined by commas and "and".
 UNNAMED = ("{list}", "it feels {list}", "a surface that feels {list}", "{list} to the touch")
-#: Words with a vowel letter but a consonant sound in front (uniform, usual, one-sided; not uninterrupted), or the reverse (hour, honest).
-_CONSONANT, _VOWEL = (
-    re.compile(r"uni(?![nm])|us[eu]|eu|once|one\b"),
-    re.compile(r"[aeiou]|hour|hono|hones|heir"),
-)
+# Words with a vowel letter but a consonant sound in front (uniform, usual, one-sided; not
+# uninterrupted), or the reverse (hour, honest).
+_CONSONANT = re.compile(r"uni(?![nm])|us[eu]|eu|once|one\b")
+_VOWEL = re.compile(r"[aeiou]|hour|hono|hones|heir")
 
 
 def article(word: str) -> str:
-    """``"a"`` or ``"an"``, by the sound that ``word`` begins with (``"a uniform"``, ``"an unusual"``)."""
+    """``"a"`` or ``"an"``, by the sound that ``word`` begins with (``"a uniform"``, ``"an
+    unusual"``).
+    """
     word = word.lower()
     return "an" if _VOWEL.match(word) and not _CONSONANT.match(word) else "a"
 
@@ -36,28 +39,26 @@ def listed(words: Sequence[str]) -> str:
 
 
 def phrase(words: Sequence[str], noun: str) -> str:
-    """``"rugged, rough tree bark"``; of a noun that can be counted (``"a leaf"``): ``"an even, waxy leaf"``."""
+    """``"rugged, rough tree bark"``; of a noun that can be counted: ``"an even, waxy leaf"``."""
     counted = bare(noun)
-    if counted != noun:
-        return f"{article(words[0])} {', '.join(words)} {counted}"
-    return f"{', '.join(words)} {noun}"
+    text = f"{', '.join(words)} {counted}"
+    return text if counted == noun else f"{article(words[0])} {text}"
 
 
 def bare(noun: str) -> str:
-    """``"leaf"`` of ``"a leaf"``; other nouns as they are."""
+    """``"leaf"`` of ``"a leaf"``; other nouns unchanged."""
     return noun.removeprefix("a ").removeprefix("an ")
 
 
-def caption(options: WorldOptions, video: int, touch: int, surface: Surface) -> str:
-    """The caption of one touch: a sentence with at least two of the piece's adjectives, in random order."""
-    rng = options.rng("text", video, touch)
+def caption(options: WorldOptions, video: int, contact: int, surface: Surface) -> str:
+    """The caption of one contact: at least two of the piece's adjectives, in random order."""
+    rng = options.rng("text", video, contact)
     words = [surface.words[k] for k in rng.permutation(len(surface.words))]
     words = words[: int(rng.integers(min(2, len(words)), len(words) + 1))]
     named = bool(rng.random() < options.named)
     if options.layout == "hct":
         return ", ".join([*words, bare(surface.noun)] if named else words)
     templates = NAMED if named else UNNAMED
-    sentence = templates[int(rng.integers(len(templates)))].format(
-        phrase=phrase(words, surface.noun), list=listed(words)
-    )
+    template = templates[int(rng.integers(len(templates)))]
+    sentence = template.format(phrase=phrase(words, surface.noun), list=listed(words))
     return f"{sentence[0].upper()}{sentence[1:]}."

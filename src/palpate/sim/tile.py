@@ -1,9 +1,11 @@
 """Periodic fields on a square tile of 64 mm, the toolbox that materials are made from.
 
-Every field repeats without a seam: noise is shaped in the Fourier domain, cells live on a jittered grid with wrapped neighbors, waves
+Every field repeats without a seam: noise is shaped in the Fourier domain, cells live on a jittered
+    grid with wrapped neighbors, waves
 have whole numbers of periods along both sides, strokes are drawn modulo the tile.
 
-- Band-limited fractal noise: white noise with amplitude f^-(beta + 1)/2 between two wavelengths, f stretched along an angle.
+- Band-limited fractal noise: white noise with amplitude f^-(beta + 1)/2 between two wavelengths, f
+  stretched along an angle.
 - Worley noise: distances F1 <= F2 to the nearest two seeds, and the cell a point belongs to.
 """
 
@@ -168,8 +170,9 @@ class Tile:
     def wave(self, period: float, angle: float = 0.0, wobble: float = 0.0) -> Array:
         """The phase of a plane wave in radians, shape (n, n), for ``sin`` and the like.
 
-        The wave vector is rounded to whole periods a side, so ``period`` mm and ``angle`` are met nearly; two waves at right angles stay so.
-        ``wobble`` adds noise of that deviation (radians) to the phase.
+        The wave vector is rounded to whole periods a side, so ``period`` mm and ``angle`` are met
+        nearly; two waves at right angles stay so. ``wobble`` adds noise of that deviation (radians)
+        to the phase.
         """
         k = TILE_MM / period
         kx, ky = round(k * math.cos(angle)), round(k * math.sin(angle))
@@ -180,7 +183,9 @@ class Tile:
         return a + wobble * self.noise(3.0, 16.0) if wobble else a
 
     def lines(self, period: float, angle: float) -> tuple[Array, float]:
-        """Distance in mm to the nearest of parallel lines ``period`` apart (rounded as in :meth:`wave`), and the period met."""
+        """Distance in mm to the nearest of parallel lines ``period`` apart (rounded as in
+        :meth:`wave`), and the period met.
+        """
         k = TILE_MM / period
         kx, ky = round(k * math.cos(angle)), round(k * math.sin(angle))
         if kx == ky == 0:
@@ -199,12 +204,14 @@ class Tile:
         count: int,
         length: float,
         width: float,
+        *,
         angle: float,
         spread: float,
         height: float,
         bend: float = 0.3,
     ) -> Array:
-        """Curved ridges (blades, fibres, scratches), the highest winning where they cross; heights in mm.
+        """Curved ridges (blades, fibres, scratches), the highest winning where they cross; heights
+        in mm.
 
         Args:
             count: how many.

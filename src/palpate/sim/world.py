@@ -1,29 +1,37 @@
-"""A world without files: any of its samples rendered when asked for.
+"""A world without files: any of its samples rendered when requested.
 
-``World(options)[k]`` gives the arrays that ``write_world`` writes as row k of its manifest, pixel for pixel (before JPEG; row k of the arrays with
-``layout="raw"``). It is a map-style data set: it has a length, takes an index, can be pickled and sent to the workers of a data loader. A few videos are
-kept ready; nothing else grows with what was rendered. In order, a sample costs its three images; in random order it costs the set-up of its object and
-its video too, which takes several times longer.
+``World(options)[k]`` gives the arrays that :func:`palpate.sim.write_world` writes as row k of its
+manifest, pixel for pixel (before JPEG). It is a map-style data set: it has a length, takes an
+index, and can be pickled and sent to the workers of a data loader. A few videos are kept ready;
+nothing else grows with what was rendered. In order a sample costs its three images; at random also
+the set-up of its object and video, several times as much.
 """
 
 from __future__ import annotations
 
+import json
 import operator
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any, SupportsIndex
 
 from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.data.formats.hct import sessions_of
+from palpate.data.formats.touch_and_go import CATEGORIES
 from palpate.data.manifest import Manifest
-from palpate.sim.lists import cut
+from palpate.sim.layouts import contact_id, image_paths, manifest_root, sample_id, video_id
+from palpate.sim.leak import cut
 from palpate.sim.materials import MATERIALS
-from palpate.sim.naming import Row, contact_row, contact_rows, sample_id, touch_id, video_id
-from palpate.sim.options import WorldOptions
-from palpate.sim.plan import VideoPlan, plan_world
-from palpate.sim.ranges import is_number, shown
-from palpate.sim.table import world_manifest, world_split
+from palpate.sim.options import VERSION, WorldOptions
+from palpate.sim.plan import Row, VideoPlan, contact_row, contact_rows, plan_world
+from palpate.sim.presets import PRESETS
 from palpate.sim.video import Video
+
+#: Seconds between the starts of two recordings of one session in the layout of HCT, as an import
+#: takes it.
+_SESSION_GAP = 60.0
 
 
 class NoSampleError(PalpateError, IndexError):
@@ -34,23 +42,26 @@ class World:
     """The contact frames of a world, by video and frame.
 
     Args:
-        options: the world, default ``WorldOptions()``.
+        options: the world, or the name of a preset (``"tiny"``, ``"small"``, ...); default
+            ``WorldOptions()``.
         cache: videos kept ready (about 1 MB each at 64 px, 4 MB at 128 px).
 
     Raises:
-        PalpateError: if ``cache`` is no whole number from 1.
+        PalpateError: for an unknown preset, or a cache below 1.
     """
 
-    def __init__(self, options: WorldOptions | None = None, *, cache: int = 4) -> None:
-        if not is_number(cache, whole=True) or cache < 1:
-            raise PalpateError(
-                "cache must be a whole number, at least 1", shown(cache), "Pass cache=4"
-            )
-        self.options, self.cache = options or WorldOptions(), cache
+    def __init__(self, options: WorldOptions | str | None = None, *, cache: int = 4) -> None:
+        if isinstance(options, str) and options not in PRESETS:
+            must = f"must be options, or one of {', '.join(PRESETS)}"
+            raise PalpateError(must, repr(options), "Choose a preset", argument="options")
+        if cache < 1:
+            raise PalpateError("must be at least 1", str(cache), "", argument="cache")
+        self.options = PRESETS[options] if isinstance(options, str) else options or WorldOptions()
+        self.cache = cache
         self._videos: OrderedDict[int, Video] = OrderedDict()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Options alone: a copy in another process renders for itself."""
+        """The options alone: a copy in another process renders for itself."""
         return {"options": self.options, "cache": self.cache}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -68,85 +79,59 @@ class World:
 
     def __len__(self) -> int:
         """Number of contact frames."""
-        return len(self.plans) * self.options.touches_per_video * self.options.frames_per_touch
+        return len(self.plans) * self.options.contacts_per_video * self.options.frames_per_contact
 
     @property
     def ids(self) -> list[str]:
-        """The ids, in order: those of the manifest."""
-        return [
-            sample_id(self.options, row.video, row.frame)
-            for row in contact_rows(self.options, self.plans)
-        ]
+        """The ids in order: those of the manifest."""
+        rows = contact_rows(self.options, self.plans)
+        return [sample_id(self.options, row.video, row.frame) for row in rows]
 
-    def row(self, k: SupportsIndex) -> Row:
-        """Video, touch and frame of sample ``k``; negative numbers count from the end.
-
-        Raises:
-            NoSampleError: if there is no such sample.
-        """
-        number = operator.index(k)
-        if not -len(self) <= number < len(self):
-            raise NoSampleError(
-                f"A sample of this world must be 0 to {len(self) - 1}",
-                shown(number),
-                "Choose another sample",
-            )
-        return contact_row(self.options, self.plans, number % len(self))
-
-    def sample(self, k: SupportsIndex) -> dict[str, Any]:
-        """Renders one sample.
+    def __getitem__(self, k: SupportsIndex) -> dict[str, Any]:
+        """Render one sample; negative numbers count from the end.
 
         Returns:
-            ``vision``, ``tactile``, ``background``: uint8 (size, size, 3); ``id``, ``video``, ``touch``, ``object``, ``material``, ``text``, ``sensor``:
-            text; ``frame``, ``label``: integers. The columns mean what they mean in the manifest; ``label`` is the material's number.
+            ``vision``, ``tactile``, ``background``: uint8 (size, size, 3); ``id``, ``video``,
+                ``contact``, ``object``,
+            ``material``, ``text``, ``sensor``: text; ``frame``, ``label``: integers. They mean what
+                they mean in
+            the manifest; ``label`` is the material's number.
 
         Raises:
             NoSampleError: if there is no such sample.
             PalpateError: if a material draws something invalid.
         """
-        row = self.row(k)
+        number = operator.index(k)
+        if not -len(self) <= number < len(self):
+            must = f"A sample of this world must be 0 to {len(self) - 1}"
+            raise NoSampleError(must, str(number), "Choose another sample")
+        row = contact_row(self.options, self.plans, number % len(self))
         video = self._video(row.video)
-        material = row.video.object_of(row.touch).material
-        return {
-            "id": sample_id(self.options, row.video, row.frame),
-            "video": video_id(self.options, row.video),
-            "frame": row.frame,
-            "contact": touch_id(self.options, row.video, row.touch),
-            "object": row.object,
-            "material": material,
-            "label": MATERIALS[material].label,
-            "text": video.text(row.touch),
-            "sensor": f"{self.options.look}-{row.video.sensor}",
+        cells = _cells(self.options, row, video.text(row.contact))
+        return cells | {
+            "label": MATERIALS[row.object.material].label,
             "vision": video.vision(row.frame),
             "tactile": video.tactile(row.frame),
-            "background": video.background_of(row.touch),
+            "background": video.background_of(row.contact),
         }
-
-    def __getitem__(self, k: SupportsIndex) -> dict[str, Any]:
-        """:meth:`sample`."""
-        return self.sample(k)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         """All samples, in order."""
-        return map(self.sample, range(len(self)))
+        return map(self.__getitem__, range(len(self)))
 
     def manifest(self, progress: Progress = quiet) -> Manifest:
-        """The world's manifest, without images; draws every object once for the captions, so it takes a while.
-
-        Args:
-            progress: told after each video.
+        """The world's manifest, without images; draws every object once for the captions, which
+        takes a while.
         """
         captions: dict[str, list[str]] = {}
         for count, plan in enumerate(self.plans, 1):
             video = self._video(plan)
-            captions[plan.name] = [
-                video.text(touch) for touch in range(self.options.touches_per_video)
-            ]
-            progress("wording videos", count, len(self.plans))
+            captions[plan.name] = [video.text(k) for k in range(self.options.contacts_per_video)]
+            progress("describing videos", count, len(self.plans))
         return world_manifest(self.options, self.plans, captions, None)
 
     def split(self, manifest: Manifest | None = None) -> Split:
-        """The world's own cut into train and test, which leaks as ``options.leak`` says.
+        """The world's cut into train and test, which leaks as ``options.leak`` says.
 
         Args:
             manifest: of this world, to enter its digest into the split.
@@ -164,3 +149,82 @@ class World:
                 self._videos.popitem(last=False)
         self._videos.move_to_end(plan.index)
         return self._videos[plan.index]
+
+
+def _cells(options: WorldOptions, row: Row, text: str) -> dict[str, Any]:
+    """What the world knows of a contact frame, in the manifest's columns."""
+    return {
+        "id": sample_id(options, row.video, row.frame),
+        "video": video_id(options, row.video),
+        "frame": row.frame,
+        "contact": contact_id(options, row.video, row.contact),
+        "object": row.object.name,
+        "material": row.object.material,
+        "text": text,
+        "sensor": f"{options.look}-{row.video.sensor}",
+    }
+
+
+def world_manifest(
+    options: WorldOptions,
+    plans: list[VideoPlan],
+    captions: Mapping[str, Sequence[str]],
+    folder: Path | None,
+) -> Manifest:
+    """The manifest of all contact frames, by video and frame.
+
+    It has the ids, videos, contacts and image paths that ``palpate import`` finds in the tree, and
+        more: the
+    object, the gel unit, and in every layout the material and the text.
+
+    Args:
+        options: the world's.
+        plans: all videos.
+        captions: video name -> one caption a contact.
+        folder: of the world, where the manifest is rooted (``hct/`` in HCT's layout); None: there
+            are no files.
+    """
+    rows = [
+        _cells(options, row, captions[row.video.name][row.contact])
+        | (image_paths(options, row) if folder is not None else {})
+        for row in contact_rows(options, plans)
+    ]
+    if options.layout == "hct":
+        recordings = {row["video"]: tuple(row["video"].split("/", 1)) for row in rows}
+        sessions = sessions_of(list(recordings.values()), _SESSION_GAP)
+        for row in rows:
+            recording = recordings[row["video"]]
+            row |= {"session": sessions[recording], "domain": recording[0]}
+    return Manifest.from_rows(rows, manifest_root(options, folder or Path()), _facts(options))
+
+
+def _facts(options: WorldOptions) -> dict[str, str]:
+    """What the data set is; it must never pass for a real one."""
+    facts = {
+        "dataset": "palpate's procedural world",
+        "synthetic": "yes",
+        "world_version": str(VERSION),
+        "world_options": options.digest,
+        "text_source": "the drawn sub-type",
+        "layout": options.layout,
+    }
+    if options.layout == "hct":
+        return facts | {"format": "hct"}
+    classes = {material.label: name for name, material in MATERIALS.items()}
+    if classes != CATEGORIES:
+        facts["classes"] = json.dumps({str(label): name for label, name in classes.items()})
+    return facts | {"format": "touch-and-go"}
+
+
+def world_split(
+    options: WorldOptions, train: Sequence[Row], test: Sequence[Row], manifest: str | None
+) -> Split:
+    """``Orig``: the world's cut over the ids of its manifest (of that digest), in the order of the
+    lists.
+    """
+    ids = {
+        part: [sample_id(options, row.video, row.frame) for row in rows]
+        for part, rows in (("train", train), ("test", test))
+    }
+    rule = {"method": "world", "leak": options.leak, "test": options.test, "seed": options.seed}
+    return Split.from_ids(rule=rule | {"world_version": VERSION}, manifest=manifest, **ids)

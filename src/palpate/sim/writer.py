@@ -1,34 +1,36 @@
-"""Writes a world as a tree in the layout of Touch and Go or of HCT, or as arrays.
+"""Write a world as a tree in the layout of Touch and Go or of HCT.
 
 ::
 
-    world.json                          options, VERSION, counts, the known leak, digest; the mark of a finished world
-    manifest.parquet  splits/Orig.json  the world's own table and cut
+    world.json                          options, VERSION, counts, the known leak, digest; marks a
+    finished world manifest.parquet  splits/Orig.json  the world's table and cut
     leak.csv                            what each test sample shares with train, exactly
-    label.txt  category_reference.txt  train.txt  test.txt  captions.csv  objects.csv      (layout="frames", "videos")
-    dataset/<video>/video_frame/0000000012.jpg      photo        (layout="frames")
-    dataset/<video>/gelsight_frame/0000000012.jpg   touch
-    dataset/<video>/video.mp4  gelsight.mp4         (layout="videos")
-    hct/data1/ ...                                  (layout="hct", see palpate.sim.lists_hct and palpate.sim.naming)
-    vision.npy  tactile.npy  background.npy  ids.txt             (layout="raw", see palpate.sim.raw)
+    label.txt  train.txt  ...  dataset/<video>/  or  hct/data1/ ...      see palpate.sim.layouts
 
-The tree grows in the hidden sibling ``.<name>.<digest>.part``, one finished video after another, and is renamed when whole; one run at a time. A run that was
-killed, or stopped by a full disk, is continued by the same call; the result is the same as without the interruption.
+The tree grows in the hidden sibling ``.<name>.<digest>.part``, one finished video after another,
+and is renamed when whole. A run that was killed, or stopped by a full disk, is continued by the
+same call with the same result. One
+run at a time writes it: the lock is ``flock`` on a file inside, which the system releases however
+    the process
+ends (not on Windows).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from palpate.core import (
+    MissingExtraError,
     PalpateError,
     Progress,
+    atomic_folder,
     digest_json,
     digest_lines,
     quiet,
@@ -36,23 +38,22 @@ from palpate.core import (
     write_json,
     write_text,
 )
-from palpate.sim.encode import require_av
-from palpate.sim.lists import cut, leak_counts, leak_file, list_files
-from palpate.sim.lists_hct import hct_list_files
-from palpate.sim.materials.entries import added_materials
-from palpate.sim.naming import contact_rows, manifest_root
-from palpate.sim.options import VERSION, WorldOptions
-from palpate.sim.plan import VideoPlan, plan_world, written_frames
+from palpate.core.processes import worker_pool
+from palpate.sim.layouts import list_files, manifest_root, video_folder, write_video_files
+from palpate.sim.leak import cut, leak_counts, leak_file
+from palpate.sim.materials import MATERIALS, Material, added_materials
+from palpate.sim.options import VERSION, WORLD_FORMAT, WorldOptions, read_world
+from palpate.sim.plan import Row, VideoPlan, contact_rows, plan_world, written_frames
 from palpate.sim.presets import SEEN, seen_by_mini
-from palpate.sim.ranges import is_number, shown
-from palpate.sim.raw import ARRAYS, allocate_arrays
-from palpate.sim.saved import WORLD_FORMAT, require_version
-from palpate.sim.table import world_manifest, world_split
-from palpate.sim.trees import WORK, captions_path, disk_error, is_written, place, write_video
-from palpate.sim.unfinished import locked, part_of, real_folder, require_free, require_same_version
-from palpate.sim.workers import render_all
+from palpate.sim.video import Video
+from palpate.sim.world import world_manifest, world_split
 
-NOTE = "Synthetic: procedural surfaces and a simulated sensor. Shows mechanisms; never compare its numbers with those of real data sets."
+NOTE = (
+    "Synthetic: procedural surfaces and a simulated sensor. Shows mechanisms; never compare its "
+    "numbers with those of real data sets."
+)
+#: Folder within an unfinished world: its lock, and the captions of each finished video.
+WORK = ".work"
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,10 @@ class WorldRecord:
     Attributes:
         folder: the tree.
         digest: SHA-256 over options, VERSION and lists.
-        counts: videos, mixed_videos, objects, touches, contact_frames, written_frames, train_frames, test_frames.
-        leak: the rule of the cut, and what train and test share, see :func:`palpate.sim.lists.leak_counts`.
+        counts: videos, mixed_videos, objects, contacts, contact_frames, written_frames,
+            train_frames, test_frames.
+        leak: the rule of the cut, and what train and test share
+            (:func:`palpate.sim.leak.leak_counts`).
         rendered: videos that this call rendered; the others were there already.
     """
 
@@ -75,183 +78,200 @@ class WorldRecord:
 
 
 def write_world(
-    out: Path, options: WorldOptions | None = None, *, workers: int = 1, progress: Progress = quiet
+    output: str | Path,
+    options: WorldOptions | None = None,
+    *,
+    workers: int = 1,
+    progress: Progress = quiet,
 ) -> WorldRecord:
-    """Writes a world, or goes on with one that was interrupted.
+    """Write a world, or continue one that was interrupted.
 
     Args:
-        out: the folder to make; absent, empty, or the same world (then nothing is done).
+        output: the folder to make; absent, empty, or the same world (then nothing is done).
         options: what to make, default ``WorldOptions()``.
         workers: processes; the bytes do not depend on it.
-        progress: told after each video.
+        progress: called after each video.
 
     Raises:
-        PalpateError: if ``out`` holds something else, is the working folder, is being written by another run, or holds a world of another version, a material draws something invalid, the world is too small
-            for its cut, or the disk is full; what was finished by then is kept, and the same call goes on.
-        MissingExtraError: if videos are asked for and PyAV is not installed.
+        PalpateError: if ``output`` holds something else, is the current folder, is written by
+            another run or holds another world, a material draws something invalid, or the world is
+            too small for its cut.
+        MissingExtraError: if videos are requested and PyAV is not installed.
+        OSError: if the disk is full; finished videos stay, and the same call continues.
     """
-    options, out = options or WorldOptions(), Path(out)
-    if not is_number(workers, whole=True) or workers < 1:
-        raise PalpateError(
-            "workers must be a whole number, at least 1", shown(workers), "Pass workers=1"
-        )
+    options, output = options or WorldOptions(), Path(output)
+    if workers < 1:
+        raise PalpateError("must be at least 1", str(workers), "", argument="workers")
     if options.layout == "videos":
-        require_av()
-    folder = real_folder(out)
+        try:
+            import av  # noqa: F401
+        except ImportError:
+            raise MissingExtraError("av", "video", "Writing a world as videos") from None
+    folder = output.resolve()
     if (folder / "world.json").is_file():
-        return _finished(out, options)
-    require_free(out, folder)
+        return _finished(output, options)
+    _require_free(output, folder)
     plans = plan_world(options)
-    cut(
-        options, plans, list(contact_rows(options, plans))
-    )  # refuses a world that is too small before anything is rendered
-    part = part_of(folder, options)
-    require_same_version(part)
-    try:
-        with locked(part, out):
-            if (folder / "world.json").is_file():  # an equal run ended meanwhile
-                shutil.rmtree(part, ignore_errors=True)
-                return _finished(out, options)
-            rendered = _write(part, folder, options, plans, workers, progress)
-        return dataclasses.replace(_finished(out, options), rendered=rendered)
-    except OSError as error:
-        raise disk_error(error, folder.parent) from error
+    rows = list(contact_rows(options, plans))
+    parts = cut(options, plans, rows)  # rejects a world that is too small before rendering
+    key = digest_json([options.digest, added_materials(options.names)])
+    part = folder.parent / f".{folder.name}.{key[:12]}.part"
+    with _locked(part, output):
+        if not (folder / "world.json").is_file():  # else an equal run ended meanwhile
+            rendered = _render(part, options, plans, workers, progress)
+            _finish(part, options, plans, parts)
+            if folder.exists():
+                folder.rmdir()
+            part.replace(folder)
+            shutil.rmtree(folder / WORK, ignore_errors=True)
+            return dataclasses.replace(_finished(output, options), rendered=rendered)
+    shutil.rmtree(part, ignore_errors=True)
+    return _finished(output, options)
 
 
-def _write(
-    part: Path,
-    folder: Path,
-    options: WorldOptions,
-    plans: list[VideoPlan],
-    workers: int,
-    progress: Progress,
+def _require_free(output: Path, folder: Path) -> None:
+    fix = "Choose another folder, or remove it"
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        must = f"{output} must be absent, empty or a finished world"
+        raise PalpateError(must, "other content", fix, argument=None)
+    if folder.exists() and folder == Path.cwd().resolve():  # it is replaced when the world is whole
+        must = f"{output} must not be the current folder"
+        raise PalpateError(must, str(folder), "Name a folder within it")
+
+
+@contextmanager
+def _locked(part: Path, output: Path) -> Generator[None]:
+    """Make ``part`` and hold its lock.
+
+    Raises:
+        PalpateError: if another process holds it.
+    """
+    (part / WORK).mkdir(parents=True, exist_ok=True)
+    with open(part / WORK / "lock", "a") as file:
+        try:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:  # Windows
+            pass
+        except BlockingIOError:
+            must, got = f"{output} must be written by one run", "another run is writing this world"
+            raise PalpateError(must, got, "Wait for it, or stop it") from None
+        yield
+
+
+def _finished(output: Path, options: WorldOptions) -> WorldRecord:
+    """The record of the finished world in ``output``.
+
+    Raises:
+        PalpateError: if it is of another version or format, or of other options or materials.
+    """
+    data = read_world(read_json(output / "world.json", "world record"), f"{output}/world.json")
+    same = data.get("options_digest") == options.digest
+    if not same or data.get("materials", {}) != added_materials(options.names):
+        must, fix = f"{output} must hold the requested world", "Choose another folder, or remove it"
+        raise PalpateError(must, "a world of other options or materials", fix)
+    return WorldRecord(output, data["digest"], data["counts"], data["leak"], 0)
+
+
+def _captions_path(part: Path, plan: VideoPlan) -> Path:
+    return part / WORK / f"{plan.name}.json"
+
+
+def _folder(options: WorldOptions, part: Path, plan: VideoPlan) -> Path:
+    return manifest_root(options, part) / video_folder(options, plan)
+
+
+def _render(
+    part: Path, options: WorldOptions, plans: list[VideoPlan], workers: int, progress: Progress
 ) -> int:
-    """Fills ``part`` and renames it to ``folder``; returns how many videos were rendered."""
-    todo: list[VideoPlan] = []
-    if not (part / "world.json").is_file():
-        state = {"version": VERSION, "options_digest": options.digest, **_materials(options)}
-        write_json(part / WORK / "state.json", state)
-        if options.layout == "raw":
-            allocate_arrays(
-                part, options, len(plans) * options.touches_per_video * options.frames_per_touch
-            )
-        todo = [plan for plan in plans if not is_written(options, part, plan)]
-        progress("rendering videos", len(plans) - len(todo), len(plans))
-        job = partial(write_video, options, part)
-        for count, name in enumerate(render_all(job, todo, workers), len(plans) - len(todo) + 1):
-            progress("rendering videos", count, len(plans), name)
-        _finish(part, options, plans)
-    shutil.rmtree(part / WORK, ignore_errors=True)
-    if folder.exists():
-        folder.rmdir()
-    part.replace(folder)
+    """Render the videos that are missing; return how many."""
+    todo = [plan for plan in plans if not _folder(options, part, plan).is_dir()]
+    finished = len(plans) - len(todo)
+    progress("rendering videos", finished, len(plans))
+    job = partial(_write_video, options, part)
+    for count, name in enumerate(_in_order(job, todo, workers), finished + 1):
+        progress("rendering videos", count, len(plans), name)
     return len(todo)
 
 
-def _materials(options: WorldOptions) -> dict[str, Any]:
-    """What the record tells of materials that were added; nothing in a world of built-in ones."""
-    added = added_materials(options.names)
-    return {"materials": added} if added else {}
+def _in_order(job: partial[str], plans: Sequence[VideoPlan], workers: int) -> Iterator[str]:
+    """Yield ``job(plan)`` for all plans; materials that a user added go to the workers too."""
+    if min(workers, len(plans)) < 2:
+        yield from map(job, plans)
+        return
+    with worker_pool(workers, _set_materials, (dict(MATERIALS),)) as pool:
+        yield from pool.map(job, plans, chunksize=max(1, min(4, len(plans) // (2 * workers))))
 
 
-def _finished(out: Path, options: WorldOptions) -> WorldRecord:
-    """The record of the finished world in ``out``.
-
-    Raises:
-        PalpateError: if it is of another version or format, of other options, or of added materials whose functions were edited since.
-    """
-    data = read_json(out / "world.json", "world record")
-    if not isinstance(data, dict) or not str(data.get("format", "")).startswith("palpate-world/"):
-        raise PalpateError(
-            f"{out} must hold a world", "another world.json", "Choose another folder or remove it"
-        )
-    require_version(data, f"The world in {out}")
-    if data["format"] != WORLD_FORMAT:
-        raise PalpateError(
-            f"{out} must hold a world of the format {WORLD_FORMAT}",
-            repr(data["format"]),
-            "Choose another folder or remove it",
-        )
-    if data.get("options_digest") != options.digest:
-        must = f"{out} must hold the world that was asked for"
-        raise PalpateError(must, "a world of other options", "Choose another folder or remove it")
-    if data.get("materials", {}) != _materials(options).get("materials", {}):
-        must = f"{out} must hold the world that was asked for"
-        raise PalpateError(
-            must,
-            "a world of materials that were edited since",
-            "Choose another folder or remove it",
-        )
-    return WorldRecord(out, data["digest"], data["counts"], data["leak"], 0)
+def _set_materials(materials: dict[str, Material]) -> None:
+    MATERIALS.clear()
+    MATERIALS.update(materials)
 
 
-def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan]) -> None:
-    """Writes the lists and, last, ``world.json``."""
-    if options.layout != "raw":
-        for folder in {place(options, part, plan).parent for plan in plans}:
-            for stray in folder.glob(".*"):  # left by a killed process
-                shutil.rmtree(stray, ignore_errors=True)
-    captions = {
-        plan.name: read_json(captions_path(part, plan), "captions of a video") for plan in plans
-    }
-    rows = list(contact_rows(options, plans))
-    train, test = cut(options, plans, rows)
+def _write_video(options: WorldOptions, part: Path, plan: VideoPlan) -> str:
+    """Render one video into ``part``, whole or not at all; return its name."""
+    video = Video(options, plan)
+    captions = [video.text(contact) for contact in range(options.contacts_per_video)]
+    write_json(_captions_path(part, plan), captions)
+    with atomic_folder(_folder(options, part, plan)) as folder:
+        write_video_files(options, video, folder)
+    return plan.name
+
+
+def _finish(
+    part: Path,
+    options: WorldOptions,
+    plans: list[VideoPlan],
+    parts: tuple[Sequence[Row], Sequence[Row]],
+) -> None:
+    """Write the lists of train and test and, last, ``world.json``."""
+    train, test = parts
+    for folder in {_folder(options, part, plan).parent for plan in plans}:
+        for stray in folder.glob(".*"):  # unfinished videos of a killed process
+            shutil.rmtree(stray, ignore_errors=True)
+    captions = {p.name: read_json(_captions_path(part, p), "captions of a video") for p in plans}
     manifest = world_manifest(options, plans, captions, part)
     files = {"leak.csv": leak_file(options, train, test)}
-    if options.layout == "hct":
-        own = hct_list_files(options, plans, train, test, captions)
-        files |= {f"hct/{name}": text for name, text in own.items()}
-    elif options.layout == "raw":
-        files["ids.txt"] = "".join(f"{name}\n" for name in manifest.ids)
-    else:
-        files |= list_files(rows, train, test, captions)
+    files |= list_files(options, plans, train, test, captions)
     for name, text in files.items():
         write_text(part / name, text)
     world_split(options, train, test, manifest.digest).save(part / "splits" / "Orig.json")
     manifest.save(part / "manifest.parquet")
-    settings = dataclasses.asdict(options)
-    lists = {name: digest_lines(text.splitlines()) for name, text in files.items()}
-    arrays = {
-        name: {
-            "file": f"{name}.npy",
-            "dtype": "uint8",
-            "shape": [len(rows), options.size, options.size, 3],
-        }
-        for name in ARRAYS
+    # The digest is taken over the column name of format 2, so that worlds that models were trained
+    # on keep theirs.
+    header = {"leak.csv": files["leak.csv"].replace("contact_in_train", "touch_in_train", 1)}
+    lists = {name: digest_lines(t.splitlines()) for name, t in (files | header).items()}
+    added = added_materials(options.names)
+    materials = {"materials": added} if added else {}
+    content = {"version": VERSION, "options": options.format_2(), "lists": lists, **materials}
+    record = {
+        "format": WORLD_FORMAT,
+        "version": VERSION,
+        "note": NOTE,
+        **({"seen_by_shipped_models": SEEN} if seen_by_mini(options) else {}),
+        "digest": digest_json(content),
+        "options_digest": options.digest,
+        "manifest_digest": manifest.digest,
+        "manifest_root": manifest_root(options, Path()).as_posix(),
+        "counts": _counts(options, plans, len(train) + len(test), len(test)),
+        "leak": {"rule": options.leak, **leak_counts(train, test)},
+        "options": dataclasses.asdict(options),
+        **materials,
     }
-    write_json(
-        part / "world.json",
-        {
-            "format": WORLD_FORMAT,
-            "version": VERSION,
-            "note": NOTE,
-            **({"seen_by_shipped_models": SEEN} if seen_by_mini(options) else {}),
-            "digest": digest_json(
-                {"version": VERSION, "options": settings, "lists": lists, **_materials(options)}
-            ),
-            "options_digest": options.digest,
-            "manifest_digest": manifest.digest,
-            "manifest_root": manifest_root(options, Path()).as_posix(),
-            "counts": _counts(options, plans, len(rows), len(test)),
-            "leak": {"rule": options.leak, **leak_counts(train, test)},
-            **({"arrays": arrays} if options.layout == "raw" else {}),
-            "options": settings,
-            **_materials(options),
-        },
-    )
+    write_json(part / "world.json", record)
 
 
 def _counts(
     options: WorldOptions, plans: Sequence[VideoPlan], contact: int, test: int
 ) -> dict[str, int]:
-    written = contact if options.layout == "raw" else len(plans) * len(written_frames(options))
     return {
         "videos": len(plans),
         "mixed_videos": sum(len(plan.objects) > 1 for plan in plans),
         "objects": len({ref for plan in plans for ref in plan.objects}),
-        "touches": len(plans) * options.touches_per_video,
+        "contacts": len(plans) * options.contacts_per_video,
         "contact_frames": contact,
-        "written_frames": written,
+        "written_frames": len(plans) * len(written_frames(options)),
         "train_frames": contact - test,
         "test_frames": test,
     }

@@ -54,13 +54,13 @@ _TEN = (
     "Gravel",
     "Sand",
 )
-_TINY = replace(WORLDS["tiny"], objects_per_material=4, touches_per_video=2, frames_per_touch=2)
+_TINY = replace(WORLDS["tiny"], objects_per_material=4, contacts_per_video=2, frames_per_contact=2)
 _MINI = replace(
     WORLDS["demo"],
     materials=_TEN,
     objects_per_material=24,
-    touches_per_video=3,
-    frames_per_touch=2,
+    contacts_per_video=3,
+    frames_per_contact=2,
     free_written="background",
 )
 _MINI_BEFORE = replace(WORLDS["pretrain"], materials=_TEN, objects_per_material=40)

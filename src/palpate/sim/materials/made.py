@@ -1,4 +1,6 @@
-"""Man-made hard goods: plastic, glass, metal, rubber, paper, and others. Their colour is free: it must not predict the touch."""
+"""Man-made hard goods: plastic, glass, metal, rubber, paper, and others. Their color is free: it
+must not predict the touch.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ def _rising(height: Array) -> Array:
 def plastic(tile: Tile, rng: np.random.Generator) -> Surface:
     """Smooth, finely textured, ribbed, or dotted."""
     kind = pick(rng, "smooth", "textured", "ribbed", "dotted")
-    colour = hsv(rng.random(), rng.uniform(0.0, 0.9), rng.uniform(0.25, 0.95))
+    color = hsv(rng.random(), rng.uniform(0.0, 0.9), rng.uniform(0.25, 0.95))
     angle = rng.uniform(0.0, math.pi)
     height = tile.noise(4.0, 40.0, 3.0) * 0.03
     words: tuple[str, ...] = ("smooth", "even", "hard")
@@ -38,14 +40,14 @@ def plastic(tile: Tile, rng: np.random.Generator) -> Surface:
         height = height + smoothstep(bumps, 0.6, 1.2) * rng.uniform(0.15, 0.35)
         words = ("dotted", "smooth", "hard")
     height = height + tile.noise(0.3, 3.0, 1.0) * 0.002
-    albedo = tint(plain(tile, colour), 1.0 + 0.02 * tile.noise(1.0, 30.0))
+    albedo = tint(plain(tile, color), 1.0 + 0.02 * tile.noise(1.0, 30.0))
     return Surface(height, albedo, kind, words, gloss=rng.uniform(0.35, 0.8), softness=0.05)
 
 
 def glass(tile: Tile, rng: np.random.Generator) -> Surface:
     """Clear, frosted, or fluted; the albedo holds soft mirrored windows, which nobody can feel."""
     kind = pick(rng, "clear", "clear", "clear", "frosted", "fluted")
-    colour = hsv(rng.uniform(0.3, 0.62), rng.uniform(0.03, 0.25), rng.uniform(0.35, 0.8))
+    color = hsv(rng.uniform(0.3, 0.62), rng.uniform(0.03, 0.25), rng.uniform(0.35, 0.8))
     height = tile.noise(8.0, 60.0, 3.0) * 0.01
     words: tuple[str, ...] = ("perfectly smooth", "slick", "hard")
     if kind == "frosted":
@@ -56,7 +58,7 @@ def glass(tile: Tile, rng: np.random.Generator) -> Surface:
             tile.wave(rng.uniform(4.0, 9.0), rng.uniform(0.0, math.pi))
         ) * rng.uniform(0.1, 0.25)
         words = ("fluted", "slick", "hard")
-    albedo = tint(colour, 0.75 + 0.16 * tile.noise(18.0, 64.0, 3.0))
+    albedo = tint(color, 0.75 + 0.16 * tile.noise(18.0, 64.0, 3.0))
     for _ in range(int(rng.integers(1, 4))):
         angle, half = rng.uniform(0.0, math.pi), TILE_MM / 2.0
         dy = (tile.y - rng.uniform(0.0, TILE_MM) + half) % TILE_MM - half
@@ -88,12 +90,12 @@ def metal(tile: Tile, rng: np.random.Generator) -> Surface:
     """Brushed, tread plate, perforated, rusted, or scratched."""
     kind = pick(rng, "brushed", "tread plate", "perforated", "rusted", "scratched")
     value = rng.uniform(0.45, 0.85)
-    colour = f32([value, value * rng.uniform(0.93, 1.0), value * rng.uniform(0.85, 1.05)])
+    color = f32([value, value * rng.uniform(0.93, 1.0), value * rng.uniform(0.85, 1.05)])
     if flip(rng, 0.25):
-        colour = hsv(rng.uniform(0.06, 0.13), 0.5, value)
+        color = hsv(rng.uniform(0.06, 0.13), 0.5, value)
     angle = rng.uniform(0.0, math.pi)
     height = tile.noise(6.0, 50.0, 3.0) * 0.015
-    albedo = plain(tile, colour)
+    albedo = plain(tile, color)
     if kind == "brushed":
         lines = tile.noise(0.2, 1.6, 0.7, 60.0, angle)
         height, albedo = (
@@ -121,7 +123,7 @@ def metal(tile: Tile, rng: np.random.Generator) -> Surface:
         albedo = blend(albedo, f32([0.42, 0.22, 0.10]), rust)
         words = ("flaking", "uneven", "cold", "hard")
     else:
-        scratch = tile.strokes(30, 25.0, 0.6, angle, 0.8, 0.09, 0.1)
+        scratch = tile.strokes(30, 25.0, 0.6, angle=angle, spread=0.8, height=0.09, bend=0.1)
         height, albedo = height - scratch, tint(albedo, 1.0 - 2.5 * scratch)
         words = ("scratched", "smooth", "cold", "hard")
     return Surface(
@@ -137,7 +139,7 @@ def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
     """Studded, treaded, ribbed, or granular."""
     kind = pick(rng, "studded", "treaded", "ribbed", "granular")
     value = rng.uniform(0.06, 0.3) if flip(rng, 0.7) else 0.6
-    colour = hsv(rng.random(), (0.0, 0.1, 0.6)[int(rng.integers(3))], value)
+    color = hsv(rng.random(), (0.0, 0.1, 0.6)[int(rng.integers(3))], value)
     angle = (0.0, math.pi / 4.0, math.pi / 3.0)[int(rng.integers(3))]
     step = rng.uniform(4.0, 9.0)
     u, v = tile.wave(step, angle), tile.wave(step, angle + math.pi / 2.0)
@@ -151,7 +153,7 @@ def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
     else:
         height, first = tile.grains(rng.uniform(1.5, 3.0))[0] * 0.2, "granular"
     height = height + tile.noise(0.3, 2.0, 1.0) * 0.008
-    albedo = tint(colour, 0.75 + 0.25 * _rising(height))
+    albedo = tint(color, 0.75 + 0.25 * _rising(height))
     return Surface(
         height,
         albedo,
@@ -165,19 +167,19 @@ def rubber(tile: Tile, rng: np.random.Generator) -> Surface:
 def paper(tile: Tile, rng: np.random.Generator) -> Surface:
     """A flat sheet, corrugated board, or crumpled; half of them printed, which nobody can feel."""
     kind = pick(rng, "sheet", "corrugated", "crumpled")
-    colour = hsv(rng.uniform(0.08, 0.15), rng.uniform(0.0, 0.15), rng.uniform(0.8, 0.97))
+    color = hsv(rng.uniform(0.08, 0.15), rng.uniform(0.0, 0.15), rng.uniform(0.8, 0.97))
     fibre = tile.noise(0.25, 2.0, 0.9)
     height = fibre * 0.010 + tile.noise(8.0, 50.0, 3.0) * 0.06
     words: tuple[str, ...] = ("thin", "flat", "dry")
     if kind == "corrugated":
-        colour = hsv(0.09, rng.uniform(0.3, 0.5), rng.uniform(0.5, 0.75))
+        color = hsv(0.09, rng.uniform(0.3, 0.5), rng.uniform(0.5, 0.75))
         flutes = np.cos(tile.wave(rng.uniform(5.0, 8.0), math.pi / 2.0 * int(rng.integers(2))))
         height, words = height + flutes * rng.uniform(0.10, 0.20), ("corrugated", "dry", "firm")
     elif kind == "crumpled":
         cells = tile.cells(rng.uniform(9.0, 16.0))
         height = height + (cells.far - cells.near) * 0.16 + tile.ridged(3.0, 24.0, 2.6) * 0.07
         words = ("crumpled", "creased", "thin")
-    albedo = tint(colour, 1.0 + 0.03 * fibre)
+    albedo = tint(color, 1.0 + 0.03 * fibre)
     if flip(rng, 0.5):
         line = smoothstep(np.sin(tile.wave(rng.uniform(3.0, 6.0), math.pi / 2.0)), 0.2, 0.4)
         albedo = blend(
@@ -189,13 +191,13 @@ def paper(tile: Tile, rng: np.random.Generator) -> Surface:
 def other(tile: Tile, rng: np.random.Generator) -> Surface:
     """Things that fit nowhere: sponge, carpet, studded mat, rope."""
     kind = pick(rng, "sponge", "carpet", "stud mat", "rope")
-    colour = hsv(rng.random(), rng.uniform(0.1, 0.9), rng.uniform(0.3, 0.95))
+    color = hsv(rng.random(), rng.uniform(0.1, 0.9), rng.uniform(0.3, 0.95))
     if kind == "sponge":
         cells = tile.cells(rng.uniform(1.5, 3.5))
         height = cells.walls(0.7) * -0.7 * cells.keep(rng, 0.8)
         words, noun = ("porous", "spongy", "unusual"), "a sponge"
     elif kind == "carpet":
-        height = tile.strokes(900, 3.5, 0.7, 0.0, 3.0, 1.0, 0.8)
+        height = tile.strokes(900, 3.5, 0.7, angle=0.0, spread=3.0, height=1.0, bend=0.8)
         words, noun = ("tufted", "springy", "unusual"), "carpet"
     elif kind == "stud mat":
         across = lambda at: at % 8.0 - 4.0  # noqa: E731
@@ -206,7 +208,7 @@ def other(tile: Tile, rng: np.random.Generator) -> Surface:
         strand = np.abs(np.sin(tile.wave(rng.uniform(10.0, 16.0), angle)))
         height = strand * 0.8 + 0.25 * np.sin(tile.wave(rng.uniform(2.0, 3.0), angle + 0.9))
         words, noun = ("corded", "twisted", "unusual"), "a rope"
-    albedo = tint(colour, 0.55 + 0.45 * _rising(height))
+    albedo = tint(color, 0.55 + 0.45 * _rising(height))
     return Surface(
         height + tile.noise(0.5, 4.0) * 0.02, albedo, kind, words, rng.uniform(0.05, 0.4), 0.4, noun
     )

@@ -81,7 +81,7 @@ def pick_angle(rng: np.random.Generator) -> float:
 def ceramic_tile(tile: Tile, rng: np.random.Generator) -> Surface:
     """Glazed, textured (anti-slip), or small mosaic."""
     kind = pick(rng, "glazed", "glazed", "textured", "mosaic")
-    colour = hsv(rng.random(), (0.05, 0.12, 0.5)[int(rng.integers(3))], rng.uniform(0.5, 0.95))
+    color = hsv(rng.random(), (0.05, 0.12, 0.5)[int(rng.integers(3))], rng.uniform(0.5, 0.95))
     side = TILE_MM / (5 if kind == "mosaic" else int(rng.integers(2, 4)))
     gap = rng.uniform(0.6, 1.4)
     body = smoothstep(tile.squares(side), gap * 0.6, gap * 1.6)
@@ -101,14 +101,14 @@ def ceramic_tile(tile: Tile, rng: np.random.Generator) -> Surface:
     grout = f32([0.6, 0.59, 0.57]) * rng.uniform(0.5, 1.3)
     gloss = rng.uniform(0.1, 0.3) if kind == "textured" else rng.uniform(0.4, 0.9)
     return Surface(
-        height, blend(grout, tint(colour, shade + marble), body), kind, words, gloss=gloss
+        height, blend(grout, tint(color, shade + marble), body), kind, words, gloss=gloss
     )
 
 
 def rock(tile: Tile, rng: np.random.Generator) -> Surface:
     """Craggy, layered, or weathered."""
     kind = pick(rng, "craggy", "layered", "weathered")
-    colour = hsv(rng.uniform(0.05, 0.6), rng.uniform(0.0, 0.18), rng.uniform(0.3, 0.7))
+    color = hsv(rng.uniform(0.05, 0.6), rng.uniform(0.0, 0.18), rng.uniform(0.3, 0.7))
     angle = rng.uniform(0.0, math.pi)
     if kind == "craggy":
         form = tile.ridged(0.8, 25.0, 2.2)
@@ -122,7 +122,7 @@ def rock(tile: Tile, rng: np.random.Generator) -> Surface:
         height, words = form * 0.55, ("weathered", "uneven", "hard")
     grit = tile.noise(0.3, 1.5, 0.6)
     specks = smoothstep(tile.noise(0.4, 1.6, 0.3), 1.0, 1.6) * (-0.5 if flip(rng, 0.5) else 0.5)
-    albedo = tint(colour, (1.0 + 0.16 * form + 0.08 * grit) * (1.0 + specks))
+    albedo = tint(color, (1.0 + 0.16 * form + 0.08 * grit) * (1.0 + specks))
     return Surface(height + grit * rng.uniform(0.02, 0.08), albedo, kind, words, gloss=0.04)
 
 
@@ -132,7 +132,7 @@ def gravel(tile: Tile, rng: np.random.Generator) -> Surface:
     size = rng.uniform(5.0, 11.0)
     stones, cells = tile.grains(size, 0.35, edge=0.75 if kind == "rounded" else 0.35)
     base = hsv(rng.uniform(0.03, 0.62), rng.uniform(0.02, 0.2), rng.uniform(0.4, 0.7))
-    colours = f32(
+    colors = f32(
         base * rng.uniform(0.55, 1.4, (cells.count, 1)) * rng.uniform(0.9, 1.1, (cells.count, 3))
     )
     height = stones * (size * 0.28)
@@ -143,7 +143,7 @@ def gravel(tile: Tile, rng: np.random.Generator) -> Surface:
         height = height + tile.noise(0.4, 3.0, 1.2) * 0.04
         words = ("pebbly", "lumpy", "hard")
     albedo = tint(
-        colours[cells.index], (1.0 + 0.1 * tile.noise(0.3, 3.0)) * smoothstep(stones, -0.05, 0.5)
+        colors[cells.index], (1.0 + 0.1 * tile.noise(0.3, 3.0)) * smoothstep(stones, -0.05, 0.5)
     )
     return Surface(height, albedo, kind, words, gloss=0.05, softness=0.1)
 
@@ -167,11 +167,11 @@ def sand(tile: Tile, rng: np.random.Generator) -> Surface:
         words = ("granular", "rippled", "loose")
     elif kind == "packed":
         height, softness, words = height * 0.5, 0.15, ("granular", "fine-grained", "firm")
-    colour = hsv(rng.uniform(0.07, 0.13), rng.uniform(0.15, 0.45), rng.uniform(0.55, 0.9))
+    color = hsv(rng.uniform(0.07, 0.13), rng.uniform(0.15, 0.45), rng.uniform(0.55, 0.9))
     speckle = np.clip(cells.each(rng, 1.0, 0.25), 0.4, 1.6)
     return Surface(
         height,
-        tint(colour, speckle * (1.0 + 0.05 * tile.noise(3.0, 30.0))),
+        tint(color, speckle * (1.0 + 0.05 * tile.noise(3.0, 30.0))),
         kind,
         words,
         gloss=0.03,
@@ -182,7 +182,7 @@ def sand(tile: Tile, rng: np.random.Generator) -> Surface:
 def soil(tile: Tile, rng: np.random.Generator) -> Surface:
     """Crumbs, clods, or soil with plant litter."""
     kind = pick(rng, "crumbs", "clods", "litter")
-    colour = hsv(rng.uniform(0.04, 0.1), rng.uniform(0.3, 0.6), rng.uniform(0.15, 0.45))
+    color = hsv(rng.uniform(0.04, 0.1), rng.uniform(0.3, 0.6), rng.uniform(0.15, 0.45))
     clods, _ = tile.grains(
         rng.uniform(4.0, 7.0) if kind == "clods" else rng.uniform(2.2, 3.5), 0.6, 0.6
     )
@@ -193,14 +193,14 @@ def soil(tile: Tile, rng: np.random.Generator) -> Surface:
         + crumbs * 0.2
     )
     tone = (1.0 + 0.22 * tile.noise(0.3, 6.0, 1.2)) * (0.75 + 0.25 * np.clip(clods, 0.0, 1.0))
-    albedo = tint(colour, tone)
+    albedo = tint(color, tone)
     words = {
         "crumbs": ("crumbly", "loose", "yielding"),
         "clods": ("clumpy", "crumbly", "uneven"),
         "litter": ("crumbly", "fibrous", "loose"),
     }[kind]
     if kind == "litter":
-        stalks = tile.strokes(25, 12.0, 0.6, 0.0, 3.0, 0.6)
+        stalks = tile.strokes(25, 12.0, 0.6, angle=0.0, spread=3.0, height=0.6)
         height = np.maximum(height, float(height.mean()) + stalks)
         albedo = blend(albedo, hsv(0.11, 0.35, 0.6), smoothstep(stalks, 0.05, 0.2))
     return Surface(height, albedo, kind, words, gloss=0.01, softness=0.55)

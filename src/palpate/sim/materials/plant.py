@@ -46,10 +46,12 @@ def wood(tile: Tile, rng: np.random.Generator) -> Surface:
 
 
 def tree(tile: Tile, rng: np.random.Generator) -> Surface:
-    """Bark: furrowed, plated, or flaky with bands; some with moss, which shows but is hardly felt."""
+    """Bark: furrowed, plated, or flaky with bands; some with moss, which shows but is hardly
+    felt.
+    """
     kind = pick(rng, "furrowed", "plated", "flaky")
     angle = math.pi / 2.0 + rng.normal(0.0, 0.1)
-    colour = hsv(rng.uniform(0.05, 0.11), rng.uniform(0.15, 0.5), rng.uniform(0.25, 0.6))
+    color = hsv(rng.uniform(0.05, 0.11), rng.uniform(0.15, 0.5), rng.uniform(0.25, 0.6))
     if kind == "furrowed":
         height = np.minimum(np.abs(tile.noise(1.2, 14.0, 2.2, 9.0, angle)), 1.2) * 1.3
         first = "deeply furrowed"
@@ -66,7 +68,7 @@ def tree(tile: Tile, rng: np.random.Generator) -> Surface:
         first = "flaky"
     height = height + tile.noise(0.3, 3.0, 1.2, 3.0, angle) * 0.12
     albedo = tint(
-        blend(colour * 0.35, colour * 1.15, _rising(height)), 1.0 + 0.12 * tile.noise(0.4, 6.0, 1.2)
+        blend(color * 0.35, color * 1.15, _rising(height)), 1.0 + 0.12 * tile.noise(0.4, 6.0, 1.2)
     )
     if flip(rng, 0.35):
         albedo = blend(
@@ -85,15 +87,15 @@ def grass(tile: Tile, rng: np.random.Generator) -> Surface:
         int(rng.integers(170, 420)),
         rng.uniform(20.0, 42.0),
         width,
-        angle,
-        spread,
-        rng.uniform(0.9, 1.6),
-        0.5,
+        angle=angle,
+        spread=spread,
+        height=rng.uniform(0.9, 1.6),
+        bend=0.5,
     )
     rise = np.clip(blades * (1.0 / float(blades.max())), 0.0, 1.0)
-    colour = hsv(rng.uniform(0.17, 0.33), rng.uniform(0.45, 0.8), rng.uniform(0.35, 0.75))
+    color = hsv(rng.uniform(0.17, 0.33), rng.uniform(0.45, 0.8), rng.uniform(0.35, 0.75))
     tone = (0.5 + 0.6 * rise) * (1.0 + 0.2 * tile.noise(1.0, 8.0, 1.5, 10.0, angle))
-    albedo = tint(blend(f32([0.16, 0.11, 0.06]), colour, smoothstep(rise, 0.05, 0.5)), tone)
+    albedo = tint(blend(f32([0.16, 0.11, 0.06]), color, smoothstep(rise, 0.05, 0.5)), tone)
     words = {
         "broad": ("bladed", "layered", "soft"),
         "thin": ("thin-bladed", "fine", "soft"),
@@ -105,10 +107,10 @@ def grass(tile: Tile, rng: np.random.Generator) -> Surface:
 def plants(tile: Tile, rng: np.random.Generator) -> Surface:
     """A leaf from below (raised veins) or above (sunken veins), or moss."""
     kind = pick(rng, "raised veins", "sunken veins", "moss")
-    colour = hsv(rng.uniform(0.2, 0.38), rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.7))
+    color = hsv(rng.uniform(0.2, 0.38), rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.7))
     if kind == "moss":
-        height = tile.strokes(520, 5.0, 0.8, 0.0, 3.0, 1.1, 0.8)
-        albedo = blend(colour * 0.25, colour, _rising(height))
+        height = tile.strokes(520, 5.0, 0.8, angle=0.0, spread=3.0, height=1.1, bend=0.8)
+        albedo = blend(color * 0.25, color, _rising(height))
         words, noun = ("tufted", "cushioned", "pliable"), "moss"
     else:
         angle, step = rng.uniform(0.0, math.pi), rng.uniform(4.0, 8.0)
@@ -125,7 +127,7 @@ def plants(tile: Tile, rng: np.random.Generator) -> Surface:
         height = (
             vein * (sign * rng.uniform(0.3, 0.6)) + cell * 0.09 + tile.noise(6.0, 30.0, 3.0) * 0.12
         )
-        albedo = blend(tint(colour, 0.8 + 0.2 * cell), hsv(0.22, 0.4, 0.8), vein * 0.7)
+        albedo = blend(tint(color, 0.8 + 0.2 * cell), hsv(0.22, 0.4, 0.8), vein * 0.7)
         words, noun = ("veined" if sign > 0 else "furrowed", "waxy", "pliable"), "a leaf"
     albedo = tint(albedo, 1.0 + 0.08 * tile.noise(1.0, 12.0))
     return Surface(height, albedo, kind, words, rng.uniform(0.1, 0.35), 0.6, noun)

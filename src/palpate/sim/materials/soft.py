@@ -21,10 +21,10 @@ def leather(tile: Tile, rng: np.random.Generator) -> Surface:
     folds = np.maximum(tile.ridged(2.0, 14.0, 2.2, 3.0, rng.uniform(0.0, math.pi)) - 1.0, 0.0)
     height = pebble * rng.uniform(0.05, 0.14) + tile.noise(4.0, 20.0, 2.5) * 0.06 - 0.08 * folds
     if flip(rng, 0.7):
-        colour = hsv(rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.75), rng.uniform(0.12, 0.6))
+        color = hsv(rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.75), rng.uniform(0.12, 0.6))
     else:
-        colour = hsv(rng.random(), rng.uniform(0.0, 0.7), rng.uniform(0.08, 0.7))
-    albedo = tint(colour, (0.72 + 0.28 * pebble) * (1.0 + 0.06 * tile.noise(2.0, 20.0)))
+        color = hsv(rng.random(), rng.uniform(0.0, 0.7), rng.uniform(0.08, 0.7))
+    albedo = tint(color, (0.72 + 0.28 * pebble) * (1.0 + 0.06 * tile.noise(2.0, 20.0)))
     words: tuple[str, ...] = ("supple", "fine-grained" if kind == "fine" else "pebbled", "soft")
     if kind == "stitched":
         line, _ = tile.lines(16.0, 0.0)
@@ -56,7 +56,9 @@ def _weave(tile: Tile, rng: np.random.Generator, kind: str, step: float, wobble:
 
 
 def synthetic_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
-    """Twill, knit, mesh, rib, or plain weave of fine even threads; a third of them striped, which nobody can feel."""
+    """Twill, knit, mesh, rib, or plain weave of fine even threads; a third of them striped, which
+    nobody can feel.
+    """
     kind = pick(rng, "twill", "knit", "mesh", "rib", "plain")
     relief = _weave(
         tile, rng, kind, rng.uniform(1.8, 3.6) if kind == "mesh" else rng.uniform(1.0, 2.2), 1.0
@@ -85,17 +87,17 @@ def natural_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
     """Coarse plain weave, knit, or corded, of uneven fuzzy threads."""
     kind = pick(rng, "plain", "plain", "knit", "rib")
     relief = _weave(tile, rng, kind, rng.uniform(1.8, 4.2), 2.5)
-    fuzz = tile.strokes(260, 5.0, 0.3, 0.0, 3.0, 0.16)
+    fuzz = tile.strokes(260, 5.0, 0.3, angle=0.0, spread=3.0, height=0.16)
     height = (
         relief * rng.uniform(0.2, 0.45)
         + fuzz * rng.uniform(0.3, 1.0)
         + tile.noise(5.0, 30.0, 3.0) * 0.15
     )
     if flip(rng, 0.6):
-        colour = hsv(rng.uniform(0.06, 0.14), rng.uniform(0.05, 0.4), rng.uniform(0.45, 0.95))
+        color = hsv(rng.uniform(0.06, 0.14), rng.uniform(0.05, 0.4), rng.uniform(0.45, 0.95))
     else:
-        colour = hsv(rng.random(), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.8))
+        color = hsv(rng.random(), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.8))
     tone = 0.5 + 0.5 * np.clip(relief * (1.0 / float(relief.max())), 0.0, 1.0)
-    albedo = tint(colour, tone * (1.0 + 0.1 * tile.noise(0.4, 6.0, 1.0)))
+    albedo = tint(color, tone * (1.0 + 0.1 * tile.noise(0.4, 6.0, 1.0)))
     first = {"plain": "coarsely woven", "knit": "knitted", "rib": "corded"}[kind]
     return Surface(height, albedo, kind, (first, "fuzzy", "soft"), gloss=0.02, softness=0.75)

@@ -1,0 +1,256 @@
+"""One world in every form: Touch and Go's tree, HCT's tree, videos, and samples rendered without files."""
+
+import csv
+import dataclasses
+import io
+import itertools
+import json
+import pickle
+import re
+from collections import Counter
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from palpate.core import PalpateError, Split
+from palpate.data.importing import import_dataset, validate_dataset
+from palpate.data.manifest import Manifest
+from palpate.leakage import audit
+from palpate.sim import MATERIALS, PRESETS, Video, World, WorldOptions, plan_world, write_world
+from palpate.sim.leak import cut
+from palpate.sim.plan import contact_frames, contact_rows
+
+TINY = dataclasses.replace(PRESETS["tiny"], size=32, tile=64, mixed=0.3, two_videos=0.25)
+HCT = dataclasses.replace(TINY, layout="hct", look="digit", objects_per_material=3)
+LEAKY = dataclasses.replace(
+    TINY, objects_per_material=4, two_videos=0.5, contacts_per_video=3, frames_per_contact=3
+)
+IMAGES = ("vision", "tactile", "background")
+CELLS = ("id", "video", "frame", "contact", "object", "material", "text", "sensor")
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    return write_world(tmp_path_factory.mktemp("frames") / "w", TINY)
+
+
+@pytest.fixture(scope="module")
+def hct(tmp_path_factory):
+    return write_world(tmp_path_factory.mktemp("hct") / "w", HCT)
+
+
+def read_list(path):
+    return [
+        (p, int(label)) for p, label in (x.split(",") for x in path.read_text().split("\n") if x)
+    ]
+
+
+def test_the_tree_has_the_layout_of_touch_and_go(frames):
+    folder, plans = frames.folder, plan_world(TINY)
+    assert sorted(p.name for p in (folder / "dataset").iterdir()) == [plan.name for plan in plans]
+    label = read_list(folder / "label.txt")
+    assert label == [
+        (f"{row.video.name}/{row.frame:010d}.jpg", MATERIALS[row.object.material].label)
+        for row in contact_rows(TINY, plans)
+    ]
+    parts = {part: read_list(folder / f"{part}.txt") for part in ("train", "test")}
+    assert dict(parts["train"] + parts["test"]) == dict(label)
+    assert all(rows != sorted(rows) for rows in parts.values())  # shuffled
+    assert not (folder / "test.txt").read_text().endswith("\n")
+    categories = (folder / "category_reference.txt").read_text().splitlines()
+    assert "Synthetic Fabric: 8" in categories
+    assert len(categories) == 20
+    images = sorted(p.name for p in folder.glob(f"dataset/{plans[0].name}/gelsight_frame/*"))
+    assert images == [f"{f:010d}.jpg" for f in range(TINY.video_length)]
+    sparse = dataclasses.replace(TINY, free_written="background")
+    assert len(World(sparse)) == len(label)
+
+
+def test_hct_has_the_layout_of_the_archive(hct):
+    root = hct.folder / "hct"
+    trajectories = sorted(p for p in root.glob("data*/*") if p.is_dir())
+    assert len(trajectories) == hct.counts["videos"]
+    for folder in trajectories:
+        place = folder.relative_to(root).as_posix()
+        assert re.fullmatch(r"data[1-3]/\d+-\d{10}\.\d\d", place)
+        names = {side: sorted(p.name for p in (folder / side).iterdir()) for side in IMAGES[:2]}
+        assert names["vision"] == names["tactile"]
+        numbers = sorted(int(re.fullmatch(r"(\d+)-0\.\d{4}\.jpg", n)[1]) for n in names["vision"])
+        assert numbers == list(range(HCT.video_length))
+    for rig in {p.parent for p in trajectories}:
+        contact, free = (
+            json.loads((rig / f"{name}.json").read_text()) for name in ("contact", "not_contact")
+        )
+        pairs = list(zip(contact["vision"], contact["tactile"], strict=True))
+        assert len(pairs) + len(free["vision"]) == sum(1 for _ in rig.glob("*/vision/*"))
+        rows = [
+            row
+            for path in rig.glob("t*.csv")
+            for row in csv.DictReader(path.read_text().splitlines())
+        ]
+        assert {(row["url"], row["tactile"]) for row in rows} == set(pairs)
+        assert all((rig / row["tactile_background"]).is_file() for row in rows)
+        assert all(re.fullmatch(r"[a-z, -]+", row["caption"]) for row in rows)
+        talks = json.loads((rig / "finetune.json").read_text())
+        captions = {row["url"]: row["caption"] for row in rows}
+        assert all(t["conversations"][-1]["value"] == captions[t["image"]] for t in talks)
+    numbers = [p.name.split("-")[0] for p in trajectories]
+    assert len(set(numbers)) < len(numbers)  # the number is used again, as in the archive
+
+
+@pytest.mark.parametrize("place", [".", "hct"])
+def test_hct_is_valid(hct, place):
+    result = validate_dataset(hct.folder / place)
+    assert (result.format, result.samples) == ("hct", hct.counts["contact_frames"])
+    assert [*result.missing, *result.invalid, *result.suspicious] == []
+
+
+@pytest.mark.parametrize("layout", ["frames", "hct"])
+def test_the_manifest_is_that_of_an_import_and_more(layout, tmp_path):
+    write_world(tmp_path / "w", dataclasses.replace(HCT, layout=layout))
+    manifest = Manifest.load(tmp_path / "w").require_valid()
+    imported = import_dataset(tmp_path / "w", tmp_path / "i")
+    rows = imported.manifest.take(manifest.ids)
+    assert len(rows) == len(imported.manifest)
+    for name in ("video", "frame", "contact", "session", "text", "domain", *IMAGES):
+        assert manifest.column(name) == rows.column(name), name
+    assert not any(manifest.table[name].null_count() for name in ("object", "material", "sensor"))
+    split = Split.load(tmp_path / "w" / "splits" / "Orig.json")
+    assert dict(split.parts) == dict(imported.splits["Orig"].parts)
+    assert split.manifest == manifest.digest
+    assert manifest.facts["synthetic"] == "yes"
+
+
+@pytest.mark.parametrize(("layout", "look"), [("frames", "gelsight"), ("hct", "digit")])
+@pytest.mark.parametrize("leak", ["frame", "contact", "none"])
+def test_an_audit_finds_exactly_the_leak_that_the_world_reports(layout, look, leak, tmp_path):
+    options = dataclasses.replace(LEAKY, layout=layout, look=look, leak=leak)
+    counts = write_world(tmp_path / "w", options).leak
+    imported = import_dataset(tmp_path / "w", tmp_path / "i")
+    split = imported.splits["Orig"]
+    lines = (tmp_path / "w" / "leak.csv").read_text().splitlines()
+    truth = {row.pop("id"): row for row in csv.DictReader(lines)}
+    assert set(truth) == set(split.ids("test"))
+    for group in ("video", "contact", *(["object"] if layout == "frames" else [])):
+        result = audit(imported.manifest, split=split, group=group, images=False)
+        shared = sum(int(row[f"{group}_in_train"]) for row in truth.values())
+        assert result.test_samples_in_shared_groups == shared
+        assert result.groups_shared == counts[f"{group}s_shared"]
+        gaps = tuple(counts[f"gap_{name}"] for name in ("min", "median", "max"))
+        assert (result.gap_min, result.gap_median, result.gap_max) == gaps
+    shortest = {"frame": 1, "contact": 6, "none": None}[leak]
+    assert counts["gap_min"] == shortest
+    assert (counts["contacts_shared"] > 0) is (leak == "frame")
+    assert (
+        counts["objects_shared"] > 0
+    )  # some objects have two videos, so a cut by video shares them
+    train = [(i.rsplit("/", 1)[0], int(i.rsplit("/", 1)[1])) for i in split.ids("train")]
+    for name, row in truth.items():
+        video, frame = name.rsplit("/", 1)
+        near = [(abs(int(frame) - f), f) for v, f in train if v == video]
+        if near:
+            assert (int(row["gap"]), int(row["nearest"].rsplit("/", 1)[1])) == min(near)
+        else:
+            assert (row["gap"], row["nearest"]) == ("", "")
+
+
+def cut_of(options):
+    plans = plan_world(options)
+    return cut(options, plans, list(contact_rows(options, plans)))
+
+
+@pytest.mark.parametrize("leak", ["frame", "contact", "none"])
+def test_a_share_near_0_or_1_leaves_each_list_one_unit(leak):
+    few = {"materials": 2, "objects_per_material": 2, "contacts_per_video": 1}
+    options = WorldOptions(**few, frames_per_contact=1, leak=leak, mixed=0.0)
+    for share, sizes in ((0.01, [3, 1]), (0.99, [1, 3])):
+        assert [len(part) for part in cut_of(dataclasses.replace(options, test=share))] == sizes
+
+
+def test_a_cut_by_video_takes_its_share_of_every_material():
+    options = WorldOptions(materials=5, objects_per_material=8, leak="none", mixed=0.0)
+    videos = {(row.object.material, row.video.index) for row in cut_of(options)[1]}
+    assert Counter(name for name, _ in videos) == dict.fromkeys(options.names, 2)
+
+
+def test_videos_hold_the_same_frames(tmp_path):
+    av = pytest.importorskip("av")
+    options = dataclasses.replace(TINY, materials=("Brick",), layout="videos")
+    write_world(tmp_path / "w", options)
+    video = Video(options, 1)
+    for name, render in (("video.mp4", video.vision), ("gelsight.mp4", video.tactile)):
+        with av.open(str(tmp_path / "w" / "dataset" / video.plan.name / name)) as file:
+            assert file.streams.video[0].average_rate == 30
+            decoded = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+        assert len(decoded) == options.video_length
+        for k, frame in enumerate(decoded):
+            assert np.abs(frame.astype(float) - render(k)).mean() < 14
+
+
+@pytest.mark.parametrize("options", [TINY, dataclasses.replace(HCT, objects_per_material=1)])
+def test_samples_rendered_alone_equal_written_files(options, tmp_path):
+    write_world(tmp_path / "w", options)
+    manifest, world = Manifest.load(tmp_path / "w"), World(options)
+    assert world.ids == manifest.ids
+    for row, sample in zip(manifest.table.iter_rows(named=True), world, strict=True):
+        assert {name: sample[name] for name in CELLS} == {name: row[name] for name in CELLS}
+        assert sample["label"] == MATERIALS[row["material"]].label
+        for name in IMAGES:
+            path, file = manifest.path(row[name]), io.BytesIO()
+            if path.suffix == ".png":
+                np.testing.assert_array_equal(np.asarray(Image.open(path)), sample[name])
+            else:
+                Image.fromarray(sample[name]).save(file, "JPEG", quality=95, subsampling=0)
+                assert path.read_bytes() == file.getvalue()
+    for k in np.random.default_rng(0).permutation(len(world))[:8]:  # random access, small cache
+        np.testing.assert_array_equal(World(options, cache=1)[k]["tactile"], world[k]["tactile"])
+    assert world[-1]["id"] == world.ids[-1]
+
+
+def test_captions_and_objects_follow_the_object_in_contact():
+    options = dataclasses.replace(TINY, mixed=1.0, contacts_per_video=4)
+    for plan in plan_world(options):
+        video, names = Video(options, plan), {ref.name for ref in plan.objects}
+        assert 2 <= len(names) <= 3
+        surface = video.object_of(3).surface
+        assert sum(word in video.text(3).lower() for word in surface.words) >= 2
+        assert list(contact_frames(options, 3))[0] < options.video_length
+
+
+def test_a_world_has_the_manifest_and_split_that_are_written(frames):
+    world = World(TINY)
+    manifest, split = world.manifest(), Split.load(frames.folder / "splits" / "Orig.json")
+    written = Manifest.load(frames.folder)
+    assert manifest.column("text") == written.column("text")
+    assert manifest.ids == written.ids
+    assert world.split(written).digest == split.digest
+    assert world.split(written).manifest == split.manifest
+    assert world.split().manifest is None
+
+
+def test_a_world_is_a_data_set_for_loaders():
+    world = World(dataclasses.replace(PRESETS["tiny"], size=16, tile=64), cache=2)
+    empty = len(pickle.dumps(world))
+    first = world[0]
+    assert len(pickle.dumps(world)) == empty < 3000  # without what it rendered
+    copy = pickle.loads(pickle.dumps(world))
+    np.testing.assert_array_equal(copy[0]["vision"], first["vision"])
+    data = pytest.importorskip("torch.utils.data")
+    batches = list(data.DataLoader(world, batch_size=8, num_workers=0))
+    assert [tuple(batch["vision"].shape) for batch in batches] == [(8, 16, 16, 3)] * 4
+    assert list(itertools.chain(*(batch["id"] for batch in batches))) == world.ids
+    assert len(world._videos) == 2
+
+
+def test_what_a_world_does_not_have_is_rejected():
+    world = World("tiny")
+    for k in (32, -33, 10**9):
+        with pytest.raises(PalpateError, match="must be 0 to 31"):
+            world[k]
+    with pytest.raises(IndexError):
+        world[32]
+    with pytest.raises(PalpateError, match="`cache` must be at least 1"):
+        World(cache=0)
+    with pytest.raises(PalpateError, match="one of tiny, demo"):
+        World("large")
