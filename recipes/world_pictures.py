@@ -145,7 +145,7 @@ def toolbox() -> Board:
     cells, (stones, _), blades = (
         tile.cells(6.0),
         tile.grains(5.0),
-        tile.strokes(250, 25.0, 2.0, 0.8, 0.5, 1.0),
+        tile.strokes(250, 25.0, 2.0, angle=0.8, spread=0.5, height=1.0),
     )
     noise = tile.noise(0.6, 20.0)
     u, v = tile.wave(5.0, 0.0), tile.wave(5.0, np.pi / 2)

@@ -1,6 +1,5 @@
 """The benchmarks of the world: cuts, words, partners and costs are what their tables say."""
 
-import dataclasses
 import sys
 from pathlib import Path
 
@@ -11,7 +10,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import split_protocols as protocols
 import world_background as background
-import world_speed as speed
 
 from palpate.sim import Video, WorldOptions, plan_world
 from palpate.sim.plan import contact_frames
@@ -63,7 +61,7 @@ def test_a_cut_keeps_its_units_whole_and_only_its_units(frames, protocol):
     assert 0.1 < len(test) / len(frames.ids) < 0.45
     units = {
         "frame": frames.ids,
-        "touch": frames.contact,
+        "contact": frames.contact,
         "video": frames.video,
         "object": frames.thing,
     }
@@ -195,36 +193,3 @@ def test_background_table_says_which_is_better(frames):
     )
     assert ("NOT better" in whole) == (not better)
     assert found[1].value > found[0].value  # halves of videos differ more than random ones
-
-
-def test_costs_count_every_object_video_and_frame_once():
-    options, mine, rivals = speed.measure_frames(16, 1, 2, 2)
-    assert (sum(map(len, mine.objects.values())), len(mine.videos), len(mine.frames)) == (
-        20,
-        20,
-        80,
-    )
-    assert rivals == {}
-    cost = speed.Cost({"a": [0.1, 0.3], "b": [0.4]}, [0.5], [0.1, 0.1])
-    mean, worst, who = cost.object_ms()
-    np.testing.assert_allclose(
-        (mean, worst, cost.rate(), cost.video_ms(), cost.total()), (800 / 3, 400, 10, 500, 1.5)
-    )
-    assert who == "b"
-    assert options.size == 16
-
-
-def test_the_prototype_is_skipped_where_it_is_absent(tmp_path, monkeypatch):
-    monkeypatch.delenv("PALPATE_SHARED_DATA", raising=False)
-    monkeypatch.chdir(tmp_path)
-    assert speed.find_prototype(None) is None
-    (tmp_path / "prototype").mkdir()
-    (tmp_path / "prototype/world_prototype.py").write_text("name = 'here'\n")
-    monkeypatch.setenv("PALPATE_SHARED_DATA", str(tmp_path / "data"))
-    assert speed.find_prototype(None).name == "here"
-
-
-def test_lazy_samples_equal_written_ones():
-    options = dataclasses.replace(OPTIONS, layout="raw", objects_per_material=1)
-    compared, differ, largest = speed.compare(options, 12)
-    assert (compared, differ, largest) == (12, 0, 0)

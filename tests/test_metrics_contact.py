@@ -252,7 +252,9 @@ def test_empty_gel_and_the_touch_itself_are_the_two_ends():
 
 def world_touches():
     world = World(
-        WorldOptions(objects_per_material=2, contacts_per_video=2, frames_per_contact=1, materials=8),
+        WorldOptions(
+            objects_per_material=2, contacts_per_video=2, frames_per_contact=1, materials=8
+        ),
         cache=40,
     )
     samples = [world[k] for k in range(len(world))]

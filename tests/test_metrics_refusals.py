@@ -184,7 +184,10 @@ X, Y, G = unit_rows(0, 8, 3), unit_rows(1, 8, 3), world(2)
         (lambda: prdc(G, G, k=2.5), "`k` must be a whole number of at least 1. Got 2.5"),
         (lambda: prdc(G, G, level=95), "level.*Got 95"),
         (lambda: contact_scores(*images(), images()[0], level=3), "level.*Got 3"),
-        (lambda: tmmd(G, G, seed=2**70), f"`seed` must be a whole number of at least 0. Got {2**70}"),
+        (
+            lambda: tmmd(G, G, seed=2**70),
+            f"`seed` must be a whole number of at least 0. Got {2**70}",
+        ),
         (lambda: tmmd(G, G, seed=1.5), "seed.*Got 1.5"),
         (lambda: fid(G, G, seed=-1), "seed.*Got -1"),
         (lambda: tmmd(G, G, level="a"), "level.*Got 'a'"),

@@ -199,7 +199,10 @@ def test_bins_are_joined_evenly_and_lose_nothing(size):
     unrelated = rng.integers(0, 5, size) * (edges[1:] > 0.2)
     bins = bins_of(
         calibrated(
-            edges=edges.tolist(), matches=found.tolist(), unrelated=unrelated.tolist(), threshold=0.9
+            edges=edges.tolist(),
+            matches=found.tolist(),
+            unrelated=unrelated.tolist(),
+            threshold=0.9,
         )
     )
     assert len(bins.matches) <= BARS

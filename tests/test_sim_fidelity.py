@@ -1,4 +1,5 @@
-"""The statistics of touch images on pictures whose answers are known, and the world against the real clips."""
+"""The statistics of touch images on pictures whose answers are known, and the world against the
+real clips."""
 
 import math
 
@@ -144,7 +145,8 @@ def test_sizes_are_means_over_areas():
 
 @pytest.mark.slow
 def test_the_world_lies_within_the_spread_of_the_real_clips(real_data):
-    """Medians over a few touches against the spread of the five real clips, as benchmarks/world_fidelity.py measures them, a little widened."""
+    """Medians over a few touches against the spread of the five real clips, as
+    benchmarks/world_fidelity.py measures them, a little widened."""
     av = pytest.importorskip("av")
     clips = {}
     for line in (real_data / "touch_and_go" / "clips" / "label.txt").read_text().split():

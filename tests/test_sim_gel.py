@@ -80,7 +80,8 @@ def test_the_membrane_is_that_of_the_docstring():
 
 
 def test_a_contact_ends_softly():
-    """A ball pressed into the gel: at the rim the slope changes less from pixel to pixel than in the bare foundation."""
+    """A ball pressed into the gel: at the rim the slope changes less from pixel to pixel than in
+    the bare foundation."""
     sensor = make_sensor(dataclasses.replace(SMALL, size=128), 0)
     y, x = (np.mgrid[:128, :128] - 63.5) * sensor.px
     gap = f32(-(x * x + y * y) / 40.0)
@@ -108,13 +109,14 @@ def test_the_frame_four_before_a_contact_is_free():
     video = Video(SMALL, 0)
     for touch in range(SMALL.contacts_per_video):
         first = first_contact(SMALL, touch)
-        assert not video.state(first - 4).contact
-        assert not video.state(first - 1).contact
-        assert all(video.state(f).contact for f in contact_frames(SMALL, touch))
+        assert not video.state(first - 4).touching
+        assert not video.state(first - 1).touching
+        assert all(video.state(f).touching for f in contact_frames(SMALL, touch))
 
 
 def test_shading_is_the_photometric_formula():
-    """A plane membrane of slope (a, b) without texture, against the formula written out in float64."""
+    """A plane membrane of slope (a, b) without texture, against the formula written out in
+    float64."""
     sensor = dataclasses.replace(
         make_sensor(SMALL, 1), ink=None, texture=np.zeros((32, 32), np.float32)
     )
@@ -188,7 +190,8 @@ def test_markers_follow_the_shear():
 
 
 def test_markers_are_pushed_apart_along_both_sides():
-    """Above a round bump, without shear: displaced by 0.107 mm x the slope of the smoothed depth, outwards."""
+    """Above a round bump, without shear: displaced by 0.107 mm x the slope of the smoothed depth,
+    outwards."""
     sensor = make_sensor(SMALL, 0)
     y, x = (np.mgrid[:32, :32] - 15.5) * sensor.px
     bump = f32(0.8 * np.exp(-(x * x + y * y) / 8.0))

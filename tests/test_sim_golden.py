@@ -1,6 +1,7 @@
 """Pictures of every material as they were when VERSION was last raised; within 2/255 on any CPU.
 
-``PALPATE_GOLDEN=write pytest tests/test_sim_golden.py`` draws them anew: raise VERSION in the same commit.
+``PALPATE_GOLDEN=write pytest tests/test_sim_golden.py`` draws them anew: raise VERSION in the same
+commit.
 """
 
 import os
@@ -15,7 +16,8 @@ GOLDEN = Path(__file__).parent / "golden" / "sim_world.npz"
 
 
 def pictures():
-    """Photo and touch of one object of each material, the two looks in turn: uint8 (20, 2, 20, 20, 3)."""
+    """Photo and touch of one object of each material, the two looks in turn: uint8 (20, 2, 20, 20,
+    3)."""
     images = []
     for k, name in enumerate(MATERIALS):
         options = WorldOptions(size=20, look=("gelsight", "digit")[k % 2])

@@ -1,4 +1,5 @@
-"""Custom materials: what their functions may return, what they may be called, how a world records them."""
+"""Custom materials: what their functions may return, what they may be called, how a world records
+them."""
 
 import dataclasses
 import json

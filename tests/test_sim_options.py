@@ -89,7 +89,7 @@ def test_series_are_a_few_numbers(name):
         ({"balance": "touch-and-go", "objects_per_material": 1}, "must be 2 or more"),
         ({"balance": "steep"}, "`balance` must be one of"),
         ({"look": np.array(["gelsight"])}, "`look` must be one of"),
-        ({"materials": (1, 2)}, "must be names of materials"),
+        ({"materials": (1,)}, "must be names of materials"),
         ({"materials": True}, "a count from 1 to 20"),
         ({"materials": 21}, "a count from 1 to 20"),
         ({"materials": ()}, "must be names"),
@@ -141,9 +141,9 @@ def test_presets_are_those_that_models_were_trained_on():
     assert seen_by_mini(WorldOptions(seed=MINI_SEEDS[0]))
 
 
-def record_of(options, **changes):
-    content = {"version": 2, "options": dataclasses.asdict(options)}
-    return {"format": "palpate-world/3", **content, "options_digest": options.digest, **changes}
+def record_of(world, **changes):
+    content = {"version": 2, "options": dataclasses.asdict(world), "options_digest": world.digest}
+    return {"format": "palpate-world/3", **content, **changes}
 
 
 def test_options_are_read_from_the_record_of_a_world(tmp_path):

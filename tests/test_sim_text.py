@@ -109,7 +109,8 @@ def test_phrases():
 
 
 def test_no_caption_has_the_prototypes_faults():
-    """ "A unusual" for "an unusual", "tree surface" for bark, words of another sub-type than the one drawn."""
+    """ "A unusual" for "an unusual", "tree surface" for bark, words of another sub-type than the
+    one drawn."""
     options = WorldOptions(
         tile=64,
         size=16,

@@ -1,4 +1,5 @@
-"""One world in every form: Touch and Go's tree, HCT's tree, videos, and samples rendered without files."""
+"""One world in every form: Touch and Go's tree, HCT's tree, videos, and samples rendered without
+files."""
 
 import csv
 import dataclasses
@@ -215,7 +216,7 @@ def test_captions_and_objects_follow_the_object_in_contact():
         assert 2 <= len(names) <= 3
         surface = video.object_of(3).surface
         assert sum(word in video.text(3).lower() for word in surface.words) >= 2
-        assert list(contact_frames(options, 3))[0] < options.video_length
+        assert contact_frames(options, 3)[0] < options.video_length
 
 
 def test_a_world_has_the_manifest_and_split_that_are_written(frames):

@@ -72,7 +72,7 @@ def test_a_world_of_another_version_is_rejected(tmp_path):
     write_world(tmp_path / "w", TINY)
     path = tmp_path / "w" / "world.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"version": 1}))
-    with pytest.raises(PalpateError, match="must be of version 2 of the world. Got version 1"):
+    with pytest.raises(PalpateError, match=r"must be of version 2 of the world\. Got version 1"):
         write_world(tmp_path / "w", TINY)
 
 

@@ -264,13 +264,17 @@ def _normal(value: Any, option: dataclasses.Field[Any]) -> Any:
     if isinstance(value, list):
         value = tuple(value)
     if kind in ("span", "series") and isinstance(value, tuple):
-        return tuple(float(v) if type(v) is int else v for v in value)
-    if kind == "number" and isinstance(low, float) and type(value) is int:
-        return float(value)
+        return tuple(map(_real, value))
+    if kind == "number" and isinstance(low, float):
+        return _real(value)
     if kind == "materials" and type(value) is int and 1 <= value <= len(MATERIALS):
         names = list(MATERIALS)
         return tuple(names[k * len(names) // value] for k in range(value))
     return value
+
+
+def _real(value: Any) -> Any:
+    return float(value) if type(value) is int and abs(value) < 10**15 else value
 
 
 def _error(name: str, must: str, got: Any, fix: str, example: Any = None) -> PalpateError:
@@ -285,7 +289,7 @@ def _check(option: dataclasses.Field[Any], value: Any) -> Iterator[PalpateError]
     if kind == "materials":
         yield from _check_materials(value)
     elif kind == "choice":
-        if value not in limits["choices"]:
+        if not isinstance(value, str) or value not in limits["choices"]:
             must = f"must be one of {', '.join(map(repr, limits['choices']))}"
             yield _error(name, must, value, "", limits["choices"][0])
     elif kind == "number":
