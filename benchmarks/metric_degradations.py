@@ -40,12 +40,12 @@ from palpate.metrics import (
     d_tmmd,
     distance,
     i_tmmd,
+    measure_contacts,
     ms_ssim_per_image,
     psnr_per_image,
     ssim_per_image,
     tmmd,
 )
-from palpate.metrics.contact import contact_per_image
 from palpate.metrics.frechet import fid
 from palpate.metrics.neighbors import prdc
 from palpate.sim import VERSION
@@ -186,11 +186,8 @@ def picture_scores(scene, images):
         key = k, images[k].tobytes()
         if key not in scene.compared:
             pair, real = images[k : k + 1], scene.real[k : k + 1]
-            found = contact_per_image(pair, real, scene.empty[k : k + 1])
-            contact = {
-                f"contact {name}": getattr(found, name.lower().replace("-", "_"))[0]
-                for name in ("PSNR", "SSIM", "MS-SSIM", "residual", "IoU")
-            }
+            contacts = measure_contacts(pair, real, scene.empty[k : k + 1])
+            contact = {name: values[0] for name, values in contacts.values.items()}
             whole = {"PSNR": psnr_per_image, "SSIM": ssim_per_image, "MS-SSIM": ms_ssim_per_image}
             scene.compared[key] = {
                 name: each(pair, real)[0] for name, each in whole.items()

@@ -117,7 +117,7 @@ def test_lpips_of_files_is_that_of_the_pictures_and_of_their_contact(
 ):
     from lpips_files import random_states, save_states
     from palpate.encoders.perceptual import load_lpips, lpips_per_image
-    from palpate.metrics import contact_pictures
+    from palpate.metrics import contact_images
 
     monkeypatch.chdir(tmp_path)
     small_manifest.save(Path("m/manifest.parquet"))
@@ -146,9 +146,9 @@ def test_lpips_of_files_is_that_of_the_pictures_and_of_their_contact(
     for name, pictures in made.items():
         images = np.stack([pictures[i] for i in small_manifest.ids])
         whole[name] = lpips_per_image(images, real, network)
-        pairs = contact_pictures(images, real, gel)
+        pairs = contact_images(images, real, gel)
         contact[name] = lpips_per_image(pairs.generated, pairs.reference, network, mask=pairs.mask)
-    pairs = contact_pictures(gel, real, gel)
+    pairs = contact_images(gel, real, gel)
     empty = lpips_per_image(pairs.generated, pairs.reference, network, mask=pairs.mask)
     for metric, values in (("LPIPS", whole), ("contact LPIPS", contact)):
         for name in "ab":

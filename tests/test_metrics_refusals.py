@@ -177,7 +177,7 @@ X, Y, G = unit_rows(0, 8, 3), unit_rows(1, 8, 3), world(2)
             r"`level` must lie in \(0, 1\). Got 95. Choose a coverage. E.g. level=0.95",
         ),
         (lambda: psnr(*images(), level=95), "level.*Got 95"),
-        (lambda: psnr(*images(), level=95, compat="torchmetrics"), "level.*Got 95"),
+        (lambda: psnr(*images(), level=95), "level.*Got 95"),
         (lambda: fid(G, G, level=2), "level.*Got 2"),
         (lambda: fid(G, G, blocks=2.5), "`blocks` must be a whole number of at least 2. Got 2.5"),
         (lambda: fid(G, G, blocks=1), "blocks.*at least 2. Got 1"),

@@ -13,14 +13,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Progress, Score, quiet
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, quiet
 from palpate.evaluation.comparing import Asked, Outcome, feature_companions
-from palpate.metrics import psnr, psnr_per_image, ssim, ssim_per_image
-from palpate.metrics.contact import contact_per_image, contact_pictures, contact_scores
-from palpate.metrics.masks import LEAST, pictures_digest
-from palpate.metrics.multiscale import ms_ssim, ms_ssim_per_image
+from palpate.metrics import (
+    background_digest,
+    contact_images,
+    mean_score,
+    measure_contacts,
+    ms_ssim,
+    ms_ssim_per_image,
+    psnr,
+    psnr_per_image,
+    ssim,
+    ssim_per_image,
+)
+from palpate.metrics.masks import LEAST
 from palpate.metrics.paired import mean_differences
-from palpate.metrics.pairwise import mean_score
 
 if TYPE_CHECKING:
     from palpate.encoders.perceptual import Lpips
@@ -37,14 +45,6 @@ NO_GEL = (
     "touches without",
     "Pass a manifest with the column background as --reference, or leave contact out of --companions",
 )
-#: Name of a contact score -> its field of :class:`palpate.metrics.contact.Contacts`.
-CONTACT = {
-    "contact residual": "residual",
-    "contact SSIM": "ssim",
-    "contact PSNR": "psnr",
-    "contact IoU": "iou",
-    "contact MS-SSIM": "ms_ssim",
-}
 #: Pairs whose contacts are made into pictures at a time.
 PICTURES = 256
 
@@ -156,18 +156,14 @@ def _contact(
 ) -> Outcome:
     if background is None:
         raise PalpateError(*NO_GEL)
-    found = {
-        name: contact_scores(images, real, background, subject=name, **common)
-        for name, images in pictures.items()
-    }
-    out = Outcome([s for scores in found.values() for s in scores])
+    contacts = {name: measure_contacts(v, real, background) for name, v in pictures.items()}
+    scores = {name: c.scores(subject=name, **common) for name, c in contacts.items()}
+    out = Outcome([s for some in scores.values() for s in some])
     if len(compared) > 1:
-        each = {name: contact_per_image(pictures[name], real, background) for name in compared}
-        for metric, attribute in CONTACT.items():
-            scores = {name: next(s for s in found[name] if s.metric == metric) for name in compared}
+        for k, metric in enumerate(s.metric for s in scores[compared[0]]):
             out.differences += mean_differences(
-                scores,
-                {name: getattr(each[name], attribute) for name in compared},
+                {name: scores[name][k] for name in compared},
+                {name: contacts[name].values[metric] for name in compared},
                 common["groups"],
             )
     return out
@@ -193,7 +189,7 @@ def _lpips(
         "level": 0.95,
         "split": common["split"],
         "encoder": network.digest,
-        "better": False,
+        "higher_is_better": False,
     }
     out = Outcome()
 
@@ -207,8 +203,8 @@ def _lpips(
             name: mean_score(
                 metric,
                 v,
-                common["ids"],
-                common["groups"],
+                ids=common["ids"],
+                groups=common["groups"],
                 subject=name,
                 settings=dict(settings),
                 **rest,
@@ -242,11 +238,9 @@ def _lpips(
                 "markers": "skip",
                 "least": round(LEAST, 6),
                 "generated_background": "real",
-                "background": pictures_digest(background),
+                "background": background_digest(background),
             },
-            note=f"{bare} of {len(real)} real touches show no contact, left out of the mean"
-            if bare
-            else "",
+            notes=[Note("no-contact", {"count": bare, "n": len(real)})] if bare else [],
             details={"empty": float(np.nanmean(empty)) if bare < len(real) else None},
         )
     return out
@@ -261,7 +255,7 @@ def _contact_lpips(
     out = np.empty(len(real))
     for start in range(0, len(real), PICTURES):
         at = slice(start, start + PICTURES)
-        pairs = contact_pictures(images[at], real[at], background[at])
+        pairs = contact_images(images[at], real[at], background[at])
         out[at] = lpips_per_image(pairs.generated, pairs.reference, network, mask=pairs.mask)
         progress("LPIPS of the contact", min(start + PICTURES, len(real)), len(real))
     return out

@@ -38,7 +38,7 @@ from palpate.evaluation.comparing import (
     compare_features,
     feature_companions,
 )
-from palpate.metrics.pairwise import paired_by_id
+from palpate.metrics import paired_by_id
 
 if TYPE_CHECKING:
     from palpate.encoders.encoder_set import EncoderSet

@@ -1,31 +1,37 @@
-"""How good are generated touches: the TMMD family and its companions. Arrays in, :class:`palpate.core.Score` out; NumPy and SciPy only."""
+"""Metrics of generated tactile images: arrays or tensors in, :class:`palpate.core.Score` out.
+
+On features of an encoder: the TMMD family, KID, CMMD, FID, precision, recall, density and coverage.
+On pairs of images: SSIM, PSNR and MS-SSIM, of whole images and of the contact alone.
+"""
 
 from palpate.metrics.contact import (
+    contact_images,
     contact_iou,
     contact_ms_ssim,
-    contact_pictures,
     contact_psnr,
     contact_residual,
     contact_scores,
     contact_ssim,
+    measure_contacts,
 )
-from palpate.metrics.frechet import compare_fid, fid
-from palpate.metrics.gaussians import frechet_distance
-from palpate.metrics.kernels import Gaussian, Linear, Polynomial
-from palpate.metrics.masks import contact_mask
-from palpate.metrics.mmd import Distance, distance, mmd2
-from palpate.metrics.multiscale import ms_ssim, ms_ssim_per_image
-from palpate.metrics.neighbors import prdc
-from palpate.metrics.paired import Comparison, compare, compare_tmmd
-from palpate.metrics.pairwise import (
+from palpate.metrics.frechet import compare_fid, fid, frechet_distance
+from palpate.metrics.images import (
     mean_score,
+    ms_ssim,
+    ms_ssim_per_image,
     paired_by_id,
     psnr,
     psnr_per_image,
     ssim,
     ssim_per_image,
 )
+from palpate.metrics.kernels import Gaussian, Linear, Polynomial
+from palpate.metrics.masks import background_digest, contact_mask
+from palpate.metrics.mmd import Distance, distance, mmd2
+from palpate.metrics.neighbors import prdc, precision_recall
+from palpate.metrics.paired import Comparison, compare, compare_tmmd
 from palpate.metrics.presets import PRESETS, Options
+from palpate.metrics.published import cmmd, kid
 from palpate.metrics.streaming import CITMMD, DTMMD, ITMMD, TMMD
 from palpate.metrics.tactile import ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
 
@@ -41,14 +47,16 @@ __all__ = [
     "Linear",
     "Options",
     "Polynomial",
+    "background_digest",
     "ci_tmmd",
+    "cmmd",
     "compare",
     "compare_fid",
     "compare_tmmd",
+    "contact_images",
     "contact_iou",
     "contact_mask",
     "contact_ms_ssim",
-    "contact_pictures",
     "contact_psnr",
     "contact_residual",
     "contact_scores",
@@ -59,12 +67,15 @@ __all__ = [
     "four_scores",
     "frechet_distance",
     "i_tmmd",
+    "kid",
     "mean_score",
+    "measure_contacts",
     "mmd2",
     "ms_ssim",
     "ms_ssim_per_image",
     "paired_by_id",
     "prdc",
+    "precision_recall",
     "psnr",
     "psnr_per_image",
     "ssim",

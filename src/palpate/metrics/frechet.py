@@ -1,15 +1,18 @@
-"""FID: the Fréchet distance between two sets of features, each taken as a Gaussian (Heusel et al., arXiv 1706.08500).
+"""FID: the Fréchet distance of two sets of features taken as Gaussians (Heusel, arXiv 1706.08500).
 
-The distance itself, in float64 and without a matrix root, is in :mod:`palpate.metrics.gaussians`.
+``|mu1 - mu2|^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2)``, covariances divided by n - 1, in float64.
+With factors ``S = F' F`` the trace of the root is the sum of the singular values of ``F1 F2'``, so
+no matrix root is needed (``scipy.linalg.sqrtm`` may turn complex or fail). F is a Cholesky factor;
+of n <= d samples it is the thin ``(X - mu) / sqrt(n - 1)``: a covariance would lose digits.
 
-**Bias.** FID is biased upwards, by about c / n with a c that depends on the generator (Chong and Forsyth, arXiv 1911.07023): compare
-values of equal n alone. ``details["infinity"]`` is the intercept of a line in 1 / n fitted to FID of parts of both sets, made of whole blocks
-of groups, so that frames of one video do not pass for so many samples; it has less bias and somewhat more noise. With n <= d the value is
-bias mostly, and the note says so.
+**Bias.** FID is biased upwards, by about c / n with a c that depends on the generator (Chong and
+Forsyth, arXiv 1911.07023): compare values of equal n only. ``details["infinity"]`` is the intercept
+of a line in 1 / n fitted to FID of parts of both sets, made of whole blocks of groups; it has less
+bias and somewhat more noise. With n <= d the value is mostly bias.
 
-**Interval.** A jackknife leaves out one block of whole groups from both sets at a time. It is an interval for the FID expected at
-this n, bias included, not for FID at infinity. The difference of two generators on the same samples is left-one-out as a whole, with the same
-blocks (:func:`compare_fid`).
+**Interval.** A jackknife leaves out one block of whole groups from both sets at a time. It is an
+interval for the FID expected at this n, bias included. The difference of two generators on the same
+samples is jackknifed as a whole, with the same blocks (:func:`compare_fid`).
 """
 
 from __future__ import annotations
@@ -21,27 +24,49 @@ from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from palpate import __version__
-from palpate.core import FeatureSet, PalpateError, Score, rng_for
-from palpate.metrics.gaussians import Array, Moments, distance_of_features, distance_of_moments
+from palpate.core import FeatureSet, Note, PalpateError, Score, rng_for
 from palpate.metrics.inputs import (
-    Floats,
     checked_level,
     checked_names,
+    checked_pair,
     checked_whole,
     copies_across,
+    feature_set,
+    require_one_encoder,
 )
 from palpate.metrics.intervals import jackknife_errors, t_interval
-from palpate.metrics.neighbors import checked_sets, copies_note
 from palpate.metrics.paired import Comparison, difference, holm, same_samples
 from palpate.metrics.scored import Scored
 
+Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+#: Mean (d,) and factor (r, d) of a covariance F' F.
+Gaussian = tuple[Array, Array]
+#: Number of rows, their sum (d,) and the sum of their outer products (d, d), about a center.
+Sums = tuple[int, Array, Array]
+
+#: Rows turned to float64 at a time.
+ROWS = 8192
+#: A covariance may differ from its transpose by this share of its largest entry.
+SYMMETRY = 1e-6
+EPSILON = float(np.finfo(np.float64).eps)
 
 
 class FidOptions(TypedDict, total=False):
-    """Options of :func:`compare_fid`; see :func:`fid`."""
+    """Options of :func:`fid` and :func:`compare_fid`.
+
+    Attributes:
+        normalize: divide every row by its norm first, default False as published.
+        blocks: the most blocks that the jackknife leaves out, default 20. With no more groups than
+            that it leaves out one group at a time; else groups are drawn into blocks of about equal
+            size. Groups count only if both sets have them; the same name is the same group.
+        seed: of that draw.
+        split: digest of the split, kept in the score.
+        level: coverage of the interval, 0.95.
+    """
 
     normalize: bool
     blocks: int
@@ -50,87 +75,78 @@ class FidOptions(TypedDict, total=False):
     level: float
 
 
+def fid(
+    generated: Any,
+    reference: Any,
+    *,
+    ids: Any = None,
+    groups: Any = None,
+    reference_ids: Any = None,
+    reference_groups: Any = None,
+    encoder: str | None = None,
+    subject: str = "generated",
+    interval: bool = True,
+    **options: Unpack[FidOptions],
+) -> Score:
+    """FID between generated and real samples; lower is better.
+
+    Args:
+        generated: (n, d) features, n >= 2: an array, a tensor, a list of rows, or a FeatureSet; FID
+            as published takes the 2048 pool features of Inception.
+        reference: (m, d) features, m >= 2.
+        ids: n sample ids.
+        groups: n groups (videos) of ``generated``.
+        reference_ids: m sample ids.
+        reference_groups: m groups of ``reference``.
+        encoder: digest of the encoder of both.
+        subject: what is scored, kept in the score.
+        interval: compute the interval and ``details["infinity"]``, which cost about ``blocks + 11``
+            times the distance itself.
+        **options: see :class:`FidOptions`.
+
+    Returns:
+        Value and interval; ``details["infinity"]`` (None where half of a set has no more than d
+        rows, or with fewer than 8 blocks) and ``details["mean_term"]``, the part |mu1 - mu2|^2.
+
+    Raises:
+        PalpateError: on features that cannot be used, unequal widths, fewer than two rows, or
+            encoders of different digests.
+    """
+    made = feature_set(generated, argument="generated", ids=ids, groups=groups, encoder=encoder)
+    real = feature_set(
+        reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
+    )
+    return _fid(made, real, subject=subject, interval=interval, **options).score
+
+
 def compare_fid(
     generators: Mapping[str, FeatureSet], reference: FeatureSet, **options: Unpack[FidOptions]
 ) -> Comparison:
     """FID of several generators on the same samples, with paired differences.
 
     Args:
-        generators: name -> features of its touches; all with the same ids (any order), labels and groups.
-        reference: features of the real touches.
-        **options: of :func:`fid`.
+        generators: name -> features; all with the same ids (any order), labels and groups.
+        reference: features of the real samples.
+        **options: see :class:`FidOptions`.
 
     Returns:
-        The differences are of FID at this n, in which the biases of the two need not be equal; ``details["infinity"]`` is the difference of the
-        two extrapolations, or None.
+        Differences of FID at this n, in which the biases of the two need not be equal;
+        ``details["infinity"]`` is the difference of the two extrapolations, or None.
 
     Raises:
         PalpateError: if generators differ in ids, labels, groups or encoder, or as :func:`fid`.
     """
-    if unknown := sorted(set(options) - set(FidOptions.__annotations__)):
-        raise PalpateError(
-            f"Options must be among {', '.join(FidOptions.__annotations__)}",
-            ", ".join(unknown),
-            "Check the spelling",
-        )
-    found = {
-        name: _fid(one, reference, subject=name, **options)
-        for name, one in same_samples(generators).items()
-    }
+    sets = same_samples(generators)
+    scored = {name: _fid(s, reference, subject=name, **options) for name, s in sets.items()}
     differences: list[Score] = []
-    for a, b in combinations(found.values(), 2):
-        one, limits = difference(a, b), [v.score.details["infinity"] for v in (a, b)]
+    for a, b in combinations(scored.values(), 2):
+        delta, limits = difference(a, b), [v.score.details["infinity"] for v in (a, b)]
         limit = None if None in limits else limits[0] - limits[1]
+        notes = (Note("fid-difference-biased"),) if delta.interval else delta.notes
         differences.append(
-            replace(one, note=one.note or _BIASED, details={**one.details, "infinity": limit})
+            replace(delta, notes=notes, details={**delta.details, "infinity": limit})
         )
-    return Comparison([one.score for one in found.values()], holm(differences))
-
-
-_BIASED = "Of FID at this size, whose biases need not be equal"
-
-
-def fid(
-    generated: FeatureSet,
-    reference: FeatureSet,
-    *,
-    normalize: bool = False,
-    interval: bool = True,
-    blocks: int = 20,
-    seed: int = 0,
-    subject: str = "generated",
-    split: str | None = None,
-    level: float = 0.95,
-) -> Score:
-    """FID between generated and real touches; lower is better.
-
-    Args:
-        generated: (n, d) features, n >= 2; FID as published takes the 2048 pool features of Inception.
-        reference: (m, d) features, m >= 2.
-        normalize: divide every row by its norm first; FID as published does not.
-        interval: make the interval and ``details["infinity"]``, which cost about ``blocks + 11`` times the distance itself.
-        blocks: the most blocks that the jackknife leaves out. With no more groups than that it leaves one group out at a time; else
-            groups are drawn into blocks of about equal size. Groups count only if both sets have them; the same name is the same group.
-        seed: of that draw.
-        subject: what is scored, kept in the score.
-        split: digest of the split, kept in the score.
-        level: coverage of the interval.
-
-    Returns:
-        Value, interval; ``details["infinity"]`` (None where half of a set has no more than d rows, or there are fewer than 8 blocks) and
-        ``details["mean_term"]``, the part ``|mu1 - mu2|^2``.
-
-    Raises:
-        PalpateError: on features that are refused, unequal widths, fewer than two rows, or encoders of different digests.
-    """
-    options: dict[str, Any] = {
-        "normalize": normalize,
-        "blocks": blocks,
-        "seed": seed,
-        "split": split,
-        "level": level,
-    }
-    return _fid(generated, reference, subject=subject, interval=interval, **options).score
+    return Comparison([s.score for s in scored.values()], holm(differences))
 
 
 def _fid(
@@ -149,30 +165,27 @@ def _fid(
     checked_whole(2, blocks=blocks)
     checked_whole(0, seed=seed)
     checked_level(level)
-    x, y = checked_sets(generated, reference, normalize=normalize, least=2)
-    whole = Moments.of(x), Moments.of(y)
-    value = (
-        distance_of_moments(*whole)
-        if min(len(x), len(y)) > x.shape[1]
-        else distance_of_features(x, y)
+    require_one_encoder(generated, reference, "reference")
+    names = ("generated", "reference")
+    x, y = checked_pair(
+        generated.features, reference.features, normalize=normalize, least=2, names=names
     )
-    details: dict[str, Any] = {
-        "mean_term": float(((whole[0].mean - whole[1].mean) ** 2).sum()),
-        "infinity": None,
-        "version": __version__,
-    }
-    note, found, method = copies_note(copies_across(x, y), len(x)), None, ""
-    replicates, units = np.zeros(0), []
+    center = (x.mean(axis=0, dtype=np.float64) + y.mean(axis=0, dtype=np.float64)) / 2
+    a, b = _gaussian(x, center), _gaussian(y, center)
+    value, delta = _distance(a, b), a[0] - b[0]
+    details: dict[str, Any] = {"mean_term": float(delta @ delta), "infinity": None}
+    limits, method, replicates, units = None, "", np.zeros(0), []
     if interval:
-        parts = _draw_parts(generated, reference, (x, y), blocks, seed)
-        replicates = parts.replicates(whole)
+        parts = _draw_parts(generated, reference, blocks, seed)
+        sets = [_Parted(v, block, center) for v, block in zip((x, y), parts.block, strict=True)]
+        replicates = _replicates(sets, parts.count)
         units = parts.names if len(replicates) else []
         error = float(jackknife_errors(replicates[:, None])[0])
         if error > 0:  # false for NaN as well
             low, high = t_interval(value, error, parts.count - 1, level)
-            found, method = (max(0.0, low), high), parts.method
+            limits, method = (max(0.0, low), high), parts.method
         details |= {
-            "infinity": parts.infinity(value, seed),
+            "infinity": _infinity(sets, parts.count, value, seed),
             "units": parts.units,
             "unit": parts.unit,
             "left_out": parts.left_out,
@@ -181,7 +194,7 @@ def _fid(
         "FID",
         subject,
         value,
-        found,
+        limits,
         level=level,
         interval_method=method,
         estimator="plug-in",
@@ -191,35 +204,172 @@ def _fid(
         encoder=generated.encoder,
         reference=reference.digest,
         split=split,
-        details=details,
+        details=details | {"version": __version__},
         settings={"normalize": normalize, "covariance": "n - 1"},
-        note=". ".join(
-            filter(
-                None,
-                [
-                    note,
-                    _note(
-                        min(len(x), len(y)),
-                        x.shape[1],
-                        value,
-                        details["infinity"],
-                        interval and found is None,
-                    ),
-                ],
-            )
-        ),
+        notes=_notes(x, y, details["infinity"] is not None, interval and limits is None),
     )
     return Scored(score, replicates, units)
 
 
-def _note(n: int, d: int, value: float, limit: float | None, lacking: bool) -> str:
+def _notes(x: Array, y: Array, extrapolated: bool, no_interval: bool) -> tuple[Note, ...]:
+    n, d = min(len(x), len(y)), x.shape[1]
+    notes: list[Note] = []
+    if copies := copies_across(x, y):
+        notes.append(Note("copied-rows", {"count": copies, "n": len(x)}))
     if n <= d:
-        text = f"Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"
-    elif limit is not None:
-        text = "Biased upwards at this size; its details have the extrapolation to infinitely many samples (infinity)"
+        notes.append(Note("fid-mostly-bias", {"n": n, "d": d}))
     else:
-        text = "Biased upwards, the more the fewer samples: compare at equal sizes alone"
-    return text + ". No interval: too few groups or samples to leave some out" * lacking
+        notes.append(Note("fid-biased", {"extrapolated": extrapolated}))
+    return (*notes, *([Note("no-interval-few-units")] if no_interval else []))
+
+
+def frechet_distance(mean1: Any, cov1: Any, mean2: Any, cov2: Any) -> float:
+    """The squared Fréchet (2-Wasserstein) distance of two Gaussians.
+
+    Args:
+        mean1: (d,).
+        cov1: (d, d) symmetric, positive semi-definite; may be singular.
+        mean2: (d,).
+        cov2: as ``cov1``.
+
+    Returns:
+        The distance, not negative: to about 1e-12 relative for covariances of full rank, 1e-7 for
+        singular ones, as much as the rounding of their entries leaves.
+
+    Raises:
+        PalpateError: on wrong shapes, NaN or infinity, or matrices that are not symmetric.
+    """
+    means = [np.asarray(v, np.float64) for v in (mean1, mean2)]
+    d = means[0].size
+    for name, mean in zip(("mean1", "mean2"), means, strict=True):
+        if mean.shape != (d,) or not d or not np.isfinite(mean).all():
+            must, got = f"must be a finite vector ({d},)", f"shape {mean.shape}"
+            raise PalpateError(must, got, "Pass the mean over rows", argument=name)
+    covs = [_checked_covariance(f"cov{i}", c, d) for i, c in enumerate((cov1, cov2), 1)]
+    return _distance((means[0], _factor(covs[0])), (means[1], _factor(covs[1])))
+
+
+def _checked_covariance(name: str, value: Any, d: int) -> Array:
+    cov = np.asarray(value, dtype=np.float64)
+    if cov.shape != (d, d) or not np.isfinite(cov).all():
+        got = f"shape {cov.shape}" if cov.shape != (d, d) else "NaN or infinity"
+        fix = "Pass the covariance of the same features as the mean"
+        raise PalpateError(f"must be a finite matrix ({d}, {d})", got, fix, argument=name)
+    off = float(np.abs(cov - cov.T).max())
+    if off > SYMMETRY * float(np.abs(cov).max()):
+        got = f"entries that differ from their mirror by {off:.3g}"
+        raise PalpateError("must be symmetric", got, "Pass a covariance matrix", argument=name)
+    return (cov + cov.T) / 2
+
+
+def _gaussian(x: Array, center: Array) -> Gaussian:
+    """Mean about the center, and factor, of the rows of (n, d) features."""
+    if len(x) > x.shape[1]:
+        return _gaussian_of_sums(_sums(x, center))
+    rows = x - center
+    mean = rows.mean(axis=0)
+    return mean, (rows - mean) / np.sqrt(len(x) - 1)
+
+
+def _sums(x: Array, center: Array) -> Sums:
+    d = x.shape[1]
+    total, squares = np.zeros(d), np.zeros((d, d))
+    for start in range(0, len(x), ROWS):
+        rows = x[start : start + ROWS] - center
+        total += rows.sum(axis=0)
+        squares += rows.T @ rows
+    return len(x), total, squares
+
+
+def _gaussian_of_sums(sums: Sums) -> Gaussian:
+    n, total, squares = sums
+    mean = total / n
+    return mean, _factor((squares - n * np.outer(mean, mean)) / (n - 1))
+
+
+def _factor(cov: Array) -> Array:
+    """F (r, d) with F' F = cov; of r = rank rows where Cholesky finds the matrix singular."""
+    try:
+        return linalg.cholesky(cov, check_finite=False)
+    except linalg.LinAlgError:
+        values, vectors = linalg.eigh(cov, check_finite=False)
+        keep = values > len(values) * EPSILON * max(values[-1], 0.0)
+        return (vectors[:, keep] * np.sqrt(values[keep])).T
+
+
+def _distance(a: Gaussian, b: Gaussian) -> float:
+    delta, (f, g) = a[0] - b[0], (a[1], b[1])
+    cross = f @ g.T
+    if len(f) == len(g) == f.shape[1]:  # faster; squares lose no digits that matter at full rank
+        values = linalg.eigvalsh(cross @ cross.T, check_finite=False)
+        # rounding leaves +-eps * largest for a zero, whose root would count
+        values[values < len(values) * EPSILON * max(values[-1], 0.0)] = 0
+        roots = np.sqrt(values)
+    else:
+        roots = linalg.svdvals(cross, check_finite=False) if cross.size else np.zeros(1)
+    traces = np.einsum("ij,ij->", f, f) + np.einsum("ij,ij->", g, g)
+    return max(float(delta @ delta + traces - 2 * roots.sum()), 0.0)
+
+
+@dataclass(frozen=True)
+class _Parted:
+    """Features (n, d) and the block of every row (n,)."""
+
+    x: Array
+    block: Index
+    center: Array
+
+    def sums(self, b: int) -> Sums:
+        """Of the rows of one block."""
+        return _sums(self.x[self.block == b], self.center)
+
+    def all_but_each(self, count: int) -> list[Gaussian]:
+        """The Gaussian without each block."""
+        d, whole = self.x.shape[1], None
+        without: list[Gaussian] = []
+        for b in range(count):
+            kept = self.block != b
+            if kept.sum() <= d:
+                without.append(_gaussian(self.x[kept], self.center))
+                continue
+            whole = whole or _sums(self.x, self.center)
+            n, total, squares = self.sums(b)
+            without.append(_gaussian_of_sums((whole[0] - n, whole[1] - total, whole[2] - squares)))
+        return without
+
+
+def _replicates(sets: Sequence[_Parted], count: int) -> Array:
+    """The distance (count,) without each block; empty where fewer than two rows would be left."""
+    if min(len(s.x) - np.bincount(s.block).max() for s in sets) < 2:
+        return np.zeros(0)
+    pairs = zip(*(s.all_but_each(count) for s in sets), strict=True)
+    return np.array([_distance(a, b) for a, b in pairs])
+
+
+def _infinity(sets: Sequence[_Parted], count: int, value: float, seed: int) -> float | None:
+    """FID extrapolated to infinitely many rows in both sets; None with too little to fit."""
+    d, full = sets[0].x.shape[1], [len(s.x) for s in sets]
+    if count < 8 or min(full) <= 2 * d:
+        return None
+    order = rng_for(seed, "fid infinity").permutation(count)
+    sizes = {int(np.ceil(count * share)) for share in (0.5, 0.6, 0.7, 0.8, 0.9)}
+    points = [(1.0, value)]
+    for start in (0, count // 2):  # the halves of the two runs are disjoint
+        grown: list[Sums] = [(0, np.zeros(d), np.zeros((d, d))) for _ in sets]
+        for k, b in enumerate(np.roll(order, -start), 1):
+            added = [s.sums(int(b)) for s in sets]
+            grown = [
+                (m + n, total + t, squares + q)
+                for (m, total, squares), (n, t, q) in zip(grown, added, strict=True)
+            ]
+            if k in sizes and min(n for n, *_ in grown) > d:
+                # the bias is a / n + b / m; both shrink together along these points
+                inverse = sum(n / part[0] for n, part in zip(full, grown, strict=True)) / 2
+                points.append((inverse, _distance(*map(_gaussian_of_sums, grown))))
+    if len({inverse for inverse, _ in points}) < 3:
+        return None
+    inverses, values = np.array(points).T
+    return float(np.polynomial.polynomial.polyfit(inverses, values, 1)[0])
 
 
 @dataclass(frozen=True)
@@ -227,7 +377,6 @@ class _Parts:
     """Rows of both sets in ``count`` blocks of whole units.
 
     Attributes:
-        sets: the features, (n, d) and (m, d).
         block: the block of every row, (n,) and (m,).
         count: number of blocks.
         unit: ``"group"`` or ``"row"``.
@@ -235,7 +384,6 @@ class _Parts:
         names: of the blocks; a block that is one group has its name.
     """
 
-    sets: tuple[Floats, Floats]
     block: tuple[Index, Index]
     count: int
     unit: str
@@ -244,12 +392,12 @@ class _Parts:
 
     @property
     def left_out(self) -> str:
-        """What the jackknife leaves out at a time: a ``"group"``, or a ``"block"`` of groups or rows."""
+        """What is left out at a time: a ``"group"``, or a ``"block"`` of groups or rows."""
         return "group" if self.unit == "group" and self.count == self.units else "block"
 
     @property
     def method(self) -> str:
-        """What the interval is of, in words."""
+        """The interval method, in words."""
         what = f"leave-one-{self.left_out}-out jackknife"
         if self.unit == "row":
             what += f", {self.count} random blocks of rows, taken as independent"
@@ -257,96 +405,28 @@ class _Parts:
             what += f", {self.count} random blocks of whole groups ({self.units} groups)"
         return f"{what}, t, {self.count - 1} df"
 
-    def rows(self, b: int) -> list[Floats]:
-        """The rows of one block, by set."""
-        return [x[block == b] for x, block in zip(self.sets, self.block, strict=True)]
 
-    def replicates(self, whole: Sequence[Moments]) -> Array:
-        """The distance (count,) without one block at a time; empty where what is left is no set."""
-        values: list[float] = []
-        for b in range(self.count):
-            kept = [
-                len(x) - int((block == b).sum())
-                for x, block in zip(self.sets, self.block, strict=True)
-            ]
-            if min(kept) < 2:
-                return np.zeros(0)
-            if min(kept) > self.sets[0].shape[1]:
-                values.append(
-                    distance_of_moments(
-                        *(
-                            w.without(Moments.of(rows))
-                            for w, rows in zip(whole, self.rows(b), strict=True)
-                        )
-                    )
-                )
-            else:
-                values.append(
-                    distance_of_features(
-                        *(x[block != b] for x, block in zip(self.sets, self.block, strict=True))
-                    )
-                )
-        return np.array(values)
-
-    def infinity(self, value: float, seed: int) -> float | None:
-        """FID extrapolated to infinitely many rows in both sets, or None where there is too little to fit a line to."""
-        d, full = self.sets[0].shape[1], [len(x) for x in self.sets]
-        if self.count < 8 or min(full) <= 2 * d:
-            return None
-        order = rng_for(seed, "fid infinity").permutation(self.count)
-        ask = {int(np.ceil(self.count * share)) for share in (0.5, 0.6, 0.7, 0.8, 0.9)}
-        points = [(1.0, value)]
-        for start in (0, self.count // 2):  # the halves of the two runs are disjoint
-            grown = Moments(), Moments()
-            for k, b in enumerate(np.roll(order, -start), 1):
-                for moments, rows in zip(grown, self.rows(int(b)), strict=True):
-                    moments.add(rows)
-                if k in ask and min(m.n for m in grown) > d:
-                    # The bias is a / n + b / m; both shrink together along these points.
-                    inverse = sum(n / m.n for n, m in zip(full, grown, strict=True)) / 2
-                    points.append((inverse, distance_of_moments(*grown)))
-        if len({inverse for inverse, _ in points}) < 3:
-            return None
-        at, values = np.array(points).T
-        return float(np.polynomial.polynomial.polyfit(at, values, 1)[0])
-
-
-def _draw_parts(
-    generated: FeatureSet, reference: FeatureSet, sets: tuple[Floats, Floats], most: int, seed: int
-) -> _Parts:
-    n, m = len(sets[0]), len(sets[1])
+def _draw_parts(generated: FeatureSet, reference: FeatureSet, most: int, seed: int) -> _Parts:
+    """Groups, or rows where a set has no groups, in at most ``most`` blocks."""
+    n, m = len(generated.ids), len(reference.ids)
     rng = rng_for(seed, "fid blocks")
-    names = [
-        checked_names("groups", s.groups, len(x))
-        for s, x in zip((generated, reference), sets, strict=True)
-    ]
-    if names[0] is None or names[1] is None:
+    groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
+    if groups[0] is None or groups[1] is None:
         count = min(most, n, m)
-        return _Parts(
-            sets,
-            (rng.permutation(n) % count, rng.permutation(m) % count),
-            count,
-            "row",
-            n + m,
-            _numbered(count),
-        )
-    called, unit = np.unique(np.array(names[0] + names[1], dtype=str), return_inverse=True)
-    units = len(called)
-    block = np.arange(units)
+        drawn = rng.permutation(n) % count, rng.permutation(m) % count
+        return _Parts(drawn, count, "row", n + m, _numbered(count))
+    names, unit = np.unique(groups[0] + groups[1], return_inverse=True)
+    units, block, blocks = len(names), np.arange(len(names)), [str(name) for name in names]
     if units > most:
-        # The largest group first into the block that holds least, ties at random: blocks of nearly equal size.
-        size = (
-            np.bincount(unit[:n], minlength=units) / n + np.bincount(unit[n:], minlength=units) / m
-        )
-        load = np.zeros(most)
-        order = rng.permutation(units)
+        # the largest group first into the block that has least, ties at random: nearly equal sizes
+        counts = [np.bincount(u, minlength=units) / len(u) for u in (unit[:n], unit[n:])]
+        size, order, load = counts[0] + counts[1], rng.permutation(units), np.zeros(most)
         for u in order[np.argsort(-size[order], kind="stable")]:
             block[u] = int(load.argmin())
             load[block[u]] += size[u]
-    blocks = [str(name) for name in called] if units <= most else _numbered(most)
-    return _Parts(
-        sets, (block[unit[:n]], block[unit[n:]]), min(units, most), "group", units, blocks
-    )
+        blocks = _numbered(most)
+    drawn = block[unit[:n]], block[unit[n:]]
+    return _Parts(drawn, min(units, most), "group", units, blocks)
 
 
 def _numbered(count: int) -> list[str]:

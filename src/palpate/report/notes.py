@@ -37,7 +37,48 @@ class Style:
 PYTHON, COMMAND_LINE = Style(), Style(command_line=True)
 Sentence = str | Callable[[Mapping[str, Any], Style], str]
 
-METRICS: dict[str, Sentence] = {}
+
+def _fewer_scales(p: Mapping[str, Any], _: Style) -> str:
+    why = f"five need {p['least']} pixels a side" if p["auto"] else "as requested"
+    return (
+        f"{p['scales']} of the 5 scales ({why}), weights divided by their sum: not comparable with "
+        "MS-SSIM of 5"
+    )
+
+
+def _fid_biased(p: Mapping[str, Any], _: Style) -> str:
+    if p["extrapolated"]:
+        return (
+            "Biased upwards at this size; its details have the extrapolation to infinitely many "
+            "samples (infinity)"
+        )
+    return "Biased upwards, the more the fewer samples: compare at equal sizes only"
+
+
+METRICS: dict[str, Sentence] = {
+    "copied-rows": (
+        "{count} of {n} generated rows equal a real row bit for bit: a copy is not a generator"
+    ),
+    "identical-pairs": ("{count} of {n} pairs are identical (infinite), excluded from the mean"),
+    "all-identical": "Undefined: all {n} pairs are identical, so the value is infinite",
+    "no-pair-has-a-value": "Undefined: no pair has a value",
+    "no-interval-over-images": (
+        "No interval: one image or one group, or no variation between them"
+    ),
+    "no-interval-over-groups": "No interval: one group, or no variation between them",
+    "no-interval-few-units": "No interval: too few groups or samples to leave some out",
+    "fewer-scales": _fewer_scales,
+    "no-contact": "{count} of {n} real images show no contact, excluded from the mean",
+    "empty-balls": "{count} of {n} {of} rows occur more than k times: their balls hold nothing",
+    "fid-mostly-bias": (
+        "Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"
+    ),
+    "fid-biased": _fid_biased,
+    "fid-difference-biased": "Of FID at this size, whose biases need not be equal",
+    "kid-interval": (
+        "The spread over random subsets that others print with KID is no interval; this one is"
+    ),
+}
 LEAKAGE: dict[str, Sentence] = {}
 EVALUATION: dict[str, Sentence] = {}
 OTHER: dict[str, Sentence] = {"text": "{text}"}

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from palpate.core import Score
+from palpate.report.notes import sentence
 from palpate.report.text import defined
 
 #: Said of every interval over frames, in the words that the metrics use.
@@ -31,7 +32,7 @@ def sentences(score: Score) -> list[str]:
     if isinstance(unstable, Sequence) and not isinstance(unstable, str) and len(unstable) > NAMES:
         names = [str(name) for name in unstable]
         note = note.replace(", ".join(names), few(names))
-    return [text for text in note.split(". ") if text]
+    return [text for text in note.split(". ") if text] + [sentence(n) for n in score.notes]
 
 
 def reason(score: Score) -> str:

@@ -1,0 +1,346 @@
+"""SSIM against scikit-image, PSNR by hand, MS-SSIM against a loop, means over images."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from skimage.metrics import structural_similarity
+
+from palpate.core import Note, PalpateError, require_comparable
+from palpate.metrics.images import (
+    WEIGHTS,
+    fitting_scales,
+    least_side,
+    mean_score,
+    ms_ssim,
+    ms_ssim_per_image,
+    paired_by_id,
+    psnr,
+    psnr_per_image,
+    scale_weights,
+    ssim,
+    ssim_per_image,
+)
+from palpate.report.notes import sentence
+
+
+def images(seed, n=6, h=20, w=27, c=3, noise=25):
+    rng = np.random.default_rng(seed)
+    a = rng.integers(0, 256, (n, h, w, c), dtype=np.uint8)
+    return a, np.clip(a + rng.normal(size=a.shape) * noise, 0, 255).astype(np.uint8)
+
+
+def coarse_images(seed, n=2, h=45, w=50, c=3, noise=60):
+    """Images with structure at several scales."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.random((n, 6, 6, c)).repeat(-(-h // 6), 1).repeat(-(-w // 6), 2)[:, :h, :w]
+    a = np.clip(255 * coarse + rng.normal(size=coarse.shape) * 10, 0, 255).astype(np.uint8)
+    return a, np.clip(a + rng.normal(size=a.shape) * noise, 0, 255).astype(np.uint8)
+
+
+def codes(score):
+    return [note.code for note in score.notes]
+
+
+# ---- SSIM and PSNR
+
+
+@pytest.mark.parametrize(("h", "w", "c"), [(20, 27, 3), (11, 11, 3), (64, 64, 1)])
+def test_ssim_equals_scikit_image(h, w, c):
+    a, b = images(0, 4, h, w, c)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    expected = [
+        structural_similarity(x / 255, y / 255, data_range=1, channel_axis=-1, **options)
+        for x, y in zip(a, b, strict=True)
+    ]
+    np.testing.assert_allclose(ssim_per_image(a, b), expected, atol=1e-12)
+    np.testing.assert_allclose(ssim_per_image(a / 255, b / 255), expected, atol=1e-12)
+    np.testing.assert_allclose(ssim_per_image((a / 255).astype(np.float32), b), expected, atol=1e-6)
+    assert ssim(a, b).value == pytest.approx(np.mean(expected), abs=1e-12)
+
+
+def test_ssim_of_constant_images_by_hand():
+    a, b = np.full((1, 12, 12, 3), 0.2), np.full((1, 12, 12, 3), 0.6)
+    expected = (2 * 0.2 * 0.6 + 1e-4) / (0.04 + 0.36 + 1e-4)
+    assert ssim(a, b).value == pytest.approx(expected, abs=1e-12)
+    assert ssim(a, a).value == 1
+
+
+def test_psnr_by_hand_is_a_mean_over_images():
+    a = np.zeros((2, 4, 5, 3))
+    b = a.copy()
+    b[0] += 0.1  # mean squared error 0.01
+    b[1, 0, 0, 0] = 1.0  # 1/60
+    assert psnr_per_image(a, b) == pytest.approx([20.0, 10 * math.log10(60)])
+    assert psnr(a, b).value == pytest.approx((20 + 10 * math.log10(60)) / 2)
+    u = np.zeros((1, 4, 5, 3), dtype=np.uint8)
+    assert psnr(u, u + np.uint8(255)).value == pytest.approx(0)
+
+
+def test_identical_images_are_counted_and_excluded_from_psnr():
+    a, b = images(1)
+    b[[1, 4]] = a[[1, 4]]
+    score, others = psnr(a, b), [0, 2, 3, 5]
+    assert score.value == pytest.approx(psnr(a[others], b[others]).value)
+    assert score.interval == pytest.approx(psnr(a[others], b[others]).interval)
+    assert score.details["identical"] == 2
+    assert list(score.notes) == [Note("identical-pairs", {"count": 2, "n": 6})]
+    every = psnr(a, a)
+    assert (every.value, every.interval, codes(every)) == (None, None, ["all-identical"])
+    json.dumps([score.to_json(), every.to_json()], allow_nan=False)
+
+
+def test_tensors_and_lists_give_the_same_scores():
+    torch = pytest.importorskip("torch")
+    a, b = images(8, n=2)
+    tensors = torch.tensor(a), torch.tensor(b / 255, requires_grad=True)
+    assert ssim(*tensors).value == pytest.approx(ssim(a, b).value, abs=1e-12)
+    assert psnr((a / 255).tolist(), b).value == pytest.approx(psnr(a, b).value)
+
+
+def test_scores_do_not_depend_on_the_coding_of_the_images():
+    a, b = images(4)
+    wide, signed = [v.astype(np.uint16) * 257 for v in (a, b)], [v / 127.5 - 1 for v in (a, b)]
+    for pair, given in ((signed, (-1, 1)), (wide, 65535), ((a.astype(float), b), 255)):
+        for metric in (ssim, psnr):
+            plain, score = metric(a, b), metric(*pair, data_range=given)
+            assert score.value == pytest.approx(plain.value, abs=1e-9)
+            assert score.details["coding"] == ([0, given] if np.ndim(given) == 0 else list(given))
+            require_comparable([plain, score])
+    black = np.zeros((2, 12, 12, 3))
+    assert ssim(black, black, data_range=255).value == 1
+
+
+# ---- means over images
+
+
+def test_intervals_over_images_and_over_groups():
+    a, b = images(2)
+    values, score = ssim_per_image(a, b), ssim(a, b)
+    reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
+    assert score.interval == pytest.approx((values.mean() - reach, values.mean() + reach))
+    grouped = ssim(a, b, groups=["u", "v", "w"] * 2, level=0.9)
+    means = np.array([values[k::3].mean() for k in range(3)])
+    reach = stats.t.ppf(0.95, 2) * means.std(ddof=1) / math.sqrt(3)
+    assert grouped.interval == pytest.approx((means.mean() - reach, means.mean() + reach))
+    assert "groups" in grouped.interval_method
+    for score in (ssim(a, b, groups=["u"] * 6), ssim(a[:1], b[:1]), ssim(a, a)):
+        assert (score.interval, codes(score)) == (None, ["no-interval-over-images"])
+
+
+def test_scores_name_their_settings_and_the_lowest_images():
+    a, b = images(3)
+    b[2] = 255 - a[2]
+    score = ssim(a, b, ids=list("pqrstu"), subject="mini", split="s")
+    assert score.details["lowest"][0]["id"] == "r"
+    assert (score.subject, score.split, score.n, score.m) == ("mini", "s", 6, 6)
+    assert (score.higher_is_better, score.estimator) == (True, "per-image mean")
+    assert score.settings["size"] == [20, 27]
+
+
+def test_means_exclude_what_has_no_value_and_stay_in_their_bounds():
+    values, note = np.array([0.9, np.nan, 1.0, 0.2]), Note("no-contact", {"count": 1, "n": 4})
+    score = mean_score("x", values, ids=list("abcd"), bounds=(0.0, 1.0), subject="s", notes=[note])
+    assert (score.value, score.interval) == (pytest.approx(0.7), (0, 1))
+    assert (score.details["identical"], score.notes) == (0, (note,))
+    assert [row["id"] for row in score.details["lowest"]] == ["d", "a", "c"]
+    down = mean_score("x", values, ids=list("abcd"), higher_is_better=False, subject="s")
+    assert [row["id"] for row in down.details["highest"]] == ["c", "a", "d"]
+    none = mean_score("x", np.full(3, np.nan), subject="s")
+    assert (none.value, codes(none)) == (None, ["no-pair-has-a-value"])
+    assert sentence(none.notes[0]).startswith("Undefined")
+
+
+# ---- MS-SSIM
+
+
+def slow_terms(x, y):
+    """Mean SSIM and mean contrast-structure of two (h, w) in [0, 1], window by window."""
+    at = np.arange(11) - 5
+    window = np.exp(-(at[:, None] ** 2 + at[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    whole, structure = [], []
+    for i in range(x.shape[0] - 10):
+        for j in range(x.shape[1] - 10):
+            u, v = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
+            mu, mv = (window * u).sum(), (window * v).sum()
+            vu, vv = (window * (u - mu) ** 2).sum(), (window * (v - mv) ** 2).sum()
+            uv = (window * (u - mu) * (v - mv)).sum()
+            structure.append((2 * uv + 0.0009) / (vu + vv + 0.0009))
+            whole.append(structure[-1] * (2 * mu * mv + 0.0001) / (mu**2 + mv**2 + 0.0001))
+    return np.mean(whole), np.mean(structure)
+
+
+def slow_halved(x):
+    x = x[: x.shape[0] // 2 * 2, : x.shape[1] // 2 * 2]
+    return (x[::2, ::2] + x[1::2, ::2] + x[::2, 1::2] + x[1::2, 1::2]) / 4
+
+
+def slow_ms_ssim(x, y, scales, weights):
+    products = []
+    for channel in range(x.shape[2]):
+        u, v, product = x[..., channel] / 255, y[..., channel] / 255, 1.0
+        for j in range(scales):
+            whole, structure = slow_terms(u, v)
+            product *= max(0.0, whole if j == scales - 1 else structure) ** weights[j]
+            u, v = slow_halved(u), slow_halved(v)
+        products.append(product)
+    return np.mean(products)
+
+
+@pytest.mark.parametrize(("scales", "c"), [(1, 1), (2, 3), (3, 1)])
+def test_ms_ssim_equals_a_loop_over_windows(scales, c):
+    a, b = coarse_images(scales, c=c)
+    weights = np.array([0.0448, 0.2856, 0.3001][:scales])
+    expected = [slow_ms_ssim(x, y, scales, weights / weights.sum()) for x, y in zip(a, b)]  # noqa: B905
+    np.testing.assert_allclose(ms_ssim_per_image(a, b, scales=scales), expected, atol=1e-12)
+    signed = ms_ssim_per_image(a / 127.5 - 1, b / 127.5 - 1, scales=scales, data_range=(-1, 1))
+    np.testing.assert_allclose(signed, expected, atol=1e-9)
+    assert ms_ssim(a, b, scales=scales).value == pytest.approx(np.mean(expected), abs=1e-12)
+    if scales == 1:
+        np.testing.assert_allclose(ssim_per_image(a, b), expected, atol=1e-12)
+
+
+def test_five_scales_of_constant_images_by_hand():
+    a, b = np.full((1, 176, 180, 3), 0.2), np.full((1, 176, 180, 3), 0.6)
+    luminance = (2 * 0.2 * 0.6 + 1e-4) / (0.04 + 0.36 + 1e-4)
+    assert ms_ssim(a, b).value == pytest.approx(luminance**0.1333, abs=1e-9)
+    assert ms_ssim(a, a, scales=5).value == 1
+
+
+def test_a_negative_structure_counts_as_zero():
+    a, _ = coarse_images(5, noise=0)
+    assert (ssim_per_image(a, 255 - a) < 0).all()
+    assert ms_ssim_per_image(a, 255 - a) == pytest.approx([0, 0])
+
+
+@pytest.mark.parametrize(
+    ("side", "scales"), [(11, 1), (21, 1), (22, 2), (43, 2), (64, 3), (88, 4), (175, 4), (176, 5)]
+)
+def test_as_many_scales_as_fit(side, scales):
+    a = np.zeros((1, side, side + 3, 1), dtype=np.uint8)
+    score = ms_ssim(a, a)
+    assert fitting_scales((side, side + 3)) == score.settings["scales"] == scales
+    assert ("fewer-scales" in codes(score)) == (scales < 5)
+    if scales < 5:
+        assert sum(score.settings["weights"]) == pytest.approx(1, abs=1e-5)
+        with pytest.raises(PalpateError, match=f"at least {11 * 2**scales} x"):
+            ms_ssim(a, a, scales=scales + 1)
+
+
+def test_weights_are_as_published():
+    assert tuple(scale_weights(5)) == WEIGHTS == (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+    assert scale_weights(3) == pytest.approx(np.array(WEIGHTS[:3]) / math.fsum(WEIGHTS[:3]))
+    assert least_side(5) == 176
+
+
+def test_different_numbers_of_scales_are_not_comparable():
+    a, b = coarse_images(6, n=4)
+    two, three = ms_ssim(a, b, scales=2), ms_ssim(a, b)
+    assert "as requested" in sentence(two.notes[0])
+    assert "five need 176 pixels" in sentence(three.notes[0])
+    with pytest.raises(PalpateError, match="settings"):
+        require_comparable([two, three])
+    require_comparable([three, ms_ssim(b, a, scales=3, groups=list("uuvv"), subject="other")])
+    assert three.interval[1] <= 1
+    assert three.value > ssim(a, b).value  # white noise averages out at the coarser scales
+
+
+# ---- bad input
+
+A, B = images(4)
+
+
+def with_pixel(value):
+    x = A / 255
+    x[3, 0, 0, 0] = value
+    return x
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "options", "words"),
+    [
+        (A[0], B[0], {}, ["`generated`", "(n, h, w, 3 or 1)"]),
+        (A[:0], B[:0], {}, ["n >= 1"]),
+        (A[:5], B, {}, ["pair one to one"]),
+        (A, B[:, :, :20], {}, ["pair one to one"]),
+        (A.transpose(0, 3, 1, 2), B.transpose(0, 3, 1, 2), {}, ["channels last"]),
+        (A.astype(int), B, {}, ["uint8", "int64"]),
+        (A, B.astype(np.float32), {}, ["`reference`", "[0, 1]", "image 0"]),
+        (with_pixel(np.nan), B, {}, ["`generated`", "nan", "image 3"]),
+        (with_pixel(-0.5), B, {}, ["`generated`", "-0.5", "image 3"]),
+        (A, B, {"groups": ["g"] * 5}, ["groups", "6", "5"]),
+        (A, B, {"ids": ["g"] * 5}, ["ids", "6", "5"]),
+        (A, B, {"level": 95}, ["`level`", "95"]),
+        (A / 127.5 - 1, B / 127.5 - 1, {}, ["[0, 1]", "image 0", "data_range=(-1, 1)"]),
+        (A / 127.5 - 1, B / 127.5 - 1, {"data_range": 2}, ["[0, 2]", "image 0"]),
+        (A, B / 127.5 - 1, {"data_range": (-1, 1)}, ["`generated`", "[-1, 1]", "255"]),
+        (A / 255, B / 255, {"data_range": 255}, ["[0, 255]", "floats in [0, 1]"]),
+        (A / 255, B / 255, {"data_range": 0}, ["`data_range`", "positive"]),
+        (A / 255, B / 255, {"data_range": (1, -1)}, ["low < high"]),
+        (A / 255, B / 255, {"data_range": (0, np.inf)}, ["low < high"]),
+        (A / 255, B / 255, {"data_range": "wide"}, ["low < high"]),
+        (A / 255, B / 255, {"data_range": (0, 1, 2)}, ["low < high"]),
+        (A > 0, B, {"data_range": 255}, ["numbers", "bool"]),
+        ([[1], [1, 2]], B, {}, ["`generated`", "array"]),
+    ],
+)
+def test_bad_images_are_rejected_by_name(a, b, options, words):
+    for metric in (ssim, psnr):
+        with pytest.raises(PalpateError) as caught:
+            metric(a, b, **options)
+        assert [word for word in words if word not in str(caught.value)] == []
+
+
+@pytest.mark.parametrize(
+    ("scales", "words"),
+    [
+        (5, ["176 x 176", "5 scales", "20 x 27"]),
+        (0, ["`scales`", "from 1 to 5", "0"]),
+        (6, ["from 1 to 5"]),
+        (2.0, ["from 1 to 5"]),
+        (True, ["from 1 to 5"]),
+        ("all", ["from 1 to 5", "all"]),
+    ],
+)
+def test_bad_scales_are_rejected(scales, words):
+    with pytest.raises(PalpateError) as caught:
+        ms_ssim(A, B, scales=scales)
+    assert [word for word in words if word not in str(caught.value)] == []
+
+
+def test_images_smaller_than_the_window_are_rejected():
+    for metric in (ssim, ms_ssim):
+        with pytest.raises(PalpateError, match="11 x 11"):
+            metric(A[:, :10], B[:, :10])
+    assert psnr(A[:, :10], B[:, :10]).value is not None
+
+
+# ---- pairing by id
+
+
+def test_images_are_paired_by_id():
+    names = [f"video/{k}" for k in range(50)]
+    order = np.random.default_rng(0).permutation(50)
+    first, second = paired_by_id([names[i] for i in order], names)
+    np.testing.assert_array_equal(order[first], second)
+    assert second.tolist() == list(range(50))
+
+
+@pytest.mark.parametrize(
+    ("generated", "reference", "message"),
+    [
+        (["a", "b"], list("abcdef"), "4 not generated: 'c', 'd', 'e' and 1 more"),
+        (["a", "x", "b"], ["a", "b"], "1 without reference: 'x'"),
+        (["a", "x"], ["a", "b"], "1 not generated: 'b'; 1 without reference: 'x'"),
+        (["a", "a", "b"], ["a", "b"], "generated id must be unique. Got 1 repeated: 'a'"),
+        (["a", "b"], ["a", "b", "b"], "reference id must be unique. Got 1 repeated: 'b'"),
+        ([], ["a"], "generated ids"),
+        (["a"], [], "reference ids"),
+    ],
+)
+def test_ids_that_do_not_pair_are_named(generated, reference, message):
+    with pytest.raises(PalpateError, match=message):
+        paired_by_id(generated, reference)
