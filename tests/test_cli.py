@@ -113,6 +113,7 @@ def test_files_that_cannot_be_written_or_hold_rubbish_are_mistakes_too(
         (["audit", *lists, "--worst", "-1"], "--worst must be at least 0"),
         (
             [
+                "train",
                 "encoder",
                 tmp_path / "m",
                 "--split",
@@ -241,7 +242,8 @@ def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_
         "-o",
         tmp_path / "audit.json",
     )
-    assert (status, json.loads(out)["groups_shared"]) == (0, 0)
+    assert status == 0, out
+    assert json.loads(out)["groups_shared"] == 0
     status, out, _ = call(
         capsys, "report", tmp_path / "audit.json", "-o", tmp_path / "page.html", "--json", "-q"
     )

@@ -1,21 +1,20 @@
-"""The command ``palpate``: a verb a stage.
+"""The command ``palpate``.
 
-This file is all that ``palpate --help`` loads: neither torch nor polars. Each verb lives in the module of its
-name and is imported when it is called.
+This file is all that ``palpate --help`` loads: neither torch nor polars. Each verb is a module that
+is imported when it is called.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from typing import NamedTuple
 
 #: Exit statuses.
 OK, FAILED_CHECK, USER_ERROR, BUG, INTERRUPTED = 0, 1, 2, 70, 130
 
 
-@dataclass(frozen=True)
-class Verb:
-    """A verb: the module that runs it, what it does, an example."""
+class Verb(NamedTuple):
+    """A verb: its module, what it does, an example."""
 
     module: str
     help: str
@@ -30,7 +29,7 @@ VERBS: dict[str, Verb] = {
     ),
     "validate": Verb(
         "validate",
-        "Tell what is missing, invalid or suspicious in a data set",
+        "List what is missing, invalid or suspicious in a data set",
         "palpate validate touch_and_go/",
     ),
     "export": Verb(
@@ -40,7 +39,7 @@ VERBS: dict[str, Verb] = {
     ),
     "audit": Verb(
         "audit",
-        "Tell whether a train/test split leaks",
+        "Check whether a train/test split leaks",
         "palpate audit train.txt test.txt --fail-over 0.01",
     ),
     "split": Verb(
@@ -51,23 +50,23 @@ VERBS: dict[str, Verb] = {
     "world": Verb(
         "world", "Write the procedural world: a small synthetic data set", "palpate world -o world/"
     ),
-    "encoder": Verb(
+    "train encoder": Verb(
         "encoder",
         "Train the tactile encoder against frozen vision and text encoders",
-        "palpate encoder tag/ --split noleak.json -o encoders/",
+        "palpate train encoder tag/ --split noleak.json -o encoders/",
     ),
-    "train": Verb(
+    "train generator": Verb(
         "train",
         "Train a generator of tactile images",
-        "palpate train tag/ --split noleak.json --encoder encoders/ -o model/",
+        "palpate train generator tag/ --split noleak.json --clip encoders/ -o model/",
     ),
     "generate": Verb(
-        "generate", "Make tactile images for photos", "palpate generate photo.jpg -o touch.png"
+        "generate", "Make tactile images for photos", "palpate generate photo.jpg -o tactile.png"
     ),
     "score": Verb(
         "score",
         "Score generated tactile images",
-        "palpate score --generated out/ --reference real/ --encoder palpate/mini",
+        "palpate score --generated generated/ --reference real/ --encoder palpate/mini",
     ),
     "report": Verb(
         "report",
@@ -77,18 +76,24 @@ VERBS: dict[str, Verb] = {
     "demo": Verb(
         "demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"
     ),
+    "completion": Verb(
+        "completion", "Print the completion script of a shell", 'eval "$(palpate completion bash)"'
+    ),
 }
 
 
-def usage() -> str:
-    """The text of ``palpate --help``."""
+def usage(group: str = "") -> str:
+    """Return the text of ``palpate --help``, or of one group of verbs (``"train"``)."""
     from palpate import __version__
 
-    width = max(map(len, VERBS))
-    verbs = "\n".join(f"  {name:<{width}}  {verb.help}" for name, verb in VERBS.items())
+    verbs = {name: verb for name, verb in VERBS.items() if name.startswith(group)}
+    width = max(map(len, verbs))
+    listed = "\n".join(f"  {name:<{width}}  {verb.help}" for name, verb in verbs.items())
+    if group:
+        return f"usage: palpate {group}VERB [options]\n\n{listed}\n"
     return (
-        f"palpate {__version__}: from a photo to the touch it would give, and honest scores for how well.\n\n"
-        f"usage: palpate VERB [options]\n\n{verbs}\n\n"
+        f"palpate {__version__}: tactile images from photos, and honest scores for them.\n\n"
+        f"usage: palpate VERB [options]\n\n{listed}\n\n"
         "  palpate VERB --help    options and an example of one verb\n"
         "  palpate --version      the version\n\n"
         f"Start here: palpate demo      Is my split leaking? {VERBS['audit'].example}\n"
@@ -96,23 +101,27 @@ def usage() -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command line.
+    """Run the command line.
 
     Returns:
-        0 done; 1 a check failed (``audit --fail-over``); 2 a user's mistake, told in one line; 70 a bug of ours;
-        130 stopped by Ctrl-C.
+        0 done; 1 a check failed (``audit --fail-over``); 2 a user's mistake, explained in one line;
+        70 a bug in palpate; 130 stopped by Ctrl-C.
     """
-    from palpate.cli.streams import steady
+    from palpate.cli.streams import resilient_streams
 
-    with steady():
+    with resilient_streams():
         try:
             try:
                 return _run(sys.argv[1:] if argv is None else argv)
             finally:
                 sys.stdout.flush()
-        except OSError as error:  # files that fail are told by their verb
-            got = f"standard output must take what is printed. Got {error.strerror}. Free some space, or send it elsewhere."
-            sys.stderr.write(f"palpate: {got}\n")
+        except (
+            OSError
+        ) as error:  # a full disk behind standard output; verbs explain their own files
+            sys.stderr.write(
+                f"palpate: standard output must be writable. Got {error.strerror}. "
+                "Free some space, or redirect it elsewhere.\n"
+            )
             return USER_ERROR
 
 
@@ -125,6 +134,12 @@ def _run(args: list[str]) -> int:
 
         sys.stdout.write(f"palpate {__version__}\n")
         return OK
+    if " ".join(args[:2]) in VERBS:
+        args = [" ".join(args[:2]), *args[2:]]
+    group = f"{args[0]} "
+    if any(name.startswith(group) for name in VERBS) and args[1:] in ([], ["-h"], ["--help"]):
+        sys.stdout.write(usage(group))
+        return OK if args[1:] else USER_ERROR
     from palpate.cli.terminal import run_verb
 
     return run_verb(args[0], args[1:])

@@ -32,7 +32,7 @@ class Options(Common):
     """What to score, one entry a generator: folders of images or of `palpate generate`, manifests, or embeddings (.npy, .npz, .safetensors, .parquet)."""
     reference: Path | None = None
     """The real touches, instead of a manifest and a split: of the same kinds. Ids are relative file names."""
-    encoder: Annotated[str | None, tyro.conf.arg(aliases=["--encoder"])] = None
+    encoder: str | None = None
     """Folder of `palpate encoder`, a hub id, or palpate/mini; the tactile encoder gives the features. Embeddings need none."""
     split: Path | None = None
     """Split file; its test part is scored. With --reference, its train part gives the floor of TMMD."""

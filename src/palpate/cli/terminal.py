@@ -1,8 +1,9 @@
 """What all verbs share: parsing with tyro, progress, tables, JSON, and errors in one line.
 
-A verb's module has a frozen dataclass ``Options`` (its docstring and field docstrings are the help) that
-derives from :class:`Common`, and ``run(options, terminal) -> dict | tuple[dict, int]``: the JSON that
-``--json`` prints, and an exit status if it is not 0.
+A verb's module has a frozen dataclass ``Options`` (its docstring and field docstrings are the help)
+that derives from :class:`Common`, and ``run(options, terminal) -> dict | tuple[dict, int]``: the
+JSON that ``--json`` prints, and an exit status if it is not 0. A nested dataclass is a group of
+options in the help; its option names stay flat.
 """
 
 from __future__ import annotations
@@ -22,67 +23,118 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Generator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from palpate.cli import BUG, FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
-from palpate.core import MissingExtraError, PalpateError, Problem, ProblemsError, Progress, quiet
+from palpate.core import (
+    MissingExtraError,
+    Note,
+    PalpateError,
+    PalpateWarning,
+    Problem,
+    ProblemsError,
+    Progress,
+    quiet,
+)
 from palpate.core.files import NO_ROOM
+
+if TYPE_CHECKING:
+    from palpate.report.results import Audit, Results
 
 #: Lines of problems shown in the terminal; ``--json`` gives all.
 SHOWN_PROBLEMS = 40
+#: Verb and option of earlier versions -> how it is written now. '' stands for every verb, and for
+#: the verb itself.
+RENAMED: dict[tuple[str, str], str] = {
+    ("encoder", ""): "palpate train encoder",
+    ("train", ""): "palpate train generator",
+    ("", "--out"): "--output",
+    ("", "--towers"): "--encoder",
+    ("", "--encoders"): "--encoder",
+    ("train generator", "--encoders"): "--clip",
+    ("train generator", "--towers"): "--clip",
+    ("split", "--group"): "--by",
+    ("score", "--generated"): "positional arguments: palpate score generated/ --reference real/",
+}
+#: Verb and argument of its function -> how the command line writes it, where that is not the
+#: argument's own name ("--sigma"). '' stands for every verb.
+OPTION_NAMES: dict[tuple[str, str], str] = {
+    ("audit", "train_or_data"): "TRAIN",
+    ("audit", "test"): "TEST",
+    ("", "data"): "DATA",
+    ("", "source"): "SOURCE",
+    ("generate", "photos"): "PHOTO",
+}
 
-JsonFlag = Annotated[
-    bool,
-    tyro.conf.arg(name="json", help="Print one JSON object on standard output instead of text."),
-]
-QuietFlag = Annotated[bool, tyro.conf.arg(aliases=["-q"], help="No progress.")]
+#: A flag without its negation: for options that are off by default.
+Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 OutPath = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+OptionalOutPath = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
+CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Common:
     """Options of every verb."""
 
-    as_json: JsonFlag = False
-    quiet: QuietFlag = False
+    as_json: Annotated[Switch, tyro.conf.arg(name="json")] = False
+    """Print one JSON object on standard output instead of text."""
+    quiet: Annotated[Switch, tyro.conf.arg(aliases=["-q"])] = False
+    """No progress."""
 
 
 class Terminal:
-    """Where a verb writes: results on standard output, progress and remarks on standard error."""
+    """Where a verb writes: results on standard output, progress and notes on standard error."""
 
     def __init__(self, options: Common, command: str = "") -> None:
         self.command = command
         self.json = options.as_json
         self.silent = options.quiet
         # Piped text is not wrapped: digests and paths must stay whole.
-        self.out = Console(
-            highlight=False, quiet=self.json, width=None if sys.stdout.isatty() else 400
-        )
+        width = None if sys.stdout.isatty() else 400
+        self.out = Console(highlight=False, quiet=self.json, width=width)
         self.err = Console(stderr=True, highlight=False, quiet=self.silent)
 
     def say(self, line: str) -> None:
-        """A remark on standard error."""
+        """Print a remark on standard error."""
         self.err.print(line, markup=False, soft_wrap=True)
 
+    def note(self, note: Note) -> None:
+        """Print a note on standard error, with options in place of arguments."""
+        from palpate.report.notes import COMMAND_LINE, sentence
+
+        self.say(f"Note: {sentence(note, COMMAND_LINE)}")
+
     def print(self, line: str) -> None:
-        """A line of the result, on standard output."""
+        """Print a line of the result on standard output."""
         self.out.print(line, markup=False, soft_wrap=True)
 
-    def skipped(self, problems: Sequence[Problem]) -> None:
-        """Lists what ``--skip-bad`` left out."""
+    def show(self, result: Results | Audit) -> None:
+        """Print the tables of a result, as wide as the terminal."""
+        from palpate.report.terminal import print_result
+
+        print_result(result, self.out)
+
+    def problems(self, title: str, problems: Sequence[Problem]) -> None:
+        """List problems on standard error, below a title and their number."""
         if problems:
-            self.say(f"Skipped {len(problems)}:")
-            _list_problems(problems, self.say)
+            self.say(f"{title} {len(problems)}:")
+            list_problems(problems, self.say)
+
+    def skipped(self, problems: Sequence[Problem]) -> None:
+        """List what ``--skip-bad`` skipped."""
+        self.problems("Skipped", problems)
 
     def facts(self, title: str, rows: Mapping[str, Any]) -> None:
-        """Prints a two-column table of names and values."""
+        """Print a two-column table of names and values."""
         self.out.print(title, style="bold")
         table = Table(show_header=False, box=None, pad_edge=False)
         table.add_column(style="dim")
@@ -93,7 +145,7 @@ class Terminal:
 
     @contextlib.contextmanager
     def progress(self) -> Generator[Progress]:
-        """A progress callback: bars on a terminal, a line now and then in a log, nothing with ``--quiet``."""
+        """Yield a callback: bars on a terminal, a line now and then in a log, or nothing."""
         if self.silent:
             yield quiet
         elif not self.err.is_terminal:
@@ -116,16 +168,16 @@ class Terminal:
                     if what not in tasks:
                         tasks[what] = bars.add_task(what, total=total or None, remark="")
                     bars.update(tasks[what], completed=done, total=total or None, remark=remark)
-                    if total and done >= total:  # finished: a task of the same name begins anew
+                    if total and done >= total:  # a later task of the same name begins anew
                         tasks.pop(what)
 
                 yield report
 
 
 class _LogProgress:
-    """Progress for logs: at most a line every ten seconds, and one at the end of what took long."""
+    """At most a line every ten seconds, and one at the end of what took long."""
 
-    def __init__(self, say: Any, every: float = 10.0) -> None:
+    def __init__(self, say: Callable[[str], None], every: float = 10.0) -> None:
         self.say, self.every = say, every
         self.last = time.monotonic()
         self.shown: set[str] = set()
@@ -138,7 +190,8 @@ class _LogProgress:
             self.shown = self.shown - {what} if ended else self.shown | {what}
 
 
-def _list_problems(problems: Sequence[Problem], say: Any) -> None:
+def list_problems(problems: Sequence[Problem], say: Callable[[str], None]) -> None:
+    """Print the first problems, one a line."""
     for problem in problems[:SHOWN_PROBLEMS]:
         say(f"  {problem}")
     if len(problems) > SHOWN_PROBLEMS:
@@ -146,43 +199,62 @@ def _list_problems(problems: Sequence[Problem], say: Any) -> None:
 
 
 def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
-    """``args`` as an ``Options`` of the verb; ``--help`` prints and exits.
+    """Parse ``args`` as the ``Options`` of a verb; ``--help`` prints and exits.
 
     Raises:
-        PalpateError: one line for what tyro would draw a box around.
+        PalpateError: in one line what tyro would draw a box around.
     """
-    verb = VERBS[name]
-    said = io.StringIO()
+    box = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
-            text = f"{options.__doc__}\n\nExample: {verb.example}"
+        with contextlib.redirect_stderr(box):
             return tyro.cli(
                 options,
                 prog=f"palpate {name}",
                 args=list(args),
-                description=text,
-                config=(tyro.conf.FlagCreatePairsOff,),
+                description=f"{options.__doc__}\n\nExample: {VERBS[name].example}",
+                config=CONFIG,
             )
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        words = re.sub(r"[\u2500-\u257f]+|─+", " ", said.getvalue())
-        words = (
-            re.split(
-                r"For full helptext|Argument helptext|Full error|If your arguments",
-                " ".join(words.split()),
-            )[0].strip()
-            or "arguments that cannot be parsed"
-        )
-        raise PalpateError(
-            f"The options of palpate {name} must be as its help says",
-            words,
-            f"See: palpate {name} --help",
-        ) from None
+        _answer_renamed(name, args)
+        words = " ".join(re.sub(r"[\u2500-\u257f]+", " ", box.getvalue()).split())
+        hints = r"For full helptext|Argument helptext|Full error|If your arguments"
+        got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
+        must = f"The options of palpate {name} must be as its help says"
+        raise PalpateError(must, got, f"See: palpate {name} --help") from None
+
+
+def _answer_renamed(name: str, args: Iterable[str]) -> None:
+    """Raise for an option of an earlier version, with its new name."""
+    for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
+        if new := RENAMED.get((name, option)) or RENAMED.get(("", option)):
+            must = f"{option} of palpate {name} is now written {new}"
+            raise PalpateError(must, option, f"See: palpate {name} --help")
+
+
+def option_name(verb: str, argument: str) -> str:
+    """Return how the command line writes an argument of the verb's function."""
+    name = OPTION_NAMES.get((verb, argument)) or OPTION_NAMES.get(("", argument))
+    return name or f"--{argument.replace('_', '-')}"
+
+
+def error_line(verb: str, error: PalpateError) -> str:
+    """Return an error in one line, with options in place of arguments."""
+
+    def example(argument: str, value: Any) -> str:
+        name = option_name(verb, argument)
+        if isinstance(value, bool):
+            return name if value else name.replace("--", "--no-", 1)
+        values = value if isinstance(value, list | tuple) else [value]
+        words = shlex.join(map(str, values))
+        return f"{name} {words}" if name.startswith("-") else words
+
+    return error.message(lambda argument: option_name(verb, argument), example)
 
 
 def require_extra(purpose: str) -> None:
-    """Says which ``pip install`` is missing, before any work is done.
+    """Check that the packages of the extra ``all`` are installed, before any work.
 
     Raises:
         MissingExtraError: if torch, diffusers, transformers or av is absent.
@@ -194,25 +266,24 @@ def require_extra(purpose: str) -> None:
 
 @contextlib.contextmanager
 def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
-    """``.<name>.work`` beside an output folder: checkpoints and caches, found again by the same command, removed when it succeeds.
+    """Yield ``.<name>.work`` next to an output folder, for checkpoints and caches.
+
+    The same command finds it again; it is removed on success.
 
     Raises:
         PalpateError: if the output exists already, before any work is done.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise PalpateError(
-            f"{output} must be absent or an empty folder",
-            "something there",
-            "Choose another -o, or remove it",
-        )
+        must, fix = "must be absent or an empty folder", "Choose another folder, or remove it"
+        raise PalpateError(must, f"{output}, which exists", fix, argument="output")
     work = output.absolute().parent / f".{output.name}.work"
     if work.exists():
-        terminal.say(f"Going on from {work}")
+        terminal.say(f"Resuming from {work}")
     work.mkdir(parents=True, exist_ok=True)
     try:
         yield work
     except PalpateError:
-        if not any(p.is_file() for p in work.rglob("*")):  # refused before any work was done
+        if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
             shutil.rmtree(work)
         raise
     shutil.rmtree(work, ignore_errors=True)
@@ -221,7 +292,7 @@ def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
 def guard_output(
     output: Path, inputs: Sequence[Path] = (), marks: Sequence[bytes] = (b'"format": "palpate-',)
 ) -> None:
-    """Refuses an output file that would replace an input, or anything that palpate did not write, or that cannot be written at all.
+    """Check that an output file replaces neither an input nor a foreign file, and is writable.
 
     Args:
         output: the file to write.
@@ -233,135 +304,127 @@ def guard_output(
         OSError: if the disk is full.
     """
     if any(output.exists() and path.exists() and output.samefile(path) for path in inputs):
-        raise PalpateError(
-            "An output must not replace an input of the same command",
-            str(output),
-            "Choose another -o",
-        )
+        must, fix = "An output must not replace an input of the same command", "Choose another file"
+        raise PalpateError(must, str(output), fix)
     _require_writable(output)
     if output.is_file():
         with open(output, "rb") as file:
             head = file.read(4096)
         if head and not any(mark in head for mark in marks):
-            raise PalpateError(
-                f"{output} must be new, or a file of the kind that this command writes",
-                "another file",
-                "Choose another -o, or remove it",
-            )
+            must = f"{output} must be new, or a file of the kind that this command writes"
+            raise PalpateError(must, "another file", "Choose another file, or remove it")
 
 
 def _require_writable(output: Path) -> None:
-    """Tells now, rather than when all is computed, that no file can be made there: rights alone do not tell, so one is made beside it."""
+    """Make a temporary file next to ``output`` now, rather than fail when all is computed."""
     try:
         if output.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        place = next(
-            p for p in output.absolute().parents if p.exists()
-        )  # the folders below it are made when the file is
-        handle, name = tempfile.mkstemp(dir=place, prefix=f".{output.name}.")
+        place = next(p for p in output.absolute().parents if p.exists())
+        with tempfile.NamedTemporaryFile(dir=place, prefix=f".{output.name}."):
+            pass
     except OSError as error:
         if error.errno in NO_ROOM:
             raise OSError(error.errno, os.strerror(error.errno), str(output)) from None
+        fix = "Choose another path, or check its rights"
         raise PalpateError(
-            f"{output} must be writable",
-            error.strerror or str(error),
-            "Choose another path, or check its rights",
+            f"{output} must be writable", error.strerror or str(error), fix
         ) from None
-    os.close(handle)
-    Path(name).unlink()
 
 
 def _set_threads() -> None:
-    """Thread counts for small models, unless the user has set them; must come before NumPy and torch load.
+    """Set thread counts for small models, before NumPy and torch load, unless the user has.
 
-    Measured on two cores with the ``mini`` models: one thread trains 59 images a second, two 36, and fitting the probe with two
-    BLAS threads takes 16 times as long as with one. Spinning while waiting makes it worse still.
+    Measured on two cores with the ``mini`` models: one thread trains 59 images a second, two 36,
+    and fitting the probe with two BLAS threads takes 16 times as long as with one.
     """
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, min(4, cores // 2))))
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def _file_error(error: OSError) -> PalpateError:
-    """A file or folder that cannot be read or written, as must / got / fix."""
     place = error.filename or "the files of this command"
+    got = error.strerror or str(error)
     if error.errno in NO_ROOM:
-        return PalpateError(
-            f"The disk must have room for {place}",
-            error.strerror or str(error),
-            "Free some space and run the same command again",
-        )
-    return PalpateError(
-        f"{place} must be readable and writable as asked",
-        error.strerror or str(error),
-        "Check the path, its rights and the free space",
-    )
+        fix = "Free some space and run the same command again"
+        return PalpateError(f"The disk must have room for {place}", got, fix)
+    fix = "Check the path, its rights and the free space"
+    return PalpateError(f"{place} must be readable and writable", got, fix)
 
 
 def _write_json(data: Any) -> None:
-    """On standard output, as it is read back whatever letters the stream has."""
-    plain = (
-        not (getattr(sys.stdout, "encoding", None) or "").lower().replace("-", "").startswith("utf")
-    )
-    sys.stdout.write(json.dumps(data, indent=1, ensure_ascii=plain, allow_nan=False) + "\n")
+    encoding = (getattr(sys.stdout, "encoding", None) or "").lower()
+    ascii_only = not encoding.replace("-", "").startswith("utf")
+    text = json.dumps(data, indent=1, ensure_ascii=ascii_only, allow_nan=False)
+    sys.stdout.write(text + "\n")
 
 
 def run_verb(name: str, args: Sequence[str]) -> int:
-    """Runs one verb with its arguments; see :func:`palpate.cli.main` for the exit statuses."""
+    """Run one verb with its arguments; see :func:`palpate.cli.main` for the exit statuses."""
     _set_threads()
     as_json = "--json" in args
     try:
-        if name not in VERBS:
-            near = difflib.get_close_matches(name, VERBS, 1)
-            raise PalpateError(
-                f"The verb must be one of {', '.join(VERBS)}",
-                repr(name),
-                f"Did you mean: palpate {near[0]}" if near else "See: palpate --help",
-            )
-        module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
-        options = parse(name, module.Options, args)
-        terminal = Terminal(options, shlex.join(["palpate", name, *args]))
-        answer = module.run(options, terminal)
-        result, status = answer if isinstance(answer, tuple) else (answer, OK)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PalpateWarning)  # results carry them as notes
+            result, status = _call(name, args)
         if as_json:
             _write_json(result)
-        return int(status)
+        return status
     except (PalpateError, OSError) as caught:
         error = caught if isinstance(caught, PalpateError) else _file_error(caught)
-        sys.stderr.write(f"palpate {name}: {error}\n")
+        sys.stderr.write(f"palpate {name}: {error_line(name, error)}\n")
         if isinstance(error, ProblemsError):
-            _list_problems(error.problems, lambda line: sys.stderr.write(f"{line}\n"))
+            list_problems(error.problems, lambda line: sys.stderr.write(f"{line}\n"))
         if as_json:
             _write_json(error.to_json())
         return USER_ERROR
     except KeyboardInterrupt:
         sys.stderr.write(
-            f"\npalpate {name}: stopped. Run the same command again: with an output or a cache it goes on from what is done.\n"
+            f"\npalpate {name}: stopped. Run the same command again: with an output or a cache it "
+            "resumes.\n"
         )
         return INTERRUPTED
-    except Exception as bug:  # our own mistake: the traceback helps to report it, and the status differs from a failed check
+    except Exception as bug:  # the traceback helps to report it
         traceback.print_exc()
         sys.stderr.write(
             f"palpate {name}: this is a bug in palpate; please report the lines above.\n"
         )
         if as_json:
-            told = PalpateError(
-                "palpate must not fail of itself",
-                str(bug),
-                "Report the traceback on standard error",
-            ).to_json()
-            _write_json(told | {"error": type(bug).__name__})
+            fix = "Report the traceback on standard error"
+            error = PalpateError("palpate must not fail", str(bug), fix)
+            _write_json(error.to_json() | {"error": type(bug).__name__})
         return BUG
 
 
+def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
+    if name not in VERBS:
+        near = difflib.get_close_matches(name, VERBS, 1)
+        new = RENAMED.get((name, ""))
+        fix = f"Write: {new}" if new else f"Did you mean: palpate {near[0]}" if near else ""
+        must = f"The verb must be one of {', '.join(VERBS)}"
+        raise PalpateError(must, repr(name), fix or "See: palpate --help")
+    module = importlib.import_module(f"palpate.cli.{VERBS[name].module}")
+    options = parse(name, module.Options, args)
+    terminal = Terminal(options, shlex.join(["palpate", *name.split(), *args]))
+    answer = module.run(options, terminal)
+    return answer if isinstance(answer, tuple) else (answer, OK)
+
+
 __all__ = [
+    "CONFIG",
     "FAILED_CHECK",
+    "OPTION_NAMES",
+    "RENAMED",
     "Common",
+    "OptionalOutPath",
     "OutPath",
+    "Switch",
     "Terminal",
+    "error_line",
     "guard_output",
+    "list_problems",
     "require_extra",
     "run_verb",
     "working_folder",

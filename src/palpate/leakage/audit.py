@@ -332,7 +332,7 @@ def _signals(
                     false_positives=matches.false_positives,
                     edges=matches.edges,
                     unrelated=matches.unrelated,
-                    matches=matches.found,
+                    found=matches.found,
                     cause=matches.cause,
                     notes=list(matches.notes),
                 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from rich.console import Console
+
 from palpate.report.notes import sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import audit_line, cause_texts, threshold_text
@@ -26,3 +28,8 @@ def audit_text(audit: Audit) -> str:
     if audit.impact is not None:
         lines.append(audit.impact.headline)
     return "\n".join([*lines, *map(str, audit.others)])
+
+
+def print_result(result: Results | Audit, console: Console) -> None:
+    """Print a result as wide as the console."""
+    console.print(str(result), markup=False, soft_wrap=True)
