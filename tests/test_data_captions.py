@@ -1,11 +1,8 @@
-"""Captions from labels: deterministic, about touch alone, and for known materials only."""
+"""Captions from labels: deterministic, about touch alone, for any material."""
 
 import re
 
-import pytest
-
-from palpate.core import PalpateError
-from palpate.data.captions import ADJECTIVES, TEXT_FROM_TEMPLATE, caption
+from palpate.data.captions import ADJECTIVES, caption
 from palpate.data.formats.touch_and_go import CATEGORIES
 
 SEEN = [
@@ -49,11 +46,9 @@ def test_the_same_sample_has_the_same_words_and_others_vary():
     assert caption("Rock", "v/1") == caption("rock ", "v/1")
     assert len({caption("Rock", f"v/{k}") for k in range(50)}) > 20
     assert len({caption("Rock", "v/1", seed=s) for s in range(50)}) > 20
-    assert "rock" in caption("Rock", "v/1", with_name=True)
-    assert "label" in TEXT_FROM_TEMPLATE
 
 
-def test_an_unknown_material_lists_the_known():
-    with pytest.raises(PalpateError, match=r"Concrete, .*Others") as caught:
-        caption("Cheese", "v/1")
-    assert "Cheese" in caught.value.got
+def test_an_unknown_material_is_named_as_it_is():
+    texts = {caption("Sandpaper  No. 5 {x}", f"v/{k}") for k in range(50)}
+    assert len(texts) == 5
+    assert all("Sandpaper No. 5 {x}" in text for text in texts)

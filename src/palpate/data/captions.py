@@ -1,18 +1,13 @@
-"""Captions made from a material's name, for data that has labels but no words.
+"""Captions made from the name of a material, for data that has labels but no words.
 
-``caption`` draws three adjectives of the material and a sentence form from (seed, sample id), so a sample has one caption
-whatever the order. The words are about touch alone: no color, no light. Such captions carry nothing but the label; a
-score that uses them measures the label, which :data:`TEXT_FROM_TEMPLATE` says for reports.
+``caption`` draws three adjectives of the material and a sentence form from (seed, sample id), so a
+sample has one caption whatever the order. The words are about touch alone: no color, no light. Such
+captions say no more than the label does; a score that uses them measures the label.
 """
 
 from __future__ import annotations
 
-from palpate.core import PalpateError, rng_for
-
-TEXT_FROM_TEMPLATE = (
-    "The captions were made from material labels by fixed templates: they say no more than the label does, and two samples of "
-    "one material may carry the same words."
-)
+from palpate.core import rng_for
 
 #: What each of the Touch and Go materials feels like.
 ADJECTIVES: dict[str, tuple[str, ...]] = {
@@ -44,39 +39,29 @@ TEMPLATES = (
     "pressing on it feels {0}, {1}, {2}",
     "{a} {0}, {1}, {2} surface",
 )
-NAMED = (
-    "{name}: {0}, {1} and {2} to the touch",
-    "{name} that feels {0}, {1} and {2}",
-    "touching {name}, which feels {0} and {1}, and rather {2}",
-    "pressing on {name} feels {0}, {1}, {2}",
-    "the {0}, {1}, {2} surface of {name}",
+#: Forms for materials without adjectives.
+UNKNOWN = (
+    "{name} to the touch",
+    "something that feels like {name}",
+    "it feels like {name}",
+    "pressing on {name}",
+    "a surface of {name}",
 )
 
 
-def caption(material: str, sample_id: str, seed: int = 0, with_name: bool = False) -> str:
-    """A touch caption for a sample of a material.
+def caption(material: str, sample_id: str, seed: int = 0) -> str:
+    """Write a caption of how a sample of a material feels.
 
     Args:
-        material: one of the 20 Touch and Go materials, in any case.
+        material: any name; the 20 Touch and Go materials (in any case) have adjectives, others are named.
         sample_id: the sample; equal ids get equal captions.
         seed: of the draw.
-        with_name: name the material too.
-
-    Raises:
-        PalpateError: for a material without words.
     """
-    known = {name.lower(): name for name in ADJECTIVES}
-    name = known.get(material.strip().lower())
-    if name is None:
-        raise PalpateError(
-            "A caption can be made for these materials: " + ", ".join(ADJECTIVES),
-            repr(material),
-            "Give the samples a text column instead",
-        )
+    names = {known.lower(): known for known in ADJECTIVES}
+    known = names.get(material.strip().lower())
     rng = rng_for(seed, "caption", sample_id)
-    words = [ADJECTIVES[name][k] for k in rng.permutation(len(ADJECTIVES[name]))[:3]]
-    forms = NAMED if with_name else TEMPLATES
-    article = "an" if words[0][0] in "aeiou" else "a"
-    return forms[int(rng.integers(len(forms)))].format(
-        *words, a=article, name="another material" if name == "Others" else name.lower()
-    )
+    if known is None:
+        return UNKNOWN[int(rng.integers(len(UNKNOWN)))].format(name=" ".join(material.split()))
+    words = [ADJECTIVES[known][k] for k in rng.permutation(len(ADJECTIVES[known]))[:3]]
+    form = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
+    return form.format(*words, a="an" if words[0][0] in "aeiou" else "a")

@@ -1,4 +1,4 @@
-"""The manifest: one row a touch of one surface at one instant, as a table with a root and a digest.
+"""The manifest: one row per sample (one surface at one instant), as a table with a root and a digest.
 
 =============  =======  ==========================================================================
 column         type     meaning (null where the data set has none; never invented)
@@ -7,13 +7,13 @@ column         type     meaning (null where the data set has none; never invente
 ``video``      string   the continuous recording it comes from
 ``frame``      int      position in both videos of the recording
 ``contact``    string   the run of consecutive in-contact frames it belongs to, unique across videos
-``object``     string   the thing touched
+``object``     string   the object
 ``session``    string   recordings made in one sitting, of which neighbors may share the object
 ``material``   string   class name
-``text``       string   what the touch feels like, in words
+``text``       string   how the surface feels, in words
 ``vision``     string   path of the photo, relative to the root
 ``tactile``    string   path of the tactile image
-``background`` string   path of the sensor's image when it touches nothing
+``background`` string   path of a tactile image without contact
 ``sensor``     string   sensor or gel unit
 ``domain``     string   recording condition that changes the look (rig, lighting)
 =============  =======  ==========================================================================
@@ -27,8 +27,8 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -64,37 +64,22 @@ IMAGE_COLUMNS = ("vision", "tactile", "background")
 #: Modality -> its image column.
 MODALITIES = {"vision": "vision", "tactile": "tactile"}
 FORMAT = "palpate-manifest/3"
-#: Format 2 called the column ``contact`` ``touch``; it is read and upgraded.
+#: In format 2 the column ``contact`` was called ``touch``; it is read and upgraded.
 FORMAT_2 = "palpate-manifest/2"
+#: Prefix of the keys of facts in the metadata.
+FACT = "palpate.fact."
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)"
 
 
-def write_parquet(
-    table: pl.DataFrame, path: Path, metadata: Mapping[str, str] | None = None
-) -> None:
-    """Writes a table as Parquet, whole or not at all.
-
-    polars encodes in memory and Python writes, so that a full disk is the OSError that it is, not an error of polars.
-
-    Raises:
-        OSError: if the disk is full.
-        PalpateError: if the path cannot be written to.
-    """
-    data = io.BytesIO()
-    table.write_parquet(data, metadata=dict(metadata) if metadata else None)
-    with atomic_path(path) as part:
-        part.write_bytes(data.getbuffer())
-
-
 @dataclass(frozen=True)
 class Manifest:
-    """Samples and where their images lie.
+    """Samples and where their images are.
 
     Attributes:
         table: the rows, with exactly the columns of ``SCHEMA``.
         root: folder that the image paths are relative to.
-        facts: JSON facts about the source (``dataset``, ``text_source`` ...), kept in the file, not in the digest.
+        facts: facts about the source (``dataset``, ``text_source`` ...), kept in the file, not in the digest.
     """
 
     table: pl.DataFrame
@@ -105,24 +90,21 @@ class Manifest:
     def from_rows(
         cls, rows: Iterable[Mapping[str, Any]], root: Path, facts: Mapping[str, str] | None = None
     ) -> Manifest:
-        """A manifest from dictionaries; absent columns become null.
+        """Make a manifest of dictionaries; absent columns become null.
 
         Raises:
             PalpateError: on an unknown column.
         """
         rows = list(rows)
-        unknown = sorted({name for row in rows for name in row} - set(SCHEMA))
-        if unknown:
+        if unknown := sorted({name for row in rows for name in row} - set(SCHEMA)):
             raise PalpateError(
-                f"Manifest columns must be among {', '.join(SCHEMA)}",
+                f"must have columns among {', '.join(SCHEMA)}",
                 repr(unknown[0]),
-                "Map the column to one of these",
+                "Rename the column to one of these, or leave it out",
+                argument="rows",
             )
-        return cls(
-            pl.DataFrame({name: [row.get(name) for row in rows] for name in SCHEMA}, schema=SCHEMA),
-            Path(root),
-            facts or {},
-        )
+        table = pl.DataFrame({c: [row.get(c) for row in rows] for c in SCHEMA}, schema=SCHEMA)
+        return cls(table, Path(root), facts or {})
 
     def __len__(self) -> int:
         return self.table.height
@@ -139,12 +121,9 @@ class Manifest:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over all rows in order, columns in the order of ``SCHEMA``."""
-        text = self.table.select(
-            pl.concat_str(
-                [pl.col(c).cast(pl.String).fill_null("\x00") for c in SCHEMA], separator="\x1f"
-            )
-        )
-        return digest_lines(text.to_series().to_list())
+        cells = [pl.col(c).cast(pl.String).fill_null("\x00") for c in SCHEMA]
+        rows = self.table.select(pl.concat_str(cells, separator="\x1f"))
+        return digest_lines(rows.to_series().to_list())
 
     def filled(self) -> pl.DataFrame:
         """The table without the columns that are all null."""
@@ -162,14 +141,13 @@ class Manifest:
             PalpateError: if a row has no such image.
         """
         values = self.column(column)
-        if (missing := sum(v is None for v in values)) > 0:
-            first = self.ids[values.index(None)]
+        if missing := values.count(None):
             raise PalpateError(
                 f"Every sample must have a {column} image here",
-                f"{missing} without, first {first!r}",
-                f"Leave those samples out, or fill the column {column}",
+                f"{missing} without, first {self.ids[values.index(None)]!r}",
+                f"Drop those samples, or fill the column {column}",
             )
-        return [self.root / v for v in values]
+        return [self.root / value for value in values]
 
     def take(self, ids: Sequence[str]) -> Manifest:
         """The rows of ``ids``, in that order.
@@ -178,14 +156,13 @@ class Manifest:
             PalpateError: if an id is not in the manifest.
         """
         row = {name: k for k, name in enumerate(self.ids)}
-        missing = [i for i in ids if i not in row]
-        if missing:
+        if missing := [i for i in ids if i not in row]:
             raise PalpateError(
                 "Every id of the split must be in the manifest",
                 f"{len(missing)} that are not, first {missing[0]!r}",
                 "Use the split made for this manifest",
             )
-        return Manifest(self.table[[row[i] for i in ids]], self.root, self.facts)
+        return replace(self, table=self.table[[row[i] for i in ids]])
 
     def part(self, split: Split, *parts: str) -> Manifest:
         """The rows in the given parts of a split, in manifest order.
@@ -193,133 +170,106 @@ class Manifest:
         Raises:
             PalpateError: if the split names ids that the manifest lacks.
         """
-        self.take(split.ids(*parts))  # names ids that are missing
-        return Manifest(
-            self.table.filter(pl.col("id").is_in(split.ids(*parts))), self.root, self.facts
-        )
+        ids = self.take(split.ids(*parts)).ids
+        return replace(self, table=self.table.filter(pl.col("id").is_in(ids)))
 
     def prefixed(self, prefix: str) -> Manifest:
-        """The same samples with ``prefix`` before their ids, videos, touches and sessions."""
-        named = self.table.with_columns(
-            (pl.lit(prefix) + pl.col(name)).alias(name)
-            for name in ("id", "video", "contact", "session")
-        )
-        return Manifest(named, self.root, self.facts)
+        """The same samples with ``prefix`` before their ids, videos, contacts and sessions."""
+        names = ("id", "video", "contact", "session")
+        return replace(self, table=self._with_prefix(prefix, names))
 
     @classmethod
     def join(cls, *manifests: Manifest) -> Manifest:
-        """The samples of several manifests in one, rooted at the folder that holds all their roots.
+        """The samples of several manifests in one, whose root is the folder that holds all their roots.
 
         Raises:
-            PalpateError: if an id stands in two of them.
+            PalpateError: if two of them share an id.
         """
         root = Path(os.path.commonpath([m.root.resolve() for m in manifests]))
         tables: list[pl.DataFrame] = []
         for m in manifests:
-            prefix = m.root.resolve().relative_to(root).as_posix()
-            prefix = "" if prefix == "." else prefix + "/"
-            tables.append(
-                m.table.with_columns(
-                    (pl.lit(prefix) + pl.col(name)).alias(name) for name in IMAGE_COLUMNS
-                )
-            )
+            folder = m.root.resolve().relative_to(root).as_posix()
+            tables.append(m._with_prefix("" if folder == "." else f"{folder}/", IMAGE_COLUMNS))
         table = pl.concat(tables)
-        double = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
-        if len(double):
+        shared = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
+        if len(shared):
             raise PalpateError(
                 "Joined manifests must not share ids",
-                f"{len(double)} shared, first {double[0]!r}",
+                f"{len(shared)} shared, first {shared[0]!r}",
                 "Rename the videos of one of them",
             )
-        return cls(
-            table, root, {"dataset": " + ".join(m.facts.get("dataset", "?") for m in manifests)}
-        )
+        names = " + ".join(m.facts.get("dataset", "?") for m in manifests)
+        return cls(table, root, {"dataset": names})
+
+    def _with_prefix(self, prefix: str, names: Sequence[str]) -> pl.DataFrame:
+        return self.table.with_columns((pl.lit(prefix) + pl.col(n)).alias(n) for n in names)
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row (a dictionary of the table) as a reference with absolute image paths, for reports."""
-        full = lambda name: str(self.path(row[name]).resolve()) if row[name] else None  # noqa: E731
-        return SampleRef(
-            row["id"], row["video"], row["frame"], row["material"], full("vision"), full("tactile")
+        vision, tactile = (
+            str(self.path(row[name]).resolve()) if row[name] else None
+            for name in ("vision", "tactile")
         )
+        names = (row[name] for name in ("id", "video", "frame", "material"))
+        return SampleRef(*names, vision, tactile)
 
     def problems(self, *, files: bool = True) -> list[Problem]:
-        """Everything wrong with the table: empty, null or double ids, paths outside the root and, if ``files``, missing files."""
-        found = [Problem("manifest", "empty", "there are no samples")] if not len(self) else []
+        """Everything wrong with the table: no rows, empty or duplicate ids, paths outside the root, missing files."""
+        problems = [] if len(self) else [Problem("manifest", "empty", "there are no samples")]
         seen: dict[str, int] = {}
         for line, i in enumerate(self.column("id"), 1):
             if not i:
-                found.append(Problem(f"row {line}", "null-id", "the id is empty"))
-            elif i in seen:
-                found.append(
-                    Problem(
-                        f"row {line}",
-                        "duplicate-id",
-                        f"the id {i!r} stands in row {seen[i]} already",
-                    )
-                )
-            else:
-                seen[i] = line
-        known: dict[str, str | None] = {}
+                problems.append(Problem(f"row {line}", "null-id", "the id is empty"))
+            elif (first := seen.setdefault(i, line)) != line:
+                text = f"the id {i!r} is in row {first} already"
+                problems.append(Problem(f"row {line}", "duplicate-id", text))
+
+        @cache
+        def wrong(value: str) -> str:
+            path = inside(self.root, value)
+            if path is None:
+                return "outside-root"
+            return "missing-file" if files and not path.is_file() else ""
+
         for name in IMAGE_COLUMNS:
             for line, value in enumerate(self.column(name), 1):
-                if value is None:
-                    continue
-                if value not in known:
-                    path = inside(self.root, value)
-                    known[value] = (
-                        "outside-root"
-                        if path is None
-                        else "missing-file"
-                        if files and not path.is_file()
-                        else None
+                if value is not None and (kind := wrong(value)):
+                    no_file, outside = (
+                        f"no {name} file {value!r}",
+                        f"the path {value!r} leaves the root",
                     )
-                if known[value] == "outside-root":
-                    found.append(
-                        Problem(
-                            f"row {line}",
-                            "outside-root",
-                            f"the {name} path {value!r} leaves the root",
-                        )
-                    )
-                elif known[value] == "missing-file":
-                    found.append(
-                        Problem(f"row {line}", "missing-file", f"no {name} file {value!r}")
-                    )
-        return found
+                    text = no_file if kind == "missing-file" else outside
+                    problems.append(Problem(f"row {line}", kind, text))
+        return problems
 
     def require_valid(self, *, files: bool = True) -> Manifest:
-        """This manifest, if it has no problems.
+        """Return this manifest, if it has no problems.
 
         Raises:
             ProblemsError: with every problem at once.
         """
-        if found := self.problems(files=files):
-            raise ProblemsError(found, "Mend the rows, or import again with --skip-bad")
+        if problems := self.problems(files=files):
+            raise ProblemsError(problems, "Correct the rows, or import again and skip the bad ones")
         return self
 
     def save(self, path: Path) -> None:
-        """Writes Parquet, atomically, with format, digest and root (relative to the file) as metadata."""
+        """Write Parquet, atomically, with format, digest and root (relative to the file) as metadata."""
         path = Path(path)
-        root = os.path.relpath(self.root.resolve(), path.parent.resolve())
-        facts = {f"palpate.fact.{k}": v for k, v in self.facts.items()}
-        write_parquet(
-            self.table,
-            path,
-            {
-                "palpate.format": FORMAT,
-                "palpate.digest": self.digest,
-                "palpate.root": root,
-                **facts,
-            },
-        )
+        metadata = {
+            "palpate.format": FORMAT,
+            "palpate.digest": self.digest,
+            "palpate.root": os.path.relpath(self.root.resolve(), path.parent.resolve()),
+            **{f"{FACT}{k}": v for k, v in self.facts.items()},
+        }
+        write_parquet(self.table, path, metadata)
 
     @classmethod
     def load(cls, path: Path, root: Path | None = None) -> Manifest:
-        """Reads a manifest file.
+        """Read a manifest file.
 
         Args:
             path: a ``.parquet`` file, or the folder that holds ``manifest.parquet``.
-            root: where the images lie now; default: where they lay relative to the file.
+            root: where the images are now; default: where they were relative to the file.
 
         Raises:
             PalpateError: if the file is missing, is no manifest, or does not match its digest.
@@ -334,28 +284,14 @@ class Manifest:
                 meta = pl.read_parquet_metadata(file)
             table = pl.read_parquet(path, glob=False)  # a path may hold brackets
         except Exception as error:  # polars raises several kinds for a file that is not Parquet
-            raise PalpateError(
-                f"The manifest {path} must be a Parquet file", str(error).splitlines()[0], fix
-            ) from None
-        if meta.get("palpate.format") == FORMAT_2 and "touch" in table.columns:
-            table = table.rename({"touch": "contact"})
-            meta["palpate.format"] = FORMAT
-        if meta.get("palpate.format") != FORMAT or list(table.columns) != list(SCHEMA):
-            raise PalpateError(
-                f"The manifest {path} must have the format {FORMAT}",
-                meta.get("palpate.format") or "a foreign Parquet file",
-                fix,
-            )
-        facts = {
-            k.removeprefix("palpate.fact."): v
-            for k, v in meta.items()
-            if k.startswith("palpate.fact.")
-        }
-        manifest = cls(
-            table,
-            Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"])),
-            facts,
-        )
+            got = str(error).splitlines()[0]
+            raise PalpateError(f"The manifest {path} must be a Parquet file", got, fix) from None
+        written = meta.get("palpate.format")
+        if written == FORMAT_2:
+            table = table.rename({"touch": "contact"}, strict=False)
+        if written not in (FORMAT, FORMAT_2) or table.columns != list(SCHEMA):
+            got = written or "a Parquet file of another program"
+            raise PalpateError(f"The manifest {path} must have the format {FORMAT}", got, fix)
         for name in IMAGE_COLUMNS:
             climbing = table.filter(pl.col(name).str.contains(CLIMBS))[name]
             if len(climbing):
@@ -364,6 +300,9 @@ class Manifest:
                     f"the {name} path {climbing[0]!r}",
                     "Remove the row, or import again",
                 )
+        facts = {k.removeprefix(FACT): v for k, v in meta.items() if k.startswith(FACT)}
+        home = Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"]))
+        manifest = cls(table, home, facts)
         if manifest.digest != meta["palpate.digest"]:
             raise PalpateError(
                 f"The digest in {path} must match its rows",
@@ -371,3 +310,20 @@ class Manifest:
                 fix,
             )
         return manifest
+
+
+def write_parquet(
+    table: pl.DataFrame, path: Path, metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write a table as Parquet, whole or not at all.
+
+    Encoded in memory and written by Python, so that a full disk is an OSError and no error of polars.
+
+    Raises:
+        OSError: if the disk is full.
+        PalpateError: if the path cannot be written to.
+    """
+    data = io.BytesIO()
+    table.write_parquet(data, metadata=dict(metadata) if metadata else None)
+    with atomic_path(path) as part:
+        part.write_bytes(data.getbuffer())
