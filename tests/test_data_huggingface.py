@@ -87,7 +87,7 @@ def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
         if parted
         else None
     )
-    files = export_dataset(manifest, tmp_path / "hf", to="hf", split=split)
+    files = export_dataset(manifest, tmp_path / "hf", to="hf", split=split).files
     assert all(f.is_file() for f in files)
     loaded = datasets.load_from_disk(str(tmp_path / "hf"))
     assert sorted(loaded) == (["test", "train", "unused", "validation"] if parted else ["all"])
@@ -117,7 +117,7 @@ def test_tables_come_back_with_their_split(small_manifest, tmp_path, to, name):
     )
     manifest = Manifest(table, small_manifest.root, {})
     split = Split({i: ("train", "test")[k % 2] for k, i in enumerate(manifest.ids) if k % 5})
-    files = export_dataset(manifest, tmp_path / "o", to=to, split=split)
+    files = export_dataset(manifest, tmp_path / "o", to=to, split=split).files
     assert {f.relative_to(tmp_path / "o").as_posix() for f in files} == {
         name,
         "lists/train.csv",

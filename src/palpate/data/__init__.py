@@ -1,1 +1,45 @@
-"""Data: the manifest, one file a data-set format, images and video frames."""
+"""Data: the manifest, one file per data-set format, images and video frames."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from palpate.data.exporting import Exported, export_dataset
+    from palpate.data.imported import Imported, Validation
+    from palpate.data.importing import import_dataset, validate
+    from palpate.data.reading import load
+    from palpate.data.manifest import Manifest
+
+#: Public name -> its module, imported on first use, so that ``import palpate.data`` is free.
+_MODULES = {
+    "Exported": "exporting",
+    "Imported": "imported",
+    "Manifest": "manifest",
+    "Validation": "imported",
+    "export_dataset": "exporting",
+    "import_dataset": "importing",
+    "load": "reading",
+    "validate": "importing",
+}
+
+__all__ = [
+    "Exported",
+    "Imported",
+    "Manifest",
+    "Validation",
+    "export_dataset",
+    "import_dataset",
+    "load",
+    "validate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'palpate.data' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"palpate.data.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value

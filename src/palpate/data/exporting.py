@@ -1,23 +1,27 @@
-"""A manifest for other tools: as a Hugging Face data set with the images inside, or as a table beside them.
+"""A manifest for other tools: a Hugging Face data set with the images inside, or a table.
 
-===========  ==========================================================================================================
+===========  =================================================================================
 form         what is written
-===========  ==========================================================================================================
-``hf``       ``datasets``' ``save_to_disk`` of a DatasetDict: the parts of the split (``train``, ``validation``, ``test``; ``unused`` for
-             the rest), or ``all``; images byte for byte, all manifest columns. ``formats/huggingface.py`` tells how it comes back.
-``csv``      ``manifest.csv``: all columns that are not empty, and ``split``; paths stay relative to the manifest's root
-``jsonl``    ``manifest.jsonl``: the same, an object a line, without nulls
+===========  =================================================================================
+``hf``       ``datasets``' ``save_to_disk`` of a DatasetDict: the parts of the split (``train``,
+             ``validation``, ``test``; ``unused`` for other samples), or ``all``; images byte for
+             byte, all manifest columns. ``formats/huggingface.py`` reads it again.
+``csv``      ``manifest.csv``: all columns that are not empty, and ``split``; paths stay relative
+             to the manifest's root
+``jsonl``    ``manifest.jsonl``: the same, one object per line, without nulls
 ``parquet``  ``samples.parquet``: the same with nulls
-===========  ==========================================================================================================
+===========  =================================================================================
 
-With a split, tables come with ``lists/``: the split in the form of the data set that the manifest came from.
+With a split, tables come with ``lists/``: the split in the form of the original data set.
 """
 
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Generator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,37 +34,77 @@ from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, write_parquet
 
 Form = Literal["hf", "csv", "jsonl", "parquet"]
 #: What Hugging Face calls our parts.
-THEIRS = {"train": "train", "val": "validation", "test": "test"}
+HF_PARTS = {"train": "train", "val": "validation", "test": "test"}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export wrote. Print it for how to read it again.
+
+    Attributes:
+        form: the form.
+        output: the folder.
+        manifest: the samples.
+        split: the split that was written with them, if any.
+        files: all files.
+    """
+
+    form: Form
+    output: Path
+    manifest: Manifest
+    split: Split | None
+    files: list[Path]
+
+    def to_json(self) -> dict[str, Any]:
+        """The facts as a JSON object."""
+        return {
+            "form": self.form,
+            "samples": len(self.manifest),
+            "digest": self.manifest.digest,
+            "parts": None if self.split is None else self.split.counts(),
+            "root": str(self.manifest.root),
+            "files": [str(path) for path in self.files],
+        }
+
+    def __str__(self) -> str:
+        quoted = [shlex.quote(str(p)) for p in (self.output, self.files[0], self.manifest.root)]
+        if self.form == "hf":
+            way = f"datasets.load_from_disk({str(self.output)!r}), or again with: palpate import {quoted[0]}"
+        else:
+            table = next(path for path in self.files if path.parent == self.output)
+            way = f"palpate import {shlex.quote(str(table))} --root {quoted[2]}"
+        count = f"{len(self.manifest)} samples in {len(self.files)} files"
+        return f"Exported {self.output}: {count}\nRead it with: {way} -o DIR"
 
 
 def export_dataset(
-    manifest: Manifest,
-    out: Path,
+    manifest: Manifest | Path | str,
+    output: Path | str,
     *,
     to: Form,
-    split: Split | None = None,
+    split: Split | Path | str | None = None,
     progress: Progress = quiet,
-) -> list[Path]:
-    """Writes a manifest in another form, whole or not at all.
+) -> Exported:
+    """Write a manifest in another form, whole or not at all.
 
     Args:
-        manifest: the samples; for ``hf`` their images must be there.
-        out: folder to write, absent or empty.
+        manifest: the samples, or a manifest file or folder; for ``hf`` their images must exist.
+        output: folder to write, absent or empty.
         to: the form.
         split: which part each sample belongs to; samples outside it are marked so.
-        progress: told what is being done.
-
-    Returns:
-        The files written.
+        progress: progress callback.
 
     Raises:
-        PalpateError: if ``out`` holds something, or the split is of another manifest.
+        PalpateError: if ``output`` is not empty, or the split is of another manifest.
         ProblemsError: with every image that is missing.
         MissingExtraError: for ``hf``, if ``datasets`` is not installed.
     """
+    manifest = manifest if isinstance(manifest, Manifest) else Manifest.load(Path(manifest))
+    split = Split.load(Path(split)) if isinstance(split, (str, Path)) else split
     if split is not None:
         manifest.take(list(split.parts))
-    with atomic_folder(Path(out)) as folder:
+    output = Path(output)
+    with atomic_folder(output) as folder:
         if to == "hf":
             _save_to_disk(manifest.require_valid(), folder, split, progress)
         else:
@@ -68,25 +112,20 @@ def export_dataset(
             if split is not None:
                 write_lists(manifest, split, folder / "lists")
         names = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    return [Path(out) / name for name in names]
+    return Exported(to, output, manifest, split, [output / name for name in names])
 
 
 def _write_table(manifest: Manifest, folder: Path, to: Form, split: Split | None) -> None:
-    table = manifest.table.select(
-        name for name in SCHEMA if manifest.table[name].null_count() < len(manifest)
-    )
+    table = manifest.filled()
     if split is not None:
-        table = table.with_columns(
-            split=pl.Series([split.parts.get(i) for i in manifest.ids], dtype=pl.String)
-        )
+        parts = [split.parts.get(i) for i in manifest.ids]
+        table = table.with_columns(split=pl.Series(parts, dtype=pl.String))
     if to == "csv":
         write_text(folder / "manifest.csv", table.write_csv())
     elif to == "jsonl":
-        lines = (
-            json.dumps({k: v for k, v in row.items() if v is not None}, ensure_ascii=False)
-            for row in table.iter_rows(named=True)
-        )
-        write_text(folder / "manifest.jsonl", "".join(f"{line}\n" for line in lines))
+        rows = ({k: v for k, v in row.items() if v is not None} for row in table.to_dicts())
+        lines = (json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
+        write_text(folder / "manifest.jsonl", "".join(lines))
     else:
         write_parquet(table, folder / "samples.parquet")
 
@@ -94,28 +133,21 @@ def _write_table(manifest: Manifest, folder: Path, to: Form, split: Split | None
 def _save_to_disk(
     manifest: Manifest, folder: Path, split: Split | None, progress: Progress
 ) -> None:
-    """Writes the DatasetDict; the library reads the image files itself, a batch at a time."""
+    """Write the DatasetDict; the library reads the image files itself, a batch at a time."""
     try:
         import datasets
     except ImportError:
         raise MissingExtraError("datasets", "hf", "Writing Hugging Face data sets") from None
     features: dict[str, Any] = {}
     for name, kind in SCHEMA.items():
-        features[name] = (
-            datasets.Image()
-            if name in IMAGE_COLUMNS
-            else datasets.Value("int64" if kind is pl.Int64 else "string")
-        )
+        features[name] = datasets.Value("int64" if kind is pl.Int64 else "string")
         if name in IMAGE_COLUMNS:
+            features[name] = datasets.Image()
             features[f"{name}_path"] = datasets.Value("string")
     features[ROW] = datasets.Value("int64")
-    about: dict[str, Any] = {
-        "format": MARK,
-        "digest": manifest.digest,
-        "facts": dict(manifest.facts),
-    }
+    facts = dict(manifest.facts)
+    about: dict[str, Any] = {"format": MARK, "digest": manifest.digest, "facts": facts}
     about |= {} if split is None else {"rule": dict(split.rule), "split": split.digest}
-    facts = manifest.facts
     info = datasets.DatasetInfo(
         description=json.dumps(about, ensure_ascii=False),
         citation=facts.get("citation", ""),
@@ -124,31 +156,18 @@ def _save_to_disk(
         features=datasets.Features(features),
     )
     table = manifest.table.with_row_index(ROW).with_columns(pl.col(ROW).cast(pl.Int64))
-    part_of = {} if split is None else split.parts
-    parts = pl.Series(
-        [
-            THEIRS[part_of[i]] if i in part_of else "all" if split is None else "unused"
-            for i in manifest.ids
-        ],
-        dtype=pl.String,
-    )
+    root = str(manifest.root) + "/"
+    for name in IMAGE_COLUMNS:
+        path = pl.col(name)
+        table = table.with_columns(path.alias(f"{name}_path"), (pl.lit(root) + path).alias(name))
+    part_of = {} if split is None else {i: HF_PARTS[part] for i, part in split.parts.items()}
+    parts = pl.Series([part_of.get(i, "all" if split is None else "unused") for i in manifest.ids])
     saved: Any = datasets.DatasetDict()
-    for part in (*THEIRS.values(), "unused", "all"):
-        rows = table.filter(parts == part)
-        if not rows.height:
-            continue
-        columns: dict[str, list[Any]] = {}
-        for name in features:
-            source = name.removesuffix("_path")
-            values = rows[source].to_list()
-            columns[name] = (
-                [v if v is None else str(manifest.root / v) for v in values]
-                if name in IMAGE_COLUMNS
-                else values
-            )
-        saved[part] = datasets.Dataset.from_dict(
-            columns, features=datasets.Features(features), info=info
-        )
+    for part in (*HF_PARTS.values(), "unused", "all"):
+        rows = table.filter(parts == part).select(list(features))
+        if rows.height:
+            columns = rows.to_dict(as_series=False)
+            saved[part] = datasets.Dataset.from_dict(columns, datasets.Features(features), info)
     progress("writing images", 0, 1)
     with _silent(datasets):
         saved.save_to_disk(str(folder))

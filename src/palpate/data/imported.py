@@ -1,29 +1,37 @@
-"""What every importer returns, and how it leaves nothing half-written behind."""
+"""What importing and validating return, and how a failed import leaves nothing half-written."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from palpate.core import PalpateError, Problem, ProblemsError, Split
 from palpate.data.manifest import Manifest
 
-FIX = "Mend these, or import again with --skip-bad to leave the rows out and list them"
+if TYPE_CHECKING:
+    from palpate.data.formats import Facts
+
+FIX = "Correct these, or skip the bad rows and list them"
+#: Problems that a printed result shows; ``to_json`` has all.
+SHOWN = 40
+#: Manifest column -> what its distinct values are called in a summary.
+COUNTED = {"video": "videos", "contact": "contacts", "material": "materials"}
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A data set that was read and written as a manifest.
+    """A data set that was read and written as a manifest. Print it for a summary.
 
     Attributes:
         manifest: the usable samples.
-        skipped: everything that was left out because it is bad.
+        skipped: everything that was skipped because it is bad.
         splits: the data set's own splits by name (``"Orig"``), over ids of the manifest.
-        inconclusive: rows left out because their label says that the material is unclear.
+        inconclusive: rows skipped because their label marks the material as unclear.
         suspicious: what was imported but looks wrong.
+        path: the manifest file.
     """
 
     manifest: Manifest
@@ -31,28 +39,114 @@ class Imported:
     splits: Mapping[str, Split] = field(default_factory=dict)
     inconclusive: int = 0
     suspicious: list[Problem] = field(default_factory=list)
+    path: Path | None = None
 
     @property
     def facts(self) -> Mapping[str, str]:
         """Facts about the source, as kept in the manifest."""
         return self.manifest.facts
 
-    def save(self, out: Path, created: list[Path]) -> Imported:
-        """Writes ``splits/<name>.json`` and, last, ``manifest.parquet`` into ``out``; new files are added to ``created``."""
-        targets = {
-            Path(out) / "splits" / f"{name}.json": split for name, split in self.splits.items()
-        }
-        for path, split in targets.items():
+    def save(self, output: Path, created: list[Path]) -> Imported:
+        """Write ``splits/<name>.json`` and, last, ``manifest.parquet``; new files are added to ``created``.
+
+        Splits of an earlier import into the same folder that this one lacks are removed.
+        """
+        folder = Path(output) / "splits"
+        for stale in folder.glob("*.json"):
+            if stale.stem not in self.splits:
+                stale.unlink()
+        for name, split in self.splits.items():
+            path = folder / f"{name}.json"
             created += [] if path.exists() else [path]
             split.save(path)
-        path = Path(out) / "manifest.parquet"
+        path = Path(output) / "manifest.parquet"
         created += [] if path.exists() else [path]
         self.manifest.save(path)
-        return self
+        return replace(self, path=path)
+
+    def summary(self) -> dict[str, Any]:
+        """What was imported, in numbers."""
+        table = self.manifest.table
+        return {
+            "manifest": str(self.path),
+            "digest": self.manifest.digest,
+            "samples": len(self.manifest),
+            **{many: table[one].drop_nulls().n_unique() for one, many in COUNTED.items()},
+            "with_background": table["background"].count(),
+            "with_text": table["text"].count(),
+            "inconclusive": self.inconclusive,
+            "splits": {name: split.counts() for name, split in self.splits.items()},
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """The summary, all problems and the facts as a JSON object."""
+        skipped, suspicious = _plain(self.skipped), _plain(self.suspicious)
+        lists = {"skipped": skipped, "suspicious": suspicious}
+        return self.summary() | lists | {"facts": dict(self.facts)}
+
+    def __str__(self) -> str:
+        lists = {"Skipped": self.skipped, "Suspicious, but imported": self.suspicious}
+        return _text(f"Imported {self.facts.get('dataset', '')}", self.summary(), lists)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """A data set checked without importing it. Print it for a report.
+
+    Attributes:
+        format: the format's name.
+        facts: about the data set.
+        samples: usable rows.
+        missing: listed but not there, or there without a partner.
+        invalid: there but unusable.
+        suspicious: usable, but a person should look.
+    """
+
+    format: str
+    facts: Facts
+    samples: int
+    missing: Sequence[Problem]
+    invalid: Sequence[Problem]
+    suspicious: Sequence[Problem]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is missing or invalid."""
+        return not self.missing and not self.invalid
+
+    def to_json(self) -> dict[str, Any]:
+        """Facts, counts and all problems as a JSON object."""
+        lists = {kind: _plain(getattr(self, kind)) for kind in ("missing", "invalid", "suspicious")}
+        facts = asdict(self.facts)
+        return {
+            "format": self.format,
+            "samples": self.samples,
+            "ok": self.ok,
+            **lists,
+            "facts": facts,
+        }
+
+    def __str__(self) -> str:
+        lists = {k: getattr(self, k.lower()) for k in ("Missing", "Invalid", "Suspicious")}
+        counts = {kind.lower(): len(problems) for kind, problems in lists.items()}
+        rows = {"format": self.format, "samples": self.samples, **counts, **readable(self.facts)}
+        verdict = "Complete." if self.ok else "Not complete."
+        return f"{_text('Validated ' + self.facts.name, rows, lists)}\n{verdict}"
+
+
+def readable(facts: Facts) -> dict[str, Any]:
+    """Facts of a data set as rows of a printed table."""
+    rows = asdict(facts)
+    size, normalization = rows.pop("image_size"), rows.pop("normalization")
+    rows["published"] = rows.pop("samples")
+    rows["image_size"] = f"{size[0]} x {size[1]}" if size else None
+    return rows | {
+        f"mean, std of {k}": f"{mean}, {std}" for k, (mean, std) in normalization.items()
+    }
 
 
 def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
-    """Raises all problems at once unless they are to be skipped.
+    """Raise all problems at once unless they are to be skipped.
 
     Raises:
         ProblemsError: if there is a problem and not ``skip_bad``.
@@ -61,15 +155,15 @@ def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
         raise ProblemsError(problems, FIX)
 
 
-def require_some(samples: int, source: Path, skipped: Sequence[Problem]) -> None:
-    """Refuses an import without samples.
+def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> None:
+    """Reject an import without samples.
 
     Raises:
         ProblemsError: with what was skipped, if that is why.
         PalpateError: if nothing was skipped either.
     """
     if samples == 0 and skipped:
-        raise ProblemsError(skipped, "No sample is left without these: mend the data set")
+        raise ProblemsError(skipped, "No sample is left without these: correct the data set")
     if samples == 0:
         raise PalpateError(
             f"{source} must hold at least one usable sample",
@@ -79,20 +173,40 @@ def require_some(samples: int, source: Path, skipped: Sequence[Problem]) -> None
 
 
 @contextmanager
-def removing_on_error(out: Path) -> Generator[list[Path]]:
-    """Yields a list to enter every new file into; on an error, though not on Ctrl-C, those files and empty folders go away."""
-    out = Path(out)
-    existed = [p for p in (out, *out.parents) if p.exists()]
+def removing_on_error(output: Path) -> Generator[list[Path]]:
+    """Yield a list for every new file; on an error, though not on Ctrl-C, remove those files and empty folders."""
+    output = Path(output)
+    existed = {p for p in (output, *output.parents) if p.exists()}
     created: list[Path] = []
     try:
         yield created
     except Exception:
         for path in created:
             path.unlink(missing_ok=True)
-        for folder in sorted(
-            {p for path in created for p in path.parents if p.is_relative_to(out)} | {out},
-            reverse=True,
-        ):
-            if folder.is_dir() and folder not in existed and not any(folder.iterdir()):
-                shutil.rmtree(folder)
+        folders = {p for path in created for p in path.parents if p.is_relative_to(output)}
+        for folder in sorted({*folders, output} - existed, reverse=True):
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
         raise
+
+
+def problem_lines(title: str, problems: Sequence[Problem]) -> list[str]:
+    """The first problems of a list under a title with their number; nothing if there are none."""
+    lines = [f"{title}: {len(problems)}"] if problems else []
+    lines += [f"  {problem}" for problem in problems[:SHOWN]]
+    more = len(problems) - SHOWN
+    return lines + [f"  ... and {more} more (JSON lists all)"] * (more > 0)
+
+
+def _plain(problems: Sequence[Problem]) -> list[dict[str, str]]:
+    return [asdict(problem) for problem in problems]
+
+
+def _text(title: str, rows: Mapping[str, Any], lists: Mapping[str, Sequence[Problem]]) -> str:
+    """A table of names and values, and lists of problems, as text."""
+    width = max(map(len, rows))
+    cells = ((name, "-" if value is None else value) for name, value in rows.items())
+    lines = [title, *(f"{name:<{width}}  {value}" for name, value in cells)]
+    for name, problems in lists.items():
+        lines += problem_lines(name, problems)
+    return "\n".join(lines)

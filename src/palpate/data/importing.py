@@ -1,104 +1,102 @@
-"""Data sets by name or by look: import one, look one over, write a split in its own form."""
+"""Data sets of any known format: import one, validate one, write a split in its own form."""
 
 from __future__ import annotations
 
 import inspect
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Progress, Split, quiet
-from palpate.data.formats import FORMATS, Format, Validation
-from palpate.data.formats.base import WORLD, import_scanned, validation, world_facts
+from palpate.data.formats import FORMATS, Format
+from palpate.data.formats.base import MISSING, WORLD, finished, import_scanned, world_facts
 from palpate.data.images import Check
-from palpate.data.imported import Imported
+from palpate.data.imported import Imported, Validation
 from palpate.data.listing import write_table
 from palpate.data.manifest import Manifest
 
+#: All that an import writes.
+WRITTEN = {"manifest.parquet", "splits", "images"}
+
 
 def import_dataset(
-    source: Path,
-    out: Path,
+    source: Path | str,
+    output: Path | str,
     *,
     format: str = "auto",  # noqa: A002 (the word that the command line uses)
     skip_bad: bool = False,
     check: Check = "decode",
-    size: int | None = None,
     progress: Progress = quiet,
     **options: Any,
 ) -> Imported:
-    """Reads a data set of any known format and writes ``out/manifest.parquet``.
+    """Read a data set of any known format and write ``output/manifest.parquet``.
 
     Args:
-        source: folder or table.
-        out: folder to write to.
-        format: a name in ``FORMATS``, or ``auto`` to take the first that the source looks like.
-        skip_bad: leave bad rows out and list them, instead of raising.
+        source: folder or table, or a name on the hub with ``format="hf"``.
+        output: folder to write to: new, empty, or an earlier import.
+        format: a name in ``FORMATS``, or ``auto`` for the first that the source looks like.
+        skip_bad: skip and list bad rows instead of raising.
         check: how images are checked.
-        size: shorter side of frames decoded from videos, in pixels; formats that decode none have no use for it.
-        progress: told what is being done.
-        options: the format's own options; None means its default.
+        progress: progress callback.
+        options: options of the format (``columns``, ``root``, ``size`` ...); None means the default.
 
     Raises:
-        PalpateError: if the source is missing or looks like no known format, or an option does not belong to the format.
+        PalpateError: if the source is missing or looks like no known format, an option does not belong to
+            the format, or the output holds other files.
         ProblemsError: with every bad row and file at once; nothing is left behind.
     """
-    name, found = _format(Path(source), format)
-    given = _given(name, found, options)
-    if found.run is not None:
-        if size is not None and "size" in found.options:
-            given["size"] = size
-        return found.run(
-            Path(source), Path(out), skip_bad=skip_bad, check=check, progress=progress, **given
+    source, output = Path(source), Path(output)
+    name, form = recognized(source, format)
+    options = _given(name, form, options)
+    foreign = {p.name for p in output.iterdir()} - WRITTEN if output.is_dir() else set[str]()
+    if foreign:
+        raise PalpateError(
+            "must be a folder that is new, empty, or an earlier import",
+            f"{output} with {sorted(foreign)[0]}",
+            "Choose another folder",
+            argument="output",
         )
-    facts = {**found.facts.of_manifest(), "format": name}
-    scan = found.scan(Path(source), progress=progress, **given)
-    return import_scanned(
-        scan, Path(source), Path(out), facts, skip_bad=skip_bad, check=check, progress=progress
-    )
+    common: dict[str, Any] = {"skip_bad": skip_bad, "check": check, "progress": progress}
+    if form.run is not None:
+        return form.run(source, output, **common, **options)
+    scan = form.scan(source, progress=progress, **options)
+    facts = {**form.facts.of_manifest(), "format": name}
+    return import_scanned(scan, source, output, facts, **common)
 
 
-def validate_dataset(
-    source: Path,
+def validate(
+    source: Path | str,
     *,
     format: str = "auto",  # noqa: A002
     check: Check = "decode",
     progress: Progress = quiet,
     **options: Any,
 ) -> Validation:
-    """Looks a data set over without writing anything: what is missing, invalid or suspicious.
+    """Check a data set without writing anything: what is missing, invalid or suspicious.
 
     Args:
-        source: folder or table.
+        source: folder or table, or a name on the hub with ``format="hf"``.
         format: as in :func:`import_dataset`.
         check: how images are checked.
-        progress: told what is being done.
-        options: the format's own options; None means its default.
+        progress: progress callback.
+        options: options of the format, those of its import included; None means the default.
 
     Raises:
         PalpateError: as :func:`import_dataset`.
     """
-    name, found = _format(Path(source), format)
-    given = _given(name, found, options)
-    taken = inspect.signature(found.scan).parameters
-    given = {
-        key: value for key, value in given.items() if key in taken
-    }  # some options matter to an import alone
-    if "check" in taken:
-        given["check"] = check
-    looked = validation(
-        name,
-        found,
-        found.scan(Path(source), progress=progress, **given),
-        check=check,
-        progress=progress,
-    )
-    # palpate's own world comes in the layouts of real sets, and must not be introduced as one of them.
-    return replace(looked, facts=WORLD) if world_facts(Path(source)) else looked
+    source = Path(source)
+    name, form = recognized(source, format)
+    options = options | {"check": check, "progress": progress}
+    scan = form.scan(source, **scan_options(name, form, options))
+    rows = finished(scan, check, progress)
+    missing = [p for p in scan.problems if p.kind.startswith(MISSING)]
+    invalid = [p for p in scan.problems if not p.kind.startswith(MISSING)]
+    # palpate's own world comes in the layouts of real sets and must not be shown as one of them.
+    facts = WORLD if world_facts(source) else form.facts
+    return Validation(name, facts, len(rows), missing, invalid, scan.suspicious)
 
 
-def write_lists(manifest: Manifest, split: Split, out: Path) -> list[Path]:
-    """Writes a split in the form of the data set that the manifest came from; a CSV of the manifest's rows a part, where it has none.
+def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
+    """Write a split in the form of the data set that the manifest came from, else as a CSV per part.
 
     Returns:
         The files written.
@@ -106,64 +104,81 @@ def write_lists(manifest: Manifest, split: Split, out: Path) -> list[Path]:
     Raises:
         PalpateError: if the split's ids are not in the manifest, or a sample lacks what the lists need.
     """
-    found = FORMATS.get(str(manifest.facts.get("format", "")))
-    if found is not None and found.write_lists is not None:
-        return found.write_lists(manifest, split, Path(out))
+    form = FORMATS.get(str(manifest.facts.get("format", "")))
+    if form is not None and form.write_lists is not None:
+        return form.write_lists(manifest, split, Path(output))
     return [
-        write_table(Path(out) / f"{part}.csv", manifest.part(split, part))
+        write_table(Path(output) / f"{part}.csv", manifest.part(split, part))
         for part in split.counts()
     ]
 
 
-def _format(source: Path, name: str) -> tuple[str, Format]:
-    """The named or recognized format.
+def recognized(source: Path, name: str = "auto") -> tuple[str, Format]:
+    """The named format, or the first that the source looks like.
 
     Raises:
         PalpateError: if there is no source, no such format, or none that fits.
     """
     if name != "auto" and name not in FORMATS:
         raise PalpateError(
-            f"The format must be auto or one of {', '.join(FORMATS)}",
+            f"must be auto or one of {', '.join(FORMATS)}",
             repr(name),
             "Choose one of these",
+            argument="format",
         )
     if not source.exists() and (name == "auto" or not FORMATS[name].remote):
         raise PalpateError(
-            "The source of an import must exist",
+            "must exist",
             f"nothing at {source}",
-            "Check the path; for a data set on the hub: --format hf",
+            "Check the path; a data set on the hub needs the format hf",
+            argument="source",
         )
     if name == "auto":
-        name = next((n for n, f in FORMATS.items() if f.detect(source)), "")
+        name = next((n for n, form in FORMATS.items() if form.detect(source)), "")
     if not name:
-        wanted = "; ".join(f"{n}: {f.looks_for}" for n, f in FORMATS.items())
+        known = "; ".join(f"{n}: {form.looks_for}" for n, form in FORMATS.items())
         raise PalpateError(
-            f"{source} must look like a known data set. Looked for {wanted}",
+            f"must look like a known data set ({known})",
             _contents(source),
-            "Name the format: --format",
+            "Name its format, or write a table of its images",
+            argument="source",
         )
     return name, FORMATS[name]
 
 
-def _given(name: str, found: Format, options: dict[str, Any]) -> dict[str, Any]:
-    """The options that were given, if they all belong to the format."""
+def scan_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
+    """The given options that the scan of a format takes; some matter to an import alone.
+
+    Raises:
+        PalpateError: if an option does not belong to the format.
+    """
+    names = inspect.signature(form.scan).parameters
+    return {key: value for key, value in _given(name, form, options).items() if key in names}
+
+
+def _given(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
+    """The options that were given, if they all belong to the format; ``size`` is ignored where no frames are decoded."""
     given = {key: value for key, value in options.items() if value is not None}
-    if strange := sorted(set(given) - set(found.options)):
+    if "size" not in form.options:
+        given.pop("size", None)
+    if unknown := sorted(set(given) - set(form.options)):
+        takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
         raise PalpateError(
-            f"The format {name} takes the options {', '.join(found.options)}",
-            ", ".join(strange),
-            "Leave the others out",
+            f"must be left out for the format {name}",
+            repr(given[unknown[0]]),
+            f"This format takes {takes or 'no options'}",
+            argument=unknown[0],
         )
     return given
 
 
 def _contents(source: Path) -> str:
-    """What lies in the source, shortly."""
+    """What a source holds, in short."""
     if source.is_file():
         return f"the file {source.name}"
     names = sorted(p.name + "/" * p.is_dir() for p in source.iterdir())
-    return (
-        "an empty folder"
-        if not names
-        else "a folder with " + ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
-    )
+    more = " ..." if len(names) > 8 else ""
+    return f"a folder with {', '.join(names[:8])}{more}" if names else "an empty folder"
+
+
+validate_dataset = validate

@@ -1,8 +1,7 @@
-"""Samples from whatever names them: a manifest, a frame list, a table, or a folder of a known data set; nothing is written."""
+"""Samples from whatever names them: a manifest, list, table, data frame or data-set folder; nothing is written."""
 
 from __future__ import annotations
 
-import inspect
 import re
 from pathlib import Path
 from typing import Any
@@ -11,84 +10,108 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, quiet
 from palpate.data.formats import FORMATS
-from palpate.data.formats.base import finished
+from palpate.data.formats.base import Scan, finished
 from palpate.data.formats.pairs import TACTILE, VISION
 from palpate.data.images import SUFFIXES
 from palpate.data.imported import raise_if, require_some
+from palpate.data.importing import recognized, scan_options
 from palpate.data.listing import LINE, read_list
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest
+from palpate.data.mapping import compile_maps
+from palpate.data.rows import manifest_rows, read_classes
+from palpate.data.tables import TABLES, Table, header_of, open_table, table_of
 from palpate.data.texts import decoded, lines_of
 
-TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
+#: Columns of which a table needs at least one.
+NAMING = ("id", "video", *IMAGE_COLUMNS[:2])
+
+
+def load(
+    source: Any,
+    *,
+    format: str = "auto",  # noqa: A002
+    images: bool = True,
+    skip_bad: bool = False,
+    progress: Progress = quiet,
+    **options: Any,
+) -> Manifest:
+    """Load samples without writing anything.
+
+    Args:
+        source: a manifest file or the folder of an import; a frame list (``video/frame.jpg,label`` per line); a
+            table file; a polars or pandas frame, or a list of dictionaries, with manifest columns; the folder of
+            a data set of any known format; or a folder of images of one modality.
+        format: name of the format, or ``auto``.
+        images: raise if samples have no image files because their frames are inside videos or tables. Frame
+            lists and tables without image columns never have images.
+        skip_bad: skip bad rows instead of raising.
+        progress: progress callback.
+        options: options of the format, e.g. ``root`` and ``columns`` of a table.
+
+    Raises:
+        PalpateError: if there is no such source, it is nothing of these, or its images must be imported first.
+        ProblemsError: with every bad row, unless ``skip_bad``.
+    """
+    keywords: dict[str, Any] = {
+        "format": format,
+        "skip_bad": skip_bad,
+        "progress": progress,
+        **options,
+    }
+    manifest, _ = read_samples(source, **keywords)
+    without = not manifest.table["vision"].count() and not manifest.table["tactile"].count()
+    if images and without and "format" in manifest.facts:  # lists and tables have no format
+        raise PalpateError(
+            "must have its images as files",
+            f"{source}, whose images are inside videos or tables",
+            f"Import it first: palpate import {source} -o DIR",
+            argument="source",
+        )
+    return manifest
 
 
 def read_samples(
-    path: Path, *, skip_bad: bool = False, root: Path | None = None, progress: Progress = quiet
+    source: Any,
+    *,
+    format: str = "auto",  # noqa: A002
+    skip_bad: bool = False,
+    progress: Progress = quiet,
+    **options: Any,
 ) -> tuple[Manifest, list[Problem]]:
-    """The samples that a path names.
-
-    Args:
-        path: ``manifest.parquet`` or its folder; a frame list (``video/frame.jpg,label`` a line); a table with the columns ``vision``
-            or ``tactile``; the folder of a data set of a known format; or a folder of pictures of one modality, photos unless it is named as touches are.
-        skip_bad: leave bad rows out and list them, instead of raising.
-        root: where the paths of a table start.
-        progress: told what is being done.
+    """Load samples as :func:`load` does; frames inside videos or tables have no images.
 
     Returns:
-        The samples, and what was left out. Samples of a list or of raw videos have no pictures.
+        The samples, and what was skipped.
 
     Raises:
-        PalpateError: if there is no such path, or it is nothing of these.
+        PalpateError: if there is no such source, or it is nothing of these.
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
-    path = Path(path)
-    if not path.exists():
-        raise PalpateError(
-            "Samples must be a manifest, a list, a table or a folder",
-            f"nothing at {path}",
-            "Check the path",
-        )
-    if is_manifest(path):
-        return Manifest.load(path), []
-    if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
-        found = read_list(path, skip_bad=skip_bad)
-        return found.manifest, found.skipped
-    name = (
-        "pairs" if path.is_file() else next((n for n, f in FORMATS.items() if f.detect(path)), "")
+    options = {name: value for name, value in options.items() if value is not None}
+    if isinstance(source, Manifest):
+        return source, []
+    if not isinstance(source, (str, Path)):
+        return _of_table(table_of(source), Path(), skip_bad, options)
+    path = Path(source)
+    if format == "auto" and path.exists():
+        if is_manifest(path):
+            return Manifest.load(path, options.get("root")), []
+        if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
+            listed = read_list(path, skip_bad=skip_bad)
+            return listed.manifest, listed.skipped
+        if path.is_dir():
+            options |= _one_modality(path, options)
+    name, form = ("pairs", FORMATS["pairs"]) if "side" in options else recognized(path, format)
+    columns = {*header_of(path), *options.get("columns", {})} if path.is_file() else set[str]()
+    if name == "pairs" and path.is_file() and columns.isdisjoint(("vision", "tactile")):
+        names = options.pop("names", None)
+        return _of_table(open_table(path, names), path.parent, skip_bad, options)
+    # Images are not decoded here: whoever reads them reports those that are broken.
+    scan = form.scan(
+        path, **scan_options(name, form, options | {"check": "none", "progress": progress})
     )
-    options: dict[str, Any] = (
-        {"root": root} if root is not None and path.is_file() and name == "pairs" else {}
-    )
-    if path.is_dir() and name in ("", "pairs"):
-        sides: list[str] = [
-            s
-            for s, names in (("vision", VISION), ("tactile", TACTILE))
-            if any((path / n).is_dir() for n in names)
-        ]
-        if not sides and not any(
-            p.suffix.lower() in SUFFIXES for p in (*path.glob("*"), *path.glob("*/*"))
-        ):
-            raise PalpateError(
-                f"{path} must hold a manifest, pictures, or a data set of a known format",
-                "none of them",
-                "Import it first: palpate import",
-            )
-        name = "pairs"
-        if (
-            len(sides) < 2
-        ):  # pictures of one modality: photos, unless the folder's name says that they are touches
-            options["side"] = (
-                sides[0] if sides else "tactile" if path.name.lower() in TACTILE else "vision"
-            )
-    # Pictures are not decoded here: who looks at them reports those that cannot be read.
-    if "check" in inspect.signature(FORMATS[name].scan).parameters:
-        options["check"] = "none"
-    scan = FORMATS[name].scan(path, progress=progress, **options)
-    rows = finished(scan, "none", progress)
-    raise_if(scan.problems, skip_bad)
-    require_some(len(rows), path, scan.problems)
-    facts = {**FORMATS[name].facts.of_manifest(), "format": name, **scan.facts}
-    return Manifest.from_rows((row for _, row in rows), scan.base.resolve(), facts), scan.problems
+    facts = {**form.facts.of_manifest(), "format": name, **scan.facts}
+    return _of_scan(scan, path, facts, skip_bad, progress)
 
 
 def is_manifest(path: Path) -> bool:
@@ -99,13 +122,10 @@ def is_manifest(path: Path) -> bool:
         return False
     try:
         with open(path, "rb") as file:
-            return str(pl.read_parquet_metadata(file).get("palpate.format", "")).startswith(
-                "palpate-manifest/"
-            )
-    except (
-        Exception
-    ):  # polars raises several kinds for a file that is not Parquet; whoever reads it next says so
+            metadata = pl.read_parquet_metadata(file)
+    except Exception:  # polars raises several kinds for a file that is not Parquet
         return False
+    return metadata.get("palpate.format", "").startswith("palpate-manifest/")
 
 
 def is_list(path: Path) -> bool:
@@ -114,3 +134,62 @@ def is_list(path: Path) -> bool:
         head = decoded(file.read(1 << 16))
     line = next((line.strip() for line in lines_of(head) if line.strip()), "")
     return re.match(LINE, line) is not None
+
+
+def _one_modality(folder: Path, options: dict[str, Any]) -> dict[str, str]:
+    """``side`` for a folder of images of one modality: photos, unless a folder's name says tactile; else nothing."""
+    known = next((n for n, form in FORMATS.items() if form.detect(folder)), "")
+    if "side" in options or known not in ("", "pairs"):
+        return {}
+    there = [s for s, names in (("vision", VISION), ("tactile", TACTILE)) if _any(folder, names)]
+    if len(there) == 2 or not (there or known or _has_images(folder)):
+        return {}
+    default = "tactile" if folder.name.lower() in TACTILE else "vision"
+    return {"side": there[0] if there else default}
+
+
+def _any(folder: Path, names: tuple[str, ...]) -> bool:
+    return any((folder / name).is_dir() for name in names)
+
+
+def _has_images(folder: Path) -> bool:
+    return any(p.suffix.lower() in SUFFIXES for p in (*folder.glob("*"), *folder.glob("*/*")))
+
+
+def _of_table(
+    table: Table, root: Path, skip_bad: bool, options: dict[str, Any]
+) -> tuple[Manifest, list[Problem]]:
+    """Samples of a data frame, or of a table without images."""
+    if unknown := sorted(set(options) - {"columns", "root", "classes"}):
+        raise PalpateError(
+            "must be left out for a table", repr(options[unknown[0]]), "", argument=unknown[0]
+        )
+    maps = compile_maps(options.get("columns", {}), table.names, [*SCHEMA, "split"])
+    if not any(name in maps.expressions for name in NAMING):
+        raise PalpateError(
+            f"must have at least one of the columns {', '.join(NAMING)}",
+            f"{', '.join(table.names) or 'no columns'}",
+            "Map a column to one of them",
+            argument="source",
+        )
+    classes = None if "classes" not in options else read_classes(Path(options["classes"]))
+    cells = maps.apply(table.read(maps.columns))
+    count = len(table.lines)
+    rows, inconclusive = manifest_rows(cells, count, table.where, classes, table.problems)
+    scan = Scan(
+        rows=[(table.where(k), row) for k, row in rows],
+        base=Path(options.get("root", root)),
+        problems=table.problems,
+        inconclusive=inconclusive,
+    )
+    return _of_scan(scan, table.name, {"dataset": Path(table.name).stem}, skip_bad, quiet)
+
+
+def _of_scan(
+    scan: Scan, source: object, facts: dict[str, str], skip_bad: bool, progress: Progress
+) -> tuple[Manifest, list[Problem]]:
+    rows = finished(scan, "none", progress)
+    raise_if(scan.problems, skip_bad)
+    require_some(len(rows), source, scan.problems)
+    manifest = Manifest.from_rows((row for _, row in rows), scan.base.resolve(), facts)
+    return manifest, scan.problems
