@@ -60,7 +60,7 @@ def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path
     assert (status, facts["samples"], facts["materials"], facts["skipped"]) == (0, 4, 2, [])
     assert [p["kind"] for p in facts["suspicious"]] == ["null-group"]
     assert Manifest.load(tmp_path / "m").column("tactile") == [f"t/{k}_tac.jpg" for k in range(4)]
-    status, out, err = call(capsys, *args)
+    status, out, _ = call(capsys, *args)
     assert "Suspicious, but imported: 1" in out
     assert "1 of 4 rows have no video" in out
 
@@ -74,9 +74,8 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
         capsys, *command, "--labels", tag / "train.txt", tag / "test.txt", "--json"
     )
     assert (status, json.loads(out)["samples"]) == (0, 4)
-    status, out, _ = call(
-        capsys, "validate", tag, *options, "--json"
-    )  # options of an import do no harm
+    # Options that matter to an import alone do no harm.
+    status, out, _ = call(capsys, "validate", tag, *options, "--json")
     assert (status, json.loads(out)["samples"]) == (0, 6)
 
 
