@@ -71,7 +71,7 @@ def test_text_output_has_every_count(capsys, lists):
         (["split", "nowhere", "-o", "s.json"], "nothing at nowhere"),
         (["split", "nowhere", "-o", "s.json", "--train", "most"], "most"),
         (["import", "nowhere", "-o", "out"], "nothing at nowhere"),
-        (["import", ".", "-o", "out", "--map", "vision"], "--map takes"),
+        (["import", ".", "-o", "out", "--map", "vision"], "as COLUMN=EXPRESSION"),
         (["demo", "--data", "nowhere"], "nowhere"),
         (["report", "-o", "page.html"], "needs results"),
         (["generate", "-o", "out"], "photos or --manifest"),

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal
 from palpate.core import PalpateError
 
 Maps = Annotated[
@@ -37,7 +37,7 @@ class TableOptions:
     """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers; -1 is inconclusive and skipped."""
     names: str | None = None
     """Columns of a table without a header line, separated by commas."""
-    half_open: bool = False
+    half_open: Switch = False
     """The end of an interval is the first frame after the contact."""
     every: int | None = None
     """Take every N-th frame of an interval."""
@@ -57,7 +57,7 @@ class FormatOptions:
     """Frame lists (Touch and Go; default: label.txt, else train.txt and test.txt)."""
     lists: Path | None = None
     """Folder of lists to use instead of those of the data set (HCT, SSVTP)."""
-    contact: bool = False
+    contact: Switch = False
     """Include frames that only contact.json names (HCT)."""
     session_gap: float | None = None
     """Trajectories that start within so many seconds share a session (HCT)."""
@@ -91,8 +91,8 @@ class SourceOptions(Common):
     """Name of the format; `auto` recognizes it. `palpate validate --list` shows all formats and their options."""
     check: Literal["decode", "header", "none"] = "decode"
     """How images are checked: `decode` detects truncated files, `header` is quicker."""
-    table: tyro.conf.OmitArgPrefixes[TableOptions] = TableOptions()
-    formats: tyro.conf.OmitArgPrefixes[FormatOptions] = FormatOptions()
+    table: TableOptions = TableOptions()
+    formats: FormatOptions = FormatOptions()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class Options(SourceOptions):
     """Root of the data set, a table (CSV, TSV, JSON lines, JSON, Parquet), or with `--format hf` a name on the hub."""
     output: OutPath
     """Folder for manifest.parquet, the data set's own splits and extracted frames."""
-    skip_bad: bool = False
+    skip_bad: Switch = False
     """Skip and list bad rows and files, instead of an error."""
 
 

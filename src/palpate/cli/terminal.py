@@ -62,6 +62,9 @@ RENAMED: dict[tuple[str, str], str] = {
     ("train generator", "--encoders"): "--clip",
     ("train generator", "--towers"): "--clip",
     ("split", "--group"): "--by",
+    ("import", "--set"): "with the option's own name, e.g. --labels train.txt",
+    ("validate", "--set"): "with the option's own name, e.g. --labels train.txt",
+    ("import", "--max-per-touch"): "--max-per-contact",
     ("score", "--generated"): "positional arguments: palpate score generated/ --reference real/",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
@@ -69,6 +72,8 @@ RENAMED: dict[tuple[str, str], str] = {
 OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "train_or_data"): "TRAIN",
     ("audit", "test"): "TEST",
+    ("", "columns"): "--map",
+    ("", "side"): "--as",
     ("", "data"): "DATA",
     ("", "source"): "SOURCE",
     ("generate", "photos"): "PHOTO",

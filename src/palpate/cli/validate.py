@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.importing import SourceOptions, format_options
-from palpate.cli.terminal import FAILED_CHECK, Terminal
+from palpate.cli.terminal import FAILED_CHECK, Switch, Terminal
 from palpate.core import PalpateError
 
 Kind = Literal["missing", "invalid", "suspicious"]
 ShowList = Annotated[
-    bool, tyro.conf.arg(name="list", help="Show the known formats, their facts and their options.")
+    Switch, tyro.conf.arg(name="list", help="Show the known formats, their facts and their options.")
 ]
 
 
