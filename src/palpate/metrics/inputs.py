@@ -3,7 +3,7 @@
 Features are finite floating-point rows ``(n, d)``: a NumPy array (also one on disk), a torch tensor on
 any device, a list of rows, or a :class:`palpate.core.FeatureSet`. Integers are rejected, since the
 distance of wrapped integers has no meaning; half precision is widened, since ``exp`` of a small exponent
-rounds to 1 there (a perfect score for anything). Images are ``(n, h, w, c)`` in [0, 1] or 8 bit.
+rounds to 1 there (a perfect score for anything).
 """
 
 from __future__ import annotations
@@ -348,44 +348,3 @@ def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
         must = f"Generated and {what} features must come from one encoder"
         got = f"digests {a.encoder[:12]} and {b.encoder[:12]}"
         raise PalpateError(must, got, "Embed both with the same encoder")
-
-
-def checked_images(generated: Any, reference: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Two image stacks (n, h, w, c), c = 1 or 3, of one shape, each 8 bit or float in [0, 1].
-
-    Raises:
-        PalpateError: on other shapes, dtypes or ranges; image numbers are given.
-    """
-    pair = [
-        np.asarray(as_array(f"The {name} images", v))
-        for name, v in (("generated", generated), ("reference", reference))
-    ]
-    for name, images in zip(("generated", "reference"), pair, strict=True):
-        if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
-            raise PalpateError(
-                f"The {name} images must have shape (n, h, w, 3), n >= 1",
-                f"shape {images.shape}",
-                "Stack them with channels last",
-            )
-        if images.dtype != np.uint8 and images.dtype.kind != "f":
-            raise PalpateError(
-                f"The {name} images must be uint8, or floats in [0, 1]",
-                f"dtype {images.dtype}",
-                "Convert them",
-            )
-        if images.dtype.kind == "f":
-            for number, image in enumerate(images):
-                low, high = float(image.min()), float(image.max())
-                if not (low >= -1e-6 and high <= 1 + 1e-6):  # also false for NaN
-                    raise PalpateError(
-                        f"The {name} images must lie in [0, 1]",
-                        f"[{low:.4g}, {high:.4g}] in image {number}",
-                        "Scale them to [0, 1]",
-                    )
-    if pair[0].shape != pair[1].shape:
-        raise PalpateError(
-            "Generated and reference images must pair one to one in one size",
-            f"shapes {pair[0].shape} and {pair[1].shape}",
-            "Pass the same samples in the same order and size",
-        )
-    return pair[0], pair[1]

@@ -1,0 +1,140 @@
+"""The public face of palpate.metrics: names, signatures, and what every function takes."""
+
+import inspect
+
+import numpy as np
+import pytest
+
+from palpate import metrics
+from palpate.core import FeatureSet, PalpateError
+from palpate.metrics import cmmd, fid, kid, prdc, precision_recall, tmmd
+
+ROWS = "ids=None, groups=None, reference_ids=None, reference_groups=None, encoder=None"
+ONE_SET = "generated, *, ids=None, labels=None, groups=None, encoder=None, **options"
+IMAGES = (
+    "generated, reference, *, ids=None, groups=None, subject='generated', split=None, level=0.95, "
+    "data_range=None"
+)
+CONTACT = "generated, reference, background, **options"
+
+FUNCTIONS = {
+    "background_digest": "images",
+    "ci_tmmd": ONE_SET,
+    "cmmd": "generated, reference, **options",
+    "compare": "generators, reference, *, floor=None, **options",
+    "compare_fid": "generators, reference, **options",
+    "compare_tmmd": "generators, reference, **options",
+    "contact_images": CONTACT,
+    "contact_iou": CONTACT,
+    "contact_mask": "tactile, background, *, least=0.01568627450980392",
+    "contact_ms_ssim": CONTACT,
+    "contact_psnr": CONTACT,
+    "contact_residual": CONTACT,
+    "contact_scores": (
+        "generated, reference, background, *, ids=None, groups=None, subject='generated', "
+        "split=None, level=0.95, **options"
+    ),
+    "contact_ssim": CONTACT,
+    "d_tmmd": ONE_SET,
+    "distance": (
+        "x, y, *, sigma=10.0, kernel=None, scale=1000.0, estimator='unbiased', groups_x=None, "
+        "groups_y=None, normalize='check', backend='auto', tolerance=0.0001, block=1024, "
+        "names=('x', 'y')"
+    ),
+    "fid": (f"generated, reference, *, {ROWS}, subject='generated', interval=True, **options"),
+    "four_scores": "generated, reference, *, floor=None, **options",
+    "frechet_distance": "mean1, cov1, mean2, cov2",
+    "i_tmmd": ONE_SET,
+    "kid": "generated, reference, **options",
+    "mean_score": (
+        "metric, values, *, ids=None, groups=None, bounds=(-inf, inf), higher_is_better=True, "
+        "level=0.95, notes=(), **fields"
+    ),
+    "measure_contacts": CONTACT,
+    "mmd2": "x, y, **options",
+    "ms_ssim": f"{IMAGES}, scales='auto'",
+    "ms_ssim_per_image": "generated, reference, *, data_range=None, scales='auto'",
+    "paired_by_id": "generated_ids, reference_ids",
+    "prdc": f"generated, reference, k=5, *, {ROWS}, **options",
+    "precision_recall": "generated, reference, k=3, **options",
+    "psnr": IMAGES,
+    "psnr_per_image": "generated, reference, *, data_range=None",
+    "ssim": IMAGES,
+    "ssim_per_image": "generated, reference, *, data_range=None",
+    "tmmd": f"generated, reference, *, {ROWS.replace('ids=None,', 'ids=None, labels=None,', 1)}, "
+    "**options",
+}
+CLASSES = {"TMMD", "ITMMD", "CITMMD", "DTMMD", "Comparison", "Distance", "Options"}
+KERNELS = {"Gaussian", "Linear", "Polynomial"}
+
+
+def signature(function):
+    """Names and defaults, without annotations."""
+    found = inspect.signature(function)
+    bare = [p.replace(annotation=p.empty) for p in found.parameters.values()]
+    return str(found.replace(parameters=bare, return_annotation=found.empty))[1:-1]
+
+
+def test_public_names():
+    assert set(metrics.__all__) == {*FUNCTIONS, *CLASSES, *KERNELS, "PRESETS"}
+    assert sorted(metrics.__all__) == list(dict.fromkeys(sorted(metrics.__all__)))
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_public_signatures(name):
+    assert signature(getattr(metrics, name)) == FUNCTIONS[name]
+
+
+def sets(n=60, m=50, d=6):
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(n, d)) + 0.3, rng.normal(size=(m, d))
+    return [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (x, y)]
+
+
+@pytest.mark.parametrize("metric", [tmmd, kid, cmmd, fid, prdc, precision_recall])
+def test_arrays_tensors_lists_and_feature_sets_give_the_same_scores(metric):
+    torch = pytest.importorskip("torch")
+    x, y = sets()
+    groups = [f"v{k // 6}" for k in range(len(x))]
+    columns = {"groups": groups, "reference_groups": groups[: len(y)]}
+
+    def values(*pair, **options):
+        scores = metric(*pair, **options)
+        scores = scores if isinstance(scores, list) else [scores]
+        return np.array([(s.value, *(s.interval or (0, 0))) for s in scores])
+
+    rows = [FeatureSet([str(k) for k in range(len(v))], v, None, groups[: len(v)]) for v in (x, y)]
+    expected = values(x, y, **columns)
+    same = pytest.approx(expected, rel=1e-9)
+    assert values(*rows) == same
+    assert values(x.tolist(), y.tolist(), **columns) == same
+    assert values(torch.tensor(x, requires_grad=True), torch.tensor(y), **columns) == same
+    assert values(x, y) != same  # without groups other intervals, at least
+    with pytest.raises(PalpateError, match="groups"):
+        metric(x, y, groups=groups[1:])
+
+
+def test_kid_is_the_unbiased_polynomial_mmd():
+    x, y = sets()
+    kernel = lambda a, b: (a @ b.T / 6 + 1) ** 3  # noqa: E731
+    off = lambda k: (k.sum() - np.trace(k)) / (len(k) * (len(k) - 1))  # noqa: E731
+    expected = off(kernel(x, x)) + off(kernel(y, y)) - 2 * kernel(x, y).mean()
+    score = kid(x, y)
+    assert score.value == pytest.approx(1000 * expected, rel=1e-9)
+    assert kid(x, y, scale=1).value == pytest.approx(expected, rel=1e-9)
+    assert (score.metric, score.higher_is_better) == ("KID", False)
+
+
+def test_cmmd_is_the_biased_gaussian_mmd():
+    x, y = sets()
+    kernel = lambda a, b: np.exp(-((a[:, None] - b[None]) ** 2).sum(-1) / 200)  # noqa: E731
+    expected = kernel(x, x).mean() + kernel(y, y).mean() - 2 * kernel(x, y).mean()
+    score = cmmd(x, y)
+    assert score.value == pytest.approx(1000 * expected, rel=1e-6)
+    assert (score.metric, score.estimator) == ("CMMD", "biased")
+
+
+def test_precision_and_recall_are_the_first_two_of_prdc():
+    x, y = sets()
+    assert [s.metric for s in precision_recall(x, y)] == ["Precision", "Recall"]
+    assert precision_recall(x, y, 5) == prdc(x, y)[:2]
