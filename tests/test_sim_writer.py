@@ -180,7 +180,7 @@ def test_a_full_disk_is_one_line_and_the_same_command_continues(
 
 
 def test_videos_without_pyav_say_how_to_install_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(PalpateError, match="video"):
         write_world(tmp_path / "w", dataclasses.replace(TINY, layout="videos"))
 

@@ -30,7 +30,7 @@ _TYPES: dict[str, Any] = {
 _METAVARS = {"span": "LOW HIGH", "series": "X ...", "materials": "NAME ..."}
 
 
-def _group(name: str, description: str) -> Any:
+def _group(name: str) -> Any:
     """Options of one group of :class:`WorldOptions`, each None unless given."""
     fields: list[tuple[str, Any, Any]] = []
     for option in dataclasses.fields(WorldOptions):
@@ -44,15 +44,13 @@ def _group(name: str, description: str) -> Any:
         default = f"(default: the preset's; WorldOptions: {option.default})"
         argument = tyro.conf.arg(help=text, metavar=metavar, help_behavior_hint=default)
         fields.append((option.name, Annotated[of | None, argument], field(default=None)))
-    kind = make_dataclass(name.title(), fields, frozen=True, kw_only=True)
-    kind.__doc__ = description
-    return kind
+    return make_dataclass(name.title(), fields, frozen=True, kw_only=True)
 
 
-_World = _group("world", "The world, and the lists that it comes with.")
-_Amounts = _group("amounts", "How much there is of what.")
-_Physics = _group("physics", "The objects, the gel and how it is pressed; lengths in mm.")
-_Photos = _group("photos", "The camera, and everything in the photos that is irrelevant to touch.")
+_World = _group("world")
+_Amounts = _group("amounts")
+_Physics = _group("physics")
+_Photos = _group("photos")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,17 +63,22 @@ class Options(Common):
     output: OutPath
     """Folder to write."""
     preset: Literal["tiny", "demo", "pretrain", "small", "full"] | None = None
-    """What to start from (default: small, 8,000 contact frames at 64 px); full has 36,000 at 128 px."""
+    """What to start from; small (the default) has 8,000 contact frames at 64 px, full 36,000 at
+    128 px."""
     options: Path | None = None
     """Start from the options of another world: its world.json."""
     workers: int = 2
     """Processes; the bytes do not depend on it."""
     sheet: Path | None = None
     """Also draw an overview image of all materials into this file."""
-    world: tyro.conf.OmitArgPrefixes[_World] = field(default_factory=_World)
-    amounts: tyro.conf.OmitArgPrefixes[_Amounts] = field(default_factory=_Amounts)
-    physics: tyro.conf.OmitArgPrefixes[_Physics] = field(default_factory=_Physics)
-    photos: tyro.conf.OmitArgPrefixes[_Photos] = field(default_factory=_Photos)
+    world: _World = field(default_factory=_World)  # pyright: ignore[reportInvalidTypeForm]
+    """The world, and the lists that it comes with."""
+    amounts: _Amounts = field(default_factory=_Amounts)  # pyright: ignore[reportInvalidTypeForm]
+    """How much there is of what."""
+    physics: _Physics = field(default_factory=_Physics)  # pyright: ignore[reportInvalidTypeForm]
+    """The objects, the gel and how it is pressed; lengths in mm."""
+    photos: _Photos = field(default_factory=_Photos)  # pyright: ignore[reportInvalidTypeForm]
+    """The camera, and everything in the photos that is irrelevant to touch."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -98,7 +101,7 @@ def world_options(options: Options) -> WorldOptions:
     """The world that the options name.
 
     Raises:
-        PalpateError: if an option is out of range, or both a preset and a file of options are given.
+        PalpateError: if an option is out of range, or both a preset and a file are given.
     """
     if options.preset is not None and options.options is not None:
         must = "must not go with a file of options"

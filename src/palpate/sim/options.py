@@ -285,7 +285,9 @@ def _error(name: str, must: str, got: Any, fix: str, example: Any = None) -> Pal
 def _check(option: dataclasses.Field[Any], value: Any) -> Iterator[PalpateError]:
     """Yield what is wrong with one value."""
     name, limits = option.name, option.metadata
-    kind, low, high = limits["kind"], limits.get("low"), limits.get("high")
+    kind = limits["kind"]
+    low: float = limits.get("low", 0)
+    high: float = limits.get("high", 0)
     if kind == "materials":
         yield from _check_materials(value)
     elif kind == "choice":
@@ -304,9 +306,8 @@ def _check(option: dataclasses.Field[Any], value: Any) -> Iterator[PalpateError]
         if not numbers or len(value) > 8 or (pair and len(value) != 2):
             count = "two numbers" if pair else "up to eight numbers"
             yield _error(name, f"must be {count} from {low:g} to {high:g}", value, "", (low, high))
-        elif pair and value[0] > value[1]:
-            must = "must have its lower end first"
-            yield _error(name, must, value, "", (value[1], value[0]))
+        elif pair and list(value) != sorted(value):
+            yield _error(name, "must have its lower end first", value, "", tuple(sorted(value)))
         elif not value and name != "relax_mm":
             yield _error(name, "must hold a number", value, "", (low,))
 
@@ -351,7 +352,7 @@ def load_options(path: str | Path) -> WorldOptions:
         must = f"{path} must hold the options of a world"
         raise PalpateError(must, "none", "Name the world.json of a finished world")
     current = {old: new for new, old in _FORMAT_2.items()}
-    values: dict[str, Any] = {current.get(k, k): v for k, v in options.items()}
+    values: dict[str, Any] = {current.get(str(k), str(k)): v for k, v in options.items()}
     if values.get("leak") == "touch":
         values["leak"] = "contact"
     known = [f.name for f in dataclasses.fields(WorldOptions)]

@@ -190,7 +190,8 @@ def world_manifest(
         for row in contact_rows(options, plans)
     ]
     if options.layout == "hct":
-        recordings = {row["video"]: tuple(row["video"].split("/", 1)) for row in rows}
+        videos = dict.fromkeys(str(row["video"]) for row in rows)
+        recordings = {video: (video.split("/", 1)[0], video.split("/", 1)[1]) for video in videos}
         sessions = sessions_of(list(recordings.values()), _SESSION_GAP)
         for row in rows:
             recording = recordings[row["video"]]

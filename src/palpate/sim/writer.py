@@ -18,6 +18,7 @@ ends (not on Windows).
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import shutil
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -102,11 +103,8 @@ def write_world(
     options, output = options or WorldOptions(), Path(output)
     if workers < 1:
         raise PalpateError("must be at least 1", str(workers), "", argument="workers")
-    if options.layout == "videos":
-        try:
-            import av  # noqa: F401
-        except ImportError:
-            raise MissingExtraError("av", "video", "Writing a world as videos") from None
+    if options.layout == "videos" and importlib.util.find_spec("av") is None:
+        raise MissingExtraError("av", "video", "Writing a world as videos")
     folder = output.resolve()
     if (folder / "world.json").is_file():
         return _finished(output, options)
