@@ -104,7 +104,7 @@ def test_what_cannot_be_done_is_one_line_and_writes_nothing(place, capsys):
         (["photo.jpg", "-o", "t.png", "--model", "nowhere"], "no folder nowhere"),
         (["photo.jpg", "-o", "t.png", "--model", "photos"], "must exist"),
         (["photo.jpg", "-o", "t.png", "--steps", "0"], "steps"),
-        ([model, "-o", "t"], "Pass models with --model"),
+        ([model, "-o", "t"], "Pass it as the model"),
     ):
         status, out, err = call(capsys, *args)
         assert (status, word in err, out, "Traceback" in err) == (2, True, "", False), (args, err)
@@ -128,7 +128,7 @@ def test_a_broken_photo_is_refused_before_the_model_is_loaded(place, capsys, mon
     for args, word in (
         (["cut.jpg", "-o", "t.png"], "cut.jpg"),
         (["gone.jpg", "-o", "t.png"], "gone.jpg"),
-        (["cut.jpg", "photo.jpg", "-o", "t"], "pass --skip-bad"),
+        (["cut.jpg", "photo.jpg", "-o", "t"], "E.g. --skip-bad"),
         (["photos", "-o", "t"], "c.jpg"),
         (["photo.jpg", "photos/../photo.jpg", "-o", "t"], "'photo.jpg' twice"),
         (["photo.jpg", "photos/../photo.jpg", "-o", "t", "--skip-bad"], "'photo.jpg' twice"),

@@ -288,5 +288,5 @@ def test_photos_of_every_kind_give_the_touch_of_what_they_show(pipeline, tmp_pat
 def test_a_model_in_the_place_of_photos_is_told(pipeline, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "palpate.json").write_text("{}")
-    with pytest.raises(PalpateError, match=r"a saved model\. Pass models with --model"):
+    with pytest.raises(PalpateError, match=r"a saved model\. Pass it as the model"):
         generate(pipeline, photos=tmp_path / "model", out=tmp_path / "out")

@@ -98,15 +98,23 @@ class ProblemsError(PalpateError):
         problems: what is wrong.
         fix: what to do next.
         must: what has to hold, where the input is neither rows nor files.
+        example: arguments that would work.
     """
 
-    def __init__(self, problems: Sequence[Problem], fix: str, must: str = "") -> None:
+    def __init__(
+        self,
+        problems: Sequence[Problem],
+        fix: str,
+        must: str = "",
+        *,
+        example: Mapping[str, Any] | None = None,
+    ) -> None:
         self.problems = list(problems)
         kinds = sorted(Counter(p.kind for p in self.problems).items())
         count = f"{len(self.problems)} problem{'s' * (len(self.problems) != 1)}"
         got = f"{count}: {', '.join(f'{n} {kind}' for kind, n in kinds)}"
         must = must or "Every row and file of the input must be readable and consistent"
-        super().__init__(must, got, fix)
+        super().__init__(must, got, fix, example=example)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.problems, self.fix, self.must), self.__dict__

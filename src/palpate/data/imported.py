@@ -152,7 +152,7 @@ def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
         ProblemsError: if there is a problem and not ``skip_bad``.
     """
     if problems and not skip_bad:
-        raise ProblemsError(problems, FIX)
+        raise ProblemsError(problems, FIX, example={"skip_bad": True})
 
 
 def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> None:

@@ -105,7 +105,7 @@ def read_lists(
     rows, doubled = _duplicates(rows)
     problems = _in_order([*problems, *unknown, *doubled], paths)
     if problems and not skip_bad:
-        raise ProblemsError(problems, FIX)
+        raise ProblemsError(problems, FIX, example={"skip_bad": True})
     labels = rows["label"]
     names = {k: str(k) for k in labels.unique()} if categories is None else dict(categories)
     table = rows.select("id", "video", "frame").with_columns(

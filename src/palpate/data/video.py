@@ -1,10 +1,11 @@
 """Frames of a video file by their exact number.
 
-Frame ``k`` is the ``k``-th picture in order of presentation, as a full decode would count it. The timestamps of all
-packets are read first (a pass over the file without decoding); sorted, they are the index: ``pts[k]``. To reach frame
-``k`` the reader seeks to the last keyframe presented at or before ``pts[k]`` and decodes until exactly that timestamp;
-where decoding is already between that keyframe and ``k``, it goes on from there. Rates and durations are not used, so
-B-frames, variable rates and clips that do not start at zero are exact.
+Frame ``k`` is the ``k``-th image in order of presentation, as a full decode would count it. The
+timestamps of all packets are read first (a pass over the file without decoding); sorted, they are the
+index: ``pts[k]``. To reach frame ``k`` the reader seeks to the last keyframe presented at or before
+``pts[k]`` and decodes until exactly that timestamp; where decoding is already between that keyframe
+and ``k``, it continues from there. Rates and durations are not used, so B-frames, variable rates and
+clips that do not start at zero are exact.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,9 @@ from palpate.core import MissingExtraError, PalpateError
 
 
 class VideoReader:
-    """A video file as a sequence of RGB pictures: ``len(reader)``, ``reader[k]``, ``reader.frames([3, 4, 90])``.
+    """A video file as a sequence of RGB images: ``len(reader)``, ``reader[k]``, ``reader.frames([3, 4, 90])``.
 
-    Not for use by several threads at once; open one reader a thread. Use as a context manager, or call :meth:`close`.
+    Use one reader per thread, as a context manager or with :meth:`close`.
 
     Args:
         path: the file.
@@ -47,11 +47,11 @@ class VideoReader:
         try:
             self._container: Any = av.open(str(self.path))
         except self._errors as error:
-            got = "an empty file (0 bytes)" if self.path.stat().st_size == 0 else _said(error)
+            got = "an empty file (0 bytes)" if self.path.stat().st_size == 0 else _reason(error)
             raise self._broken(f"{got}: it is cut short, or no video") from None
         try:
             if not self._container.streams.video:
-                raise self._broken("a file without pictures: it is cut short, or no video")
+                raise self._broken("a file without images: it is cut short, or no video")
             self._stream: Any = self._container.streams.video[0]
             self._stream.thread_type = "AUTO"
             self._pts, self._keys = self._index()
@@ -62,11 +62,11 @@ class VideoReader:
         self._last: tuple[int, NDArray[np.uint8]] | None = None
 
     def __len__(self) -> int:
-        """Number of pictures."""
+        """Number of frames."""
         return len(self._pts)
 
     def __getitem__(self, k: int) -> NDArray[np.uint8]:
-        """Picture ``k`` (from 0) as (h, w, 3), 0 to 255.
+        """Frame ``k`` (from 0) as (h, w, 3), 0 to 255.
 
         Raises:
             PalpateError: if ``k`` lies outside the video, or the file breaks off before it.
@@ -82,37 +82,32 @@ class VideoReader:
         return self._last[1]
 
     def frames(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yields ``(k, (h, w, 3) picture)`` in the order given; rising numbers are decoded in a single pass.
+        """Yield ``(k, (h, w, 3) image)`` in the order given; rising numbers are decoded in one pass.
 
         Raises:
-            PalpateError: as for a single picture.
+            PalpateError: as for a single frame.
         """
         for k in indices:
             yield k, self[k]
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         self._decoded = None
         self._container.close()
 
     def __enter__(self) -> VideoReader:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _index(self) -> tuple[list[int], list[tuple[int, int]]]:
-        """Sorted timestamps of the pictures, and (pts, dts) of the keyframes, sorted."""
+        """Sorted timestamps of the frames, and sorted (pts, dts) of the keyframes."""
         times: list[int] = []
         keys: list[tuple[int, int]] = []
         packets = cut = 0
         # Where the index of the container is readable it counts what is presented; the header's count may
-        # include pictures that an edit list removed.
+        # include frames that an edit list removed.
         entries = getattr(self._stream, "index_entries", None)
         declared = len(entries) if entries else self._stream.frames
         try:
@@ -125,7 +120,7 @@ class VideoReader:
                     continue
                 if packet.pts is None:
                     raise self._broken(
-                        "pictures without timestamps",
+                        "frames without timestamps",
                         "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4",
                     )
                 times.append(packet.pts)
@@ -133,7 +128,7 @@ class VideoReader:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
         except self._errors as error:
             raise self._broken(
-                f"{packets} readable of {declared or 'an unknown number of'} frames ({_said(error)})"
+                f"{packets} readable of {declared or 'an unknown number of'} frames ({_reason(error)})"
             ) from None
         if packets - cut < declared:
             raise self._broken(
@@ -143,46 +138,37 @@ class VideoReader:
             raise self._broken("0 frames")
         if len(set(times)) < len(times):
             raise self._broken(
-                "two pictures with one timestamp", "Write it again: ffmpeg -i FILE -c copy NEW.mp4"
+                "two frames with one timestamp", "Write it again: ffmpeg -i FILE -c copy NEW.mp4"
             )
         return sorted(times), sorted(keys)
 
     def _reach(self, k: int) -> NDArray[np.uint8]:
-        """Decodes until picture ``k``."""
+        """Decode until frame ``k``."""
         target = self._pts[k]
         key = bisect_right(self._keys, target, key=lambda pair: pair[0]) - 1
-        ahead = self._decoded is not None and self._last is not None and self._last[0] < k
-        if (
-            ahead
-            and self._last is not None
-            and self._pts[self._last[0]] >= self._keys[max(key, 0)][0]
-        ):
-            found = self._until(target)
-            if found is not None:
-                return found
-        while key >= 0:
-            self._seek(self._keys[key][1])
-            found = self._until(target)
-            if found is not None:
-                return found
-            key -= 1  # the demuxer went to a later keyframe than asked for, or this one cannot be entered
-        self._seek(None)
-        found = self._until(target)
-        if found is None:
+        last = self._last[0] if self._last is not None else k
+        image = None
+        if last < k and self._pts[last] >= self._keys[max(key, 0)][0]:
+            image = self._until(target)
+        # The demuxer may land on a later keyframe, or one may be undecodable: then try earlier ones.
+        for _, time in [*reversed(self._keys[: key + 1]), (0, self._pts[0])]:
+            if image is not None:
+                return image
+            self._seek(time)
+            image = self._until(target)
+        if image is None:
             raise self._broken(f"frame {k} of {len(self)} cannot be decoded")
-        return found
+        return image
 
-    def _seek(self, time: int | None) -> None:
+    def _seek(self, time: int) -> None:
         try:
-            self._container.seek(
-                self._pts[0] if time is None else time, stream=self._stream, backward=True
-            )
+            self._container.seek(time, stream=self._stream, backward=True)
         except self._errors as error:
-            raise self._broken(_said(error)) from None
+            raise self._broken(_reason(error)) from None
         self._decoded = self._container.decode(self._stream)
 
     def _until(self, target: int) -> NDArray[np.uint8] | None:
-        """The picture with timestamp ``target``, or None if decoding starts behind it or ends before it."""
+        """The frame with timestamp ``target``, or None if decoding starts after it or ends before it."""
         assert self._decoded is not None
         try:
             for frame in self._decoded:
@@ -191,13 +177,13 @@ class VideoReader:
                 if frame.pts is not None and frame.pts > target:
                     return None
         except self._errors as error:
-            raise self._broken(f"a picture that cannot be decoded ({_said(error)})") from None
+            raise self._broken(f"a frame that cannot be decoded ({_reason(error)})") from None
         return None
 
     def _broken(self, got: str, fix: str = "Fetch the file again") -> PalpateError:
         return PalpateError(f"The video {self.path} must be whole and readable", got, fix)
 
 
-def _said(error: BaseException) -> str:
-    """FFmpeg's words without the file name, which the error names already."""
+def _reason(error: BaseException) -> str:
+    """The message of FFmpeg without the file name."""
     return str(getattr(error, "strerror", None) or error).split(";")[0]

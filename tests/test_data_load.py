@@ -1,0 +1,157 @@
+"""The door `palpate.data.load`: every kind of source, nothing written, errors with the argument at fault."""
+
+import subprocess
+import sys
+
+import polars as pl
+import pytest
+
+from data_forge import tree, write_image
+from forges import FORGES
+from palpate import data
+from palpate.core import PalpateError, ProblemsError
+
+ROWS = [
+    {
+        "video": "x",
+        "frame": k,
+        "vision": f"v/{k}.jpg",
+        "gel": f"t/{k}.jpg",
+        "material": "Sandpaper No. 5",
+    }
+    for k in range(3)
+]
+
+
+@pytest.fixture
+def images(tmp_path):
+    root = tmp_path / "data"
+    for k in range(3):
+        write_image(root / "v" / f"{k}.jpg", k)
+        write_image(root / "t" / f"{k}.jpg", k)
+    return root
+
+
+def sources(root):
+    """The same three samples in every form that has a name for its columns."""
+    frame = pl.DataFrame(ROWS)
+    frame.write_csv(root / "t.csv")
+    frame.write_ndjson(root / "t.jsonl")
+    frame.write_parquet(root / "t.parquet")
+    yield from (root / "t.csv", str(root / "t.jsonl"), root / "t.parquet", frame, ROWS)
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    yield pandas.DataFrame(ROWS)
+
+
+def test_tables_frames_and_dictionaries_give_the_same_manifest(images):
+    before = {*tree(images), "t.csv", "t.jsonl", "t.parquet"}
+    digests = set()
+    for source in sources(images):
+        manifest = data.load(source, root=images, columns={"tactile": "gel"}).require_valid()
+        assert manifest.ids == ["x/0", "x/1", "x/2"]
+        assert manifest.column("material") == ["Sandpaper No. 5"] * 3
+        digests.add(manifest.digest)
+    assert len(digests) == 1
+    assert tree(images) == before
+
+
+def test_an_import_and_a_manifest_object_are_taken_as_they_are(images, tmp_path):
+    (images / "t.csv").write_text("vision\nv/0.jpg\nv/1.jpg\n")
+    imported = data.import_dataset(images / "t.csv", tmp_path / "m").manifest
+    for source in (imported, tmp_path / "m", tmp_path / "m" / "manifest.parquet"):
+        assert data.load(source).digest == imported.digest
+    assert data.load(images / "t.csv").digest == imported.digest
+
+
+def test_tables_without_images_are_loaded_for_audits(tmp_path):
+    frame = pl.DataFrame({"clip": ["a", "a", "b"], "k": [0, 1, 0]})
+    manifest = data.load(frame, columns={"video": "clip", "frame": "k"})
+    assert manifest.ids == ["a/0", "a/1", "b/0"]
+    frame.write_csv(tmp_path / "t.csv")
+    again = data.load(tmp_path / "t.csv", columns={"video": "clip", "frame": "k"})
+    assert again.digest == manifest.digest
+    (tmp_path / "list.txt").write_text("v/1.jpg,3\nv/2.jpg,3")
+    assert data.load(tmp_path / "list.txt").column("contact") == ["v#0001"] * 2
+
+
+@pytest.mark.parametrize("name", [name for name in FORGES if name != "hf"])
+def test_data_set_folders_load_as_they_import(name, tmp_path):
+    forged = FORGES[name](tmp_path / "forged")
+    before = tree(tmp_path / "forged")
+    loaded = data.load(forged.source, **forged.options)
+    assert tree(tmp_path / "forged") == before
+    imported = data.import_dataset(forged.source, tmp_path / "m", **forged.options).manifest
+    assert loaded.digest == imported.digest
+    assert loaded.require_valid().root == imported.root
+
+
+def test_raw_videos_are_loaded_without_images_on_request(tmp_path):
+    pytest.importorskip("av", reason="PyAV is not installed")
+    from test_data_touch_and_go import forge
+
+    root = forge(tmp_path / "tag", raw=("a",))
+    with pytest.raises(PalpateError, match="palpate import .* -o DIR") as caught:
+        data.load(root)
+    assert caught.value.argument == "source"
+    manifest = data.load(root, images=False)
+    assert manifest.column("tactile") == [None] * len(manifest)
+
+
+def test_a_folder_of_one_modality(images, tmp_path):
+    assert data.load(images / "v").column("vision") == ["0.jpg", "1.jpg", "2.jpg"]
+    (images / "t").rename(images / "gelsight")
+    assert data.load(images / "gelsight").column("tactile") == ["0.jpg", "1.jpg", "2.jpg"]
+    assert data.load(images / "v", side="tactile").column("vision") == [None] * 3
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "argument"),
+    [
+        (3, {}, "source"),
+        ("none", {}, "source"),
+        (".", {}, "source"),
+        (pl.DataFrame({"a": [1]}), {}, "source"),
+        (ROWS, {"columns": {"tactile": "gel["}}, "columns"),
+        (ROWS, {"size": 3}, "size"),
+        (ROWS, {"classes": "none.txt"}, "classes"),
+    ],
+)
+def test_mistakes_name_the_argument(source, options, argument, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PalpateError) as caught:
+        data.load(source, **options)
+    assert caught.value.argument == argument
+
+
+def test_bad_rows_are_raised_together_or_skipped(images):
+    rows = [
+        *ROWS,
+        {"video": "x", "frame": "one"},
+        {"video": "x", "frame": 0},
+        {"vision": "../x.jpg"},
+    ]
+    with pytest.raises(ProblemsError) as caught:
+        data.load(rows, root=images)
+    assert [(p.where, p.kind) for p in caught.value.problems] == [
+        ("row:4", "bad-frame"),
+        ("row:5", "duplicate-id"),
+        ("row:6", "outside-root"),
+    ]
+    assert len(data.load(rows, root=images, skip_bad=True)) == 3
+
+
+def test_results_print_themselves(images, tmp_path):
+    (images / "t.csv").write_text("vision\nv/0.jpg\nv/9.jpg\n")
+    validation = data.validate(images / "t.csv")
+    assert (validation.ok, len(validation.to_json()["missing"])) == (False, 1)
+    assert "Missing: 1\n" in str(validation)
+    imported = data.import_dataset(images / "t.csv", tmp_path / "m", skip_bad=True)
+    assert "Skipped: 1\n" in str(imported)
+    assert imported.to_json()["samples"] == 1
+    exported = data.export_dataset(tmp_path / "m", tmp_path / "e", to="csv")
+    assert "palpate import" in str(exported)
+
+
+def test_importing_the_room_loads_no_polars():
+    code = "import sys, palpate.data; sys.exit('polars' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
