@@ -206,12 +206,8 @@ class Manifest:
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row (a dictionary of the table) as a reference with absolute image paths, for reports."""
-        vision, tactile = (
-            str(self.path(row[name]).resolve()) if row[name] else None
-            for name in ("vision", "tactile")
-        )
-        names = (row[name] for name in ("id", "video", "frame", "material"))
-        return SampleRef(*names, vision, tactile)
+        full = {n: str(self.path(row[n]).resolve()) if row[n] else None for n in MODALITIES}
+        return SampleRef(row["id"], row["video"], row["frame"], row["material"], **full)
 
     def problems(self, *, files: bool = True) -> list[Problem]:
         """Everything wrong with the table: no rows, empty or duplicate ids, paths outside the root, missing files."""

@@ -62,11 +62,11 @@ class Row:
 
 @dataclass(frozen=True)
 class _Job:
-    """The needed frames of one modality of a recording; without ``frames`` its typical frame."""
+    """The needed frames of one modality of a recording; no ``frames``: its typical frame."""
 
     video: str
     modality: str
-    frames: frozenset[int] | None
+    frames: set[int]
 
 
 def rows_of(listed: FrameList) -> list[Row]:
@@ -270,20 +270,24 @@ class Recordings:
             paths.append(self.backgrounds[row.contact])
         return paths
 
-    def decode(self, rows: list[Row], progress: Progress) -> list[Row]:
-        """Decode what ``extract`` would, and write nothing; keep the rows whose images are whole."""
+    def decode(self, rows: list[Row], progress: Progress, *, videos: bool = True) -> list[Row]:
+        """Decode what ``extract`` would, and write nothing; keep the rows whose images are whole.
+
+        With ``videos=False`` only the typical frames of folders are determined, and every row stays.
+        """
         whole: set[tuple[str, str, int]] = set()
 
         def work(job: _Job, stop: Event) -> None:
-            frames = self.frames[job.video][job.modality]
-            if job.frames is None:
-                nearest_to_median(frames, self._without_contact(job.video))
-            for k, _ in frames.read(sorted(job.frames or ())) if job.frames else ():
+            for k, _ in self.frames[job.video][job.modality].read(sorted(job.frames)):
                 if stop.is_set():
                     return
                 whole.add((job.video, job.modality, k))
 
-        self._run("decoding frames", self._jobs(rows), work, rows, progress)
+        jobs = self._jobs(rows) if videos else []
+        typical = self._typical(rows, videos=videos)
+        self._run("decoding frames", [*jobs, *typical], work, rows, progress)
+        if not videos:
+            return rows
         return [
             row
             for row in rows
@@ -293,25 +297,15 @@ class Recordings:
     def extract(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Extract the needed frames of videos; keep the rows whose images are there."""
         jobs = self._jobs(rows)
-        self._require_same_settings([job for job in jobs if job.frames])
-        typical: dict[str, Path] = {}
+        self._require_same_settings(jobs)
 
         def work(job: _Job, stop: Event) -> None:
             frames = self.frames[job.video][job.modality]
-            if job.frames is not None:
-                assert isinstance(frames, VideoFrames)
-                frames.extract(set(job.frames), self.created, stop)
-                return
-            k, image = nearest_to_median(frames, self._without_contact(job.video))
-            path = typical[job.video] = frames.path(k)
-            if not path.is_file():
-                self.created.append(path)
-                save_frame(path, image, self.size)
+            assert isinstance(frames, VideoFrames)
+            frames.extract(job.frames, self.created, stop)
 
-        self._run("extracting frames", jobs, work, rows, progress)
-        for contact, video in self.typical_of.items():
-            if video in typical:
-                self.backgrounds[contact] = typical[video]
+        typical = self._typical(rows, videos=True)
+        self._run("extracting frames", [*jobs, *typical], work, rows, progress, save=True)
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
         rows = [
             row
@@ -335,21 +329,22 @@ class Recordings:
         return [m for m, f in self.frames[row.video].items() if isinstance(f, VideoFrames)]
 
     def _jobs(self, rows: Iterable[Row]) -> list[_Job]:
-        """The frames of videos that the rows and their backgrounds need, and the typical frames."""
+        """The frames of videos that the rows and their backgrounds need."""
         needed: dict[tuple[str, str], set[int]] = {}
-        typical: set[str] = set()
         for row in rows:
             for modality in self._of_videos(row):
                 frames = needed.setdefault((row.video, modality), set())
                 frames.add(row.frame)
                 if modality == "tactile" and row.contact in self.background_frames:
                     frames.add(self.background_frames[row.contact])
-            if row.contact in self.typical_of:
-                typical.add(row.video)
-        return [
-            *(_Job(video, modality, frozenset(k)) for (video, modality), k in needed.items()),
-            *(_Job(video, "tactile", None) for video in sorted(typical)),
-        ]
+        return [_Job(video, modality, k) for (video, modality), k in needed.items()]
+
+    def _typical(self, rows: Iterable[Row], *, videos: bool) -> list[_Job]:
+        """Recordings whose typical frame is needed; without ``videos`` only those in folders."""
+        contacts = {row.contact for row in rows}
+        names = sorted({video for contact, video in self.typical_of.items() if contact in contacts})
+        folders = {v for v in names if isinstance(self.frames[v]["tactile"], FolderFrames)}
+        return [_Job(video, "tactile", set()) for video in names if videos or video in folders]
 
     def _run(
         self,
@@ -358,14 +353,28 @@ class Recordings:
         work: Callable[[_Job, Event], None],
         rows: Sequence[Row],
         progress: Progress,
+        *,
+        save: bool = False,
     ) -> None:
-        """Run jobs in threads; a video that breaks off becomes a problem."""
+        """Run jobs in threads; a video that breaks off becomes a problem.
+
+        Jobs without frames choose a typical frame, and ``save`` it if it is not a file.
+        """
         first = {row.video: row for row in reversed(rows)}
+        typical: dict[str, Path] = {}
         stop = Event()
+
+        def choose(video: str) -> None:
+            frames = self.frames[video]["tactile"]
+            k, image = nearest_to_median(frames, self._without_contact(video))
+            path = typical[video] = frames.path(k)
+            if save and not path.is_file():
+                self.created.append(path)
+                save_frame(path, image, self.size)
 
         def attempt(job: _Job) -> str | None:
             try:
-                work(job, stop)
+                work(job, stop) if job.frames else choose(job.video)
             except PalpateError as error:
                 return f"{self.frames[job.video][job.modality].source}: {error.got}"
             return None
@@ -373,6 +382,9 @@ class Recordings:
         for job, text in in_threads(attempt, jobs, what, progress, stop=stop):
             if text:
                 self.problems.append(Problem(first[job.video].where, "bad-video", text))
+        for contact, video in self.typical_of.items():
+            if video in typical:
+                self.backgrounds[contact] = typical[video]
         self.problems.sort(key=place_of)
 
     def _gather(self, rows: Sequence[Row]) -> None:
