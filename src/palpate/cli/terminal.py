@@ -251,6 +251,8 @@ def error_line(verb: str, error: PalpateError) -> str:
         name = option_name(verb, argument)
         if isinstance(value, bool):
             return name if value else name.replace("--", "--no-", 1)
+        if isinstance(value, Mapping):  # e.g. columns={"vision": "rgb"}
+            value = [f"{key}={cell}" for key, cell in value.items()]
         values = value if isinstance(value, list | tuple) else [value]
         words = shlex.join(map(str, values))
         return f"{name} {words}" if name.startswith("-") else words
