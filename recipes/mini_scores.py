@@ -24,7 +24,7 @@ from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.metrics.probe import material_accuracy, retrieval, text_positives
 from palpate.encoders.zero_shot import zero_shot_accuracy
-from palpate.evaluation.scoring import score_generated
+from palpate.evaluation import score
 from palpate.sim import MATERIALS, WorldOptions
 from palpate.sim.objects import make_object
 from palpate.sim.plan import ObjectRef
@@ -176,12 +176,14 @@ def score_generator(
         seed=0,
         progress=progress,
     )
-    scores = score_generated(
+    scores = score(
+        made.folder,
         joined,
-        split,
-        {"generated": made},
-        encoders,
+        encoder=encoders,
+        split=split,
+        names=["generated"],
         presets=("grouped",),
+        companions=("ssim", "psnr"),
         cache=cache,
         progress=progress,
     )

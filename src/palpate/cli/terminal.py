@@ -65,7 +65,6 @@ RENAMED: dict[tuple[str, str], str] = {
     ("import", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("validate", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",
-    ("score", "--generated"): "positional arguments: palpate score generated/ --reference real/",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' stands for every verb.

@@ -53,7 +53,7 @@ from palpate.encoders.contrastive import train_clip, train_touch
 from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, pick_device
 from palpate.encoders.presets import preset as encoder_preset
-from palpate.evaluation.scoring import score_generated
+from palpate.evaluation.scoring import score
 from palpate.leakage.audit import Pictures, audit_split
 from palpate.leakage.splits import describe, leak_free_split
 from palpate.report.results import Audit
@@ -101,7 +101,7 @@ class PipelineOutcome:
         manifest, split: the data and the leak-free split that was trained and scored on.
         audits: of the data set's own splits, if it has any, and of ours.
         generated: the touches made for the test part.
-        scores: see :func:`palpate.evaluation.scoring.score_generated`.
+        scores: see :func:`palpate.evaluation.score`.
         stages: by name, with digests, facts and times.
         options: what was asked for.
         models: the pretrained models that were taken, by role (``clip``, ``autoencoder``); None: trained in the run.
@@ -577,18 +577,20 @@ class _Pipeline:
         """The scores of the generated touches and of the controls."""
 
         def build(folder: Path) -> dict[str, Any]:
-            scores = score_generated(
+            results = score(
+                generated.folder,
                 manifest,
-                split,
-                {"generated": generated},
-                encoders,
-                group=str(split.rule["group"]),
+                encoder=encoders,
+                split=split,
+                names=["generated"],
+                presets=("grouped", "paper"),
+                companions=("ssim", "psnr"),
                 seed=self.options.seed,
                 cache=self.cache,
                 progress=self.progress,
             )
-            write_json(folder / "scores.json", [s.to_json() for s in scores])
-            return {"scores": len(scores)}
+            write_json(folder / "scores.json", [s.to_json() for s in results])
+            return {"scores": len(results)}
 
         inputs = {"encoder": encoders.digest("tactile"), "seed": self.options.seed}
         stage = self.run.stage(
