@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, Terminal, guard_output, require_extra
+from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, guard_output, require_extra
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,9 +25,9 @@ class Options(Common):
     """Whose encoder."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
     """What stays together in cross-validation and intervals; `auto` takes what the split kept whole, else the video."""
-    balanced: bool = False
+    balanced: Switch = False
     """Average the accuracy over materials instead of samples."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    output: OptionalOutPath = None
     """Write the scores as JSON, for `palpate report`."""
     cache: Path | None = None
     """Folder for embeddings, which an interrupted run finds again."""

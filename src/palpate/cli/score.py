@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import shutil
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, Terminal, guard_output
-from palpate.core import PalpateError, PalpateWarning
+from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_output
+from palpate.core import PalpateError
 
 Companion = Literal[
     "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
@@ -39,7 +38,7 @@ class Options(Common):
     """CSV or Parquet file with the columns id, material, video, in place of what the inputs have."""
     groups: Path | None = None
     """The same for groups alone, where labels and groups are in two files."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    output: OptionalOutPath = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
     latex: Path | None = None
     """Write the tables as LaTeX (booktabs; longtable for many differences)."""
@@ -67,8 +66,8 @@ class Options(Common):
     """What stays together in halves and intervals; `auto` takes what the split kept whole, else the video."""
     cache: Path | None = None
     """Folder for embeddings and decoded images. Default: one next to -o, for a run that is interrupted; removed at the end."""
-    controls: Annotated[bool, tyro.conf.FlagConversionOff] = True
-    """With a split: score the no-contact image and real images of the same material as well (True or False)."""
+    controls: bool = True
+    """With a split: score the no-contact image and real images of the same material as well."""
     seed: int = 0
     """Of random halves, permutations and the control images."""
 
@@ -82,8 +81,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     names = ("encoder", "split", "labels", "groups", "group", "estimator", "backend", "controls")
     names += ("inception", "clip", "lpips", "permutations", "seed")
     cache = _cache(options)
-    with terminal.progress() as progress, warnings.catch_warnings():
-        warnings.simplefilter("ignore", PalpateWarning)  # the scores' notes say the same
+    with terminal.progress() as progress:
         results = score(
             list(options.generated),
             options.reference,

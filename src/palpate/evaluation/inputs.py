@@ -33,6 +33,8 @@ from palpate.core import (
     read_json,
     short,
 )
+from palpate.core.features import is_missing
+from palpate.core.plain import to_numpy
 from palpate.evaluation.embedding_files import (
     GROUPS,
     LABELS,
@@ -374,8 +376,6 @@ def read(source: Source, name: str, group: str = "video") -> Samples:
 
 
 def _texts(column: Sequence[Any] | None) -> list[str] | None:
-    from palpate.core.score import is_missing
-
     return None if column is None else ["" if is_missing(v) else str(v) for v in column]
 
 
@@ -527,10 +527,7 @@ def _read_array(source: Any, name: str) -> Samples:
 
 def _on_host(value: Any) -> NDArray[Any]:
     """An array, a tensor on any device, or a PIL image as an array."""
-    if hasattr(value, "detach"):
-        value = value.detach().cpu()
-        return np.asarray(value.float() if "bfloat16" in str(value.dtype) else value)
-    return np.asarray(value.convert("RGB") if hasattr(value, "getbands") else value)
+    return to_numpy(value.convert("RGB") if hasattr(value, "getbands") else value)
 
 
 def _as_images(array: NDArray[Any], name: str) -> NDArray[np.uint8]:

@@ -94,7 +94,43 @@ def _ahead(params: Mapping[str, Any], _: Style) -> str:
     return f"{params['better']} is better with {share} confidence{holm}"
 
 
+def _materials_excluded(params: Mapping[str, Any], _: Style) -> str:
+    materials = "; ".join(f"{m} ({why})" for m, why in sorted(params["materials"].items()))
+    return f"Excluded ({len(params['materials'])} of {params['total']} materials): {materials}"
+
+
 EVALUATION: dict[str, Sentence] = {
+    "few-test-groups": (
+        "A test part holds {count} {group} group(s) only: the intervals are wide, and too trusting "
+        "if anything"
+    ),
+    "materials-excluded": _materials_excluded,
+    "no-background": (
+        "{count} of {n} samples have no background: tactile images are used as they are only"
+    ),
+    "no-images": "No sample has a {column} image: no features of it",
+    "no-material": "{count} samples without a material are excluded",
+    "no-shared-group": (
+        "The given split shares no {group} between train and test: a difference is due to which of "
+        "them are in test"
+    ),
+    "repeated-splits": (
+        "{repeated} of {n} seeds gave a leak-free split that another gave: there are too few {group} "
+        "groups for more"
+    ),
+    "shared-videos": (
+        "Whole contacts are kept together, but train and test share videos: what a shared video is "
+        "worth is not in this number, and contacts of one video are less independent than the "
+        "intervals take them to be"
+    ),
+    "uneven-materials": (
+        "Materials are not equally common. Always guessing the commonest material of train scores "
+        "{share:.1%} under the given split, not chance"
+    ),
+    "val-excluded": (
+        "The validation part of the given split is excluded; the leak-free splits are made of its "
+        "train and test samples"
+    ),
     "ahead": _ahead,
     "below-floor": "{metric}, {subject}: below the floor of real images, so these vary less than real "
     "ones do; that is not better",
