@@ -190,6 +190,6 @@ def _next_steps(outcome: PipelineOutcome) -> list[str]:
     run = Path(outcome.stages["data"].folder).parent
     return [
         f"palpate audit {run / 'data'} --split {run / 'split' / 'noleak.json'} --worst 50",
-        f"palpate generate YOUR_PHOTOS/ --model {run / 'generator' / 'model'} -o touches/",
-        f"palpate score {run / 'data'} --split {run / 'split' / 'noleak.json'} --generated YOUR_TOUCHES/ --encoder {run / 'towers' / 'towers'} -o scores.json",
+        f"palpate generate YOUR_PHOTOS/ --model {run / 'generator' / 'model'} -o YOUR_IMAGES/",
+        f"palpate score --generated YOUR_IMAGES/ --reference {run / 'data'} --split {run / 'split' / 'noleak.json'} --encoder {run / 'encoders' / 'encoders'} -o scores.json",
     ]
