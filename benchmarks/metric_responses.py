@@ -1,11 +1,12 @@
 """What each of the four metrics responds to, on synthetic features whose structure is known.
 
-    python benchmarks/metric_responses.py                                    # prints the tables, about four minutes on one core
-    python benchmarks/metric_responses.py --write docs/studies/metric_responses.md   # writes them
-    python benchmarks/metric_responses.py --draws 2                          # a quick look
+    python benchmarks/metric_responses.py                 # print the tables, about four minutes
+    python benchmarks/metric_responses.py --write docs/studies/metric_responses.md
+    python benchmarks/metric_responses.py --draws 2       # a quick look
 
-Frames are drawn as ``normalized(mean + class + video + frame)``, Gaussian effects in 64 dimensions, unit-norm rows: ten classes, eight videos of each, ten
-frames of a video. The reference is drawn so; a generator is scored on the same videos, whose effects it shares with a correlation of 0.7, and
+Frames are drawn as ``normalized(mean + class + video + frame)``, Gaussian effects in 64 dimensions,
+unit-norm rows: ten classes, eight videos of each, ten frames of a video. The reference is drawn so;
+a generator is scored on the same videos, whose effects it shares with a correlation of 0.7, and
 deviates in one respect.
 """
 
@@ -14,6 +15,7 @@ import datetime
 import itertools
 import sys
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +39,8 @@ GENERATORS = {
     "collapsed, a point a class": {"video": 0.0, "frame": 0.0},
     "collapsed to one point": {"class": 0.0, "video": 0.0, "frame": 0.0},
 }
-PRESETS = ("paper", "cmmd", "paper-tables", "grouped")
+REFERENCE_FREE = {"I": i_tmmd, "CI": ci_tmmd, "D": d_tmmd}
+SIGMAS = (50.0, 10.0, 3.0, 1.0, 0.5, "median", "multi")
 
 
 def unit(v):
@@ -46,39 +49,31 @@ def unit(v):
 
 def draw(rng, change=None, videos=VIDEOS, frames=FRAMES, classes=CLASSES):
     """(generated, reference) feature sets; ``change`` is an entry of :data:`GENERATORS`."""
-    of = {"shift": 0.0, "confused": 0.0} | SPREAD | (change or {})
+    model = {"shift": 0.0, "confused": 0.0} | SPREAD | (change or {})
     noise = lambda n: rng.normal(size=(n, WIDTH)) / np.sqrt(WIDTH)  # noqa: E731
     mean, centers = unit(rng.normal(size=WIDTH)), unit(rng.normal(size=(classes, WIDTH)))
     label = np.repeat(np.arange(classes), videos)
     real = noise(len(label))
     made = FIDELITY * real + np.sqrt(1 - FIDELITY**2) * noise(len(label))
-    index = np.repeat(np.arange(len(label)), frames)
-    away = unit(rng.normal(size=WIDTH))
-    shown = label[index].copy()
-    wrong = rng.random(len(shown)) < of["confused"]
+    video = np.repeat(np.arange(len(label)), frames)
+    away, shown = unit(rng.normal(size=WIDTH)), label[video].copy()
+    wrong = rng.random(len(shown)) < model["confused"]
     shown[wrong] = rng.integers(classes, size=int(wrong.sum()))
-    rows = (
-        mean
-        + of["shift"] * away
-        + of["class"] * centers[shown]
-        + of["video"] * made[index]
-        + of["frame"] * noise(len(index))
-    )
-    true = (
-        mean
-        + SPREAD["class"] * centers[label[index]]
-        + SPREAD["video"] * real[index]
-        + SPREAD["frame"] * noise(len(index))
-    )
-    ids = [f"s{k:05d}" for k in rng.permutation(len(index))]  # a name says nothing of the video
-    names = [f"v{v}" for v in index]
-    return tuple(
-        FeatureSet(ids, unit(x), [str(c) for c in label[index]], names) for x in (rows, true)
-    )
+
+    def rows(spread, center, effects):
+        x = mean + spread["class"] * center + spread["video"] * effects[video]
+        return x + spread["frame"] * noise(len(video))
+
+    generated = unit(rows(model, centers[shown], made) + model["shift"] * away)
+    reference = unit(rows(SPREAD, centers[label[video]], real))
+    ids = [f"s{k:05d}" for k in rng.permutation(len(video))]  # tells nothing about the video
+    columns = [str(c) for c in label[video]], [f"v{v}" for v in video]
+    return tuple(FeatureSet(ids, x, *columns) for x in (generated, reference))
 
 
 def by_video(made):
-    """The same set with names in the order of class, video and frame: what ``ordered`` halves cut."""
+    """The same set with ids in the order of class, video and frame, which ``ordered`` halves "
+    "cut."""
     return FeatureSet(
         [f"s{k:05d}" for k in range(len(made.ids))], made.features, made.labels, made.groups
     )
@@ -86,70 +81,62 @@ def by_video(made):
 
 def cell(values, digits=3):
     values = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-    if not np.isfinite(values).any():
+    missing = int((~np.isfinite(values)).sum())
+    if missing == len(values):
         return "undefined"
-    tail = (
-        ""
-        if np.isfinite(values).all()
-        else f" (undefined {int((~np.isfinite(values)).sum())} of {len(values)})"
-    )
+    tail = f" (undefined {missing} of {len(values)})" if missing else ""
     return f"{np.nanmean(values):.{digits}f} ± {np.nanstd(values):.{digits}f}{tail}"
 
 
-def generator_tables(draws, seed, say):
+def table(head, rows):
+    """Lines of a Markdown table."""
+    cells = [head, ["---"] * len(head), *rows]
+    return [*(f"| {' | '.join(map(str, row))} |" for row in cells), ""]
+
+
+def reference_free(made, preset):
+    """Column -> value of the metrics that need no reference."""
+    scores = {name: metric(made, preset=preset) for name, metric in REFERENCE_FREE.items()}
+    values = {f"{name}, {preset}": score.value for name, score in scores.items()}
+    if preset == "grouped":
+        values["z"] = scores["I"].details["z"]
+        for name, key in (("I", "E"), ("CI", "E"), ("D", "E_ratio")):
+            values[f"{name}: {key}"] = scores[name].details[key]
+    return values
+
+
+def generator_tables(draws, seed, report):
     """Every generator under every preset."""
-    found = {}
+    columns = {name: defaultdict(list) for name in GENERATORS}
     for name, change in GENERATORS.items():
         for k in range(draws):
             made, real = draw(rng_for(seed, "metric responses", f"draw {k}"), change)
-            row = found.setdefault(name, {})
-            put = lambda column, value: row.setdefault(column, []).append(value)  # noqa: B023, E731
-            put("TMMD", tmmd(made, real, permutations=0).value)
-            put("TMMD, multi", tmmd(made, real, sigma="multi", permutations=0).value)
-            for preset in PRESETS:
-                given = by_video(made) if preset == "paper-tables" else made
-                scores = [f(given, preset=preset) for f in (i_tmmd, ci_tmmd, d_tmmd)]
-                for metric, score in zip(("I", "CI", "D"), scores, strict=True):
-                    put(f"{metric}, {preset}", score.value)
-                if preset == "grouped":
-                    put("I: E", scores[0].details["E"])
-                    put("z", scores[0].details["z"])
-                    put("CI: E", scores[1].details["E"])
-                    put("D: E_ratio", scores[2].details["E_ratio"])
-        say(name)
-    wide = [
-        ("TMMD", 2),
-        ("TMMD, multi", 1),
-        ("I, grouped", 3),
-        ("I: E", 2),
-        ("z", 1),
-        ("CI, grouped", 3),
-        ("CI: E", 2),
-        ("D, grouped", 3),
-        ("D: E_ratio", 2),
-    ]
-    paper = [(f"{m}, {p}", 4) for p in ("paper", "cmmd", "paper-tables") for m in ("I", "CI", "D")]
+            values = {"TMMD": tmmd(made, real, permutations=0).value}
+            values["TMMD, multi"] = tmmd(made, real, sigma="multi", permutations=0).value
+            for preset in ("paper", "cmmd", "grouped"):
+                values |= reference_free(made, preset)
+            values |= reference_free(by_video(made), "paper-tables")
+            for column, value in values.items():
+                columns[name][column].append(value)
+        report(name)
+    grouped = {"TMMD": 2, "TMMD, multi": 1, "I, grouped": 3, "I: E": 2, "z": 1}
+    grouped |= {"CI, grouped": 3, "CI: E": 2, "D, grouped": 3, "D: E_ratio": 2}
+    others = {f"{m}, {p}": 4 for p in ("paper", "cmmd", "paper-tables") for m in REFERENCE_FREE}
     lines = []
-    for title, columns in (
-        ("### Whole videos (`grouped`)", wide),
-        ("### The other presets", paper),
-    ):
-        lines += [
-            title,
-            "",
-            f"| generator | {' | '.join(name for name, _ in columns)} |",
-            "|---" * (len(columns) + 1) + "|",
+    for title, digits in (("Whole videos (`grouped`)", grouped), ("The other presets", others)):
+        rows = [
+            [name, *(cell(values[column], d) for column, d in digits.items())]
+            for name, values in columns.items()
         ]
-        lines += [
-            f"| {name} | {' | '.join(cell(row[column], digits) for column, digits in columns)} |"
-            for name, row in found.items()
-        ]
-        lines.append("")
+        lines += [f"### {title}", "", *table(["generator", *digits], rows)]
     return lines
 
 
 def all_halves(n=8, seed=0):
-    """Largest |mean| of unbiased dist^2 over all halves of n samples, and of biased minus its closed form, over several data sets."""
+    """Largest |mean| of unbiased dist^2 over all halves of n samples, of several data sets.
+
+    And that of biased dist^2 minus its closed form.
+    """
     worst = [0.0, 0.0]
     for k in range(5):
         rng = rng_for(seed, "metric responses", f"all halves {k}")
@@ -160,96 +147,52 @@ def all_halves(n=8, seed=0):
         for j, (estimator, expected) in enumerate(
             (("unbiased", 0.0), ("biased", 1000 * 2 / (n // 2) * (1 - off)))
         ):
-            mean = np.mean(
-                [mmd2(x[h], x[np.setdiff1d(np.arange(n), h)], estimator=estimator) for h in halves]
-            )
+            pairs = [(x[h], x[np.setdiff1d(np.arange(n), h)]) for h in halves]
+            mean = np.mean([mmd2(*pair, estimator=estimator) for pair in pairs])
             worst[j] = max(worst[j], abs(float(mean) - expected))
     return worst
 
 
 def halves_table(halvings, seed):
-    """Random halves of several generators: mean and spread over halvings, beside the closed forms and whole videos."""
-    lines = [
-        "| generator | unbiased: mean over halvings ± its error | sd, observed | sd, closed form | biased: mean | closed form | whole videos | z |",
-        "|---|" + "---|" * 7,
-    ]
-    for name in (
-        "good",
-        "unstable over videos",
-        "classes indistinguishable",
-        "memorized videos: one a class",
-    ):
-        made, _ = draw(
-            rng_for(seed, "metric responses", "halves"), GENERATORS[name], videos=4, frames=5
-        )
+    """Random halves of several generators: mean and spread over halvings, and closed forms."""
+    names = ("good", "unstable over videos", "classes indistinguishable")
+    rows = []
+    for name in (*names, "memorized videos: one a class"):
+        rng = rng_for(seed, "metric responses", "halves")
+        made, _ = draw(rng, GENERATORS[name], videos=4, frames=5)
         scores = [i_tmmd(made, preset="paper", seed=k) for k in range(halvings)]
-        values = np.array([s.value for s in scores])
         biased = [i_tmmd(made, preset="cmmd", seed=k) for k in range(halvings // 8)]
-        whole = i_tmmd(made)
-        sd = (scores[0].null[1] - scores[0].null[0]) / (2 * 1.96)
-        lines.append(
-            f"| {name} | {values.mean():+.5f} ± {values.std() / np.sqrt(halvings):.5f} | {values.std():.5f} | {sd:.5f} "
-            f"| {np.mean([s.value for s in biased]):.4f} | {biased[0].details['dispersion']:.4f} | {whole.value:.4f} | {whole.details['z']:.1f} |"
-        )
-    return [*lines, ""]
+        values, whole = np.array([s.value for s in scores]), i_tmmd(made)
+        row = [name, f"{values.mean():+.5f} ± {values.std() / np.sqrt(halvings):.5f}"]
+        row += [f"{values.std():.5f}", f"{np.ptp(scores[0].null) / (2 * 1.96):.5f}"]
+        row += [f"{np.mean([s.value for s in biased]):.4f}"]
+        row += [f"{biased[0].details['dispersion']:.4f}", f"{whole.value:.4f}"]
+        rows.append([*row, f"{whole.details['z']:.1f}"])
+    head = ["generator", "unbiased: mean over halvings ± its error", "sd, observed"]
+    head += ["sd, closed form", "biased: mean", "closed form", "whole videos", "z"]
+    return table(head, rows)
 
 
 def size_table(draws, seed):
-    """Numbers of videos and frames: what depends on them."""
-    columns = (
-        "I, paper",
-        "I, cmmd",
-        "I, grouped",
-        "I: E",
-        "z",
-        "CI, cmmd",
-        "CI, grouped",
-        "CI: E",
-        "D, cmmd",
-        "D, grouped",
-        "D: E_ratio",
-    )
-    lines = [
-        f"| videos a class, frames | n | {' | '.join(columns)} |",
-        "|---" * (len(columns) + 2) + "|",
-    ]
+    """What depends on the numbers of videos and frames."""
+    columns = ("I, paper", "I, cmmd", "I, grouped", "I: E", "z", "CI, cmmd", "CI, grouped")
+    columns += ("CI: E", "D, cmmd", "D, grouped", "D: E_ratio")
+    rows = []
     for videos, frames in ((2, 10), (4, 10), (8, 10), (16, 10), (8, 3), (8, 20)):
-        row = {name: [] for name in columns}
+        values = defaultdict(list)
         for k in range(draws):
-            made, _ = draw(
-                rng_for(seed, "metric responses", f"size {k}"), videos=videos, frames=frames
-            )
+            rng = rng_for(seed, "metric responses", f"size {k}")
+            made, _ = draw(rng, videos=videos, frames=frames)
             for preset in ("paper", "cmmd", "grouped"):
-                for metric, score in (
-                    ("I", i_tmmd(made, preset=preset)),
-                    ("CI", ci_tmmd(made, preset=preset)),
-                    ("D", d_tmmd(made, preset=preset)),
-                ):
-                    if f"{metric}, {preset}" in row:
-                        row[f"{metric}, {preset}"].append(score.value)
-                    for key, name in (
-                        ("E", f"{metric}: E"),
-                        ("E_ratio", "D: E_ratio"),
-                        ("z", "z" if metric == "I" else ""),
-                    ):
-                        if (
-                            preset == "grouped"
-                            and name in row
-                            and score.details.get(key) is not None
-                        ):
-                            row[name].append(score.details[key])
-        n = videos * frames * CLASSES
-        lines.append(
-            f"| {videos}, {frames} | {n} | {' | '.join(cell(row[name]) for name in columns)} |"
-        )
-    return [*lines, ""]
-
-
-SIGMAS = (50.0, 10.0, 3.0, 1.0, 0.5, "median", "multi")
+                for column, value in reference_free(made, preset).items():
+                    values[column].append(value)
+        row = [f"{videos}, {frames}", videos * frames * CLASSES]
+        rows.append([*row, *(cell(values[column]) for column in columns)])
+    return table(["videos a class, frames", "n", *columns], rows)
 
 
 def modes(rng, count, n, dims=256, noise=0.02):
-    """n unit-norm rows around ``+-e_1 .. +-e_(count/2)``, drawn at random: the expected mean is 0 whatever the count."""
+    """n unit-norm rows around ``+-e_1 .. +-e_(count/2)`` at random: the expected mean is 0."""
     at = rng.integers(count, size=n)
     x = noise * rng.normal(size=(n, dims)) / np.sqrt(dims)
     x[np.arange(n), at // 2] += np.where(at % 2, -1.0, 1.0)
@@ -257,34 +200,26 @@ def modes(rng, count, n, dims=256, noise=0.02):
 
 
 def flat(x, prefix):
+    """A set without labels and groups."""
     return FeatureSet([f"{prefix}{k}" for k in range(len(x))], x)
 
 
 def sigma_tables(seed):
-    """Collapse from 512 modes to fewer at the same mean, a shift of the mean, and the scale of every metric, by bandwidth."""
+    """Collapse at the same mean, a shift of the mean, and the scale of every metric, by sigma."""
     rng = rng_for(seed, "metric responses", "modes")
-    real = flat(modes(rng, 512, 1024), "r")
-    away = unit(rng.normal(size=256))
-    cases = {
-        f"{count} of 512 modes": flat(modes(rng, count, 1024), "g") for count in (512, 256, 64, 8)
-    }
-    cases["512 modes, mean moved by 0.1"] = flat(unit(modes(rng, 512, 1024) + 0.1 * away), "g")
-    lines = [
-        f"| generator | ‖Δ mean‖² x 9.9 | {' | '.join(f'sigma {s}' for s in SIGMAS)} |",
-        "|---" * (len(SIGMAS) + 2) + "|",
-    ]
+    real, away = modes(rng, 512, 1024), unit(rng.normal(size=256))
+    cases = {f"{count} of 512 modes": modes(rng, count, 1024) for count in (512, 256, 64, 8)}
+    cases["512 modes, mean moved by 0.1"] = unit(modes(rng, 512, 1024) + 0.1 * away)
+    rows = []
     for name, made in cases.items():
-        shift = 9.9 * float(((made.features.mean(axis=0) - real.features.mean(axis=0)) ** 2).sum())
-        scores = [tmmd(made, real, sigma=s, permutations=99) for s in SIGMAS]
-        cells = [f"{s.value:.3f} (p {s.details['p_value']:.2f})" for s in scores]
-        lines.append(f"| {name} | {shift:.3f} | {' | '.join(cells)} |")
+        shift = 9.9 * float(((made.mean(axis=0) - real.mean(axis=0)) ** 2).sum())
+        sets = flat(made, "g"), flat(real, "r")
+        scores = [tmmd(*sets, sigma=s, permutations=99) for s in SIGMAS]
+        cells = (f"{s:.3f} (p {s.details['p_value']:.2f})" for s in scores)
+        rows.append([name, f"{shift:.3f}", *cells])
+    lines = table(["generator", "‖Δ mean‖² x 9.9", *(f"sigma {s}" for s in SIGMAS)], rows)
     made, reference = draw(rng_for(seed, "metric responses", "sigma"), {"shift": 0.35})
-    lines += [
-        "",
-        f"| metric, times sigma² / 100 | {' | '.join(f'sigma {s:g}' for s in SIGMAS if not isinstance(s, str))} |",
-        "|---" * len(SIGMAS[:-2]) + "|---|",
-    ]
-    ask = {
+    metrics = {
         "TMMD": lambda s: tmmd(made, reference, sigma=s, permutations=0).value * s**2 / 100,
         "I": lambda s: i_tmmd(made, sigma=s).value * s**2 / 100,
         "I: E": lambda s: i_tmmd(made, sigma=s).details["E"] * s**2 / 100,
@@ -292,27 +227,29 @@ def sigma_tables(seed):
         "D (not scaled)": lambda s: d_tmmd(made, sigma=s).value,
         "D: E_ratio (not scaled)": lambda s: d_tmmd(made, sigma=s).details["E_ratio"],
     }
-    lines += [
-        f"| {name} | {' | '.join(f'{f(s):.3f}' for s in SIGMAS if not isinstance(s, str))} |"
-        for name, f in ask.items()
-    ]
-    return [*lines, ""]
+    numbers = [s for s in SIGMAS if not isinstance(s, str)]
+    rows = [[name, *(f"{f(s):.3f}" for s in numbers)] for name, f in metrics.items()]
+    return lines + table(["metric, times sigma² / 100", *(f"sigma {s:g}" for s in numbers)], rows)
 
 
-def tables(draws, halvings, seed, say):
+def tables(draws, halvings, seed, report):
     worst = all_halves()
-    say("halves enumerated")
-    lines = [
+    report("halves enumerated")
+    return [
         "## What each metric responds to",
         "",
-        f"{CLASSES} classes, {VIDEOS} videos each, {FRAMES} frames a video; mean ± standard deviation over {draws} draws of everything. Lower is called better. For `paper-tables` the ids are in "
-        "the order of class, video and frame, as sorted file names are; for the others they are shuffled.",
+        f"{CLASSES} classes, {VIDEOS} videos each, {FRAMES} frames a video; mean ± standard "
+        f"deviation over {draws} draws of everything. Lower is called better. For `paper-tables` "
+        "the ids are in the order of class, video and frame, as sorted file names are; for the "
+        "others they are shuffled.",
         "",
-        *generator_tables(draws, seed, say),
+        *generator_tables(draws, seed, report),
         "## Random halves carry no signal",
         "",
-        f"Over *all* halves of eight samples, five data sets: the mean of the unbiased dist² is 0 to {worst[0]:.0e}, that of the biased one is its closed form (2/m) 1000 (1 - mean k) "
-        f"to {worst[1]:.0e}. Below: {halvings} random halvings of 200 samples (biased: an eighth of that) of one data set.",
+        "Over *all* halves of eight samples, five data sets: the mean of the unbiased dist² is 0 "
+        f"to {worst[0]:.0e}, that of the biased one is its closed form (2/m) 1000 (1 - mean k) to "
+        f"{worst[1]:.0e}. Below: {halvings} random halvings of 200 samples (biased: an eighth of "
+        "that) of one data set.",
         "",
         *halves_table(halvings, seed),
         "## Numbers of videos and frames",
@@ -320,18 +257,15 @@ def tables(draws, halvings, seed, say):
         f"The good generator; mean ± standard deviation over {draws} draws.",
         "",
         *size_table(draws, seed),
-    ]
-    say("sizes")
-    lines += [
         "## What a bandwidth sees",
         "",
-        "TMMD (unbiased, no groups, 1024 samples in 256 dimensions) of a generator that shows some of 512 modes `±e_k`, each as likely as the others: the expected mean is 0 for all of them. In brackets the p-value of a "
-        "permutation test with 99 relabelings, so that 0.01 is the least. The median distance and its multiples are those of the reference.",
+        "TMMD (unbiased, no groups, 1024 samples in 256 dimensions) of a generator that shows "
+        "some of 512 modes `±e_k`, each as likely as the others: the expected mean is 0 for all "
+        "of them. In brackets the p-value of a permutation test with 99 relabelings, so that "
+        "0.01 is the least. The median distance and its multiples are those of the reference.",
         "",
         *sigma_tables(seed),
     ]
-    say("sigma")
-    return lines
 
 
 def main():
@@ -342,25 +276,27 @@ def main():
     parser.add_argument("--halvings", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", type=Path, help="Markdown file to write")
-    asked = parser.parse_args()
-    started = time.process_time()
-    say = lambda text: print(
-        f"{time.process_time() - started:6.0f} s  {text}", file=sys.stderr, flush=True
-    )
-    body = tables(asked.draws, asked.halvings, asked.seed, say)
-    command = "python benchmarks/metric_responses.py" + (
-        f" --write {asked.write}" if asked.write else ""
-    )
+    options = parser.parse_args()
+    start = time.process_time()
+
+    def report(text):
+        print(f"{time.process_time() - start:6.0f} s  {text}", file=sys.stderr, flush=True)
+
+    body = tables(options.draws, options.halvings, options.seed, report)
+    command = "python benchmarks/metric_responses.py"
+    command += f" --write {options.write}" if options.write else ""
+    command += f" --draws {options.draws} --halvings {options.halvings} --seed {options.seed}"
     head = [
         "# What the metrics respond to",
         "",
-        f"Written by `{command} --draws {asked.draws} --halvings {asked.halvings} --seed {asked.seed}`, {datetime.datetime.now(tz=datetime.UTC).date()}. Synthetic unit-norm features of {WIDTH} dimensions "
-        "with effects of class, video and frame; the model stands in that script. sigma = 10 and scale 1000 unless said.",
+        f"Written by `{command}`, {datetime.datetime.now(tz=datetime.UTC).date()}. Synthetic "
+        f"unit-norm features of {WIDTH} dimensions with effects of class, video and frame; the "
+        "script describes the model. sigma = 10 and scale 1000 unless said.",
         "",
     ]
     text = "\n".join([*head, *body]).rstrip() + "\n"
-    if asked.write:
-        asked.write.write_text(text, encoding="utf-8")
+    if options.write:
+        options.write.write_text(text, encoding="utf-8")
     else:
         print(text)
 

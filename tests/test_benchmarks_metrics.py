@@ -1,4 +1,4 @@
-"""The studies of the metrics: what they draw is what their tables say, and on the world the controls are ranked as the docs claim."""
+"""Studies of the metrics: what they draw is what they say; controls rank as the docs claim."""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
-import degraded_touches as touches
+import degraded_images
 import metric_coverage as coverage
 import metric_degradations as study
 import metric_responses as responses
@@ -50,7 +50,7 @@ def grouped(made, real, **options):
 
 
 def test_degradations_are_nested_and_change_what_they_say(scene, encoders):
-    base = scene.features["made"]
+    base = scene.features["generated"]
     for kind in (
         "wrong material",
         "memorized videos",
@@ -63,13 +63,15 @@ def test_degradations_are_nested_and_change_what_they_say(scene, encoders):
         changed, later = (np.abs(f - base).max(axis=1) > 1e-6 for f in (features, more))
         assert abs(changed.sum() - 0.5 * len(base)) <= 0.05 * len(base), kind
         assert not (changed & ~later).any(), kind
-        assert (images[~changed] == scene.made[~changed]).all()
+        assert (images[~changed] == scene.generated[~changed]).all()
     collapsed, images = study.degraded(scene, "full collapse", 1.0, encoders)
     assert np.ptp(collapsed, axis=0).max() == 0
     assert (images == images[0]).all()
     empty, images = study.degraded(scene, "empty gel", 1.0, encoders)
-    assert (images == scene.own).all()
-    np.testing.assert_allclose(empty[:3], touches.embed_images(scene.own[:3], encoders), atol=1e-5)
+    assert (images == scene.generated_gel).all()
+    np.testing.assert_allclose(
+        empty[:3], degraded_images.embed_images(scene.generated_gel[:3], encoders), atol=1e-5
+    )
     for kind in study.FEATURES_ONLY:
         features, images = study.degraded(scene, kind, study.STRENGTHS[kind][2], encoders)
         assert images is None
@@ -93,7 +95,7 @@ def test_exchange_gives_every_row_another_label():
         label = rng.permutation(np.arange(40) % 4)
         rows = np.flatnonzero(rng.random(40) < 0.9)
         if np.bincount(label[rows]).max() * 2 <= len(rows):
-            got = touches.exchange(rng, label, rows)
+            got = degraded_images.exchange(rng, label, rows)
             assert sorted(got) == list(rows)
             assert (label[got] != label[np.sort(rows)]).all()
 
@@ -128,11 +130,11 @@ def test_tau_and_verdicts():
 
 
 def test_controls_are_ranked_as_the_docs_claim(scene, real, degraded):
-    perfect = grouped(study.feature_set(scene, scene.features["made"]), real)
+    perfect = grouped(study.feature_set(scene, scene.features["generated"]), real)
     found = {name: grouped(made, real) for name, made in degraded.items()}
     worst = max(abs(perfect.value), 1e-3)
     assert perfect.details["p_value"] > 0.05
-    for name in ("blurred, 4 px", "empty gel", "one touch"):
+    for name in ("blurred, 4 px", "empty gel", "one image"):
         assert found[name].value > 10 * worst, name
         assert found[name].details["p_value"] <= 0.05, name
     assert found["blurred, 1 px"].value < found["blurred, 4 px"].value < found["empty gel"].value
@@ -153,27 +155,29 @@ def test_real_halves_by_video_are_the_null(scene):
 def test_the_excess_of_a_class_separates_what_tmmd_does_not(scene, real, degraded):
     floor = ci_tmmd(real, normalize=True).details["E"]
     excess = {name: ci_tmmd(made, normalize=True).details["E"] for name, made in degraded.items()}
-    perfect = ci_tmmd(study.feature_set(scene, scene.features["made"]), normalize=True).details["E"]
+    perfect = ci_tmmd(
+        study.feature_set(scene, scene.features["generated"]), normalize=True
+    ).details["E"]
     assert abs(perfect - floor) < 0.35 * floor
     for name in (
         "wrong material",
         "memorized videos",
         "empty gel",
-        "one touch a material",
-        "one touch",
+        "one image a material",
+        "one image",
     ):
         assert excess[name] < 0.35 * floor, (
             name
         )  # called better by the number alone: read it beside the floor
-    assert i_tmmd(degraded["one touch"], normalize=True).value == 0
+    assert i_tmmd(degraded["one image"], normalize=True).value == 0
 
 
-def test_picture_metrics_prefer_the_empty_gel_and_the_contact_does_not(scene, encoders):
+def test_image_metrics_prefer_the_empty_gel_and_the_contact_does_not(scene, encoders):
     at = {
-        name: study.picture_scores(scene, study.degraded(scene, name, 1.0, encoders)[1])
+        name: study.image_scores(scene, study.degraded(scene, name, 1.0, encoders)[1])
         for name in ("empty gel", "class collapse")
     }
-    perfect = study.picture_scores(scene, scene.made)
+    perfect = study.image_scores(scene, scene.generated)
     assert at["empty gel"]["PSNR"] > perfect["PSNR"]
     assert at["empty gel"]["SSIM"] > perfect["SSIM"]
     assert at["empty gel"]["contact SSIM"] < perfect["contact SSIM"]

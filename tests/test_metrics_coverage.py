@@ -47,7 +47,7 @@ def test_truth_is_that_of_a_closed_form():
     expected = 1000 * ((first - first.mean(0)) * (second - second.mean(0))).sum(axis=1).mean() / 100
     found = study.truth_of(raw, videos=40_000)
     np.testing.assert_allclose(found.mixture, expected, rtol=0.03)
-    np.testing.assert_allclose(found.own, found.mixture, rtol=0.05)
+    np.testing.assert_allclose(found.within, found.mixture, rtol=0.05)
     np.testing.assert_allclose(found.between, 0, atol=0.02)
     shifted, _ = raw.frames(rng, raw.videos(rng, len(labels)), labels, np.full(len(labels), 1), 1.0)
     np.testing.assert_allclose(
