@@ -1,4 +1,6 @@
-"""Column mapping: SQL expressions, mistakes in one line, the former spelling, and the examples of the documentation."""
+"""Column mapping: SQL expressions, mistakes in one line, the former spelling, and the examples of
+the documentation.
+"""
 
 import contextlib
 import json

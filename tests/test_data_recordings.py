@@ -1,4 +1,6 @@
-"""Recordings looked at: raw videos decoded by a validation, stray and doubled numbers, untouched frames, classes of one's own."""
+"""Recordings looked at: raw videos decoded by a validation, stray and doubled numbers, untouched
+frames, classes of one's own.
+"""
 
 import numpy as np
 import pytest
