@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from data_fixtures import write_image
-from format_trees import TREES
+from data_forge import write_image
+from forges import FORGES
 from palpate.cli import main
 from palpate.cli.importing import FormatOptions, TableOptions
 from palpate.core import Split
@@ -27,7 +27,7 @@ def call(capsys, *args):
 
 @pytest.fixture
 def tag(tmp_path):
-    return TREES["touch-and-go"](tmp_path / "forged").source
+    return FORGES["touch-and-go"](tmp_path / "forged").source
 
 
 @pytest.fixture
@@ -145,7 +145,7 @@ def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
     )
     assert (status, json.loads(out)["samples"]) == (0, 4)
     status, _, err = call(capsys, "import", table.parent / "v", "-o", tmp_path / "n")
-    assert (status, "--as tactile" in err) == (2, True)
+    assert (status, "--as vision or --as tactile" in err) == (2, True)
     status, _, err = call(capsys, "import", table, "--as", "vision", "-o", tmp_path / "n")
     assert (status, "Traceback" in err) == (2, False)
 
