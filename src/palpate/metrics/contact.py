@@ -227,12 +227,12 @@ def measure_contacts(
             values[metric][i] = row.get(metric, overlap)
             empty[metric][i] = gel.get(metric, 0.0)
         energy[i], area[i] = row["per_real_energy"], contact.mask.mean()
-    own = options.get("generated_background") is not None
+    given = options.get("generated_background") is not None
     settings = {
         "markers": pairs.markers,
         "least": round(float(pairs.least), 6),
         "size": pairs.reference.size,
-        "generated_background": "own" if own else "real",
+        "generated_background": "own" if given else "real",
         "background": background_digest(background),
     }
     return Contacts(values, empty, energy, area, settings)
@@ -302,29 +302,29 @@ class _ContactPairs:
         image_pairs(generated, reference)
         gel = options.get("generated_background")
         names = ("generated", "background" if gel is None else "generated_background")
-        made = image_pairs(generated, background if gel is None else gel, arguments=names)
-        return cls(made, real, markers, least)
+        pairs = image_pairs(generated, background if gel is None else gel, arguments=names)
+        return cls(pairs, real, markers, least)
 
     def __iter__(self) -> Iterator[_Contact]:
         pairs = zip(self.generated, self.reference, strict=True)
-        for i, ((made, made_gel), (real, gel)) in enumerate(pairs):
-            mask, markers = mask_of(real, gel, self.least)
+        for i, ((x, x_gel), (y, y_gel)) in enumerate(pairs):
+            mask, markers = mask_of(y, y_gel, self.least)
             kept = mask & ~markers if self.markers == "skip" else mask
             if kept.any():
-                yield _Contact(i, made - made_gel, real - gel, kept, mask)
+                yield _Contact(i, x - x_gel, y - y_gel, kept, mask)
 
 
-def _compare(made: Array, real: Array, kept: Mask) -> dict[str, float]:
+def _compare(x: Array, y: Array, kept: Mask) -> dict[str, float]:
     """Every metric of two differences (h, w, c) on the pixels ``kept``."""
-    error, energy, own = (float((v[kept] ** 2).mean()) for v in (made - real, real, made))
+    error, energy, generated = (float((v[kept] ** 2).mean()) for v in (x - y, y, x))
     scales = fitting_scales(kept.shape)
     with np.errstate(divide="ignore"):
         level = -10 * np.log10(error)
     return {
-        "contact residual": error / (energy + own) if energy + own else np.nan,
-        "contact SSIM": float(local_maps(made, real, "mirror", SSIM_RANGE)[0][kept].mean()),
+        "contact residual": error / (energy + generated) if energy + generated else np.nan,
+        "contact SSIM": float(local_maps(x, y, "mirror", SSIM_RANGE)[0][kept].mean()),
         "contact PSNR": float(level),
-        "contact MS-SSIM": multiscale_similarity(made, real, scales, kept, SSIM_RANGE),
+        "contact MS-SSIM": multiscale_similarity(x, y, scales, kept, SSIM_RANGE),
         "per_real_energy": error / energy if energy else np.nan,
     }
 

@@ -112,11 +112,11 @@ def fid(
         PalpateError: on features that cannot be used, unequal widths, fewer than two rows, or
             encoders of different digests.
     """
-    made = feature_set(generated, argument="generated", ids=ids, groups=groups, encoder=encoder)
-    real = feature_set(
+    x = feature_set(generated, argument="generated", ids=ids, groups=groups, encoder=encoder)
+    y = feature_set(
         reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
     )
-    return _fid(made, real, subject=subject, interval=interval, **options).score
+    return _fid(x, y, subject=subject, interval=interval, **options).score
 
 
 def compare_fid(
@@ -308,7 +308,7 @@ def _distance(a: Gaussian, b: Gaussian) -> float:
     else:
         roots = linalg.svdvals(cross, check_finite=False) if cross.size else np.zeros(1)
     traces = np.einsum("ij,ij->", f, f) + np.einsum("ij,ij->", g, g)
-    return max(float(delta @ delta + traces - 2 * roots.sum()), 0.0)
+    return max(float(delta @ delta + traces - 2 * np.sum(roots)), 0.0)
 
 
 @dataclass(frozen=True)

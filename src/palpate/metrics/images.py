@@ -18,7 +18,7 @@ sensor itself; :mod:`palpate.metrics.contact` compares the contact alone.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -259,21 +259,24 @@ def paired_by_id(
     Raises:
         PalpateError: if an id is repeated, or is in one list only; the first few are named.
     """
-    made, real = ([str(v) for v in ids] for ids in (generated_ids, reference_ids))
-    for name, ids in (("generated", made), ("reference", real)):
+    generated, reference = ([str(v) for v in ids] for ids in (generated_ids, reference_ids))
+    for name, ids in (("generated", generated), ("reference", reference)):
         if not ids:
             raise PalpateError(f"There must be {name} ids", "none", f"Pass the {name} ids")
         if repeated := [i for i, count in Counter(ids).items() if count > 1]:
             got = f"{len(repeated)} repeated: {_first(repeated)}"
             raise PalpateError(f"Every {name} id must be unique", got, "Keep one image an id")
-    row, known = {name: k for k, name in enumerate(made)}, set(real)
-    missing, surplus = [i for i in real if i not in row], [i for i in made if i not in known]
+    row, known = {name: k for k, name in enumerate(generated)}, set(reference)
+    missing, surplus = (
+        [i for i in reference if i not in row],
+        [i for i in generated if i not in known],
+    )
     if missing or surplus:
         lists = (("not generated", missing), ("without reference", surplus))
         got = "; ".join(f"{len(ids)} {what}: {_first(ids)}" for what, ids in lists if ids)
         fix = "Score the same samples in both: take() the common ids if that is what you mean"
         raise PalpateError("Generated and reference ids must be the same set", got, fix)
-    return np.array([row[i] for i in real], np.intp), np.arange(len(real))
+    return np.array([row[i] for i in reference], np.intp), np.arange(len(reference))
 
 
 def _first(ids: Sequence[str]) -> str:
@@ -308,9 +311,10 @@ class Pairs:
         return len(self.reference)
 
     def __getitem__(self, i: int) -> tuple[Array, Array]:
-        if i >= len(self):
-            raise IndexError(i)
         return self.generated[i], self.reference[i]
+
+    def __iter__(self) -> Iterator[tuple[Array, Array]]:
+        return (self[i] for i in range(len(self)))
 
     @property
     def size(self) -> list[int]:
@@ -494,9 +498,8 @@ def _scale_count(scales: Any, size: Sequence[int]) -> int:
     if scales == "auto":
         require_side(size, WINDOW, "MS-SSIM")
         return fitting_scales(size)
-    whole = isinstance(scales, int | np.integer) and not isinstance(scales, bool)
-    if not whole or not 1 <= scales <= len(WEIGHTS):
+    if type(scales) is not int or not 1 <= scales <= len(WEIGHTS):
         must = f'must be "auto" or a whole number from 1 to {len(WEIGHTS)}'
         raise PalpateError(must, repr(scales), "Use the default", argument="scales")
     require_side(size, least_side(scales), f"MS-SSIM of {scales} scales")
-    return int(scales)
+    return scales

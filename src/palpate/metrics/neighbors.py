@@ -106,11 +106,11 @@ def prdc(
         PalpateError: on features that cannot be used, unequal widths, encoders of different
             digests, or (grouped) a group outside which there are fewer than k rows.
     """
-    made = feature_set(generated, argument="generated", ids=ids, groups=groups, encoder=encoder)
-    real = feature_set(
+    x = feature_set(generated, argument="generated", ids=ids, groups=groups, encoder=encoder)
+    y = feature_set(
         reference, argument="reference", ids=reference_ids, groups=reference_groups, encoder=encoder
     )
-    return prdc_rows(made, real, k, **options)[0]
+    return prdc_rows(x, y, k, **options)[0]
 
 
 def precision_recall(generated: Any, reference: Any, k: int = 3, **options: Any) -> list[Score]:
@@ -149,26 +149,28 @@ def prdc_rows(
         raise PalpateError(must, "True", fix, argument="grouped")
     grouped = known if grouped is None else grouped
     copies = copies_across(x, y)
-    notes = [Note("copied-rows", {"count": copies, "n": len(x)})] if copies else []
     center = (x.sum(axis=0, dtype=np.float64) + y.sum(axis=0, dtype=np.float64)) / (len(x) + len(y))
     x, y = x - center, y - center  # so that a large common mean costs no digits
     radii = [
-        _squared_radii(name, rows, names if grouped else None, k, progress)
-        for name, rows, names in zip(("generated", "real"), (x, y), groups, strict=True)
+        _squared_radii(name, rows, unit if grouped else None, k, progress)
+        for name, rows, unit in zip(("generated", "real"), (x, y), groups, strict=True)
     ]
-    rows = _compare(x, y, radii, k, progress)
     median = [float(np.median(np.sqrt(r))) for r in radii]
+    rows = _compare(x, y, radii, k, progress)
     scores: list[Score] = []
     for metric, values in rows.items():
-        of_real = metric in ("Recall", "Coverage")  # the mean is over real rows
-        empty = int((radii[0 if metric == "Recall" else 1] == 0).sum())
-        interval, method = mean_interval(values, groups[of_real], level)
+        over_real, balls = metric in ("Recall", "Coverage"), int(metric != "Recall")
+        interval, method = mean_interval(values, groups[over_real], level)
         if interval is not None:  # a t interval may leave the bounds of a share
             high = interval[1] if metric == "Density" else min(1.0, interval[1])
             interval = (max(0.0, interval[0]), high)
+        empty, of = int((radii[balls] == 0).sum()), ("generated", "real")[balls]
         details = {"radius_generated": median[0], "radius_real": median[1], "empty_balls": empty}
-        balls = {"count": empty, "n": len(radii[0 if metric == "Recall" else 1])}
-        balls["of"] = "generated" if metric == "Recall" else "real"
+        notes = [
+            (copies, Note("copied-rows", {"count": copies, "n": len(x)})),
+            (empty, Note("empty-balls", {"count": empty, "n": len(radii[balls]), "of": of})),
+            (interval is None, Note("no-interval-over-groups")),
+        ]
         scores.append(
             Score(
                 metric,
@@ -186,11 +188,7 @@ def prdc_rows(
                 higher_is_better=True,
                 settings={"k": k, "grouped": grouped, "normalize": normalize, "inside": "<"},
                 details=details | {"version": __version__},
-                notes=(
-                    *notes,
-                    *([Note("empty-balls", balls)] if empty else []),
-                    *([] if interval else [Note("no-interval-over-groups")]),
-                ),
+                notes=tuple(note for holds, note in notes if holds),
             )
         )
     return scores, rows

@@ -208,7 +208,7 @@ def retrieval(
         mean_over_groups(
             f"{name} top-{k}",
             hits[k][used] / seen[used],
-            [groups[i] for i in used],
+            [groups[int(i)] for i in used],
             weights=seen[used],
             estimator="mean over pools" if pool else "mean",
             subject=subject,
