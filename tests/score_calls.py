@@ -1,20 +1,55 @@
-"""``palpate score`` called by a test: status and streams, or the scores by (metric, subject, preset)."""
+"""Sets and images that the tests of scoring share."""
 
-import json
+from pathlib import Path
 
-from palpate.cli import main
+import numpy as np
+from PIL import Image
+
+from palpate.core import FeatureSet
+
+VIDEOS, FRAMES, DIM = 8, 6, 5
+IDS = [f"v{v}/{k}" for v in range(VIDEOS) for k in range(FRAMES)]
+GROUPS = [f"v{v}" for v in range(VIDEOS) for _ in range(FRAMES)]
+LABELS = [["Wood", "Brick"][v % 2] for v in range(VIDEOS) for _ in range(FRAMES)]
 
 
-def call(capsys, *args):
-    status = main(["score", *map(str, args)])
-    said = capsys.readouterr()
-    return status, said.out, said.err
+def unit(x):
+    """Rows of length 1, float32."""
+    return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
 
 
-def score(capsys, *args):
-    status, out, err = call(capsys, *args, "--json")
-    assert status == 0, err
-    data = json.loads(out)
-    return {
-        (s["metric"], s["subject"], s["settings"].get("preset")): s for s in data["scores"]
-    }, data
+def features(seed: int, noise: float, shift: float) -> np.ndarray:
+    """Features of the same 48 samples, with noise of their own."""
+    rng = np.random.default_rng(0)
+    real = 3 + np.repeat(rng.normal(size=(VIDEOS, DIM)), FRAMES, 0)
+    real = real + 0.3 * rng.normal(size=(len(IDS), DIM))
+    own = np.random.default_rng(seed)
+    return unit(real + noise * own.normal(size=real.shape) + shift * own.normal(size=DIM))
+
+
+def feature_sets() -> dict[str, FeatureSet]:
+    """``real``, ``near`` and ``far``, with labels, groups and an encoder."""
+    settings = {"real": (1, 0.1, 0), "near": (2, 0.2, 0.1), "far": (3, 0.5, 1.5)}
+    return {n: FeatureSet(IDS, features(*s), LABELS, GROUPS, "e" * 64) for n, s in settings.items()}
+
+
+def paint(folder: Path, names, seed: int, suffix: str = ".png", side: int = 32):
+    """Random images, one file a name; returns their arrays by name."""
+    rng = np.random.default_rng(seed)
+    images = {}
+    for name in names:
+        path = folder / f"{name}{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        images[name] = rng.integers(90, 160, (side, side, 3)).astype(np.uint8)
+        Image.fromarray(images[name]).save(path)
+    return images
+
+
+def by_key(results) -> dict:
+    """Scores by (metric, subject, preset)."""
+    return {(s.metric, s.subject, s.settings.get("preset")): s for s in results}
+
+
+def codes(results) -> list[str]:
+    """Codes of the results' notes."""
+    return [note.code for note in results.notes]

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
-from forges import FORGES
+from format_trees import TREES
 from palpate.cli import main
 from palpate.core import Split
 
@@ -272,7 +272,7 @@ def test_plain_folders_of_pictures_are_photos(folders, capsys):
 
 
 def test_a_small_tree_whose_backgrounds_are_all_unlike_is_audited(tmp_path, capsys):
-    source = FORGES["touch-and-go"](tmp_path / "forged").source
+    source = TREES["touch-and-go"](tmp_path / "forged").source
     assert main(["import", str(source), "-o", str(tmp_path / "m"), "-q"]) == 0
     capsys.readouterr()
     status, found, err = run(

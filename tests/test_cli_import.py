@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from data_forge import write_image
-from forges import FORGES
+from data_fixtures import write_image
+from format_trees import TREES
 from palpate.cli import main
 from palpate.cli.importing import FormatOptions, TableOptions
 from palpate.core import Split
@@ -27,7 +27,7 @@ def call(capsys, *args):
 
 @pytest.fixture
 def tag(tmp_path):
-    return FORGES["touch-and-go"](tmp_path / "forged").source
+    return TREES["touch-and-go"](tmp_path / "forged").source
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ MAPS = [
 
 def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path):
     args = ["import", table, "-o", tmp_path / "m", *MAPS, "--classes", table.parent / "classes.txt"]
-    status, out, _ = call(capsys, *args, "--json")
+    status, out, err = call(capsys, *args, "--json")
     facts = json.loads(out)
     assert (status, facts["samples"], facts["materials"], facts["skipped"]) == (0, 4, 2, [])
     assert [p["kind"] for p in facts["suspicious"]] == ["null-group"]
@@ -145,7 +145,7 @@ def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
     )
     assert (status, json.loads(out)["samples"]) == (0, 4)
     status, _, err = call(capsys, "import", table.parent / "v", "-o", tmp_path / "n")
-    assert (status, "--as vision or --as tactile" in err) == (2, True)
+    assert (status, "--as tactile" in err) == (2, True)
     status, _, err = call(capsys, "import", table, "--as", "vision", "-o", tmp_path / "n")
     assert (status, "Traceback" in err) == (2, False)
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from palpate.cli.scoring_tables import GEL, show
 from palpate.cli.terminal import Common, Terminal
-from palpate.core import Score
+from palpate.core import Note, Score
 from palpate.report.remarks import INDEPENDENT, NEARER
 from palpate.report.results import Results
 
@@ -186,12 +186,12 @@ def test_differences_of_intervals_over_frames_say_so():
         *(scored("TMMD", n, floor=0.1, **frames) for n in "ab"),
         *(scored("SSIM", n, preset="") for n in "ab"),
     ]
-    said = "a is better with 97.5 % confidence, Holm p = 0.05"
+    ahead = Note("ahead", {"better": "a", "confidence": 0.975, "p_adjusted": 0.05})
     text = printed(
         [
             *scores,
-            delta("TMMD", "a", "b", **paired, note=said),
-            delta("SSIM", "a", "b", preset="", note=f"{said}. Of this size"),
+            delta("TMMD", "a", "b", **paired, notes=[ahead]),
+            delta("SSIM", "a", "b", preset="", notes=[ahead], note="Of this size"),
         ]
     )
     tail = text.partition("Differences on the same samples")[2]

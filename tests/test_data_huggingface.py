@@ -6,7 +6,9 @@ import sys
 
 import pytest
 
-from generic_forge import hf_rows, save_hf
+from format_trees import HF_MAPS as MAPS
+from format_trees import hf_kinds as kinds
+from format_trees import hf_rows, save_hf
 from palpate.core import MissingExtraError, PalpateError, ProblemsError, Split
 from palpate.data.exporting import export_dataset
 from palpate.data.formats.huggingface_source import open_source
@@ -14,26 +16,11 @@ from palpate.data.importing import import_dataset, validate_dataset
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 datasets = pytest.importorskip("datasets", reason="the extra hf is not installed")
-MAPS = {
-    "vision": "rgb",
-    "tactile": "gel",
-    "video": "regexp_replace(path, '/[^/]*$', '')",
-    "frame": "split_part(gel, '.', 1)",
-    "material": "kind",
-}
-
-
-def kinds():
-    return {
-        "rgb": datasets.Image(),
-        "gel": datasets.Image(),
-        "kind": datasets.ClassLabel(names=["Wood", "Rock"]),
-    }
 
 
 @pytest.fixture
 def source(tmp_path):
-    return save_hf(tmp_path / "mine", hf_rows(tmp_path / "made"), **kinds())
+    return save_hf(tmp_path / "mine", hf_rows(), **kinds())
 
 
 def same_bytes(one: Manifest, other: Manifest) -> bool:
@@ -46,7 +33,7 @@ def same_bytes(one: Manifest, other: Manifest) -> bool:
 
 @pytest.mark.parametrize("form", ["saved", "parquet"])
 def test_a_foreign_set_keeps_its_bytes_parts_and_labels(source, tmp_path, form):
-    rows = hf_rows(tmp_path / "again")
+    rows = hf_rows()
     if form == "parquet":
         loaded, source = datasets.load_from_disk(str(source)), tmp_path / "shards"
         (source / "data").mkdir(parents=True)
@@ -142,7 +129,7 @@ def test_an_export_is_whole_or_absent(small_manifest, tmp_path):
 
 
 def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_manifest, tmp_path):
-    rows = hf_rows(tmp_path / "made")
+    rows = hf_rows()
     for row in rows:
         row["gel"] = rows[0]["gel"]
     found = import_dataset(
@@ -166,7 +153,7 @@ def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_ma
 
 
 def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_path):
-    rows = hf_rows(tmp_path / "made")
+    rows = hf_rows()
     secret = tmp_path / "secret.jpg"
     secret.write_bytes(rows[0]["gel"]["bytes"])
     rows[1]["gel"] = None
@@ -258,7 +245,7 @@ def test_a_hub_out_of_reach_is_told_at_once_with_what_to_do(tmp_path, monkeypatc
 
 
 def test_an_id_of_two_parts_is_in_neither_and_parts_follow_the_kept_row(tmp_path):
-    rows = hf_rows(tmp_path / "made")
+    rows = hf_rows()
     rows[5]["path"] = rows[1]["path"]  # of validation: the id of a row of train
     rows[2]["path"] = rows[1]["path"]  # twice in train
     found = import_dataset(
@@ -276,7 +263,7 @@ def test_an_id_of_two_parts_is_in_neither_and_parts_follow_the_kept_row(tmp_path
 
 
 def test_numbers_that_are_no_class_are_told_and_minus_one_is_inconclusive(tmp_path):
-    rows = hf_rows(tmp_path / "made")
+    rows = hf_rows()
     rows[1]["kind"], rows[2]["kind"], rows[6]["kind"] = 7, -1, -2
     source = save_hf(tmp_path / "mine", rows, **kinds() | {"kind": datasets.Value("int64")})
     for path in source.glob(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_forge import number, picture, tree, write_image
+from data_fixtures import number, picture, tree, write_image
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.images import (
     cached_images,

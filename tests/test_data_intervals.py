@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from data_forge import number, tree, write_frames, write_video
+from data_fixtures import number, tree, write_frames, write_video
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats.touch_and_go import import_touch_and_go
 from palpate.data.images import read_image
@@ -223,9 +223,9 @@ def test_mistakes(tmp_path):
     (root / "l.csv").write_text("video,start,label\na,1,x\n")
     for options, word in (
         ({}, "no end among video, start, label"),
-        ({"every": 0}, "every must be"),
+        ({"every": 0, "columns": {"end": "start"}}, "`every` must be"),
         ({"root": tmp_path / "none"}, "no folder"),
-        ({"size": 0}, "size must"),
+        ({"size": 0}, "`size` must"),
     ):
         with pytest.raises(PalpateError, match=word):
             import_dataset(root / "l.csv", tmp_path / "out", format="intervals", **options)

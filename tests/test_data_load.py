@@ -1,6 +1,4 @@
-"""The door `palpate.data.load`: every kind of source, nothing written, errors with the argument at
-fault.
-"""
+"""The door `palpate.data.load`: every kind of source, nothing written, errors with the argument at fault."""
 
 import subprocess
 import sys
@@ -94,7 +92,7 @@ def test_raw_videos_are_loaded_without_images_on_request(tmp_path):
     from test_data_touch_and_go import forge
 
     root = forge(tmp_path / "tag", raw=("a",))
-    with pytest.raises(PalpateError, match=r"palpate import .* -o DIR") as caught:
+    with pytest.raises(PalpateError, match="palpate import .* -o DIR") as caught:
         data.load(root)
     assert caught.value.argument == "source"
     manifest = data.load(root, images=False)

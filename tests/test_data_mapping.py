@@ -1,6 +1,4 @@
-"""Column mapping: SQL expressions, mistakes in one line, the former spelling, and the examples of
-the documentation.
-"""
+"""Column mapping: SQL expressions, mistakes in one line, the former spelling, and the examples of the documentation."""
 
 import contextlib
 import json
@@ -13,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from data_forge import write_image
+from data_fixtures import write_image
 from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest

@@ -6,7 +6,7 @@ from functools import partial
 import polars as pl
 import pytest
 
-from data_forge import tree, write_frames, write_image
+from data_fixtures import tree, write_frames, write_image
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.formats import FORMATS
 from palpate.data.importing import import_dataset, validate_dataset
@@ -458,7 +458,7 @@ def test_a_folder_of_one_kind_of_images(tmp_path):
     )
     assert mapped.manifest.column("video") == ["a.jpg", "b", "b"]
     assert mapped.manifest.column("sensor") == ["DIGIT"] * 3
-    with pytest.raises(PalpateError, match="--as vision or --as tactile"):
+    with pytest.raises(PalpateError, match=r"say what they show. E.g. side="):
         import_dataset(tmp_path / "d", tmp_path / "out3")
 
 

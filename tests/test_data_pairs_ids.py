@@ -56,4 +56,4 @@ def test_a_bad_row_takes_no_id_from_a_good_one(images, tmp_path):
     table.write_text("vision,tactile\nv/2.jpg,t/1.jpg\nv/3.jpg,t/1.jpg\n")
     (problem,) = validate_dataset(table).invalid
     assert (problem.where, problem.kind) == (f"{table}:3", "duplicate-id")
-    assert problem.text.endswith("made of the path since there is none: map one (--map id=...)")
+    assert problem.text.endswith("made of the path since there is none: map a column to id")

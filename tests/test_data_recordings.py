@@ -1,12 +1,10 @@
-"""Recordings looked at: raw videos decoded by a validation, stray and doubled numbers, untouched
-frames, classes of one's own.
-"""
+"""Recordings looked at: raw videos decoded by a validation, stray and doubled numbers, untouched frames, classes of one's own."""
 
 import numpy as np
 import pytest
 
 import palpate.data.recordings as recordings
-from data_forge import tree, write_image
+from data_fixtures import tree, write_image
 from palpate.core import ProblemsError, Split
 from palpate.data.formats.touch_and_go import import_touch_and_go
 from palpate.data.importing import validate_dataset, write_lists

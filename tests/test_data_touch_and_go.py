@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import palpate.data.recordings as recordings
-from data_forge import number, tree, write_frames, write_image, write_video
+from data_fixtures import number, tree, write_frames, write_image, write_video
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats.touch_and_go import find_videos, import_touch_and_go
 from palpate.data.images import read_image
@@ -313,9 +313,9 @@ def test_max_per_contact_takes_evenly_spaced_frames(tmp_path):
 
 
 def test_missing_root_list_and_recordings_are_named(tmp_path):
-    with pytest.raises(PalpateError, match="no folder"):
+    with pytest.raises(PalpateError, match="nothing at"):
         import_touch_and_go(tmp_path / "none", tmp_path / "out")
-    with pytest.raises(PalpateError, match=r"dataset/, final_dataset/, the folder itself"):
+    with pytest.raises(PalpateError, match=r"nor in dataset/ or final_dataset/"):
         import_touch_and_go(tmp_path, tmp_path / "out")
     write_image(tmp_path / "dataset" / "a" / "video_frame" / "0.jpg", 1)
     with pytest.raises(PalpateError, match=r"label\.txt"):

@@ -9,26 +9,31 @@ import pytest
 from PIL import Image
 
 from palpate.core import PalpateError, ProblemsError, Split, quiet
-from palpate.data.formats import hct, tvl
-from palpate.data.formats.hct_lists import TRAJECTORY
+from palpate.data.formats.base import Scan
+from palpate.data.formats import hct, swapped, tvl
+from palpate.data.formats.hct import TRAJECTORY
 from palpate.data.importing import import_dataset, validate_dataset, write_lists
-from tvl_forge import (
-    COLUMNS,
+from format_trees import (
+    TVL_COLUMNS as COLUMNS,
     PHOTO,
-    TOUCH,
-    forge_hct,
+    TACTILE as TOUCH,
+    make_hct,
     gel,
     name_of,
     photo,
     put,
-    trajectory,
+    make_trajectory as trajectory,
     write_csv,
 )
 
 
 @pytest.fixture
 def tree(tmp_path):
-    return forge_hct(tmp_path / "in").source
+    return make_hct(tmp_path / "in").source
+
+
+def read_list(path):
+    return tvl.read_list(Scan(path.parent), path)
 
 
 def kinds(problems):
@@ -42,36 +47,23 @@ def read(source, out, **options):
 # ---------------------------------------------------------------- contact.json, captions, touches, sessions
 
 
-def test_without_lists_contact_json_gives_the_samples_and_finetune_json_the_words(tree, tmp_path):
+def test_without_lists_contact_json_gives_the_samples_if_requested(tree, tmp_path):
     listed = read(tree, tmp_path / "listed").manifest
-    talk = []
-    for path in sorted(tree.glob("data1/*.csv")):
-        for _, cells in tvl.read_csv(path, []):
-            turns = [
-                {"from": "human", "value": "What?"},
-                {"from": "gpt", "value": cells["caption"]},
-            ]
-            talk.append(
-                {"image": cells["url"], "tactile": cells["tactile"], "conversations": turns}
-            )
-    (tree / "data1" / "finetune.json").write_text(json.dumps(talk))
     for path in tree.glob("data*/*.csv"):
         path.unlink()
-    found = read(tree, tmp_path / "found")
+    with pytest.raises(PalpateError, match="at least one usable sample"):
+        read(tree, tmp_path / "none")
+    found = read(tree, tmp_path / "found", contact=True)
     assert found.manifest.ids == listed.ids
     assert found.manifest.column("contact") == listed.column("contact")
-    assert found.manifest.column("text") == [
-        t if i.startswith("data1/") else None
-        for i, t in zip(listed.ids, listed.column("text"), strict=True)
-    ]
-    assert found.facts["text_source"] == "captions of finetune.json"
-    assert not found.splits
+    assert set(found.manifest.column("text")) == {None}
+    assert (found.facts["text_source"], found.splits) == ("none", {})
 
 
 def test_frames_that_only_contact_json_names_are_counted_or_taken(tree, tmp_path):
     path = tree / "data1" / "test.csv"
     path.write_text("\n".join(path.read_text().splitlines()[:-1]))
-    whole = forge_hct(tmp_path / "again").source
+    whole = make_hct(tmp_path / "again").source
     left = read(tree, tmp_path / "a")
     (note,) = left.suspicious
     assert (note.kind, note.text.split(":")[0]) == ("unlisted-contact", "1 row")
@@ -161,13 +153,10 @@ def test_touches_are_runs_and_sessions_chains(tree, tmp_path):
     assert [t.split("#")[1] for t in first["contact"]] == ["0001", "0001", "0002", "0002"]
     starts = [1702596200.5, 1702596265.5, 1702596380.5]  # gaps of 65 and 115 seconds
     for gap, sessions in ((64.9, 3), (65.0, 2), (115.0, 1)):
-        found = hct.sessions_of({("data1", f"{k}-{t}") for k, t in enumerate(starts)}, gap)
+        found = hct.sessions_of([f"data1/{k}-{t}" for k, t in enumerate(starts)], gap)
         assert len(set(found.values())) == sessions
-    chained = hct.sessions_of(
-        [("data1", f"9-{100 + 50 * k}") for k in range(4)]
-        + [("data2", "9-120"), ("data2", "odd name")],
-        60.0,
-    )
+    videos = [*(f"data1/9-{100 + 50 * k}" for k in range(4)), "data2/9-120", "data2/odd name"]
+    chained = hct.sessions_of(videos, 60.0)
     assert set(chained.values()) == {"data1/9-100", "data2/9-120", "data2/odd name"}
     wide = read(tree, tmp_path / "b", session_gap=120.0).manifest
     assert sorted(set(wide.column("session"))) == ["data1/7-1702596200.5", "data2/7-1702599800.5"]
@@ -217,7 +206,7 @@ def test_the_untouched_frame_nearest_to_the_median_is_taken(tmp_path):
         "4-100.5",
         range(5),
         background=False,
-        touch=lambda k: Image.new("RGB", TOUCH, (light[k % 100],) * 3),
+        tactile=lambda k: Image.new("RGB", TOUCH, (light[k % 100],) * 3),
     )
     write_csv(rig / "train.csv", COLUMNS, [[*row, "soft"] for row in rows])
     (rig / "not_contact.json").write_text(
@@ -246,8 +235,8 @@ def rig_of(tmp_path, *, swapped, sizes, count=12, **sides):
             f"3-{1000 + 100 * k}.5",
             [5, 6],
             swapped=k in swapped,
-            view=sides.get("view", lambda n: photo(n, sizes[0])),
-            touch=sides.get("touch", lambda n: gel(n, sizes[1])),
+            vision=sides.get("vision", lambda n: photo(n, sizes[0])),
+            tactile=sides.get("tactile", lambda n: gel(n, sizes[1])),
         )
         rows += [[*row, "soft"] for row in own]
     write_csv(rig / "train.csv", COLUMNS, rows)
@@ -276,7 +265,7 @@ def test_exchanged_folders_are_told_and_mended(tmp_path, sizes, swapped):
     (tmp_path / "hct" / "digit_background.png").write_bytes(
         put(tmp_path / "b.png", gel(0, pressed=False)).read_bytes()
     )
-    mended = read(tmp_path, tmp_path / "b", swap="mend").manifest
+    mended = read(tmp_path, tmp_path / "b", swap="fix").manifest
     for video, vision, tactile, background in mended.table.select(
         "video", "vision", "tactile", "background"
     ).iter_rows():
@@ -286,7 +275,7 @@ def test_exchanged_folders_are_told_and_mended(tmp_path, sizes, swapped):
     again = write_lists(mended, Split(dict.fromkeys(mended.ids, "train")), tmp_path / "lists")
     assert named(read(tmp_path, tmp_path / "c", lists=tmp_path / "lists").suspicious) == set()
     assert len(again) == 1
-    with pytest.raises(PalpateError, match="swap must be one of report, mend"):
+    with pytest.raises(PalpateError, match="must be report or fix"):
         read(tmp_path, tmp_path / "out", swap="yes")
 
 
@@ -296,7 +285,7 @@ def test_a_rig_that_is_exchanged_as_a_whole_is_found_too(tmp_path):
 
 
 def test_sides_that_look_alike_are_not_called_exchanged(tmp_path):
-    rig_of(tmp_path, swapped={1}, sizes=(TOUCH, TOUCH), touch=lambda n: photo(n + 7, TOUCH))
+    rig_of(tmp_path, swapped={1}, sizes=(TOUCH, TOUCH), tactile=lambda n: photo(n + 7, TOUCH))
     assert read(tmp_path, tmp_path / "a").suspicious == []
     shutil.rmtree(tmp_path / "hct")
     rig_of(
@@ -314,14 +303,14 @@ def test_exchange_by_color_over_many_rigs():
         truth = {str(k) for k in rng.permutation(30)[: rng.integers(0, 7)]}
         sides = {}
         for k in range(30):
-            touch = tvl.Look(
+            touch = swapped.Look(
                 (240, 320), (base + rng.normal(0, 0.01) + rng.normal(0, 0.02, (8, 8, 3))).clip(0, 1)
             )
-            view = tvl.Look(
+            view = swapped.Look(
                 (240, 320), (0.5 * tint + 0.5 * rng.uniform(0, 1, (8, 8, 3))).clip(0, 1)
             )
             sides[str(k)] = (touch, view) if str(k) in truth else (view, touch)
-        found = set(tvl.exchanged(sides, (240, 320)))
+        found = set(swapped.swapped(sides, (240, 320)))
         hits, wrong, planted = (
             hits + len(found & truth),
             wrong + len(found - truth),
@@ -339,14 +328,14 @@ def test_a_recording_with_touch_on_both_sides_is_not_called_exchanged(tmp_path):
 
 
 def constant(*levels):
-    return [tvl.Look((240, 320), np.full((8, 8, 3), level)) for level in levels]
+    return [swapped.Look((240, 320), np.full((8, 8, 3), level)) for level in levels]
 
 
 def test_colors_that_prove_nothing_are_not_used():
     gels, views = constant(*np.linspace(0.30, 0.34, 9)), constant(*np.linspace(0.1, 0.9, 9))
     (far, further) = constant(0.6, 0.95)  # one side is nearer to the gel, but neither is one
     assert (
-        tvl.exchanged(
+        swapped.swapped(
             {str(k): p for k, p in enumerate([*zip(views, gels, strict=True), (far, further)])},
             (240, 320),
         )
@@ -355,22 +344,21 @@ def test_colors_that_prove_nothing_are_not_used():
     for seed in range(20):  # both sides vary alike: nobody knows the gel
         levels = np.random.default_rng(seed).uniform(0, 1, (2, 25))
         pairs = zip(constant(*levels[0]), constant(*levels[1]), strict=True)
-        assert tvl.exchanged({str(k): p for k, p in enumerate(pairs)}, (240, 320)) == {}
+        assert swapped.swapped({str(k): p for k, p in enumerate(pairs)}, (240, 320)) == {}
 
 
 def test_looks_pass_over_what_cannot_be_read(tmp_path):
     (tmp_path / "cut.jpg").write_bytes(b"")
     put(tmp_path / "a.jpg", gel(1))
-    put(tmp_path / "b.jpg", photo(1))
-    assert tvl.look([tmp_path / "cut.jpg", tmp_path / "none.jpg"]) is None
-    seen = tvl.look([tmp_path / "cut.jpg", tmp_path / "a.jpg", tmp_path / "b.jpg"])
+    assert swapped.look([tmp_path / "cut.jpg", tmp_path / "none.jpg"]) is None
+    seen = swapped.look([tmp_path / "cut.jpg", tmp_path / "a.jpg"])
     assert seen is not None
     assert seen.size == TOUCH
     assert (
         np.abs(seen.thumbnail - np.asarray(gel(1).resize((8, 8), Image.Resampling.BOX)) / 255).max()
         < 0.06
     )
-    assert tvl.looks({"x": ([tmp_path / "cut.jpg"], [tmp_path / "a.jpg"])}, quiet) == {}
+    assert swapped.looks({"x": ([tmp_path / "cut.jpg"], [tmp_path / "a.jpg"])}, quiet) == {}
 
 
 # ---------------------------------------------------------------- bad input
@@ -440,22 +428,6 @@ def test_a_rig_that_is_missing_is_one_problem(tree, tmp_path):
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")
     assert [p.text.split(":")[0] for p in caught.value.problems] == ["3 rows"] * 3
-    for path in (
-        tree / "data1" / "train.csv",
-        tree / "data2" / "train.csv",
-    ):  # one list for all, in hct/
-        rows = [
-            [f"{path.parent.name}/{cell}" for cell in (c["url"], c["tactile"])]
-            for _, c in tvl.read_csv(path, [])
-        ]
-        with (tree / "train.csv").open("a") as file:
-            file.writelines(",".join([*row, "", "soft"]) + "\n" for row in rows)
-        path.unlink()
-    (tree / "data1" / "test.csv").unlink()
-    shutil.rmtree(tree / "data2")
-    with pytest.raises(ProblemsError) as caught:
-        read(tree, tmp_path / "out")
-    assert [p.text for p in caught.value.problems] == [f"9 rows: no folder 'data2' in {tree}"]
 
 
 def test_names_with_spaces_commas_and_other_scripts(tmp_path):

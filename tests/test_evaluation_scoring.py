@@ -1,5 +1,6 @@
-"""Pictures and ids: whose picture is compared with which, whose video it has, and which real touches a score was made against."""
+"""``palpate.evaluation.score``: values against loops and the library, splits, controls, companions, notes, caches."""
 
+import dataclasses
 import os
 import shutil
 from pathlib import Path
@@ -8,169 +9,532 @@ import numpy as np
 import polars as pl
 import pytest
 from PIL import Image
+from scipy import stats
 
-from palpate.core import PalpateError, Split, require_comparable
+from palpate.core import FeatureSet, PalpateError, Score, Split
+from palpate.core.score import require_comparable
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generate import Generated
-from palpate.encoders.encoder_set import EncoderSet
-from palpate.evaluation import touches as touches_module
-from palpate.evaluation.comparing import Asked
-from palpate.evaluation.embeddings import Columns
-from palpate.evaluation.score_inputs import completed, read_touches
-from palpate.evaluation.scoring import compare_generated
-from palpate.evaluation.touches import compare_touches, files_digest
-from palpate.metrics import ssim
+from palpate.evaluation import companions, inputs, score, scoring
+from palpate.metrics import Polynomial, compare, distance, i_tmmd, ssim
+from palpate.metrics.intervals import mean_interval
+from palpate.metrics.neighbors import prdc_rows
+from score_calls import DIM, FRAMES, GROUPS, IDS, LABELS, VIDEOS, by_key, codes, feature_sets, features, paint, unit
+
+SETS = feature_sets()
+TEST, TRAIN = IDS[:24], IDS[24:]
+SPLIT = Split.from_ids(train=TRAIN, test=TEST, rule={"name": "halves"}, manifest="m" * 64)
+FAST = {"companions": [], "permutations": 0}
 
 
-def pictures(folder: Path, ids, seed: int) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    out = {}
-    for i in ids:
-        (folder / i).parent.mkdir(parents=True, exist_ok=True)
-        out[i] = rng.integers(60, 200, (32, 32, 3)).astype(np.uint8)
-        Image.fromarray(out[i]).save(folder / f"{i}.png")
-    return out
+def pairwise_mean(x, y, kernel, groups, same):
+    """Mean of the kernel over pairs, by two loops; pairs of one group are excluded."""
+    pairs = [(i, j) for i in range(len(x)) for j in range(len(y))]
+    kept = [(i, j) for i, j in pairs if not (same and i == j) and (not groups or groups[i] != groups[j])]
+    return np.mean([kernel(x[i], y[j]) for i, j in kept])
 
 
-def test_every_generated_picture_is_compared_with_that_of_its_id(tmp_path, small_manifest):
-    ids = small_manifest.ids
-    split = Split.from_ids(
-        train=ids[:16], test=ids[16:], rule={"group": "video"}, manifest=small_manifest.digest
-    )
-    made = pictures(tmp_path / "made" / "images", ids[16:], 1)
-    folder = Generated(tmp_path / "made", {i: f"{i}.png" for i in reversed(ids[16:])})
-    found = compare_generated(
-        small_manifest,
-        split,
-        {"g": folder},
-        EncoderSet.load("palpate/mini"),
-        Asked(presets=("paper",), permutations=0),
-        controls=False,
-        companions=("ssim",),
-    )
-    real = small_manifest.part(split, "test")
-    images = np.stack([np.asarray(Image.open(p)) for p in real.paths("tactile")])
-    want = ssim(np.stack([made[i] for i in real.ids]), images, ids=real.ids)
-    [got] = [s for s in found.scores if s.metric == "SSIM"]
-    assert got.value == pytest.approx(want.value, abs=1e-12)
-    digest = files_digest(real.ids, real.paths("tactile"))
-    compared = {"TMMD", "SSIM"}
-    assert {s.metric: s.reference for s in found.scores} == {
-        s.metric: digest if s.metric in compared else None for s in found.scores
-    }
-    assert {s.metric for s in found.scores} > compared
+def mmd2(x, y, kernel, groups=None):
+    within = pairwise_mean(x, x, kernel, groups, True) + pairwise_mean(y, y, kernel, groups, True)
+    return within - 2 * pairwise_mean(x, y, kernel, groups, False)
 
 
-@pytest.mark.parametrize("name", ["real", "background only", "real, same material"])
-def test_no_generator_bears_the_name_of_a_control(tmp_path, small_manifest, name):
-    ids = small_manifest.ids
-    split = Split.from_ids(
-        train=ids[:16], test=ids[16:], rule={"group": "video"}, manifest=small_manifest.digest
-    )
-    pictures(tmp_path / "made", ids[16:], 1)
-    folder = Generated(tmp_path / "made", {i: f"{i}.png" for i in ids[16:]})
-    with pytest.raises(PalpateError, match=f"name of a control. Got '{name}'"):
-        compare_generated(
-            small_manifest,
-            split,
-            {name: folder},
-            EncoderSet.load("palpate/mini"),
-            Asked(presets=("paper",)),
-        )
+def test_embeddings_agree_with_loops_and_with_the_library():
+    made = {name: SETS[name] for name in ("near", "far")}
+    results = score(made, SETS["real"])
+    scores = by_key(results)
+    x, y = (SETS[name].features.astype(float) for name in ("far", "real"))
+
+    def gauss(a, b):
+        return 1000 * np.exp(-((a - b) ** 2).sum() / 200)
+
+    def cubic(a, b):
+        return 1000 * (a @ b / DIM + 1) ** 3
+
+    assert scores["TMMD", "far", "paper"].value == pytest.approx(mmd2(x, y, gauss), abs=1e-6)
+    assert scores["TMMD", "far", "grouped"].value == pytest.approx(mmd2(x, y, gauss, GROUPS), abs=1e-6)
+    assert scores["KID (embeddings)", "far", None].value == pytest.approx(mmd2(x, y, cubic), rel=1e-9)
+    library = compare(made, SETS["real"], floor=SETS["real"], preset="grouped")
+    for s in [*library.scores, *library.differences]:
+        got = scores[s.metric, s.subject, "grouped"]
+        assert (got.value, got.interval, got.floor) == (s.value, s.interval, s.floor), s.metric
+    for metric in ("FID", "KID", "Precision", "Recall", "Density", "Coverage"):
+        assert f"{metric} (embeddings)" in {m for m, _, _ in scores}
+    assert results.settings["digests"] == {"encoder": "e" * 64, "reference": SETS["real"].digest}
 
 
-def test_the_digest_of_pictures_is_that_of_a_copy_and_not_that_of_others(tmp_path):
-    pictures(tmp_path / "a", ["v/1", "v/2"], 0)
-    shutil.copytree(tmp_path / "a", tmp_path / "b")
-    read = lambda name: read_touches(tmp_path / name)  # noqa: E731
-    digest = lambda m: files_digest(m.ids, m.paths("tactile"))  # noqa: E731
-    assert digest(read("a")) == digest(read("b")) == digest(read("b").take(["v/2", "v/1"]))
-    assert digest(read("b").take(["v/1"])) != digest(read("a"))
-    with open(tmp_path / "b" / "v" / "1.png", "ab") as file:
-        file.write(b"\0")
-    assert digest(read("a")) != digest(read("b"))
+def test_a_difference_notes_which_generator_is_ahead():
+    results = score({"near": SETS["near"], "far": SETS["far"]}, SETS["real"], **FAST)
+    ahead = by_key(results)["TMMD difference", "near - far", "grouped"]
+    [note] = [n for n in ahead.notes if n.code == "ahead"]
+    assert note.params["better"] == ahead.details["better"] == "near"
+    assert note.params["confidence"] == ahead.details["p_better"] > 0.99
 
 
-def test_pairs_that_were_asked_for_by_name_must_be_there(tmp_path):
-    for seed, name in enumerate(("real", "made")):
-        pictures(tmp_path / name, [f"{name}{k}" for k in range(3)], seed)
-    made, real = {"g": read_touches(tmp_path / "made")}, read_touches(tmp_path / "real")
-    with pytest.raises(PalpateError, match=r"g: .* id"):
-        compare_touches(made, real, None, Asked(), companions=("ssim",))
-    found = compare_touches(made, real, None, Asked())
-    assert found.scores == []
-    assert found.remarks == [
-        "Scores of pairs of pictures left out: generated and real touches share no id"
-    ]
+@pytest.mark.parametrize("companion", ["kid", "prdc", "fid", "cmmd"])
+def test_companions_on_features_have_paired_differences(companion):
+    made = {name: SETS[name] for name in ("near", "far")}
+    results = score(made, SETS["real"], companions=[companion], permutations=0)
+    scores = by_key(results)
+    metrics = {m for m, _, _ in scores if "(embeddings)" in m and "difference" not in m}
+    assert metrics
+    for metric in metrics:
+        preset = "cmmd" if companion == "cmmd" else None
+        a, b = (scores[metric, name, preset].value for name in made)
+        difference = scores[f"{metric} difference", "near - far", preset]
+        assert difference.value == pytest.approx(a - b, abs=1e-12)
+    if companion == "kid":
+        near = scores["KID (embeddings)", "near", None]
+        options = {"kernel": Polynomial(), "normalize": False}
+        direct = distance(SETS["near"].features, SETS["real"].features, **options).value
+        assert near.value == pytest.approx(direct, abs=1e-9)
+        assert "kid-interval" in [n.code for n in near.notes]
 
 
-def test_videos_and_materials_are_taken_by_id_and_never_lost_for_one_stray_picture(tmp_path):
+def test_differences_of_precision_take_the_groups_of_the_rows_they_average():
+    order = np.random.default_rng(0).permutation(IDS)
+    made = {"a": SETS["near"], "b": SETS["far"].take([*order])}
+    few = 6 * FRAMES
+    videos = [f"w{v}" for v in range(6) for _ in range(FRAMES)]
+    names = [f"r{k}" for k in range(few)]
+    real = FeatureSet(names, SETS["real"].features[:few], None, videos, "e" * 64)
+    scores = by_key(score(made, real, companions=["prdc"], permutations=0))
+    rows = [prdc_rows(SETS[name], real)[1] for name in ("near", "far")]
+    for metric, groups in (("Precision", GROUPS), ("Density", GROUPS), ("Recall", videos), ("Coverage", videos)):
+        delta = rows[0][metric] - rows[1][metric]
+        got = scores[f"{metric} (embeddings) difference", "a - b", None]
+        assert got.value == pytest.approx(delta.mean(), abs=1e-12)
+        interval = mean_interval(delta, groups, 0.95)[0]
+        assert (got.interval is None) == (interval is None)
+        assert interval is None or got.interval == pytest.approx(interval, abs=1e-9)
+
+
+def test_bare_arrays_have_no_groups_and_pair_by_row():
+    x = {name: SETS[name].features for name in ("near", "far")}
+    results = score(x, SETS["real"].features, **FAST)
+    scores = by_key(results)
+    assert {preset for _, _, preset in scores} == {"paper"}
+    want = distance(x["near"], SETS["real"].features).value
+    assert scores["TMMD", "near", "paper"].value == pytest.approx(want, abs=1e-9)
+    assert scores["CI-TMMD", "near", "paper"].value is None
+    assert scores["TMMD difference", "near - far", "paper"].interval is not None
+    assert codes(results) == ["row-pairs"]
+    results = score({"near": x["near"], "short": x["far"][:30]}, SETS["real"].features, **FAST)
+    assert not [m for m, _, _ in by_key(results) if "difference" in m]
+    assert codes(results) == ["no-differences"]
+
+
+def test_a_generator_in_another_order_takes_labels_and_groups_from_the_reference():
+    order = np.random.default_rng(0).permutation(len(IDS))
+    bare = FeatureSet([IDS[k] for k in order], SETS["far"].features[order])
+    want, got = (by_key(score({"g": s}, SETS["real"], presets=["grouped"], **FAST)) for s in (SETS["far"], bare))
+    assert want.keys() == got.keys()
+    for key, s in want.items():
+        assert got[key].value == pytest.approx(s.value, abs=1e-9), key
+
+
+def test_several_bandwidths_have_names_of_their_own():
+    made = {name: SETS[name] for name in ("near", "far")}
+    scores = by_key(score(made, SETS["real"], sigma=[10, 1, "median", "multi"], companions=["cmmd"]))
+    x, y = SETS["far"].features, SETS["real"].features
+    narrow = scores["TMMD (σ = 1)", "far", "paper"].value
+    assert narrow == pytest.approx(distance(x, y, sigma=1).value, abs=1e-9)
+    assert scores["TMMD (σ median)", "far", "paper"].settings["kernel"] == "gaussian, median"
+    assert ("D-TMMD (σ multi) difference", "near - far", "grouped") in scores
+    biased = distance(x, y, estimator="biased").value
+    assert scores["CMMD (embeddings)", "far", "cmmd"].value == pytest.approx(biased, abs=1e-9)
+    single = by_key(score(SETS["far"], SETS["real"], sigma=1, **FAST))
+    assert single["TMMD", "generated", "paper"].bandwidth == 1
+
+
+def test_a_preset_with_another_estimator_says_so():
+    def presets(**options):
+        scores = by_key(score({"g": SETS["far"]}, SETS["real"], **FAST, **options))
+        return {preset for metric, _, preset in scores if metric == "TMMD"}
+
+    assert presets() == {"grouped", "paper"}
+    assert presets(estimator="biased") == {"paper, biased"}
+    assert presets(estimator="biased", presets=["cmmd", "paper-tables"]) == {"cmmd", "paper-tables"}
+    assert presets(estimator="grouped") == {"grouped", "paper, grouped"}
+
+
+def test_a_split_scores_the_test_part_against_the_floor_of_the_train_part():
+    results = score({"g": SETS["far"]}, SETS["real"], split=SPLIT, **FAST)
+    s = by_key(results)["TMMD", "g", "paper"]
+    assert (s.n, s.m, s.split) == (24, 24, SPLIT.digest)
+    real = SETS["real"]
+    floor = distance(real.take(TRAIN).features, real.take(TEST).features).value
+    assert s.floor == pytest.approx(floor, abs=1e-9)
+    assert codes(results) == ["outside-test-part"]
+    part = by_key(score({"g": SETS["far"].take(TEST)}, real, split=SPLIT, **FAST))
+    assert part["TMMD", "g", "grouped"].value == by_key(results)["TMMD", "g", "grouped"].value
+
+
+def test_the_excess_has_a_floor_where_the_whole_score_has_none():
+    real = SETS["real"]
+    scores = by_key(score({"g": SETS["near"]}, real, presets=["grouped"], **FAST))
+    whole, excess = scores["I-TMMD", "g", "grouped"], scores["I-TMMD E", "g", "grouped"]
+    assert (excess.value, excess.interval) == (whole.details["E"], tuple(whole.details["E_interval"]))
+    assert whole.floor == pytest.approx(i_tmmd(real).value, abs=1e-9)
+    few = real.take([i for i, g in zip(IDS, GROUPS, strict=True) if g in sorted({*GROUPS})[::2]])
+    scores = by_key(score({"a": SETS["near"], "b": SETS["far"]}, few, presets=["grouped"], **FAST))
+    assert scores["I-TMMD", "a", "grouped"].floor is None  # another number of videos
+    assert scores["I-TMMD E", "a", "grouped"].floor == pytest.approx(i_tmmd(few).details["E"], abs=1e-9)
+    assert scores["I-TMMD difference", "a - b", "grouped"].details["better"] is None
+
+
+def test_collapse_and_copies_are_noted():
+    real = SETS["real"]
+    mean = real.features.mean(axis=0)
+    still = dataclasses.replace(real, features=unit(mean + 0.05 * real.features))
+    copied = dataclasses.replace(real, features=np.vstack([real.features[:5], SETS["far"].features[5:]]))
+    results = score({"still": still, "copied": copied}, real, **FAST)
+    [copies] = [n.params for n in results.notes if n.code == "copies"]
+    assert copies == {"subject": "copied", "copies": 5, "n": 48}
+    below = {n.params["subject"] for n in results.notes if n.code == "below-floor"}
+    assert below == {"still"}
+
+
+def test_of_many_rows_only_fid_is_computed_by_default(monkeypatch):
+    monkeypatch.setattr(companions, "MANY", 10)
+    results = score({"g": SETS["far"]}, SETS["real"], permutations=0)
+    assert {m for m, _, _ in by_key(results) if "(embeddings)" in m} == {"FID (embeddings)"}
+    assert [n.params["name"] for n in results.notes] == ["kid", "prdc"]
+    results = score({"g": SETS["far"]}, SETS["real"], companions=["kid"], permutations=0)
+    assert "KID (embeddings)" in {m for m, _, _ in by_key(results)}
+
+
+def test_a_default_companion_that_cannot_be_computed_becomes_a_note():
+    few = {name: s.take([IDS[0], IDS[7], IDS[13]]) for name, s in SETS.items()}
+    results = score({"g": few["far"]}, few["real"], presets=["paper"], permutations=0)
+    assert [n.params["name"] for n in results.notes if n.code == "companion-skipped"] == ["prdc"]
+    with pytest.raises(PalpateError):
+        score({"g": few["far"]}, few["real"], presets=["paper"], companions=["prdc"])
+
+
+@pytest.fixture
+def streamed(tmp_path, monkeypatch):
+    monkeypatch.setattr(inputs, "STREAMED", 500)
+    rng = np.random.default_rng(5)
+    for name, shift in (("big", 0.1), ("base", 0.0)):
+        np.save(tmp_path / f"{name}.npy", unit(rng.normal(size=(600, 16)) + 2 + shift))
+    return tmp_path / "big.npy", tmp_path / "base.npy"
+
+
+def test_many_bare_rows_are_streamed_and_never_held(streamed, monkeypatch):
+    calls = []
+    monkeypatch.setattr(scoring, "distance", lambda x, y, **how: calls.append((x, y)) or distance(x, y, **how))
+    monkeypatch.setattr(inputs.Samples, "feature_set", lambda *_: pytest.fail("held in memory"))
+    results = score(*streamed)
+    [s] = results
+    assert all(isinstance(x, np.memmap) for x in calls[0])
+    exact = distance(*map(np.load, streamed), backend="blocked").value
+    assert abs(s.value - exact) <= s.details["bound"] + 1e-6
+    assert (s.metric, s.subject, s.details["backend"]) == ("TMMD", "big", "moments")
+    assert 0 < s.details["bound"] < 1e-4
+    assert codes(results) == ["streamed"]
+    assert s.reference == results.settings["digests"]["reference"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"presets": ["grouped"]}, "group of every row"),
+        ({"sigma": "multi"}, "`sigma` must need no pairs"),
+        ({"sigma": 0.3}, "`sigma` must be wide .* backend='blocked'"),
+        ({"normalize": True}, "`normalize` must not change"),
+        ({"companions": ["fid"]}, "`companions` must go with rows that fit"),
+    ],
+)
+def test_what_streamed_rows_cannot_have(streamed, options, words):
+    with pytest.raises(PalpateError, match=words):
+        score(*streamed, **options)
+
+
+PICTURES = np.random.default_rng(0).integers(0, 256, (12, 32, 32, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("generated", "options", "words"),
+    [
+        (SETS["far"], {"sigma": "ten"}, "`sigma` must be numbers .* Got 'ten'"),
+        (SETS["far"], {"sigma": -1}, "`sigma`"),
+        (SETS["far"], {"sigma": []}, "`sigma` must name"),
+        (SETS["far"], {"permutations": -1}, "`permutations` must not be negative"),
+        (SETS["far"], {"presets": ["grouped"], "estimator": "biased"}, "`estimator` must be grouped"),
+        (SETS["far"], {"companions": ["ssim"]}, "`companions` must need no images for embeddings. Got ssim"),
+        (SETS["far"], {"companions": ["sism"]}, "`companions` must be among"),
+        (SETS["far"], {"encoder": "palpate/mini"}, "`encoder` must go with images"),
+        (SETS["far"], {"companions": ["ssim"], "clip": "x"}, "`clip` must have a companion"),
+        (SETS["far"], {"cache": "c"}, "`cache` must go with images"),
+        (SETS["far"], {"group": "contact"}, "`group` must be known"),
+        (dataclasses.replace(SETS["far"], features=2 * SETS["far"].features), {}, "generated.* must be L2-norm"),
+        (dataclasses.replace(SETS["far"], groups=["", *GROUPS[1:]]), {}, "must be known for every row"),
+        (PICTURES, {}, "`encoder` must be given for images"),
+        (PICTURES, {"encoder": "palpate/mini", "normalize": True}, "`normalize` must go with embeddings"),
+        (PICTURES, {"companions": ["contact"]}, "`companions` must need no background images"),
+        (PICTURES, {"companions": ["lpips"]}, "`lpips` must hold .* alexnet-owt"),
+        (PICTURES, {"companions": ["fid"]}, "features of images without an encoder. Got fid.* inception-2015"),
+        (PICTURES, {"companions": ["cmmd"]}, "clip-vit-large-patch14-336"),
+    ],
+)  # fmt: skip
+def test_arguments_that_contradict_each_other(generated, options, words):
+    reference = PICTURES if isinstance(generated, np.ndarray) else SETS["real"]
+    with pytest.raises(PalpateError, match=words):
+        score(generated, reference, **options)
+
+
+def test_nan_is_named_by_generator_and_id(tmp_path):
+    x = SETS["far"].features.copy()
+    x[7] = np.nan
+    np.savez(tmp_path / "nan.npz", features=x, ids=np.array(IDS))
+    with pytest.raises(PalpateError, match=r"nan\.npz: Features must be finite.*7: 'v1/1'"):
+        score(tmp_path / "nan.npz", SETS["real"])
+
+
+def test_scores_of_two_references_do_not_share_a_column():
+    few = SETS["real"].take(IDS[:30])
+    options = {"companions": ["kid"], "presets": ["grouped"], "permutations": 0}
+    first, second = (by_key(score({"g": SETS["far"]}, real, **options)) for real in (SETS["real"], few))
+    for key, s in first.items():
+        if key[0].startswith(("TMMD", "KID")):
+            assert s.reference == SETS["real"].digest
+            with pytest.raises(PalpateError, match="must agree in reference"):
+                require_comparable([s, second[key]])
+        else:
+            require_comparable([s, second[key]])
+
+
+# Images
+
+
+def test_paired_differences_of_pixels_are_those_of_the_images(tmp_path, small_manifest):
+    ids, videos = small_manifest.ids, small_manifest.column("video")
+    a, b = (paint(tmp_path / name, ids, seed) for seed, name in enumerate("ab", 5))
+    made = [tmp_path / "a", tmp_path / "b"]
+    scores = by_key(score(made, small_manifest, companions=["psnr", "ms-ssim", "contact"]))
+    real = {i: np.asarray(Image.open(p)) for i, p in zip(ids, small_manifest.paths("tactile"), strict=True)}
+
+    def psnr(x, i):
+        return -10 * np.log10(((x[i] / 255 - real[i] / 255) ** 2).mean())
+
+    values = {i: psnr(a, i) for i in ids}
+    assert scores["PSNR", "a", None].value == pytest.approx(np.mean([*values.values()]), rel=1e-12)
+    delta = {i: values[i] - psnr(b, i) for i in ids}
+    difference = scores["PSNR difference", "a - b", None]
+    assert difference.value == pytest.approx(np.mean([*delta.values()]), abs=1e-9)
+    means = [np.mean([delta[i] for i, v in zip(ids, videos, strict=True) if v == w]) for w in {*videos}]
+    assert difference.details["p_value"] == pytest.approx(stats.ttest_1samp(means, 0).pvalue, rel=1e-9)
+    assert difference.details["better"] == ("a" if difference.value > 0 else "b")
+    assert {"MS-SSIM", "contact residual", "contact IoU difference"} <= {m for m, _, _ in scores}
+
+
+def test_images_in_memory_pair_by_position_on_request():
+    made = 255 - PICTURES
+    [s] = score([Image.fromarray(x) for x in made], PICTURES, companions=["ssim"])
+    assert s.value == pytest.approx(ssim(made, PICTURES).value, abs=1e-12)
+
+
+def test_lpips_of_whole_images_and_of_their_contact(tmp_path, small_manifest):
+    pytest.importorskip("torch")
+    from lpips_files import random_states, save_states
+    from palpate.encoders.perceptual import load_lpips, lpips_per_image
+    from palpate.metrics import contact_images
+
+    made = {n: paint(tmp_path / n, small_manifest.ids, seed) for seed, n in enumerate("ab", 5)}
+    files = save_states(random_states(), tmp_path)
+    folders = [tmp_path / n for n in made]
+    scores = by_key(score(folders, small_manifest, companions=["lpips"], lpips=files))
+    network = load_lpips(*files)
+    real, gel = (np.stack([np.asarray(Image.open(p)) for p in small_manifest.paths(k)]) for k in ("tactile", "background"))
+
+    def on_contact(x):
+        cut = contact_images(x, real, gel)
+        return lpips_per_image(cut.generated, cut.reference, network, mask=cut.mask)
+
+    x = {n: np.stack([images[i] for i in small_manifest.ids]) for n, images in made.items()}
+    for metric, of in (("LPIPS", lambda v: lpips_per_image(v, real, network)), ("contact LPIPS", on_contact)):
+        values = {n: of(v) for n, v in x.items()}
+        for n, v in values.items():
+            assert scores[metric, n, None].value == pytest.approx(np.nanmean(v), rel=1e-5)
+        difference = scores[f"{metric} difference", "a - b", None].value
+        assert difference == pytest.approx(np.nanmean(values["a"] - values["b"]), rel=1e-3, abs=1e-6)
+    empty = scores["contact LPIPS", "a", None].details["empty"]
+    assert empty == pytest.approx(np.nanmean(on_contact(gel)), rel=1e-5)
+
+
+def test_unpaired_images_are_an_error_and_disjoint_ones_a_note(tmp_path):
+    pytest.importorskip("torch")
+    for seed, (name, ids) in enumerate({"real": "123", "some": "124", "other": "789"}.items()):
+        paint(tmp_path / name, [*ids], seed)
+    real = tmp_path / "real"
+    with pytest.raises(PalpateError, match=r"some: .*1 not generated: '3'; 1 without reference: '4'"):
+        score(tmp_path / "some", real, companions=["ssim"])
+    results = score(tmp_path / "other", real, encoder="palpate/mini", presets=["paper"], permutations=0)
+    assert "no-pairs" in codes(results)
+    assert not {m for m, _, _ in by_key(results)} & {"SSIM", "PSNR"}
+
+
+def test_images_of_several_sizes(tmp_path):
+    for name, side in (("real", 32), ("small", 16), ("same", 32)):
+        paint(tmp_path / name, ["1", "2"], 0, side=side)
+    paint(tmp_path / "mixed", ["1"], 0, side=32)
+    paint(tmp_path / "mixed", ["2"], 0, side=16)
+    real, psnr = tmp_path / "real", {"companions": ["psnr"]}
+    with pytest.raises(PalpateError, match="small 16, same 32"):
+        score([tmp_path / "small", tmp_path / "same"], real, **psnr)
+    with pytest.raises(PalpateError, match=r"1\.png of 32 x 32 and 2\.png of 16 x 16"):
+        score(tmp_path / "mixed", real, **psnr)
+    [resized] = score(tmp_path / "small", real, **psnr).notes
+    assert (resized.code, resized.params) == ("resized", {"size": 16, "side": 32})
+    assert not score(tmp_path / "same", real, **psnr).notes
+    (tmp_path / "same" / "2.png").write_bytes(b"\x89PNG broken")
+    with pytest.raises(PalpateError, match=r"2\.png"):
+        score(tmp_path / "same", real, **psnr)
+
+
+def test_the_digest_of_images_is_that_of_a_copy_and_not_that_of_others(tmp_path):
+    for seed, name in enumerate(("real", "made", "other")):
+        paint(tmp_path / name, ["v/1", "v/2", "v/3"], seed)
+    shutil.copytree(tmp_path / "real", tmp_path / "copy")
+    digests = {}
+    for name in ("real", "copy", "other"):
+        results = score(tmp_path / "made", tmp_path / name, companions=["psnr"])
+        digests[name] = results.settings["digests"]["reference"]
+        assert {s.reference for s in results} == {digests[name]}
+    assert digests["real"] == digests["copy"] != digests["other"]
+
+
+@pytest.fixture(scope="module")
+def mini():
+    pytest.importorskip("torch")
+    from palpate.encoders.encoder_set import EncoderSet
+
+    return EncoderSet.load("palpate/mini")
+
+
+@pytest.fixture
+def split(small_manifest) -> Split:
+    ids, rule = small_manifest.ids, {"group": "video"}
+    return Split.from_ids(train=ids[:24], test=ids[24:], rule=rule, manifest=small_manifest.digest)
+
+
+def embedded(manifest, mini):
+    from palpate.encoders.embed import embed
+
+    return embed(manifest, mini, "tactile")
+
+
+def test_images_are_embedded_and_scored_as_their_features(tmp_path, small_manifest, mini):
+    for seed, name in enumerate("ab"):
+        paint(tmp_path / name, small_manifest.ids, seed)
+    results = score([tmp_path / "a", tmp_path / "b"], small_manifest, encoder=mini, permutations=19)
+    scores, real = by_key(results), embedded(small_manifest, mini)
     rows = [
-        {"id": f"{v}/{k}", "tactile": "x.png", "video": v, "material": v.upper()}
-        for v in "cab"
-        for k in (1, 0)
+        {"id": i, "tactile": f"{i}.png", "material": m, "video": v}
+        for i, m, v in zip(*(small_manifest.column(c) for c in ("id", "material", "video")), strict=True)
     ]
-    like = Manifest.from_rows(rows, tmp_path)  # in another order than the folder
-    pictures(tmp_path / "made", [r["id"] for r in rows[:-1]], 0)
-    made = read_touches(tmp_path / "made")
-    found = completed(made, group="video", like=like)
-    assert found.column("video") == [i[0] for i in found.ids]
-    assert found.column("material") == [i[0].upper() for i in found.ids]
-    pictures(tmp_path / "made", ["b/stray"], 1)
-    made = read_touches(tmp_path / "made")
-    with pytest.raises(
-        PalpateError, match=r"gives material and video by id\. Got 1 of 6 without, first 'b/stray'"
-    ):
-        completed(made, group="video", like=like)
-    columns = Columns(tmp_path / "c.csv", made.ids, ["Wood"] * 6, ["v"] * 6)  # which cover it
-    assert completed(made, group="video", columns=columns, like=like).column("video") == ["v"] * 6
-    bare = Manifest.from_rows(
-        ({"id": r["id"], "tactile": "x.png"} for r in rows), tmp_path
-    )  # which has nothing to give
-    assert completed(made, group="video", like=bare).ids == made.ids
-    pictures(tmp_path / "own", ["1", "2"], 1)  # names of their own
-    assert completed(read_touches(tmp_path / "own"), group="video", like=like).column("video") == [
-        None,
-        None,
-    ]
+    made = embedded(Manifest.from_rows(rows, tmp_path / "a"), mini)
+    for s in compare({"a": made}, real, floor=real, preset="grouped", permutations=19).scores:
+        got = scores[s.metric, "a", "grouped"].value
+        assert got == pytest.approx(s.value, rel=1e-6, abs=1e-6), s.metric
+    metrics = {m for m, _, _ in scores}
+    for metric in ("FID (tactile) difference", "SSIM", "MS-SSIM", "contact residual", "Precision (tactile)"):
+        assert metric in metrics
+    assert not [m for m in metrics if m.startswith(("CMMD", "LPIPS", "material"))]
+    assert results.settings["digests"]["tactile encoder"] == mini.digest("tactile")
+    assert len(results.gallery) == 40
+    cmmd = by_key(score(tmp_path / "a", small_manifest, companions=["cmmd"], clip="palpate/mini"))
+    assert cmmd["CMMD (CLIP)", "a", "cmmd"].encoder == mini.digest("vision")
 
 
-def test_contacts_are_those_against_the_gel_of_now(small_manifest, tmp_path, monkeypatch):
-    """Decoded pictures in a cache are of the bytes of now, also the empty gel's, whatever name, size and time it has."""
-    monkeypatch.setattr(touches_module, "HELD", 0)
-    root = tmp_path / "gel"
-    root.mkdir()
+def test_a_split_scores_controls_and_a_material_probe(tmp_path, small_manifest, mini, split):
+    paint(tmp_path / "g", split.ids("test"), 1)
+    options = {"encoder": mini, "split": split, "permutations": 0, "companions": ["ssim"]}
+    results = score(tmp_path / "g", small_manifest, **options)
+    scores = by_key(results)
+    real = embedded(small_manifest, mini)
+    test, train = (real.take(small_manifest.part(split, part).ids) for part in ("test", "train"))
+    floor = distance(train.features, test.features).value
+    assert scores["TMMD", "g", "paper"].floor == pytest.approx(floor, abs=1e-6)
+    controls = {"background only", "real, same material"}
+    assert {subject for m, subject, _ in scores if m == "TMMD"} == {"g", *controls}
+    gel = embedded(
+        Manifest(small_manifest.table.with_columns(tactile=pl.col("background")), small_manifest.root), mini
+    ).take(test.ids)
+    want = distance(gel.features, test.features).value
+    assert scores["TMMD", "background only", "paper"].value == pytest.approx(want, abs=1e-4)
+    probed = {subject for m, subject, _ in scores if m == "material accuracy"}
+    assert probed == {"g", "background only", "real"}
+    assert not [m for m, _, _ in scores if "difference" in m]
+    doubts = [n.code for n in scores["TMMD", "g", "paper"].notes]
+    assert doubts == ["encoder-of-other-split"]
+    fewer = by_key(score(tmp_path / "g", small_manifest, controls=False, **options))
+    assert {subject for _, subject, _ in fewer} == {"g", "real"}
+    for key, s in fewer.items():
+        assert scores[key].value == s.value or s.value == pytest.approx(scores[key].value), key
+    with pytest.raises(PalpateError, match="`names` must not be .*'real'"):
+        score({"real": tmp_path / "g"}, small_manifest, **options)
+
+
+def test_an_interrupted_run_goes_on_from_its_embeddings(tmp_path, monkeypatch, small_manifest, mini):
+    for seed, name in enumerate("ab"):  # of one size and time
+        paint(tmp_path / name, small_manifest.ids, seed, ".bmp")
+        for file in (tmp_path / name).rglob("*.bmp"):
+            os.utime(file, ns=(10**18, 10**18))
+    made = [tmp_path / "a", tmp_path / "b"]
+    options = {"encoder": mini, "companions": ["psnr"], "permutations": 0}
+    plain = by_key(score(made, small_manifest, **options))
+    cache = tmp_path / "cache"
+    with monkeypatch.context() as stop:
+        stop.setattr(scoring, "score_family", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            score(made, small_manifest, cache=cache, **options)
+    assert len([*cache.rglob("tactile-*.npz")]) == 3
+    monkeypatch.setattr(inputs, "IN_MEMORY", 0)  # every image in a file of the cache
+    monkeypatch.setattr(type(mini), "encode", lambda *_, **__: pytest.fail("embedded again"))
+    again = by_key(score(made, small_manifest, cache=cache, **options))
+    assert again.keys() == plain.keys()
+    for key, s in plain.items():
+        assert again[key].value == pytest.approx(s.value, rel=1e-6, abs=1e-9)
+    assert len([*cache.rglob("tactile-*.npy")]) == 3
+
+
+@pytest.mark.parametrize("column", ["tactile", "background"])
+def test_another_image_of_the_same_name_size_and_time_is_not_taken_from_the_cache(
+    tmp_path, monkeypatch, small_manifest, column
+):
+    """Decoded images in a cache are of the bytes of now."""
+    monkeypatch.setattr(inputs, "IN_MEMORY", 0)
     some = small_manifest.take(small_manifest.ids[:4])
-    paths = []
-    for k, path in enumerate(some.paths("background")):
-        paths.append(root / f"{k}.bmp")
-        Image.open(path).save(paths[-1])
-    real = Manifest(
-        some.table.with_columns(pl.Series("background", [str(p) for p in paths])), some.root
-    )
-    made = Manifest(
-        some.table.with_columns(
-            pl.Series("tactile", list(reversed(some.table["tactile"].to_list())))
-        ),
-        some.root,
-    )
+    paths = [tmp_path / "root" / f"{column}{k}.bmp" for k in range(4)]
+    for path, old in zip(paths, some.paths(column), strict=True):
+        Image.open(old).save(path)
+        os.utime(path, ns=(10**18, 10**18))
+    real = Manifest(some.table.with_columns(pl.Series(column, [p.name for p in paths])), some.root)
+    paint(tmp_path / "g", some.ids, 0)
 
-    def scores(cache):
-        found = compare_touches(
-            {"g": made}, real, None, Asked(), companions=("contact",), cache=cache
-        ).scores
-        assert len(found) == 5
-        return found
+    def values(cache=None):
+        results = score(tmp_path / "g", real, companions=["psnr", "contact"], cache=cache)
+        return [s.value for s in results]
 
-    for path in paths:
-        os.utime(path, (10**9, 10**9))
-    before, cache = scores(None), tmp_path / "cache"
-    assert [s.value for s in scores(cache)] == [s.value for s in before]
+    before = values()
+    assert values(tmp_path / "cache") == before
     for path in paths:
         Image.open(path).point(lambda v: min(255, v + 40)).save(path)
-        os.utime(path, (10**9, 10**9))
-    after = scores(None)
-    assert [s.value for s in after] != [s.value for s in before]
-    assert [s.value for s in scores(cache)] == [s.value for s in after]
-    with pytest.raises(PalpateError, match="agree in settings"):  # another gel, another contact
-        require_comparable([before[0], after[0]])
+        os.utime(path, ns=(10**18, 10**18))
+    after = values()
+    assert after != before
+    assert values(tmp_path / "cache") == after
+
+
+def test_pairs_without_a_finite_value_are_excluded_from_a_difference():
+    from palpate.metrics.paired import mean_differences
+
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(30, 1, 20), rng.normal(28, 1, 20)
+    a[3], b[5] = np.inf, np.nan
+    kept = [k for k in range(20) if k not in (3, 5)]
+    scores = {name: Score("PSNR", name, 1.0, higher_is_better=True) for name in "ab"}
+    [difference] = mean_differences(scores, {"a": a, "b": b}, None)
+    assert difference.value == pytest.approx((a - b)[kept].mean(), rel=1e-12)
+    assert (difference.details["better"], difference.details["decided"]) == ("a", True)

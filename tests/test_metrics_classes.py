@@ -6,7 +6,7 @@ from scipy import stats
 
 from palpate.core import FeatureSet
 from palpate.metrics import ci_tmmd, compare, d_tmmd, four_scores, i_tmmd
-from test_metrics_tactile import change, keep, world
+from test_metrics_tactile import codes, change, keep, world
 
 OFF_DIAGONAL = {"denominator": "mean_off_diagonal"}
 
@@ -78,7 +78,7 @@ def test_classes_within_two_errors_of_the_others_are_unstable_and_have_no_excess
     assert score.details["unstable"] == [f"m{c}" for c in range(3) if each[c] <= 2]
     if seed < 2:
         assert ((each > 1) & (each <= 2)).any()  # else one error would do for two
-    assert ("unreliable" in score.note) == bool(score.details["unstable"])
+    assert ("unstable-denominators" in codes(score)) == bool(score.details["unstable"])
     assert low < inter < high
     if inter <= 2:
         assert (score.details["E_ratio"], score.details["E_ratio_interval"]) == (None, None)
@@ -103,7 +103,7 @@ def test_a_generator_of_some_classes_has_the_floor_of_these(preset):
     for score in (ci, d):
         assert score.value is not None
         assert score.floor is None
-        assert "No floor: real touches of other classes" in score.note
+        assert "no-floor:classes" in codes(score)
     assert d.details["E_ratio_floor"] is None
     whole = four_scores(r, r, floor=r, preset=preset, permutations=0)
     assert whole[2].details["E_floor"] == pytest.approx(np.mean(list(excess.values())), abs=1e-9)
@@ -136,7 +136,7 @@ def test_biased_halves_have_a_floor_of_as_many_samples_alone(preset):
     few, many, equal = drawn(60, "a"), drawn(240, "b"), drawn(60, "c")
     for score in four_scores(few, many, floor=many, preset=preset, permutations=0)[1:]:
         assert score.floor is None
-        assert "other numbers of samples" in score.note
+        assert "no-floor:sizes" in codes(score)
     assert all(
         s.floor is not None
         for s in four_scores(few, equal, floor=equal, preset=preset, permutations=0)[1:]
@@ -163,14 +163,11 @@ def test_halves_of_whole_videos_have_a_floor_of_as_many_frames_alone(options):
     few, many, equal = (videos_of(n, draw=k, prefix=str(k)) for k, n in enumerate((2, 40, 2)))
     for score in four_scores(few, many, floor=many, permutations=0, **options)[1:]:
         assert score.floor is None
-        assert (
-            "No floor: real touches of other numbers of samples a group have another value"
-            in score.note
-        )
+        assert "no-floor:group-sizes" in codes(score)
         assert score.metric == "D-TMMD" or score.details["E_floor"] is not None
     for score in four_scores(few, equal, floor=equal, permutations=0, **options)[1:]:
         assert score.floor is not None
-        assert "No floor" not in score.note
+        assert not [c for c in codes(score) if c.startswith("no-floor")]
     whole = videos_of([200] * 12)
     one_less = whole.take([i for i in whole.ids if not i.endswith("/0")])
     assert (
@@ -283,7 +280,7 @@ def test_sets_that_leave_out_other_things_are_compared_over_classes(seed):
     for s in (mixed_up, fine):
         score = four_scores(s, others, floor=others, permutations=0)[3]
         assert score.floor is None
-        assert "No floor: real touches of other groups" in score.note
+        assert "no-floor:groups" in codes(score)
 
 
 def test_the_excess_over_classes_is_that_of_the_classes():

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy import stats
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, mmd2, tmmd
 from palpate.metrics.halves import half_of
+from palpate.report.notes import sentence
 from test_metrics_mmd import loop_mmd, unit_rows
 
 
@@ -34,6 +36,11 @@ def world(seed, classes=3, videos=4, frames=3, d=6, draw=None, prefix="", encode
                 groups.append(f"c{c}v{v}")
     x = np.array(rows)
     return FeatureSet(ids, x / np.linalg.norm(x, axis=1, keepdims=True), labels, groups, encoder)
+
+
+def codes(score):
+    """The notes: code, and reason where there is one."""
+    return [":".join(filter(None, [n.code, n.params.get("reason")])) for n in score.notes]
 
 
 def change(s, **fields):
@@ -274,7 +281,7 @@ def test_jackknife_of_random_halves_keeps_the_halves():
     assert score.interval == pytest.approx(
         recomputed_interval(score.value, np.array(replicates)), abs=1e-9
     )
-    assert "no signal" in score.note
+    assert "random-halves" in codes(score)
     assert score.seed == 3
 
 
@@ -407,10 +414,10 @@ def test_small_sets_give_a_score_or_a_note(classes, videos, frames, preset, recw
         text = json.dumps(s.to_json(), allow_nan=False)
         assert "NaN" not in text
         if s.value is None:
-            assert s.note.startswith("Undefined: ")
+            assert codes(s)[0].startswith("undefined:")
             assert s.interval is None
         elif s.interval is None:
-            assert "No interval" in s.note
+            assert "no-interval:too-few" in codes(s)
         else:
             assert s.interval[0] <= s.value <= s.interval[1]
             assert s.interval_method
@@ -430,10 +437,10 @@ def test_classes_left_out_are_listed_with_reasons():
     for score in (ci_tmmd(s), d_tmmd(s)):
         assert score.details["classes"] == ["m4", "m5"]
         assert score.details["excluded"] == {
-            "(no label)": "no label",
-            "m1": "fewer than 4 samples",
-            "m2": "all samples are of one group",
-            "m3": "no group has two samples",
+            "(no label)": "no-label",
+            "m1": "few-samples",
+            "m2": "one-group",
+            "m3": "single-samples",
         }
     assert ci_tmmd(s).value == pytest.approx(
         ci_tmmd(keep(s, np.isin(np.array(s.labels, dtype=str), ["m4", "m5"]))).value, abs=1e-9
@@ -441,17 +448,21 @@ def test_classes_left_out_are_listed_with_reasons():
     assert list(ci_tmmd(s, preset="paper").details["excluded"]) == ["(no label)", "m1"]
 
 
-def test_undefined_cases_say_why():
+def test_undefined_scores_have_a_reason():
     s = world(16, classes=2, videos=2, frames=3)
-    assert "no labels" in ci_tmmd(change(s, labels=None)).note
-    assert "no labels" in d_tmmd(change(s, labels=None)).note
-    assert "needs two classes" in d_tmmd(change(s, labels=["a"] * 12)).note
-    assert "one group" in i_tmmd(change(s, groups=["v"] * 12)).note
-    assert "no group has two samples" in i_tmmd(change(s, groups=s.ids)).note
-    assert "fewer than 4" in i_tmmd(s.take(s.ids[:3])).note
     one = change(s, groups=["v"] * 12)
-    assert "two groups" in tmmd(one, one).note
-    assert "two samples" in tmmd(without_groups(s.take(s.ids[:1])), without_groups(s)).note
+    for score, reason, text in (
+        (ci_tmmd(change(s, labels=None)), "no-class", "no labels"),
+        (d_tmmd(change(s, labels=None)), "one-class", "no labels"),
+        (d_tmmd(change(s, labels=["a"] * 12)), "one-class", "needs two classes.*has 1"),
+        (i_tmmd(one), "one-group", "all samples are of one group"),
+        (i_tmmd(change(s, groups=s.ids)), "single-samples", "no group has two samples"),
+        (i_tmmd(s.take(s.ids[:3])), "few-samples", "fewer than 4 samples .n = 3"),
+        (tmmd(one, one), "few-groups", "two groups"),
+        (tmmd(without_groups(s.take(s.ids[:1])), without_groups(s)), "one-sample", "two samples"),
+    ):
+        assert (score.value, codes(score)[0]) == (None, f"undefined:{reason}")
+        assert re.match(f"Undefined: .*{text}", sentence(score.notes[0]))
 
 
 def test_collapse_is_named():
@@ -459,9 +470,9 @@ def test_collapse_is_named():
     s = change(s, features=np.tile(unit_rows(0, 1, 6), (len(s.ids), 1)))
     for score in (i_tmmd(s), ci_tmmd(s)):
         assert score.value == 0
-        assert "collapse" in score.note
+        assert codes(score)[0] == "collapse"
     assert d_tmmd(s).value is None
-    assert "do not separate" in d_tmmd(s).note
+    assert codes(d_tmmd(s)) == ["undefined:not-separate"]
 
 
 def test_unstable_classes_are_flagged():
@@ -471,7 +482,8 @@ def test_unstable_classes_are_flagged():
     )  # labels without meaning: no class differs from another
     score = d_tmmd(s)
     assert score.details["unstable"]
-    assert "unreliable" in score.note
+    assert codes(score)[0] == "unstable-denominators"
+    assert "unreliable: m" in sentence(score.notes[0])
 
 
 @pytest.mark.parametrize(
@@ -483,7 +495,7 @@ def test_unstable_classes_are_flagged():
         ),
         (lambda g: four_scores(g, g, floor=change(g, encoder="f" * 64)), ["floor", "one encoder"]),
         (lambda g: four_scores(g, g, floor=without_groups(g)), ["floor", "groups"]),
-        (lambda g: i_tmmd(without_groups(g), halves="group"), ['halves="group"']),
+        (lambda g: i_tmmd(without_groups(g), halves="group"), ["halves='group'"]),
         (lambda g: i_tmmd(without_groups(g), preset="grouped"), ["grouped"]),
         (lambda g: tmmd(g, without_groups(g), estimator="grouped"), ["grouped"]),
         (lambda g: i_tmmd(change(g, groups=[None, *g.groups[1:]])), ["groups", "1 row (0)"]),

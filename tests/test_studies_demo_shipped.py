@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from mini_fixtures import WORLD, write_shipped
+from mini_forge import WORLD, write_shipped
 from palpate.core import PalpateError, read_json, shipped, write_json
-from palpate.encoders.models import shipped_folder
+from palpate.core.shipped import shipped_folder
 from palpate.data.importing import import_dataset
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.encoder_set import EncoderSet
@@ -54,14 +54,14 @@ def test_shipped_models_take_the_place_of_three_stages(mini, tmp_path):
     )
     ready = EncoderSet.load("palpate/mini")
     assert encoders.digest("vision") == ready.digest("vision")
-    assert encoders.digest("tactile") != ready.digest("tactile")
+    assert encoders.digest("touch") != ready.digest("touch")
     assert encoders.card["start_card"]["data"] == WORLD
     assert encoders.card["clip"] == "palpate/mini"
     assert model.training["start"] == mini.digest
     assert model.training["start_record"]["data"] == WORLD
     assert model.stats == mini.stats
     assert "Brick" in model.notice
-    assert {s.encoder for s in done.scores if s.metric == "TMMD"} == {encoders.digest("tactile")}
+    assert {s.encoder for s in done.scores if s.metric == "TMMD"} == {encoders.digest("touch")}
     bound = done.stages["generator"].facts["autoencoder on test touches"]
     assert (bound["n"], bound["codes"]) == (len(done.split.ids("test")), 64)
     results = summarize(done, "palpate demo")

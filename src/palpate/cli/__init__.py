@@ -68,6 +68,11 @@ VERBS: dict[str, Verb] = {
         "Score generated tactile images",
         "palpate score --generated generated/ --reference real/ --encoder palpate/mini",
     ),
+    "probe": Verb(
+        "probe",
+        "Tell how well an encoder's embeddings name the material",
+        "palpate probe tag/ --split noleak.json --encoder encoders/",
+    ),
     "report": Verb(
         "report",
         "Write the page: audit, gallery, scores, settings",

@@ -18,8 +18,7 @@ from rich.text import Text
 from palpate.cli.terminal import Terminal
 from palpate.core import Score
 from palpate.core.score import ARROWS
-from palpate.evaluation.comparing import confidence, percent
-from palpate.report.notes import COMMAND_LINE, sentence
+from palpate.report.notes import COMMAND_LINE, confidence, sentence
 from palpate.report.remarks import INDEPENDENT, Footnotes, no_floor, reason, remarks
 from palpate.report.results import Results
 from palpate.report.sides import TAIL
@@ -128,7 +127,7 @@ def _differences(scores: Sequence[Score], notes: Footnotes, frames: set[tuple[st
     rows: list[tuple[str, str, Sequence[str]]] = []
     for s in sorted(scores, key=lambda s: order.index(_column(s))):
         metric, d = s.metric.removesuffix(TAIL), s.details
-        ahead = confidence(s)
+        ahead = [sentence(n, COMMAND_LINE) for n in s.notes if n.code == "ahead"]
         known = [t for t in remarks(s) if t not in ahead]
         known += (
             [INDEPENDENT]
@@ -141,7 +140,7 @@ def _differences(scores: Sequence[Score], notes: Footnotes, frames: set[tuple[st
             d["b"],
             _number(s.value),
             _interval(s.interval),
-            "-" if sure is None else percent(sure),
+            "-" if sure is None else confidence(sure),
             _p(d.get("p_adjusted")),
             _marks(notes, known),
         ]

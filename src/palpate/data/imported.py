@@ -47,7 +47,7 @@ class Imported:
         return self.manifest.facts
 
     def save(self, output: Path, created: list[Path]) -> Imported:
-        """Write the splits and, last, ``manifest.parquet``; new files are added to ``created``.
+        """Write ``splits/<name>.json`` and, last, ``manifest.parquet``; new files are added to ``created``.
 
         Splits of an earlier import into the same folder that this one lacks are removed.
         """
@@ -174,7 +174,7 @@ def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> No
 
 @contextmanager
 def removing_on_error(output: Path) -> Generator[list[Path]]:
-    """Yield a list for new files, which are removed on an error, though not on Ctrl-C."""
+    """Yield a list for every new file; on an error, though not on Ctrl-C, remove those files and empty folders."""
     output = Path(output)
     existed = {p for p in (output, *output.parents) if p.exists()}
     created: list[Path] = []

@@ -1,7 +1,7 @@
-"""From listed frames of recordings to manifest rows: open, choose backgrounds, check, extract.
+"""From listed frames of recordings with two modalities to manifest rows: open, choose backgrounds, check, extract.
 
-Every step drops the rows that it cannot use and adds the reason to ``problems``, so that a user
-sees everything that is wrong with a data set at once.
+Every step drops the rows that it cannot use and adds the reason to ``problems``, so that a user sees
+everything that is wrong with a data set at once.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MODALITIES = ("vision", "tactile")
 
 @dataclass(frozen=True)
 class VideoFiles:
-    """One recording: each modality is a folder of frames, a video file, or None."""
+    """One recording: each modality is a folder of frames, a video file, or None where it is missing."""
 
     name: str
     vision: Path | None
@@ -128,8 +128,7 @@ class Recordings:
         suspicious: what looks wrong, but can be used.
         frames: recording -> modality -> frames, for those that could be opened.
         backgrounds: contact -> background image.
-        background_frames: contact -> the frame before it that is its background, where there is
-            one.
+        background_frames: contact -> the frame before it that is its background, where there is one.
         typical_of: contacts without such a frame -> their recording.
         moved: image -> its copy below ``out``, where some recordings are videos and others folders.
     """
@@ -190,7 +189,7 @@ class Recordings:
                 except PalpateError as error:
                     return f"bad-video: {source}: {error.got}"
             elif inside(self.root, os.path.relpath(source, self.root)) is None:
-                return f"outside-root: {source} is a link that leaves the data set"
+                return f"outside-root: {source} is a link that leaves the data set; import from the folder that really holds it"
             else:
                 opened[modality] = FolderFrames(source, self.root)
         return opened
@@ -200,7 +199,7 @@ class Recordings:
         opened = self.frames[row.video]
         length = min(map(len, opened.values()))
         if row.frame >= length:
-            text = f"frame {row.frame} of {row.video!r}, which has {length} frames, counted from 0"
+            text = f"frame {row.frame} is beyond the end of {row.video!r}: both modalities have {length} frames, counted from 0"
             self.problems.append(Problem(row.where, "beyond-end", text))
             return False
         missing = [frames for frames in opened.values() if not frames.has(row.frame)]
@@ -232,7 +231,7 @@ class Recordings:
                 self.typical_of[contact] = video
 
     def _without_contact(self, video: str) -> list[int]:
-        """Up to 15 evenly spaced frames without contact, if possible 4 frames away from any."""
+        """Up to 15 evenly spaced frames without contact, 4 frames away from any where that leaves some."""
         numbers = np.asarray(self.frames[video]["tactile"].numbers, np.int64)
         contact = np.array(sorted(self.in_contact.get(video, set())), np.int64)
         for margin in (BACKGROUND_BEFORE, 0):
@@ -274,8 +273,7 @@ class Recordings:
     def decode(self, rows: list[Row], progress: Progress, *, videos: bool = True) -> list[Row]:
         """Decode what ``extract`` would, and write nothing; keep the rows whose images are whole.
 
-        With ``videos=False`` only the typical frames of folders are determined, and every row
-        stays.
+        With ``videos=False`` only the typical frames of folders are determined, and every row stays.
         """
         whole: set[tuple[str, str, int]] = set()
 
@@ -410,7 +408,7 @@ class Recordings:
                     self.moved[path] = target
 
     def _require_same_settings(self, jobs: Sequence[_Job]) -> None:
-        """Record the settings of extracted frames; reject a folder with others."""
+        """Record the settings of the extracted frames; reject a folder with frames of other settings or videos."""
         if not jobs:
             return
         path = self.out / "images" / "settings.json"
@@ -432,7 +430,7 @@ class Recordings:
                     else f"{earlier} there, {settings} here"
                 )
                 raise PalpateError(
-                    f"Frames in {path.parent} must be of the same videos and the same settings",
+                    f"The frames in {path.parent} must have been made from the same videos with the same settings",
                     got,
                     "Choose another folder, or remove that one",
                 )

@@ -1,22 +1,38 @@
-"""Scores of pictures beside the TMMD family: image by image, on the contact alone, and on the features of standard encoders.
+"""Companions: the scores reported next to the TMMD family.
 
-Whose weights are not there is said by :mod:`palpate.encoders.standard` and :mod:`palpate.encoders.perceptual`: which file, and where to get it.
+=============  =========  ================================================================
+name           needs      score
+=============  =========  ================================================================
+``fid``        features   Frechet distance, of Inception's features if its weights are given
+``kid``        features   MMD^2 with the kernel (x.y / d + 1)^3, as ``fid``
+``prdc``       features   precision, recall, density and coverage of nearest neighbors
+``cmmd``       features   biased MMD^2, of CLIP's features if a CLIP is given
+``ssim``       pairs      structural similarity
+``psnr``       pairs      peak signal-to-noise ratio
+``ms-ssim``    pairs      structural similarity at several scales
+``contact``    pairs      residual, SSIM, PSNR, IoU and MS-SSIM of the contact alone; needs backgrounds
+``lpips``      pairs      LPIPS, and that of the contact where there are backgrounds; needs weights
+=============  =========  ================================================================
+
+"Pairs" are a generated and a real image of one id.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, quiet
-from palpate.evaluation.comparing import Asked, Outcome, feature_companions
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Score
 from palpate.metrics import (
+    Polynomial,
     background_digest,
+    compare_fid,
+    compare_tmmd,
     contact_images,
     mean_score,
     measure_contacts,
@@ -28,302 +44,406 @@ from palpate.metrics import (
     ssim_per_image,
 )
 from palpate.metrics.masks import LEAST
+from palpate.metrics.neighbors import prdc_rows
 from palpate.metrics.paired import mean_differences
 
-if TYPE_CHECKING:
-    from palpate.encoders.perceptual import Lpips
-    from palpate.encoders.standard import Kind
-
 Images = NDArray[np.uint8]
-#: Companions on pairs of pictures.
-ON_PAIRS = ("ssim", "psnr", "ms-ssim", "contact", "lpips")
-#: Those that look at the gel without contact where it is known.
-ON_GEL = frozenset({"contact", "lpips"})
-#: What is said where it is not.
-NO_GEL = (
-    "Contact scores must have the gel without contact of every touch",
-    "touches without",
-    "Pass a manifest with the column background as --reference, or leave contact out of --companions",
-)
-#: Pairs whose contacts are made into pictures at a time.
-PICTURES = 256
+Name = Literal["fid", "kid", "prdc", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
+#: With more rows the companions that form all pairs must be requested by name.
+MANY = 50_000
+#: Pairs whose contacts are cut out at a time.
+BATCH = 256
 
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """Weights of one's own for encoders that are not ours.
+    """Weights of encoders that palpate does not ship: Inception (TorchScript), a CLIP, LPIPS (backbone, heads)."""
 
-    Attributes:
-        inception: TorchScript file.
-        clip: folder, shipped name or hub id.
-        lpips: backbone and heads.
-    """
-
-    inception: Path | None = None
-    clip: str | None = None
+    inception: Path | str | None = None
+    clip: Path | str | None = None
     lpips: tuple[Path, Path] | None = None
 
-    def require(self, kinds: Sequence[str]) -> None:
-        """Refuses companions whose weights were not given, saying which and where to get them.
-
-        Raises:
-            PalpateError: for ``lpips`` without its files.
-        """
-        if "lpips" in kinds and self.lpips is None:
-            from palpate.encoders.perceptual import FIX
-
-            raise PalpateError("LPIPS must have weights: --lpips BACKBONE HEADS", "none", FIX)
+    def for_features(self, name: str) -> tuple[Literal["inception", "clip"], Path | str | None]:
+        """The standard encoder of a companion on features, and its weights."""
+        return ("clip", self.clip) if name == "cmmd" else ("inception", self.inception)
 
 
-def picture_companions(
-    kinds: Sequence[str],
-    pictures: Mapping[str, Images],
-    real: Images,
-    *,
-    ids: Sequence[str],
-    groups: Sequence[str] | None,
-    compared: Sequence[str],
-    background: Images | None = None,
-    weights: Weights | None = None,
-    split: str | None = None,
-    default: bool = False,
-    progress: Progress = quiet,
-) -> Outcome:
-    """SSIM, PSNR, MS-SSIM, contact scores and LPIPS of every subject, with paired differences of the generators.
+@dataclass
+class Outcome:
+    """Scores of all subjects, differences between generators, and what was skipped."""
+
+    scores: list[Score] = field(default_factory=list)
+    differences: list[Score] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
+
+    def add(self, other: Outcome) -> None:
+        """Append another outcome."""
+        self.scores += other.scores
+        self.differences += other.differences
+        self.notes += other.notes
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of generators and controls, and of the reference they are compared with.
+
+    Attributes:
+        generators: name -> features; differences are made between these.
+        controls: the same for controls.
+        reference: real features.
+        paired: whether the generators' rows stand for the same samples.
+        name: where the features come from: ``tactile``, ``embeddings``, ``Inception``, ``CLIP``.
+        common: seed and split digest.
+        family: options that ``cmmd`` shares with the TMMD family.
+    """
+
+    generators: Mapping[str, FeatureSet]
+    controls: Mapping[str, FeatureSet]
+    reference: FeatureSet
+    paired: bool
+    name: str
+    common: Mapping[str, Any]
+    family: Mapping[str, Any]
+
+    def batches(self) -> Iterator[dict[str, FeatureSet]]:
+        """Sets to compare in one call: paired generators together, every other set alone."""
+        if self.paired:
+            yield dict(self.generators)
+        else:
+            yield from ({name: s} for name, s in self.generators.items())
+        yield from ({name: s} for name, s in self.controls.items())
+
+    @property
+    def rows(self) -> int:
+        """Rows of the largest set."""
+        return max(len(s.ids) for s in (self.reference, *self.generators.values()))
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Images of generators and controls, each paired with the reference's by position.
+
+    Attributes:
+        images: subject -> (n, h, w, 3).
+        generators: names of the subjects between which differences are made.
+        reference: (n, h, w, 3).
+        background: no-contact images of the reference, or None.
+        common: ids, groups and split digest.
+        weights: for LPIPS.
+        progress: called with what is done.
+    """
+
+    images: Mapping[str, Images]
+    generators: Sequence[str]
+    reference: Images
+    background: Images | None
+    common: Mapping[str, Any]
+    weights: Weights
+    progress: Progress
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Companions to compute: on the encoder's features, on those of standard encoders, on pairs of images."""
+
+    default: bool
+    features: Sequence[str]
+    standard: Sequence[str]
+    pairs: Sequence[str]
+
+
+def choose(
+    requested: Sequence[str] | None, weights: Weights, *, images: bool, encoder: bool, gel: bool
+) -> Chosen:
+    """Sort the requested companions by what they need; None means all whose inputs are there.
 
     Args:
-        kinds: of :data:`ON_PAIRS`; others are passed over.
-        pictures: subject -> (n, h, w, 3), in the order of ``ids``.
-        real: the real touches, the same shape.
-        ids: n ids.
-        groups: n groups, or None.
-        compared: the subjects that are generators.
-        background: the gel without contact, the same shape; the contact scores need it.
-        weights: for LPIPS.
-        split: digest that scores keep.
-        default: nobody asked for these by name: one that refuses its input is left out with a remark.
-        progress: told which subject is scored.
+        requested: names, or None; an empty list is none.
+        weights: of standard encoders.
+        images: whether there are images (else embeddings).
+        encoder: whether there are features of an encoder.
+        gel: whether the reference has backgrounds.
 
     Raises:
-        PalpateError: as the metrics, unless ``default``.
+        PalpateError: for an unknown name, or a companion whose inputs are not there.
     """
-    common: dict[str, Any] = {"ids": ids, "groups": groups, "split": split}
-    out, todo = Outcome(), [k for k in ON_PAIRS if k in kinds]
-    for done, kind in enumerate(todo):
-        progress("comparing pictures", done, len(todo))
-        if kind == "contact":
-            make = lambda: _contact(pictures, real, background, compared, common)  # noqa: E731
-        elif kind == "lpips":
-            make = lambda: _lpips(
-                pictures, real, background, weights or Weights(), compared, common, progress
-            )
-        else:
-            make = lambda kind=kind: _pairwise(kind, pictures, real, compared, common)  # noqa: E731
-        out.attempt(kind, make, asked=not default)
-    progress("comparing pictures", len(todo), len(todo))
-    return out
+    has = {name: weights.for_features(name)[1] is not None for name in FEATURES if name != "prdc"}
+    if requested is None:
+        names = [n for n in FEATURES if has.get(n) or (encoder and n != "cmmd")]
+        able = {"contact": gel, "lpips": weights.lpips is not None}
+        names += [n for n in PAIRS if able.get(n, True)] if images else []
+    else:
+        names = list(dict.fromkeys(requested))
+    for name in names:
+        _require(name, weights, images=images, encoder=encoder, gel=gel, standard=has.get(name))
+    standard = [n for n in names if has.get(n)]
+    features = [n for n in names if n in FEATURES and n not in standard]
+    return Chosen(requested is None, features, standard, [n for n in names if n in PAIRS])
 
 
-def _pairwise(
-    kind: str,
-    pictures: Mapping[str, Images],
-    real: Images,
-    compared: Sequence[str],
-    common: Mapping[str, Any],
+def _require(
+    name: str, weights: Weights, *, images: bool, encoder: bool, gel: bool, standard: bool | None
+) -> None:
+    """Raise if a companion is unknown or lacks its inputs."""
+    argument: dict[str, Any] = {"argument": "companions"}
+    if name not in (*FEATURES, *PAIRS):
+        must = f"must be among {', '.join((*FEATURES, *PAIRS))}"
+        raise PalpateError(must, repr(name), "Check the spelling", **argument)
+    if name in PAIRS and not images:
+        must = "must need no images for embeddings"
+        raise PalpateError(must, name, "Score folders of images, or drop it", **argument)
+    if name == "contact" and not gel:
+        must = "must need no background images where the reference has none"
+        fix = "Pass a reference with a column background, or drop it"
+        raise PalpateError(must, name, fix, **argument)
+    if name == "lpips" and weights.lpips is None:
+        from palpate.encoders.perceptual import FIX
+
+        raise PalpateError("must hold the two files of LPIPS", "none", FIX, argument="lpips")
+    if name in FEATURES and not (encoder or standard):
+        fix = "Pass an encoder"
+        if name != "prdc":
+            from palpate.encoders.standard import CLIP_FIX, INCEPTION_FIX
+
+            kind = weights.for_features(name)[0]
+            weights_fix = {"inception": INCEPTION_FIX, "clip": CLIP_FIX}[kind]
+            fix = f"{fix}, or weights of {kind}. {weights_fix}"
+        must = "must need no features of images without an encoder"
+        raise PalpateError(must, name, fix, example={"encoder": "palpate/mini"}, **argument)
+
+
+def score_features(
+    names: Sequence[str], features: Features, *, default: bool, progress: Progress
 ) -> Outcome:
-    score: Callable[..., Score] = {"ssim": ssim, "psnr": psnr, "ms-ssim": ms_ssim}[kind]
-    each: Callable[..., Any] = {
-        "ssim": ssim_per_image,
-        "psnr": psnr_per_image,
-        "ms-ssim": ms_ssim_per_image,
-    }[kind]
-    found = {name: score(images, real, subject=name, **common) for name, images in pictures.items()}
-    if len(compared) < 2:
-        return Outcome(list(found.values()))
-    values = {name: each(pictures[name], real) for name in compared}
-    return Outcome(
-        list(found.values()),
-        mean_differences({name: found[name] for name in compared}, values, common["groups"]),
+    """Compute companions on given features.
+
+    Args:
+        names: among :data:`FEATURES`.
+        features: of generators, controls and reference.
+        default: whether nobody requested them: one that raises, or forms too many pairs, becomes a note.
+        progress: called with what is done.
+    """
+    outcome = Outcome()
+    for name in (n for n in FEATURES if n in names):
+        if default and name != "fid" and features.rows > MANY:
+            outcome.notes.append(Note("too-many-rows", {"name": name, "rows": MANY}))
+            continue
+        _attempt(outcome, name, lambda name=name: FEATURES[name](features, progress), default)
+    return outcome
+
+
+def score_pairs(names: Sequence[str], pairs: Pairs, *, default: bool) -> Outcome:
+    """Compute companions on pairs of images; arguments as :func:`score_features`."""
+    outcome, chosen = Outcome(), [n for n in PAIRS if n in names]
+    for done, name in enumerate(chosen):
+        pairs.progress("comparing images", done, len(chosen))
+        _attempt(outcome, name, lambda name=name: PAIRS[name](pairs), default)
+    pairs.progress("comparing images", len(chosen), len(chosen))
+    return outcome
+
+
+def _attempt(outcome: Outcome, name: str, run: Callable[[], Outcome], default: bool) -> None:
+    try:
+        outcome.add(run())
+    except PalpateError as error:
+        if not default:
+            raise
+        params = {"name": name, "must": error.must, "got": error.got}
+        outcome.notes.append(Note("companion-skipped", params))
+
+
+def _fid(features: Features, _: Progress) -> Outcome:
+    outcome = Outcome()
+    for sets in features.batches():
+        result = compare_fid(sets, features.reference, **features.common)
+        outcome.scores += _renamed(result.scores, "FID", features)
+        outcome.differences += _renamed(result.differences, "FID", features)
+    return outcome
+
+
+def _kid(features: Features, _: Progress) -> Outcome:
+    options: dict[str, Any] = {
+        "kernel": Polynomial(),
+        "preset": "paper",
+        "normalize": False,
+        "permutations": 0,
+        **features.common,
+    }
+    outcome = Outcome()
+    for sets in features.batches():
+        result = compare_tmmd(sets, features.reference, **options)
+        for scores, results in (
+            (outcome.scores, result.scores),
+            (outcome.differences, result.differences),
+        ):
+            for s in _renamed(results, "TMMD", features, "KID"):
+                settings = {k: v for k, v in s.settings.items() if k != "preset"}
+                notes = [Note("kid-interval"), *s.notes] if results is result.scores else s.notes
+                scores.append(replace(s, settings=settings, notes=notes))
+    return outcome
+
+
+def _prdc(features: Features, progress: Progress) -> Outcome:
+    outcome, split = Outcome(), features.common["split"]
+    for sets in features.batches():
+        first = next(iter(sets.values()))
+        results = {
+            name: prdc_rows(s.take(list(first.ids)), features.reference, subject=name, split=split, progress=progress)
+            for name, s in sets.items()
+        }  # fmt: skip
+        # Precision and density average over generated rows, recall and coverage over real ones.
+        groups = (first.groups, features.reference.groups) * 2
+        for k, metric_groups in enumerate(groups):
+            scores = {name: s[k] for name, (s, _) in results.items()}
+            if len(sets) > 1:
+                values = {name: rows[s[k].metric] for name, (s, rows) in results.items()}
+                grouped = scores[next(iter(scores))].settings["grouped"]
+                between = mean_differences(scores, values, metric_groups if grouped else None)
+                outcome.differences += _renamed(
+                    between, scores[next(iter(scores))].metric, features
+                )
+            for s in scores.values():
+                outcome.scores += _renamed([s], s.metric, features)
+    return outcome
+
+
+def _cmmd(features: Features, _: Progress) -> Outcome:
+    options: dict[str, Any] = {**features.family, **features.common, "preset": "cmmd"}
+    outcome = Outcome()
+    for sets in features.batches():
+        result = compare_tmmd(sets, features.reference, **options)
+        outcome.scores += _renamed(result.scores, "TMMD", features, "CMMD")
+        outcome.differences += _renamed(result.differences, "TMMD", features, "CMMD")
+    return outcome
+
+
+def _renamed(
+    scores: Sequence[Score], old: str, features: Features, new: str | None = None
+) -> list[Score]:
+    """Scores whose metric says where the features come from: ``FID (Inception)``."""
+    label = f"{new or old} ({features.name})"
+    return [replace(s, metric=label + s.metric.removeprefix(old)) for s in scores]
+
+
+def _ssim(pairs: Pairs) -> Outcome:
+    return _mean_of_pairs(pairs, ssim, ssim_per_image)
+
+
+def _psnr(pairs: Pairs) -> Outcome:
+    return _mean_of_pairs(pairs, psnr, psnr_per_image)
+
+
+def _ms_ssim(pairs: Pairs) -> Outcome:
+    return _mean_of_pairs(pairs, ms_ssim, ms_ssim_per_image)
+
+
+def _mean_of_pairs(
+    pairs: Pairs, metric: Callable[..., Score], per_image: Callable[..., NDArray[np.float64]]
+) -> Outcome:
+    scores = {
+        name: metric(images, pairs.reference, subject=name, **pairs.common)
+        for name, images in pairs.images.items()
+    }
+    return _with_differences(
+        pairs, scores, lambda name: per_image(pairs.images[name], pairs.reference)
     )
 
 
-def _contact(
-    pictures: Mapping[str, Images],
-    real: Images,
-    background: Images | None,
-    compared: Sequence[str],
-    common: Mapping[str, Any],
+def _with_differences(
+    pairs: Pairs, scores: Mapping[str, Score], values: Callable[[str], NDArray[np.float64]]
 ) -> Outcome:
-    if background is None:
-        raise PalpateError(*NO_GEL)
-    contacts = {name: measure_contacts(v, real, background) for name, v in pictures.items()}
-    scores = {name: c.scores(subject=name, **common) for name, c in contacts.items()}
-    out = Outcome([s for some in scores.values() for s in some])
-    if len(compared) > 1:
-        for k, metric in enumerate(s.metric for s in scores[compared[0]]):
-            out.differences += mean_differences(
-                {name: scores[name][k] for name in compared},
-                {name: contacts[name].values[metric] for name in compared},
-                common["groups"],
-            )
-    return out
+    """Scores of one metric, with differences from the generators' values per image."""
+    outcome = Outcome([*scores.values()])
+    if len(pairs.generators) > 1:
+        compared = {name: scores[name] for name in pairs.generators}
+        per_image = {name: values(name) for name in pairs.generators}
+        outcome.differences += mean_differences(compared, per_image, pairs.common["groups"])
+    return outcome
 
 
-def _lpips(
-    pictures: Mapping[str, Images],
-    real: Images,
-    background: Images | None,
-    weights: Weights,
-    compared: Sequence[str],
-    common: Mapping[str, Any],
-    progress: Progress,
-) -> Outcome:
-    """LPIPS of whole pictures and, where there are backgrounds, of the contact alone."""
-    weights.require(["lpips"])
-    assert weights.lpips is not None
+def _contact(pairs: Pairs) -> Outcome:
+    contacts = {
+        name: measure_contacts(images, pairs.reference, pairs.background)
+        for name, images in pairs.images.items()
+    }
+    scores = {name: c.scores(subject=name, **pairs.common) for name, c in contacts.items()}
+    outcome = Outcome()
+    for of_metric in zip(*scores.values(), strict=True):
+        metric, by_name = of_metric[0].metric, dict(zip(scores, of_metric, strict=True))
+        outcome.add(_with_differences(pairs, by_name, lambda n, m=metric: contacts[n].values[m]))
+    return outcome
+
+
+def _lpips(pairs: Pairs) -> Outcome:
+    """LPIPS of whole images and, where there are backgrounds, of the contact alone."""
     from palpate.encoders.perceptual import load_lpips, lpips_per_image
 
-    network = load_lpips(*weights.lpips)
+    assert pairs.weights.lpips is not None  # `choose` requires it
+    network, real = load_lpips(*pairs.weights.lpips), pairs.reference
     settings = {"network": "alex", "version": "0.1", "size": [int(v) for v in real.shape[1:3]]}
-    rest: dict[str, Any] = {
+    more: dict[str, Any] = {
+        **pairs.common,
         "level": 0.95,
-        "split": common["split"],
-        "encoder": network.digest,
         "higher_is_better": False,
+        "encoder": network.digest,
     }
-    out = Outcome()
 
-    def keep(
-        metric: str,
-        values: Mapping[str, NDArray[np.float64]],
-        settings: Mapping[str, Any],
-        **more: Any,
-    ) -> None:
-        found = {
-            name: mean_score(
-                metric,
-                v,
-                ids=common["ids"],
-                groups=common["groups"],
-                subject=name,
-                settings=dict(settings),
-                **rest,
-                **more,
-            )
+    def outcome_of(metric: str, values: Mapping[str, Any], **extra: Any) -> Outcome:
+        scores = {
+            name: mean_score(metric, v, subject=name, **more, **extra)
             for name, v in values.items()
         }
-        out.scores += found.values()
-        if len(compared) > 1:
-            out.differences += mean_differences(
-                {name: found[name] for name in compared}, values, common["groups"]
-            )
+        return _with_differences(pairs, scores, lambda name: values[name])
 
-    keep(
-        "LPIPS",
-        {
-            name: lpips_per_image(images, real, network, progress=progress)
-            for name, images in pictures.items()
-        },
-        settings,
-    )
-    if background is not None:
-        on_contact = lambda images: _contact_lpips(images, real, background, network, progress)  # noqa: E731
-        empty = on_contact(background)
-        bare = int(np.isnan(empty).sum())
-        keep(
-            "contact LPIPS",
-            {name: on_contact(images) for name, images in pictures.items()},
-            settings
-            | {
-                "markers": "skip",
-                "least": round(LEAST, 6),
-                "generated_background": "real",
-                "background": background_digest(background),
-            },
-            notes=[Note("no-contact", {"count": bare, "n": len(real)})] if bare else [],
-            details={"empty": float(np.nanmean(empty)) if bare < len(real) else None},
-        )
-    return out
+    whole = {
+        n: lpips_per_image(x, real, network, progress=pairs.progress)
+        for n, x in pairs.images.items()
+    }
+    outcome = outcome_of("LPIPS", whole, settings=settings)
+    if pairs.background is None:
+        return outcome
+    empty = _contact_lpips(pairs.background, pairs, network)
+    contact = {name: _contact_lpips(x, pairs, network) for name, x in pairs.images.items()}
+    settings |= {
+        "markers": "skip",
+        "least": round(LEAST, 6),
+        "generated_background": "real",
+        "background": background_digest(pairs.background),
+    }
+    bare = int(np.isnan(empty).sum())
+    gel = float(np.nanmean(empty)) if bare < len(real) else None
+    on_contact = outcome_of("contact LPIPS", contact, settings=settings, details={"empty": gel})
+    if bare:
+        note = Note("no-contact", {"count": bare, "n": len(real)})
+        on_contact.scores = [replace(s, notes=[*s.notes, note]) for s in on_contact.scores]
+    outcome.add(on_contact)
+    return outcome
 
 
-def _contact_lpips(
-    images: Images, real: Images, background: Images, network: Lpips, progress: Progress
-) -> NDArray[np.float64]:
-    """LPIPS (n,) of the differences to the empty gel inside the contact mask; NaN where a real touch is empty."""
+def _contact_lpips(images: Images, pairs: Pairs, network: Any) -> NDArray[np.float64]:
+    """LPIPS (n,) of the differences to the background inside the contact mask; NaN where a real image is empty."""
     from palpate.encoders.perceptual import lpips_per_image
 
-    out = np.empty(len(real))
-    for start in range(0, len(real), PICTURES):
-        at = slice(start, start + PICTURES)
-        pairs = contact_images(images[at], real[at], background[at])
-        out[at] = lpips_per_image(pairs.generated, pairs.reference, network, mask=pairs.mask)
-        progress("LPIPS of the contact", min(start + PICTURES, len(real)), len(real))
-    return out
+    assert pairs.background is not None
+    values = np.empty(len(images))
+    for start in range(0, len(images), BATCH):
+        at = slice(start, start + BATCH)
+        cut = contact_images(images[at], pairs.reference[at], pairs.background[at])
+        values[at] = lpips_per_image(cut.generated, cut.reference, network, mask=cut.mask)
+        pairs.progress("LPIPS of the contact", min(start + BATCH, len(images)), len(images))
+    return values
 
 
-def standard_companions(
-    kinds: Sequence[str],
-    sets: Mapping[str, FeatureSet],
-    pictures: Mapping[str, Images],
-    reference: FeatureSet,
-    real: Images,
-    weights: Weights,
-    asked: Asked,
-    *,
-    compared: Sequence[str],
-    paired: bool = True,
-    progress: Progress = quiet,
-) -> Outcome:
-    """FID and KID on Inception's features, CMMD on CLIP's, where weights are given.
-
-    Args:
-        kinds: those among ``fid``, ``kid`` and ``cmmd`` that are wanted.
-        sets: subject -> ids and groups of its pictures; its features do not matter.
-        pictures: subject -> (n, h, w, 3), in the order of its set.
-        reference: ids and groups of the real touches.
-        real: (m, h, w, 3), in the order of ``reference``.
-        weights: which encoders there are.
-        asked: seed, split, back end.
-        compared: the subjects that are generators.
-        paired: whether they stand for the same samples.
-        progress: told how many images are done.
-
-    Raises:
-        PalpateError: if weights are missing or of another kind, saying where to get them.
-    """
-    out = Outcome()
-    sources: list[tuple[Kind, Path | str | None, tuple[str, ...]]] = [
-        ("inception", weights.inception, ("fid", "kid")),
-        ("clip", weights.clip, ("cmmd",)),
-    ]
-    for kind, source, wanted in sources:
-        some = [k for k in wanted if k in kinds]
-        if source is None or not some:
-            continue
-        from palpate.encoders.standard import load_standard
-
-        encoder = load_standard(source, kind=kind)
-        embedded = lambda one, images: replace(
-            one, features=encoder.embed(images, progress=progress), encoder=encoder.digest
-        )
-        made = {name: embedded(sets[name], images) for name, images in pictures.items()}
-        found = embedded(reference, real)
-        what = {"inception": "Inception", "clip": "CLIP"}[kind]
-        for together in split_off(made, compared):
-            out.add(
-                feature_companions(
-                    some, together, found, asked, what=what, paired=paired, progress=progress
-                )
-            )
-    return out
-
-
-def split_off(
-    sets: Mapping[str, FeatureSet], compared: Sequence[str]
-) -> list[dict[str, FeatureSet]]:
-    """The generators together, every other subject alone: differences are made between generators only."""
-    together = {name: one for name, one in sets.items() if name in compared}
-    return [
-        *([together] if together else []),
-        *({name: one} for name, one in sets.items() if name not in compared),
-    ]
+FEATURES: Mapping[str, Callable[[Features, Progress], Outcome]] = {
+    "fid": _fid,
+    "kid": _kid,
+    "prdc": _prdc,
+    "cmmd": _cmmd,
+}
+PAIRS: Mapping[str, Callable[[Pairs], Outcome]] = {
+    "ssim": _ssim,
+    "psnr": _psnr,
+    "ms-ssim": _ms_ssim,
+    "contact": _contact,
+    "lpips": _lpips,
+}

@@ -1,18 +1,22 @@
-"""What leaking costs: material accuracy of simple classifiers under a given split and under leak-free ones of the same shares.
+"""What a leak is worth: material accuracy under a given split and under leak-free ones of the same shares.
 
-Under a leaking split a test picture nearly stands in train, so that remembering is enough; under a leak-free one the classifier must know
-the material. The difference, in points of accuracy, is what leaking is worth. Two classifiers that need no training worth the name measure it:
-1-NN (remembers everything) and a linear probe (remembers little), on raw pixels or on any embeddings.
+Under a leaking split a test image nearly repeats in train, so remembering is enough; under a leak-free one
+the classifier must know the material. The difference, in points of accuracy, is what leaking is worth. Two
+classifiers measure it: 1-NN (remembers everything) and a linear probe (remembers little), on raw pixels or
+on any embeddings.
 
-What is held equal: the samples (those of the given split's train and test parts, of materials that can be compared), the shares, the number of
-train samples (the larger train sides are thinned evenly, :func:`palpate.evaluation.impact_scores.thin`), the features and their reduction
-(fitted to each train side alone), the classifiers, and how the probe's penalty is chosen (on the train side, by leaving out groups).
+What is held equal: the samples (train and test of the given split, of materials that can be compared), the
+shares, the number of train samples (larger train parts are thinned evenly), the features and their
+reduction (fitted to each train part alone), the classifiers, and how the probe's penalty is chosen (on the
+train part, leaving out groups).
 
-What can be compared: a material needs two groups, one for each side, and must occur on both sides of the given and of every leak-free split.
+What can be compared: a material needs two groups, one for each part, and must occur in both parts of the
+given and of every leak-free split.
 
-Intervals: 95 %, by leaving out one group at a time. Leaving out video v removes its test samples from both sides at once (the clean side pools
-the test samples of all its splits), so that what is easy or hard about v cancels in the difference. Train sides stay as they are: the
-interval tells how the number would vary with other test videos, not with other train videos.
+Intervals: 95 %, leaving out one group at a time. Leaving out video v removes its test samples from both
+splits at once (the clean side pools the test samples of all its splits), so what is easy or hard about v
+cancels in the difference. Train parts stay as they are: the interval says how the number would vary with
+other test videos, not with other train videos.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Progress, Split, quiet
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet
 from palpate.data.manifest import Manifest
 from palpate.evaluation.impact_features import (
     Rows,
@@ -53,12 +57,12 @@ from palpate.report.results import Impact, ImpactRow
 #: Train samples of the linear probe; its penalty is chosen by twelve fits.
 PROBE_ROWS = 10_000
 CLASSIFIERS = ("1-NN", "linear probe")
-Features = Literal["pixels"] | Mapping[str, FeatureSet | NDArray[np.floating]]
+Features = Literal["pixels"] | Mapping[str, FeatureSet | NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class _Side:
-    """One split of the compared samples: row numbers of its train and test sides."""
+class _Parts:
+    """One split of the compared samples: numbers of its train and test samples."""
 
     digest: str
     train: Rows
@@ -67,19 +71,24 @@ class _Side:
 
 @dataclass(frozen=True)
 class _Design:
-    """What is compared: samples (ids and rows of the manifest), their materials and groups, and the given split followed by the clean ones.
+    """What is compared.
 
-    ``material`` and ``group`` are codes into ``classes`` and ``groups``, one a sample; ``sides`` number the samples from 0.
+    Attributes:
+        ids, rows: the samples, and their rows in the manifest.
+        material, group: codes into ``materials`` and ``groups``, one per sample.
+        splits: the given split, then the leak-free ones.
+        notes: what was excluded, and what qualifies the result.
+        settings: sizes and baselines.
     """
 
     ids: list[str]
     rows: Rows
     material: Codes
     group: Codes
-    classes: list[str]
+    materials: list[str]
     groups: list[str]
-    sides: list[_Side]
-    notes: list[str]
+    splits: list[_Parts]
+    notes: list[Note]
     settings: dict[str, Any]
 
 
@@ -97,65 +106,64 @@ def impact(
     cache: Path | None = None,
     progress: Progress = quiet,
 ) -> Impact:
-    """Measures what a split's leak is worth in material accuracy (see the head of this file).
+    """Measure what a split's leak is worth in material accuracy (see the head of this file).
 
     Args:
         manifest: the samples, with materials.
-        split: the split in question; its train and test parts are compared, a validation part is left aside.
-        group: column that the leak-free splits keep whole and that intervals are made over; ``auto`` chooses as
-            :func:`palpate.leakage.splits.choose_group` does.
-        features: ``pixels`` (touch, touch minus background, vision: whichever the manifest has), or name -> features, e.g. a encoder's embeddings,
-            as a :class:`FeatureSet` or an (n, d) array in the order of ``manifest.ids``.
+        split: the split in question; its train and test parts are compared.
+        group: column that the leak-free splits keep whole and that intervals are made over; ``auto``
+            takes what the data set has.
+        features: ``pixels`` (tactile, tactile minus background, vision: those that the manifest has), or
+            name -> features, as a :class:`FeatureSet` or an (n, d) array in the order of ``manifest.ids``.
         seeds: one leak-free split each; the clean accuracy is that of their test samples together.
         size: side of the pixels.
-        components: columns kept by the PCA; features with no more columns are not reduced.
+        components: columns kept by the PCA; features of no more columns are not reduced.
         balanced: average accuracies over materials instead of over samples.
-        name: of the split, for the sentence; default: its rule's name.
+        name: of the split, for the headline; default: its rule's name.
         cache: folder for decoded pixels; None keeps nothing.
-        progress: told what is being done.
+        progress: called with what is done.
 
     Returns:
-        A row for each kind of features and classifier. The headline is about the first one: 1-NN on touch pixels (on vision without touch), or on
-        the first of ``features``; the rule is fixed so that nobody picks the largest number.
+        A row for each kind of features and classifier. The headline is about the first one: 1-NN on
+        tactile pixels (vision without tactile), or on the first of ``features``; the rule is fixed so
+        that nobody picks the largest number.
 
     Raises:
-        PalpateError: without materials, with fewer than two that can be compared, with nulls in the group column, on ids that the
-            manifest lacks, and on features that are missing, of another length, or not finite.
+        PalpateError: without two materials that can be compared, with nulls in the group column, or on
+            features that are missing, of another length, or not finite.
         ProblemsError: naming every missing or unreadable image.
     """
-    _require(features, seeds, components)
+    _check(features, seeds, components)
     design = _design(manifest, split, group, seeds)
     notes = list(design.notes)
     if isinstance(features, str):
-        sources, more = pixel_sources(
-            manifest.take(design.ids), size=size, cache=cache, progress=progress
-        )
+        samples = manifest.take(design.ids)
+        sources, more = pixel_sources(samples, size=size, cache=cache, progress=progress)
         notes += more
     else:
         sources = array_sources(features, manifest, design.ids, design.rows)
     rows: list[ImpactRow] = []
     facts: dict[str, Any] = {}
-    total = len(sources) * len(design.sides)
+    total = len(sources) * len(design.splits)
     for at, source in enumerate(sources):
         tables: dict[str, list[Table]] = {c: [] for c in CLASSIFIERS}
-        fact: dict[str, Any] = {
+        fits: list[tuple[float, float]] = []
+        for k, parts in enumerate(design.splits):
+            progress("classifying materials", at * len(design.splits) + k, total, source.name)
+            by_classifier, penalty, explained = _classify(source, parts, design, components)
+            fits.append((penalty, round(explained, 4)))
+            for c in CLASSIFIERS:
+                tables[c].append(by_classifier[c])
+        facts[source.name] = {
             "digest": source.digest,
             "columns": source.width,
             "standardized": source.standardize,
-            "penalty": [],
-            "explained": [],
+            "penalty": [penalty for penalty, _ in fits],
+            "explained": [explained for _, explained in fits],
+            **{c: [round(accuracy(t, balanced), 5) for t in tables[c]] for c in CLASSIFIERS},
         }
-        for k, side in enumerate(design.sides):
-            progress("classifying materials", at * len(design.sides) + k, total, source.name)
-            found, penalty, explained = _classify(source, side, design, components)
-            for c in CLASSIFIERS:
-                tables[c].append(found[c])
-            fact["penalty"].append(penalty)
-            fact["explained"].append(round(explained, 4))
-        for c in CLASSIFIERS:
-            rows.append(_row(source.name, c, tables[c], len(design.classes), balanced))
-            fact[c] = [round(accuracy(t, balanced), 5) for t in tables[c]]
-        facts[source.name] = fact
+        chance = 1 / len(design.materials)
+        rows += [_row(source.name, c, tables[c], chance, balanced) for c in CLASSIFIERS]
     progress("classifying materials", total, total)
     settings = {
         **design.settings,
@@ -165,146 +173,89 @@ def impact(
         "features": facts,
         "interval": "leave-one-group-out jackknife over test groups, paired, t, 95 %",
     }
-    headline = _headline(
-        rows[0], name or str(split.rule.get("name") or "the given split"), design.settings, balanced
-    )
-    return Impact(
-        rows,
-        headline,
-        design.settings["group"],
-        [s.digest for s in design.sides[1:]],
-        settings,
-        notes,
-    )
+    name = name or str(split.rule.get("name") or "the given split")
+    headline = _headline(rows[0], name, settings)
+    digests = [parts.digest for parts in design.splits[1:]]
+    return Impact(rows, headline, design.settings["group"], digests, settings, notes)
 
 
-def _require(features: Features, seeds: Sequence[int], components: int) -> None:
+def _check(features: Features, seeds: Sequence[int], components: int) -> None:
     if isinstance(features, str) and features != "pixels":
-        raise PalpateError(
-            "Features must be 'pixels' or a mapping name -> features",
-            repr(features),
-            "Pass features={name: embeddings}",
-        )
+        fix = "Pass name -> embeddings"
+        raise PalpateError("must be 'pixels' or a mapping", repr(features), fix, argument="features")
     if not seeds or len(set(seeds)) < len(seeds):
-        raise PalpateError(
-            "There must be at least one seed, and each once",
-            f"{list(seeds)}",
-            "Pass e.g. seeds=(0, 1, 2)",
-        )
+        must, example = "must hold at least one seed, each once", {"seeds": (0, 1, 2)}
+        raise PalpateError(must, f"{list(seeds)}", "", argument="seeds", example=example)
     if components < 1:
-        raise PalpateError(
-            "The PCA must keep at least one component", f"{components}", "Pass e.g. components=128"
-        )
+        must, example = "must be at least one", {"components": 128}
+        raise PalpateError(must, f"{components}", "", argument="components", example=example)
 
 
 def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) -> _Design:
-    """Chooses the samples and materials that can be compared, and makes the leak-free splits of them."""
+    """Choose the samples and materials that can be compared, and make the leak-free splits of them."""
     manifest.take(split.ids("train", "test"))  # names ids that are missing
     for part in ("train", "test"):
         if not split.ids(part):
             raise PalpateError(f"The {part} part must hold samples", "none", "Check the split")
-    part_of = [split.parts.get(i) for i in manifest.ids]
+    ids, part_of = manifest.ids, [split.parts.get(i) for i in manifest.ids]
     labels = manifest.column("material")
     inside = [k for k, part in enumerate(part_of) if part in ("train", "test")]
-    names = manifest.ids
-    rows = sorted(
-        (k for k in inside if labels[k]), key=lambda k: names[k]
-    )  # so that the order of the manifest does not matter
+    rows = sorted((k for k in inside if labels[k]), key=lambda k: ids[k])  # in any manifest's order
     if not rows:
-        raise PalpateError(
-            "The impact of leaking needs materials",
-            "none in train and test",
-            "Fill the manifest's column material",
-        )
-    notes = (
-        [f"{n} samples without a material are left out."] if (n := len(inside) - len(rows)) else []
-    )
-    if "val" in split.parts.values():
-        notes.append(
-            "The validation part of the given split is left aside; the leak-free splits are made of its train and test samples."
-        )
-    pool = manifest.take([names[k] for k in rows])
+        must, fix = "The impact of a leak needs materials", "Fill the manifest's column material"
+        raise PalpateError(must, "none in train and test", fix)
+    pool = manifest.take([ids[k] for k in rows])
     column, reason = choose_group(pool) if group == "auto" else (group, "")
-    notes += [reason] if reason else []
+    notes = [Note("text", {"text": reason})] if reason else []
+    if len(rows) < len(inside):
+        notes.append(Note("no-material", {"count": len(inside) - len(rows)}))
+    if "val" in split.parts.values():
+        notes.append(Note("val-excluded"))
     owners = _owners(pool, column)
-    if column == "contact" and pool.table["video"].drop_nulls().n_unique() not in (
-        0,
-        pool.table["contact"].n_unique(),
-    ):
-        notes.append(
-            "Whole touches are kept together, but train and test share videos: what a shared video is worth is not in this number, and touches "
-            "of one video are less independent than the intervals take them to be."
-        )
-    here = [labels[k] for k in rows]
-    given = [str(part_of[k]) for k in rows]
-    left_out = _incomparable(here, owners, [given], column)
-    rows, here, owners, given = _keep(rows, here, owners, given, left_out=left_out)
+    videos = pool.table["video"].drop_nulls().n_unique()
+    if column == "contact" and videos not in (0, pool.table["contact"].n_unique()):
+        notes.append(Note("shared-videos"))
+    here, given = [labels[k] for k in rows], [str(part_of[k]) for k in rows]
+    excluded = _incomparable(here, owners, [given], column)
+    rows, here, owners, given = _without(excluded, here, rows, here, owners, given)
     share = given.count("train") / len(given)
-    kept = manifest.take([names[k] for k in rows])
+    kept = manifest.take([ids[k] for k in rows])
     plans = [leak_free_split(kept, train=share, group=column, seed=s) for s in seeds]
     parts = [given, *([p.split.parts[i] for i in kept.ids] for p in plans)]
     late = _incomparable(here, owners, parts, column)
-    rows, here, owners, *parts = _keep(rows, here, owners, *parts, left_out=late)
-    left_out |= late
-    if left_out:
-        notes.append(
-            f"Left out ({len(left_out)} of {len(left_out) + len(set(here))} materials): "
-            + "; ".join(f"{m} ({why})" for m, why in sorted(left_out.items()))
-            + "."
-        )
+    rows, here, owners, *parts = _without(late, here, rows, here, owners, *parts)
+    excluded |= late
     digests = [split.digest, *(p.split.digest for p in plans)]
-    sides = [
-        _Side(d, *(np.flatnonzero(np.array(p) == side) for side in ("train", "test")))
+    splits = [
+        _Parts(d, *(np.flatnonzero(np.array(p) == part) for part in ("train", "test")))
         for d, p in zip(digests, parts, strict=True)
     ]
-    if (same := len(plans) - len(set(digests[1:]))) > 0:
-        notes.append(
-            f"{same} of {len(plans)} seeds gave a leak-free split that another gave: there are too few {column} groups for more."
-        )
-    classes, material = code(here)
+    materials, material = code(here)
     groups, owner = code(owners)
-    settings = _facts(split, column, list(seeds), share, classes, left_out, sides, owner, material)
+    settings = {
+        "given_split": split.digest,
+        "group": column,
+        "seeds": list(seeds),
+        "train_share": round(share, 5),
+        "materials": materials,
+        "left_out": excluded,
+        **_sizes(splits, owner, material),
+    }
     settings["deviation"] = [round(p.deviation, 5) for p in plans]
-    if settings["shared_groups"] == 0:
-        notes.append(
-            f"The given split shares no {column} between train and test: a difference is due to which of them are in test."
-        )
-    if (guess := settings["majority"][0]) > 1.5 / len(classes):
-        scores = f"{guess:.1%} under the given split".replace("%", " %")
-        notes.append(
-            f"Materials are not equally common. Always guessing the commonest material of train scores {scores}, not chance."
-        )
-    if (few := min(settings["test_groups"])) < 5:
-        notes.append(
-            f"A test part holds {few} {column} group(s) only: the intervals are wide, and too trusting if anything."
-        )
-    return _Design(
-        [names[k] for k in rows],
-        np.array(rows),
-        material,
-        owner,
-        classes,
-        groups,
-        sides,
-        notes,
-        settings,
-    )
+    notes += _qualifications(settings, excluded, len(plans) - len(set(digests[1:])))
+    ids = [ids[k] for k in rows]
+    return _Design(ids, np.array(rows), material, owner, materials, groups, splits, notes, settings)
 
 
 def _owners(pool: Manifest, column: str) -> list[str]:
     """The group of each sample."""
     if column not in GROUPS:
-        raise PalpateError(
-            f"The group must be auto or one of {', '.join(GROUPS)}",
-            repr(column),
-            "Pass e.g. --group video",
-        )
+        must, example = f"must be auto or one of {', '.join(GROUPS)}", {"group": "video"}
+        raise PalpateError(must, repr(column), "", argument="group", example=example)
     if nulls := pool.table[column].null_count():
-        raise PalpateError(
-            f"Every sample that is compared needs a {column}",
-            f"{nulls} without",
-            "Fill the column, or choose another group: --group touch",
-        )
+        must = f"Every sample that is compared needs a {column}"
+        fix, example = "Fill the column, or choose another group", {"group": "contact"}
+        raise PalpateError(must, f"{nulls} without", fix, example=example)
     return pool.column(column)
 
 
@@ -314,144 +265,122 @@ def _incomparable(
     """Materials that cannot be compared, with the reason.
 
     Raises:
-        PalpateError: if fewer than two are left.
+        PalpateError: if fewer than two remain.
     """
     groups = Counter(label for label, _ in set(zip(labels, owners, strict=True)))
-    seen = [set(zip(labels, parts, strict=True)) for parts in splits]
-    out: dict[str, str] = {}
-    for label, count in groups.items():
-        if count < 2:
-            out[label] = f"one {column}"
-            continue
-        for at, pairs in enumerate(seen):
+    reasons = {label: f"one {column}" for label, count in groups.items() if count < 2}
+    for at, parts in enumerate(splits):
+        present = set(zip(labels, parts, strict=True))
+        name = "the given" if at == 0 else "a leak-free"
+        for label in groups:
             for part in ("train", "test"):
-                if label not in out and (label, part) not in pairs:
-                    out[label] = (
-                        f"not in {part} of {'the given' if at == 0 else 'a leak-free'} split"
-                    )
-    if len(groups) - len(out) < 2:
-        reasons = Counter(out.values())
-        raise PalpateError(
-            f"What leaking costs can be told for materials in two or more {column}s that are on both sides of each split; it takes two materials",
-            f"{len(groups) - len(out)} of {len(groups)} ({', '.join(f'{n} {why}' for why, n in reasons.most_common())})"
-            if out
-            else f"{len(groups)} material",
-            f"Choose a finer group than {column}, e.g. --group touch (train and test then share videos), or add recordings",
-        )
-    return out
+                if (label, part) not in present:
+                    reasons.setdefault(label, f"not in {part} of {name} split")
+    if len(groups) - len(reasons) < 2:
+        counts = ", ".join(f"{n} {why}" for why, n in Counter(reasons.values()).most_common())
+        got = f"{len(groups) - len(reasons)} of {len(groups)} ({counts})"
+        must = f"There must be two materials in two or more {column}s and in both parts of each split"
+        fix = "Add recordings, or choose a finer group (of contacts train and test share videos)"
+        got = got if reasons else f"{len(groups)} material"
+        raise PalpateError(must, got, fix, example={"group": "contact"})
+    return {label: reasons[label] for label in groups if label in reasons}
 
 
-def _keep(
-    rows: Sequence[int], labels: Sequence[str], *columns: Sequence[Any], left_out: Mapping[str, str]
-) -> tuple[list[int], list[str], *tuple[list[Any], ...]]:
-    """Rows, labels and further columns without the samples of some materials."""
-    keep = [k for k, label in enumerate(labels) if label not in left_out]
-    pick = lambda column: [column[k] for k in keep]  # noqa: E731
-    return (pick(rows), pick(labels), *(pick(c) for c in columns))
+def _without(
+    excluded: Mapping[str, str], labels: Sequence[str], *columns: Sequence[Any]
+) -> list[Any]:
+    """Columns without the samples of some materials."""
+    keep = [k for k, label in enumerate(labels) if label not in excluded]
+    return [[column[k] for k in keep] for column in columns]
 
 
-def _facts(
-    split: Split,
-    column: str,
-    seeds: list[int],
-    share: float,
-    classes: list[str],
-    left_out: Mapping[str, str],
-    sides: list[_Side],
-    owner: Codes,
-    material: Codes,
-) -> dict[str, Any]:
-    """Sizes and baselines of all sides as JSON; lists are in the order given, then clean by seed."""
-    size = min(len(s.train) for s in sides)
-    common = [int(np.bincount(material[s.train]).argmax()) for s in sides]
+def _sizes(splits: Sequence[_Parts], owner: Codes, material: Codes) -> dict[str, Any]:
+    """Sizes and baselines of all splits: lists are in the order given, then clean by seed."""
+    size = min(len(s.train) for s in splits)
+    common = [int(np.bincount(material[s.train]).argmax()) for s in splits]
+    guess = [float((material[s.test] == c).mean()) for s, c in zip(splits, common, strict=True)]
     return {
-        "given_split": split.digest,
-        "group": column,
-        "seeds": seeds,
-        "train_share": round(share, 5),
-        "materials": classes,
-        "left_out": dict(left_out),
         "train_samples": size,
         "probe_train_samples": min(size, PROBE_ROWS),
-        "test_samples": [len(s.test) for s in sides],
-        "test_groups": [len(np.unique(owner[s.test])) for s in sides],
-        "shared_groups": len(np.intersect1d(owner[sides[0].train], owner[sides[0].test])),
-        "majority": [
-            round(float((material[s.test] == c).mean()), 5)
-            for s, c in zip(sides, common, strict=True)
-        ],
+        "test_samples": [len(s.test) for s in splits],
+        "test_groups": [len(np.unique(owner[s.test])) for s in splits],
+        "shared_groups": len(np.intersect1d(owner[splits[0].train], owner[splits[0].test])),
+        "majority": [round(g, 5) for g in guess],
     }
+
+
+def _qualifications(
+    settings: Mapping[str, Any], excluded: Mapping[str, str], repeated: int
+) -> list[Note]:
+    """Notes on materials, splits and groups that qualify the result."""
+    notes: list[Note] = []
+    column, materials = settings["group"], settings["materials"]
+    if excluded:
+        total = len(excluded) + len(materials)
+        notes.append(Note("materials-excluded", {"materials": dict(excluded), "total": total}))
+    if repeated > 0:
+        params = {"repeated": repeated, "n": len(settings["seeds"]), "group": column}
+        notes.append(Note("repeated-splits", params))
+    if settings["shared_groups"] == 0:
+        notes.append(Note("no-shared-group", {"group": column}))
+    if (share := settings["majority"][0]) > 1.5 / len(materials):
+        notes.append(Note("uneven-materials", {"share": share}))
+    if (few := min(settings["test_groups"])) < 5:
+        notes.append(Note("few-test-groups", {"count": few, "group": column}))
+    return notes
 
 
 def _classify(
-    source: Source, side: _Side, design: _Design, components: int
+    source: Source, parts: _Parts, design: _Design, components: int
 ) -> tuple[dict[str, Table], float, float]:
-    """Both classifiers on one split: a table each, the probe's penalty, and the share of variance that the PCA kept."""
-    shape = (len(design.groups), len(design.classes))
+    """Both classifiers on one split: a table each, the probe's penalty, the share of variance kept."""
+    shape = (len(design.groups), len(design.materials))
     size, seed = int(design.settings["train_samples"]), int(design.settings["seeds"][0])
-    train = thin(side.train, design.group[side.train], design.material[side.train], size, seed)
+    group, material = design.group, design.material
+    train = thin(parts.train, group[parts.train], material[parts.train], size, seed)
     reduction = fit_reduction(source, train, components, seed)
-    x, z = reduction.apply(source, train), reduction.apply(source, side.test)
-    y, truth, owner = design.material[train], design.material[side.test], design.group[side.test]
-    few = thin(np.arange(len(train)), design.group[train], y, min(size, PROBE_ROWS), seed)
-    pick = lambda names, codes: [names[k] for k in codes.tolist()]  # noqa: E731
+    x, z = reduction.apply(source, train), reduction.apply(source, parts.test)
+    y, truth, owner = material[train], material[parts.test], group[parts.test]
+    few = thin(np.arange(len(train)), group[train], y, min(size, PROBE_ROWS), seed)
     rows = train[few]
-    known = FeatureSet(
-        pick(design.ids, rows),
-        x[few],
-        pick(design.classes, y[few]),
-        pick(design.groups, design.group[rows]),
-    )
+    ids = [design.ids[k] for k in rows]
+    labels = [design.materials[k] for k in y[few]]
+    known = FeatureSet(ids, x[few], labels, [design.groups[k] for k in group[rows]])
     probe = fit_probe(known, seed=seed)
-    number = {name: k for k, name in enumerate(design.classes)}
-    guess = np.array([number[c] for c in probe.predict(z)])
-    hits = {
-        "1-NN": nearest_hits(z, x, truth, y),
-        "linear probe": (guess == truth).astype(np.float64),
-    }
-    return (
-        {c: tabulate(hits[c], owner, truth, shape) for c in CLASSIFIERS},
-        probe.l2,
-        reduction.explained,
-    )
+    right = np.array(probe.predict(z)) == np.array(design.materials)[truth]
+    hits = {"1-NN": nearest_hits(z, x, truth, y), "linear probe": right.astype(np.float64)}
+    tables = {c: tabulate(hits[c], owner, truth, shape) for c in CLASSIFIERS}
+    return tables, probe.l2, reduction.explained
 
 
 def _row(
-    features: str, classifier: str, tables: Sequence[Table], classes: int, balanced: bool
+    features: str, classifier: str, tables: Sequence[Table], chance: float, balanced: bool
 ) -> ImpactRow:
     """One row from the tables of the given split and of the clean ones."""
     given, clean = tables[0], tables[1]
     for more in tables[2:]:
         clean = clean + more
-    a, a_range, _ = jackknife(given, balanced=balanced)
-    b, b_range, _ = jackknife(clean, balanced=balanced)
-    cost, range_, _ = jackknife(given, clean, balanced=balanced)
-    return ImpactRow(features, classifier, a, b, cost, a_range, b_range, range_, 1 / classes)
+    a, a_interval, _ = jackknife(given, balanced=balanced)
+    b, b_interval, _ = jackknife(clean, balanced=balanced)
+    cost, interval, _ = jackknife(given, clean, balanced=balanced)
+    return ImpactRow(features, classifier, a, b, cost, a_interval, b_interval, interval, chance)
 
 
-def _headline(row: ImpactRow, name: str, settings: Mapping[str, Any], balanced: bool) -> str:
+def _headline(row: ImpactRow, name: str, settings: Mapping[str, Any]) -> str:
     """The one sentence for a paper."""
-    clean = (
-        "the leak-free split"
-        if len(settings["seeds"]) == 1
-        else f"{len(settings['seeds'])} leak-free splits"
-    )
-    span = (
-        f" [{100 * row.cost_interval[0]:.1f}, {100 * row.cost_interval[1]:.1f}]"
-        if row.cost_interval
-        else ""
-    )
-    kind = " (balanced)" if balanced else ""
+    count, group = len(settings["seeds"]), settings["group"]
+    clean = "the leak-free split" if count == 1 else f"{count} leak-free splits"
+    interval, doubt = "", ""
+    if row.cost_interval:
+        low, high = row.cost_interval
+        interval = f" [{100 * low:.1f}, {100 * high:.1f}]"
+        doubt = ", which may be nothing" if low <= 0 <= high else ""
+    kind = " (balanced)" if settings["balanced"] else ""
     start = (
-        f"{row.classifier} on {row.features}{kind}: {100 * row.given:.1f} % under {name}, {100 * row.clean:.1f} % under {clean} by "
-        f"{settings['group']} (chance {100 * row.chance:.1f} %)"
+        f"{row.classifier} on {row.features}{kind}: {100 * row.given:.1f} % under {name}, "
+        f"{100 * row.clean:.1f} % under {clean} by {group} (chance {100 * row.chance:.1f} %)"
     )
-    points = f"{100 * row.cost:.1f} points{span}"
+    points = f"{100 * row.cost:.1f} points{interval}"
     if not settings["shared_groups"]:
-        return f"{start}: {name} shares no {settings['group']}, and the difference is {points}."
-    doubt = (
-        ", which may be nothing"
-        if row.cost_interval and row.cost_interval[0] <= 0 <= row.cost_interval[1]
-        else ""
-    )
+        return f"{start}: {name} shares no {group}, and the difference is {points}."
     return f"{start}: leaking is worth {points}{doubt}."

@@ -1,12 +1,14 @@
-"""Classifiers and intervals of the impact of leaking: 1-NN with ties in expectation, even thinning, the paired jackknife.
+"""Classifiers and intervals of the impact of a leak: 1-NN with ties, even thinning, the paired jackknife.
 
-1-NN: a test row x gets the label of the train row that minimizes ``||x - z||^2 = ||x||^2 + ||z||^2 - 2 x.z``. Equal pictures are common (an
-untouched gel, a frame stored twice), so where several train rows are equally near, the hit is the share of them with the right label: what
-a random choice among them would score on average. Equally near means within the rounding of float32, ``TIE (||x||^2 + max ||z||^2)``.
+1-NN: a test row x gets the label of the train row z with the smallest ||x - z||^2. Equal images are common
+(an untouched gel, a frame stored twice), so where several train rows are equally near, the hit is the share
+of them with the right label: what a random choice among them would score on average. Equally near means
+within the rounding of float32, ``TIE (||x||^2 + max ||z||^2)``.
 
-Tables: hits and samples of a test side by group g and class c, (G, C). The accuracy is ``sum hits / sum samples``, or the mean over classes of
-that ratio. Jackknife: theta_g is the statistic without row g, ``SE^2 = (G-1)/G sum_g (theta_g - mean theta)^2``, interval theta +- t(G-1) SE.
-For a difference of two sides both lose row g at once, so what a group does to both cancels.
+Tables: hits and samples of a test part by group g and class c, (G, C). The accuracy is sum hits / sum
+samples, or the mean over classes of that ratio. Jackknife: theta_g is the statistic without row g,
+SE^2 = (G-1)/G sum_g (theta_g - mean theta)^2, interval theta +- t(G-1) SE. For a difference both tables
+lose row g at once, so what a group does to both cancels.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 from palpate.core import rng_for
 from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
 
-#: Entries of the block of distances in memory (float32: 64 MB); a block is some test rows by all train rows.
+#: Entries of a block of distances (float32: 64 MB), of some test rows by all train rows.
 CELLS = 1 << 24
 #: Rounding of a float32 distance, relative to the squared lengths.
 TIE = 2e-6
@@ -31,7 +33,7 @@ Codes = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Table:
-    """Hits and samples of a test side, by group and class: two (G, C) arrays of the same groups and classes in the same order."""
+    """Hits and samples of a test part by group and class: two (G, C) arrays."""
 
     hits: Floats
     samples: Floats
@@ -41,7 +43,7 @@ class Table:
 
 
 def tabulate(hits: Floats, groups: Codes, classes: Codes, shape: tuple[int, int]) -> Table:
-    """Sums the hits of test rows (each in [0, 1]) by group and class numbers."""
+    """Sum the hits of test rows (each in [0, 1]) by group and class numbers."""
     cell = groups * shape[1] + classes
     sums = [
         np.bincount(cell, weights=w, minlength=shape[0] * shape[1]).reshape(shape)
@@ -62,7 +64,7 @@ def nearest_hits(
         base_class: the same, (n,).
 
     Returns:
-        (m,), in [0, 1]. Memory: ``CELLS`` distances and as many flags at a time, whatever m and n.
+        (m,), in [0, 1].
     """
     classes = int(max(query_class.max(), base_class.max())) + 1
     one_hot = np.zeros((len(base), classes), np.float32)
@@ -87,8 +89,9 @@ def nearest_hits(
 def thin(rows: Codes, groups: Codes, classes: Codes, count: int, seed: int) -> Codes:
     """Evenly chosen rows: every class keeps its share (at least one row), and within it every group.
 
-    Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class the rows, sorted by group and at random within it,
-    are taken at equal steps from a random start, so a group keeps its share to within one row.
+    Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class the
+    rows, sorted by group and at random within it, are taken at equal steps from a random start, so a
+    group keeps its share to within one row.
 
     Args:
         rows: row numbers to choose from.
@@ -142,26 +145,27 @@ def jackknife(
     """An accuracy, or the difference of two, with its interval over groups.
 
     Args:
-        plus: table of one test side.
+        plus: table of one test part.
         minus: table of the other, over the same groups and classes; None for the accuracy of ``plus`` alone.
         balanced: mean over classes of their accuracies, over the classes that are left.
 
     Returns:
-        (value, interval, groups). The interval is at 95 %, cut to the possible range; None with fewer than two groups, where a side has samples
-        of one group only, or where no group changes anything (no variation is no evidence of certainty).
+        (value, interval, groups). The interval is at 95 %, cut to the possible range; None with fewer
+        than two groups, where a table has samples of one group only, or where no group changes
+        anything (no variation is no evidence of certainty).
     """
-    sides = [plus] if minus is None else [plus, minus]
-    used = np.any([side.samples.sum(axis=1) > 0 for side in sides], axis=0)
+    tables = [plus] if minus is None else [plus, minus]
+    used = np.any([table.samples.sum(axis=1) > 0 for table in tables], axis=0)
     signs = (1.0, -1.0)
-    value = sum(sign * accuracy(side, balanced) for sign, side in zip(signs, sides, strict=False))
+    value = sum(sign * accuracy(table, balanced) for sign, table in zip(signs, tables, strict=False))
     without = sum(
         sign
         * _accuracy(
-            side.hits.sum(axis=0) - side.hits[used],
-            side.samples.sum(axis=0) - side.samples[used],
+            table.hits.sum(axis=0) - table.hits[used],
+            table.samples.sum(axis=0) - table.samples[used],
             balanced,
         )
-        for sign, side in zip(signs, sides, strict=False)
+        for sign, table in zip(signs, tables, strict=False)
     )
     count = int(used.sum())
     error = float(jackknife_errors(np.asarray(without)[:, None])[0])

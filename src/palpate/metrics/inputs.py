@@ -1,9 +1,9 @@
 """What the metrics take, and what they reject: every input is checked once, at the public function.
 
-Features are finite floating-point rows ``(n, d)``: a NumPy array (also one on disk), a torch tensor on
-any device, a list of rows, or a :class:`palpate.core.FeatureSet`. Integers are rejected, since the
-distance of wrapped integers has no meaning; half precision is widened, since ``exp`` of a small exponent
-rounds to 1 there (a perfect score for anything).
+Features are finite floating-point rows ``(n, d)``: a NumPy array (also one on disk), a torch tensor
+on any device, a list of rows, or a :class:`palpate.core.FeatureSet`. Integers are rejected, since
+the distance of wrapped integers has no meaning; half precision is widened, since ``exp`` of a small
+exponent rounds to 1 there (a perfect score for anything).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def invalid(name: str, must: str, got: str, fix: str, **example: Any) -> Palpate
 def feature_set(
     features: Any,
     *,
-    argument: str,
+    argument: str = "generated",
     ids: Any = None,
     labels: Any = None,
     groups: Any = None,
@@ -50,8 +50,8 @@ def feature_set(
     """Features as a :class:`FeatureSet`: the door of every metric on features.
 
     Args:
-        features: (n, d) array, tensor on any device, list of rows, or a FeatureSet, whose columns the
-            other arguments replace.
+        features: (n, d) array, tensor on any device, list of rows, or a FeatureSet, whose columns
+            the other arguments replace.
         argument: name of the caller's argument, for errors and for default ids.
         ids: n sample ids. Without, the row numbers behind the name of the argument: rows of two
             arrays without ids are different samples.
@@ -72,10 +72,7 @@ def feature_set(
     if x.ndim != 2:
         raise _not_rows(argument, x)
     n = len(x)
-    names = column("ids", ids, n)
-    if names is None:
-        width = len(str(n))
-        names = [f"{argument} {k:0{width}d}" for k in range(n)]
+    names = column("ids", ids, n) or [f"{argument} {k:0{len(str(n))}d}" for k in range(n)]
     return FeatureSet(names, x, column("labels", labels, n), column("groups", groups, n), encoder)
 
 
@@ -110,7 +107,7 @@ def is_foreign(x: Any) -> bool:
 
 
 def release(x: Any) -> None:
-    """Drop the pages of an array on disk that were read; they would count as this process's memory."""
+    """Drop the pages of an array on disk that were read; they would count as memory."""
     pages = getattr(x, "_mmap", None)
     if isinstance(x, np.memmap) and hasattr(pages, "madvise") and x.mode != "c":
         pages.madvise(mmap.MADV_DONTNEED)  # in mode "c" the caller's changes would be lost
@@ -141,14 +138,15 @@ def as_array(name: str, x: Any) -> Any:
 def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least: int = 1) -> Any:
     """``x`` as a float32 or float64 array (n, d), checked slab by slab.
 
-    An array on disk of float32 or float64 rows is read but not kept; one that has to be normalized or
-    widened is copied into memory.
+    An array on disk of float32 or float64 rows is read but not kept; one that has to be normalized
+    or widened is copied into memory.
 
     Args:
         name: argument or clause for errors, see :func:`invalid`.
-        x: an array (n, d), or one of a library of the array-API standard, which stays on its device.
-        normalize: ``"check"`` rejects rows whose L2 norm is not 1 within 1e-3; ``True`` divides by the
-            norm; ``False`` takes rows as they are.
+        x: an array (n, d), or one of a library of the array-API standard, which stays on its
+            device.
+        normalize: ``"check"`` rejects rows whose L2 norm is not 1 within 1e-3; ``True`` divides by
+            the norm; ``False`` takes rows as they are.
         least: the fewest rows that the estimator can use.
 
     Raises:
@@ -184,7 +182,7 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         return (x / scale).astype(x.dtype) if isinstance(x, np.ndarray) else x / scale
     if (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
         got = f"norm {norms[np.flatnonzero(bad)[0]]:.4g} in {rows_text(bad)}"
-        fix = "Divide by the norm, or keep the norms with normalize=False"
+        fix = "Divide by the norm, or choose to keep the norms"
         raise invalid(name, "must be L2-normalized", got, fix, normalize=True)
     return x
 

@@ -4,12 +4,16 @@ For sets X (m rows) and Y (n rows), with mean kernels XX, YY inside the sets and
 
 ``dist^2(X, Y) = scale * (XX + YY - 2 XY)``  (paper, Eq. 2, times scale)
 
-* ``unbiased``: XX and YY over pairs i != j, divided by m(m-1) and n(n-1) -- Eq. 2 as printed. Can be negative.
-* ``biased``: XX and YY over all pairs, divided by m^2 and n^2; what CMMD's published code computes. Larger by ``scale * [(1 - XX)/m + (1 - YY)/n]``.
-* ``grouped``: pairs of the same group (video) are left out of all three sums, divided by the pairs that are left. Frames of a
-  video are not independent; with 40 videos of 15 frames the unbiased form is +0.1 too large under the null, this one is not.
+* ``unbiased``: XX and YY over pairs i != j, divided by m(m-1) and n(n-1): Eq. 2 as printed. Can be
+  negative.
+* ``biased``: XX and YY over all pairs, divided by m^2 and n^2; what CMMD's published code computes.
+  Larger by ``scale * [(1 - XX)/m + (1 - YY)/n]``.
+* ``grouped``: pairs of the same group (video) are excluded from all three sums. Frames of a video
+  are not independent; with 40 videos of 15 frames the unbiased form is +0.1 too large under the
+  null.
 
-The kernel is linear in x.y to one per cent on unit-norm features with sigma = 10: the value is about 9.9 ||mean(X) - mean(Y)||^2 at scale 1000.
+The kernel is linear in x.y to one per cent on unit-norm features with sigma = 10: the value is
+about 9.9 ||mean(X) - mean(Y)||^2 at scale 1000.
 """
 
 from __future__ import annotations
@@ -21,9 +25,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from palpate.core import PalpateError
-from palpate.metrics.engine import BACKENDS, Backend, kernel_sums
+from palpate.core import PalpateError, PalpateWarning
 from palpate.metrics.inputs import (
+    Array,
+    Index,
     Normalize,
     checked_choice,
     checked_names,
@@ -31,63 +36,62 @@ from palpate.metrics.inputs import (
     checked_pair,
     checked_whole,
     copies_across,
+    invalid,
 )
-from palpate.metrics.kernels import Array, Index, Kernel, Sigma, checked_kernel, gaussian
+from palpate.metrics.kernels import Kernel, Sigma, checked_kernel, gaussian
+from palpate.metrics.pairs import BACKENDS, Backend, kernel_sums
 from palpate.metrics.sums import PairSums, Totals
 
 Estimator = Literal["unbiased", "biased", "grouped"]
 ESTIMATORS = ("unbiased", "biased", "grouped")
 
 
-def mmd_matrix(t: Totals, estimator: Estimator, scale: float) -> Array:
-    """Eq. 2 between every two segments, (S, S); NaN where an estimator has no pairs to average. The diagonal has no meaning.
+def mmd_matrix(t: Totals, estimator: str, scale: float) -> Array:
+    """Eq. 2 between every two segments, (S, S); NaN where there are no pairs to average.
 
-    A constant in k cancels, as XX + YY - 2 XY weighs it 1 + 1 - 2: k - 1 serves for k.
+    The diagonal has no meaning. A constant in k cancels, as XX + YY - 2 XY weighs it 1 + 1 - 2.
     """
     inner, cross = _means(t, estimator)
     with np.errstate(invalid="ignore"):
         return scale * (inner[:, None] + inner[None, :] - 2 * cross)  # Eq. 2
 
 
-def mmd_bound(rest: Totals, estimator: Estimator, scale: float) -> Array:
-    """What :func:`mmd_matrix` may be off by, where sums may be off by ``rest`` in either direction."""
-    inner, cross = _means(rest, estimator)
-    return scale * (inner[:, None] + inner[None, :] + 2 * cross)
+def mmd_bound(remainder: Totals, estimator: str, scale: float) -> Array:
+    """What :func:`mmd_matrix` may be off by, where sums may be off by ``remainder``."""
+    inner, cross = _means(remainder, estimator)
+    with np.errstate(invalid="ignore"):
+        return scale * (inner[:, None] + inner[None, :] + 2 * cross)
 
 
-def _means(t: Totals, estimator: Estimator) -> tuple[Array, Array]:
-    """Mean kernel inside each segment (S,) and between segments (S, S), over the pairs of an estimator."""
-    cross_sums, cross_pairs = t.sums, np.outer(t.n, t.n)
+def _means(t: Totals, estimator: str) -> tuple[Array, Array]:
+    """Mean kernel inside segments (S,) and between them (S, S), over an estimator's pairs."""
+    sums, pairs = t.sums, np.outer(t.n, t.n)
     if estimator == "grouped":
-        cross_sums, cross_pairs = t.sums - t.same, cross_pairs - t.pairs
-    inner_sums, inner_pairs = np.diagonal(cross_sums), np.diagonal(cross_pairs)
+        sums, pairs = t.sums - t.same, pairs - t.pairs
+    inner_sums, inner_pairs = np.diagonal(sums), np.diagonal(pairs)
     if estimator == "unbiased":
         inner_pairs = t.n * (t.n - 1)
     if estimator == "biased":
-        inner_sums = inner_sums + t.own
+        inner_sums = inner_sums + t.diagonal
     with np.errstate(divide="ignore", invalid="ignore"):
-        return inner_sums / inner_pairs, cross_sums / cross_pairs
+        return inner_sums / inner_pairs, sums / pairs
 
 
-def largest_bound(sums: PairSums, estimator: Estimator, scale: float) -> float:
+def largest_bound(sums: PairSums, estimator: str, scale: float) -> float:
     """The largest :func:`mmd_bound` between two segments; 0 where sums are exact."""
     if sums.bound is None:
         return 0.0
-    # Where there are no pairs there is nothing to bound; elsewhere a bound that overflowed is no bound.
-    known = np.isfinite(mmd_matrix(sums.totals, estimator, scale)) & ~np.eye(
-        sums.segments, dtype=bool
-    )
+    # Where there are no pairs there is nothing to bound; elsewhere a bound that overflowed is none.
+    known = np.isfinite(mmd_matrix(sums.totals, estimator, scale))
+    known &= ~np.eye(sums.segments, dtype=bool)
     off = mmd_bound(sums.bound.totals, estimator, scale)[known]
     return float(np.where(np.isfinite(off), off, np.inf).max(initial=0.0))
 
 
-def unit_index(*columns: Sequence[str]) -> list[Index]:
-    """Integers for names, the same integer for the same name in every column."""
-    _, inverse = np.unique(
-        np.concatenate([np.asarray(c, dtype=object).astype(str) for c in columns]),
-        return_inverse=True,
-    )
-    return list(np.split(inverse.astype(np.intp), np.cumsum([len(c) for c in columns])[:-1]))
+def unit_index(*columns: Sequence[str]) -> Index:
+    """Integers for the names of all columns, one column after the other."""
+    names = np.concatenate([np.asarray(c, dtype=object).astype(str) for c in columns])
+    return np.unique(names, return_inverse=True)[1].astype(np.intp)
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,8 @@ class Distance:
 
     Attributes:
         value: times ``scale``; negative values are possible for ``unbiased`` and ``grouped``.
-        bound: the value is within this of the exact one (rounding aside); 0 for the blocked back end.
+        bound: the value is within this of the exact one (rounding aside); 0 for the blocked back
+            end.
         backend: ``"blocked"`` or ``"moments"``.
         estimator: which pairs were averaged.
         kernel: the kernel's settings.
@@ -121,7 +126,7 @@ class Distance:
         return self.value
 
 
-def distance(
+def distance(  # noqa: PLR0913
     x: Any,
     y: Any,
     *,
@@ -129,40 +134,43 @@ def distance(
     kernel: Kernel | None = None,
     scale: float = 1000.0,
     estimator: Estimator = "unbiased",
-    groups_x: Sequence[str] | None = None,
-    groups_y: Sequence[str] | None = None,
+    groups_x: Any = None,
+    groups_y: Any = None,
     normalize: Normalize = "check",
     backend: Backend = "auto",
     tolerance: float = 1e-4,
     block: int = 1024,
     names: tuple[str, str] = ("x", "y"),
 ) -> Distance:
-    """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``, with back end and bound.
+    """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``.
 
     Args:
-        x: (m, d) features: anything ``np.asarray`` takes, an array on disk (``np.memmap``), or an array of a library of the
-            array-API standard (torch on CPU or CUDA), which is worked on where it is.
+        x: (m, d) features: anything ``np.asarray`` takes, an array on disk (``np.memmap``), or an
+            array of a library of the array-API standard (torch on CPU or CUDA), which stays on its
+            device.
         y: (n, d) features of the same library; m and n may differ.
-        sigma: bandwidth of the Gaussian kernel; several are averaged; ``"median"`` and ``"multi"`` take the median distance of ``y``.
-        kernel: instead of the Gaussian, e.g. :class:`palpate.metrics.kernels.Polynomial`.
+        sigma: bandwidth of the Gaussian kernel; several are averaged; ``"median"`` and ``"multi"``
+            take the median distance of ``y``.
+        kernel: instead of the Gaussian, e.g. :class:`palpate.metrics.Polynomial`.
         scale: factor on the result; 1000 as in CMMD.
         estimator: ``"unbiased"``, ``"biased"`` or ``"grouped"``, see the module.
         groups_x: m group names, for ``"grouped"``; the same name in both sets is the same group.
         groups_y: n group names.
-        normalize: ``"check"`` refuses rows not of unit length (1e-3), ``True`` normalizes, ``False`` takes them as they are.
-        backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
+        normalize: ``"check"`` rejects rows not of unit length (1e-3), ``True`` normalizes,
+            ``False`` takes them as they are.
+        backend: ``"auto"``, ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.pairs`.
         tolerance: largest bound that ``auto`` accepts, at scale 1000.
         block: rows of a kernel block; memory is about ``block^2`` numbers a thread.
         names: what errors and warnings call the two sets.
 
     Returns:
-        The value; blocked: float32 features with an error below 1e-6 at scale 1000, float64 below 1e-9 (up to 1e-6 where rows lie hundreds to
-        ten thousand bandwidths from their mean; farther ones are refused). What float32 rounds averages out over pairs that
-        differ; where copies leave few of those, float64 is taken (near-copies that share one large coordinate may leave 2e-6 where sigma is 4).
+        The value. Blocked: float32 unit-norm features with an error below 1e-4 at scale 1000,
+        float64 below 1e-9.
 
     Raises:
-        PalpateError: on features that :func:`palpate.metrics.inputs.checked_features` refuses, fewer than two rows for
-            ``"unbiased"``, missing groups, or fewer than two groups a set for ``"grouped"``.
+        PalpateError: on features that :func:`palpate.metrics.inputs.checked_features` rejects,
+            fewer than two rows for ``"unbiased"``, or groups that are missing or too few for
+            ``"grouped"``.
     """
     checked_choice("estimator", estimator, ESTIMATORS)
     checked_choice("backend", backend, BACKENDS)
@@ -170,33 +178,25 @@ def distance(
     checked_number(tolerance=tolerance)
     checked_whole(1, block=block)
     checked_kernel(kernel)
-    x, y = checked_pair(
-        x, y, normalize=normalize, least=1 if estimator == "biased" else 2, names=names
-    )
+    least = 1 if estimator == "biased" else 2
+    x, y = checked_pair(x, y, normalize=normalize, least=least, names=names)
     if copies := copies_across(x, y):
-        warnings.warn(
-            f"{copies} rows of {names[0]} are bit for bit rows of {names[1]}: a copy is not a generator",
-            stacklevel=2,
-        )
-    sets = np.repeat(np.arange(2), [len(x), len(y)])
-    units = sets  # no pair is left out: a set is one item
-    gx, gy = (
-        checked_names("groups_x", groups_x, len(x)),
-        checked_names("groups_y", groups_y, len(y)),
-    )
+        text = f"{copies} rows of {names[0]} are bit for bit rows of {names[1]}"
+        warnings.warn(f"{text}: a copy is not a generator", PalpateWarning, stacklevel=2)
+    segment = np.repeat(np.arange(2), [len(x), len(y)])
+    unit = segment  # no pair is excluded: a set is one item
+    gx = checked_names("groups_x", groups_x, len(x))
+    gy = checked_names("groups_y", groups_y, len(y))
     if estimator == "grouped":
         if gx is None or gy is None:
-            raise PalpateError(
-                'estimator="grouped" must know the groups of both sets',
-                "none",
-                "Pass groups_x and groups_y",
-            )
-        units = np.concatenate(unit_index(gx, gy))
+            must = "must be unbiased or biased where the groups of a set are unknown"
+            raise invalid("estimator", must, "'grouped'", "Pass groups_x and groups_y")
+        unit = unit_index(gx, gy)
     kernel = gaussian(sigma, y, gy) if kernel is None else kernel
-    found = kernel_sums(
+    sums = kernel_sums(
         [x, y],
-        sets,
-        units,
+        segment,
+        unit,
         segments=2,
         kernel=kernel,
         backend=backend,
@@ -204,38 +204,22 @@ def distance(
         block=block,
         bound=lambda sums: largest_bound(sums, estimator, scale),
     ).sums
-    value = float(mmd_matrix(found.totals, estimator, scale)[0, 1])
-    if not np.isfinite(found.totals.sums).all():
-        raise PalpateError(
-            "Kernel values must be finite",
-            "infinity or NaN",
-            "Normalize the rows, or scale them down",
-        )
+    value = float(mmd_matrix(sums.totals, estimator, scale)[0, 1])
+    bound = largest_bound(sums, estimator, scale)
+    if not np.isfinite(sums.totals.sums).all():
+        fix = "Normalize the rows, or scale them down"
+        raise PalpateError("Kernel values must be finite", "infinity or NaN", fix)
     if not np.isfinite(value):
         got = f"{len(set(gx or ()))} and {len(set(gy or ()))} groups"
-        raise PalpateError(
-            "Each set must have at least two groups, not all shared",
-            got,
-            'Use estimator="unbiased", or more groups',
-        )
-    bound = largest_bound(found, estimator, scale)
+        must = "Each set must have at least two groups, not all shared"
+        raise PalpateError(must, got, "Pass more groups", example={"estimator": "unbiased"})
     if bound > 2 * scale:  # more than the metric can be
+        must = "must be wide against the features for the moments back end"
         got = f"a bound of {bound:.2g}"
-        raise PalpateError(
-            "The moments back end needs a bandwidth that is wide against the features",
-            got,
-            'Pass backend="blocked"',
-        )
+        raise invalid("sigma", must, got, "Sum blocks", backend="blocked")
+    settings, bandwidth = kernel.settings(), kernel.bandwidth
     return Distance(
-        value,
-        bound,
-        found.backend,
-        estimator,
-        kernel.settings(),
-        kernel.bandwidth,
-        scale,
-        len(x),
-        len(y),
+        value, bound, sums.backend, estimator, settings, bandwidth, scale, len(x), len(y)
     )
 
 

@@ -1,16 +1,21 @@
-"""Generators side by side on the same test videos: differences with intervals, and how sure it is that one beats the other.
+"""Generators compared on the same test videos: differences with intervals, and which is better.
 
-Two generators that are scored on the same samples share what is hard about them, so their scores move together when a video is left out, and the
-interval of the difference is far narrower than the two intervals suggest. The leave-one-unit-out jackknife is applied to the difference
-itself: ``SE^2 = (G-1)/G sum_g (delta_g - mean delta)^2`` with ``delta_g = a_g - b_g``, Student's t with G - 1 degrees of freedom.
+Two generators that are scored on the same samples share what is hard about them, so their scores
+move together when a video is left out, and the interval of the difference is far narrower than the
+two intervals suggest. The leave-one-unit-out jackknife is applied to the difference itself:
+``SE^2 = (G-1)/G sum_g (delta_g - mean delta)^2`` with ``delta_g = a_g - b_g``, Student's t with G -
+1 degrees of freedom.
 
-``p_better`` is the confidence that a is the better of the two: the share of that t distribution on the side where a is ahead. It is no
-probability of a hypothesis, and it is not adjusted for the number of pairs; ``p_adjusted`` (Holm) is the two-sided p-value that is.
+``p_better`` is the confidence that a is the better of the two: the share of that t distribution on
+the side where a is ahead. It is no probability of a hypothesis, and it is not adjusted for the
+number of pairs; ``p_adjusted`` (Holm) is the two-sided p-value that is.
 
-Metrics without reference have no better direction but towards the floor, what real touches score: collapse is lowest. There a is better where
-its distance to the floor is smaller, ``gap = |a - floor| - |b - floor|`` is what p_better and ``better`` speak of, and the floor is
-left-one-out along with the generators, and the p-value is that of the gap (``p_difference`` is that of a - b). Without a floor, or with one
-of other videos, classes or numbers of samples, neither is given, and the p-value is that of a - b.
+Metrics without reference have no better direction but towards the floor, what real samples score:
+collapse is lowest. There a is better where its distance to the floor is smaller:
+``gap = |a - floor| - |b - floor|`` is what ``p_better``, ``better`` and ``p_value`` speak of
+(``p_difference`` is the p-value of a - b), and the floor is left-one-out along with the generators.
+Without a floor, or with one of other videos, classes or numbers of samples, neither ``p_better``
+nor ``better`` is given, and the p-value is that of a - b.
 """
 
 from __future__ import annotations
@@ -23,14 +28,12 @@ from typing import Any, Unpack, cast
 import numpy as np
 from scipy import special
 
-from palpate.core import FeatureSet, PalpateError, Score, require_comparable
-from palpate.metrics.inputs import require_one_encoder
+from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
+from palpate.metrics.inputs import Array, feature_set, require_one_encoder
 from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
-from palpate.metrics.kernels import Array
-from palpate.metrics.presets import Options, plan_for
-from palpate.metrics.scored import Scored, excess_of, left_out_alike, not_comparable, with_floor
-from palpate.metrics.tables import build_table
-from palpate.metrics.tactile import floors_of, four_of, tmmd_of
+from palpate.metrics.presets import Options
+from palpate.metrics.scored import Scored, excess_of, not_comparable, same_units, with_floor
+from palpate.metrics.tactile import floors_of, four_of, tmmd_scored
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,11 @@ class Comparison:
     """Scores of several generators, and their differences.
 
     Attributes:
-        scores: the four metrics of each generator, in the order given; ``subject`` is its name.
-        differences: one score a metric and pair, ``value`` = a - b; ``details`` as in :func:`difference`, and ``p_adjusted``.
-        excess: of :func:`compare`: the same of E, the between-group excess of I- and CI-TMMD (``"I-TMMD E"``, ``"CI-TMMD E"``).
+        scores: the metrics of each generator, in the order given; ``subject`` is its name.
+        differences: one score a metric and pair, ``value`` = a - b; ``details`` as in
+            :func:`difference`, and ``p_adjusted``.
+        excess: of :func:`compare`: the same of E, the between-group excess of I- and CI-TMMD
+            (``"I-TMMD E"``, ``"CI-TMMD E"``).
     """
 
     scores: list[Score]
@@ -49,122 +54,99 @@ class Comparison:
 
 
 def compare(
-    generators: Mapping[str, FeatureSet],
-    reference: FeatureSet,
-    *,
-    floor: FeatureSet | None = None,
-    **options: Unpack[Options],
+    generators: Mapping[str, Any], reference: Any, *, floor: Any = None, **options: Unpack[Options]
 ) -> Comparison:
     """TMMD, I-, CI- and D-TMMD of several generators on the same samples, with paired differences.
 
     Args:
-        generators: name -> features of its touches; all with the same ids (any order), labels and groups.
-        reference: features of the real test touches.
-        floor: real touches for ``Score.floor`` of the reference-free metrics.
+        generators: name -> features of its samples; all with the same ids (any order), labels and
+            groups. Arrays without ids are taken row by row for the same samples.
+        reference: features of the real test samples.
+        floor: real samples for ``Score.floor`` of the reference-free metrics.
         **options: see :class:`palpate.metrics.Options`; ``subject`` is the generator's name.
 
     Raises:
         PalpateError: if generators differ in ids, labels, groups or encoder, or as the metrics do.
     """
+    reference = feature_set(reference, argument="reference")
     sets = same_samples(generators)
-    found = {
+    scores = {
         name: four_of(of, reference, cast("Options", {**options, "subject": name}))
         for name, of in sets.items()
     }
     floors: list[Scored | None] = [None] * 4
     if floor is not None:
-        real = floors_of(floor, reference, next(iter(sets.values())), options)
-        found, floors = (
-            {name: [four[0], *map(with_floor, four[1:], real)] for name, four in found.items()},
-            [None, *real],
-        )
-    excess = {name: [excess_of(one) for one in four[1:3]] for name, four in found.items()}
-    between = _compared(excess, [None if one is None else excess_of(one) for one in floors[1:3]])
-    return replace(_compared(found, floors), excess=between)
+        first = next(iter(sets.values()))
+        real = floors_of(feature_set(floor, argument="floor"), reference, first, options)
+        floors = [None, *real]
+        scores = {n: [s[0], *map(with_floor, s[1:], real)] for n, s in scores.items()}
+    excess = {name: [excess_of(s) for s in four[1:3]] for name, four in scores.items()}
+    of_floors = [None if s is None else excess_of(s) for s in floors[1:3]]
+    return replace(_compared(scores, floors), excess=_compared(excess, of_floors))
 
 
 def _compared(
-    found: Mapping[str, Sequence[Scored | None]], floors: Sequence[Scored | None]
+    sets: Mapping[str, Sequence[Scored | None]], floors: Sequence[Scored | None]
 ) -> Comparison:
-    """Scores of each generator, and differences of those that both of a pair have, metric by metric."""
+    """Scores of each generator, and differences of those that both of a pair have."""
     differences: list[Score] = []
     for k, floor in enumerate(floors):
-        pairs = [(found[a][k], found[b][k]) for a, b in combinations(found, 2)]
-        differences += holm(
-            [difference(a, b, floor) for a, b in pairs if a is not None and b is not None]
-        )
-    return Comparison(
-        [one.score for some in found.values() for one in some if one is not None], differences
-    )
+        pairs = [(sets[a][k], sets[b][k]) for a, b in combinations(sets, 2)]
+        differences += holm([difference(a, b, floor) for a, b in pairs if a and b])
+    return Comparison([s.score for row in sets.values() for s in row if s], differences)
 
 
 def compare_tmmd(
-    generators: Mapping[str, FeatureSet], reference: FeatureSet, **options: Unpack[Options]
+    generators: Mapping[str, Any], reference: Any, **options: Unpack[Options]
 ) -> Comparison:
-    """As :func:`compare`, TMMD alone: with ``kernel=Polynomial()``, ``normalize=False`` and ``preset="paper"`` it is KID, with intervals.
+    """As :func:`compare`, TMMD alone.
+
+    With ``kernel=Polynomial()``, ``normalize=False`` and ``preset="paper"`` it is KID, with
+    intervals.
 
     Raises:
         PalpateError: as :func:`compare`.
     """
-    found: dict[str, Scored] = {}
-    for name, of in same_samples(generators).items():
-        require_one_encoder(of, reference, "reference")
-        grouped = of.groups is not None and reference.groups is not None
-        plan = plan_for(cast("Options", {**options, "subject": name}), grouped=grouped)
-        found[name] = tmmd_of(
-            build_table(of, reference, plan, grouped=grouped), of, reference, plan
-        )
-    differences = [difference(found[a], found[b]) for a, b in combinations(found, 2)]
-    return Comparison([one.score for one in found.values()], holm(differences))
+    reference = feature_set(reference, argument="reference")
+    sets = {
+        name: [tmmd_scored(of, reference, cast("Options", {**options, "subject": name}))]
+        for name, of in same_samples(generators).items()
+    }
+    return _compared(sets, [None])
 
 
-def same_samples(generators: Mapping[str, FeatureSet]) -> dict[str, FeatureSet]:
+def same_samples(generators: Mapping[str, Any]) -> dict[str, FeatureSet]:
     """The generators with their rows in the order of the first.
 
     Raises:
         PalpateError: if there is none, or if they differ in ids, labels, groups or encoder.
     """
     if not generators:
-        raise PalpateError("There must be a generator to score", "none", "Pass at least one")
-    first, *others = generators
-    return {first: generators[first]} | {
-        name: _like(generators[first], first, generators[name], name) for name in others
-    }
+        must = "must hold a generator"
+        raise PalpateError(must, "none", "Pass its features by name", argument="generators")
+    sets = {name: feature_set(x) for name, x in generators.items()}
+    first = next(iter(sets))
+    return {name: _ordered(sets[first], first, x, name) for name, x in sets.items()}
 
 
-def _like(wanted: FeatureSet, name: str, other: FeatureSet, called: str) -> FeatureSet:
-    """``other`` in the order of ``wanted``."""
-    missing, surplus = (
-        sorted(set(wanted.ids) - set(other.ids)),
-        sorted(set(other.ids) - set(wanted.ids)),
-    )
-    if (
-        missing
-        or surplus
-        or len(other.ids) != len(wanted.ids)
-        or len(set(wanted.ids)) != len(wanted.ids)
-    ):
-        got = f"{len(missing)} missing and {len(surplus)} surplus ids" + (
-            f", first {(missing + surplus)[0]!r}" if missing or surplus else ", repeated ids"
-        )
-        raise PalpateError(
-            f"{called!r} and {name!r} must have the same samples, each once",
-            got,
-            "Generate for the same manifest and split",
-        )
-    require_one_encoder(wanted, other, repr(called))
-    other = other if list(other.ids) == list(wanted.ids) else other.take(list(wanted.ids))
+def _ordered(first: FeatureSet, first_name: str, other: FeatureSet, name: str) -> FeatureSet:
+    """``other`` in the order of ``first``."""
+    a, b = set(first.ids), set(other.ids)
+    both = f"{name!r} and {first_name!r}"
+    if a != b or not len(a) == len(first.ids) == len(other.ids):
+        odd = sorted(a - b) + sorted(b - a)
+        named = f", first {odd[0]!r}" if odd else ", repeated ids"
+        got = f"{len(a - b)} missing and {len(b - a)} surplus ids{named}"
+        fix = "Generate for the same manifest and split"
+        raise PalpateError(f"{both} must have the same samples, each once", got, fix)
+    require_one_encoder(first, other, repr(name))
+    other = other if list(other.ids) == list(first.ids) else other.take(list(first.ids))
     for column in ("labels", "groups"):
-        mine, yours = (
-            None if (c := getattr(s, column)) is None else list(map(str, c))
-            for s in (wanted, other)
-        )
-        if mine != yours:
-            raise PalpateError(
-                f"{called!r} and {name!r} must have the same {column}",
-                "different ones",
-                "Take both from one manifest",
-            )
+        values = [getattr(s, column) for s in (first, other)]
+        known = [None if v is None else list(map(str, v)) for v in values]
+        if known[0] != known[1]:
+            fix = "Take both from one manifest"
+            raise PalpateError(f"{both} must have the same {column}", "different ones", fix)
     return other
 
 
@@ -174,44 +156,86 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     Args:
         a: one generator.
         b: the other.
-        floor: real touches, for a metric without a better direction of its own.
+        floor: real samples, for a metric without a better direction.
 
     Returns:
-        ``details``: ``a``, ``b``, ``better`` (a name or None), ``p_better``, ``decided`` (whether the interval of what decides leaves out 0),
-        ``p_value``, and for metrics without reference ``gap``, ``gap_interval`` and ``p_difference``.
+        ``details``: ``a``, ``b``, ``better`` (a name or None), ``p_better``, ``decided`` (whether
+        the interval of what decides excludes 0), ``p_value``, and for metrics without reference
+        ``gap``, ``gap_interval`` and ``p_difference``.
 
     Raises:
         PalpateError: if the two scores are of different settings.
     """
     require_comparable([a.score, b.score])
-    a, b, *rest = left_out_alike(
-        a, b, *([floor] if floor is not None and not not_comparable(a, floor) else [])
-    )
-    x, y, floor = a.score, b.score, rest[0] if rest else None
-    names = ("better", "p_better", "p_value")
-    details: dict[str, Any] = {"a": x.subject, "b": y.subject, "decided": False} | dict.fromkeys(
-        names
-    )
-    interval, method, note = None, "", ""
-    value = None if x.value is None or y.value is None else x.value - y.value
-    if value is None:
-        note = "Undefined: one of the two scores is"
-    elif not a.units or list(a.units) != list(b.units):
-        note = (
-            "No interval: the two scores share no units to leave out"
-            if a.units
-            else "No interval: there is nothing to leave out"
-        )
-    else:
-        method = f"paired leave-one-{x.details.get('left_out', x.details['unit'])}-out jackknife, t, {len(a.units) - 1} df"
-        interval, ahead = _interval(value, a.replicates - b.replicates, x.level)
-        if interval is None:
-            note, method = "No interval: leaving out a unit is undefined, or changes nothing", ""
-        else:
-            details["p_value"] = 2 * min(
-                ahead, _interval(-value, a.replicates - b.replicates, x.level)[1]
-            )
-        _decide(details, value, (interval, ahead), a, b, floor)
+    use_floor = floor is not None and not not_comparable(a, floor)
+    a, b, *others = same_units(a, b, *([floor] if floor and use_floor else []))
+    x, y = a.score, b.score
+    if x.value is None or y.value is None:
+        return _as_difference(x, y, None, {}, Note("undefined", {"reason": "score"}))
+    value, level, df = x.value - y.value, x.level, len(a.units) - 1
+    if not a.units or list(a.units) != list(b.units):
+        reason = "different-units" if a.units else "no-units"
+        return _as_difference(x, y, value, {}, Note("no-interval", {"reason": reason}))
+    tested = _test(value, _error(a.replicates - b.replicates), df, level)
+    interval, below, above = tested
+    note = Note("no-interval", {"reason": "no-change"}) if interval is None else None
+    unit = x.details.get("left_out", x.details["unit"])
+    method = f"paired leave-one-{unit}-out jackknife, t, {df} df" if interval else ""
+    p = 2 * min(below, above) if interval else None
+    details: dict[str, Any] = {"p_value": p}
+    if x.higher_is_better is not None:
+        details = _verdict(x, y, value, tested)
+    elif others and others[0].score.value is not None and list(others[0].units) == list(a.units):
+        real, center = others[0].replicates, others[0].score.value
+        gap = abs(x.value - center) - abs(y.value - center)
+        moved = np.abs(a.replicates - real) - np.abs(b.replicates - real)
+        of_gap = _test(gap, _error(moved), df, level)
+        details = {"gap": gap, "gap_interval": of_gap[0], "p_difference": p}
+        details |= _verdict(x, y, gap, of_gap)
+    return _as_difference(x, y, value, details, note, interval, method)
+
+
+def _error(replicates: Array) -> float:
+    return float(jackknife_errors(replicates[:, None])[0])
+
+
+def _test(
+    value: float, error: float, df: int, level: float
+) -> tuple[Interval | None, float, float]:
+    """The t interval of a value, and the shares of its distribution below and above 0."""
+    if not (np.isfinite(error) and error > 0):
+        return None, 0.5, 0.5
+    below, above = (float(special.stdtr(df, s * value / error)) for s in (-1, 1))
+    return t_interval(value, error, df, level), below, above
+
+
+def _verdict(
+    x: Score, y: Score, value: float, tested: tuple[Interval | None, float, float]
+) -> dict[str, Any]:
+    """Which of two is ahead, where ``value`` is a difference of which 0 is a tie."""
+    interval, below, above = tested
+    ahead = value if x.higher_is_better else -value
+    better = x.subject if ahead > 0 else y.subject if ahead < 0 else None
+    if interval is None:
+        return {"better": better, "p_value": None}
+    return {
+        "better": better,
+        "p_better": above if x.higher_is_better else below,
+        "p_value": 2 * min(below, above),
+        "decided": not interval[0] <= 0 <= interval[1],
+    }
+
+
+def _as_difference(
+    x: Score,
+    y: Score,
+    value: float | None,
+    details: Mapping[str, Any],
+    note: Note | None,
+    interval: Interval | None = None,
+    method: str = "",
+) -> Score:
+    empty = {"better": None, "p_better": None, "p_value": None, "decided": False}
     return replace(
         x,
         metric=f"{x.metric} difference",
@@ -221,52 +245,9 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
         interval_method=method,
         null=None,
         floor=None,
-        details=details,
-        note=note,
+        details={"a": x.subject, "b": y.subject, **empty, **details},
+        notes=[note] if note else [],
     )
-
-
-def _interval(value: float, replicates: Array, level: float) -> tuple[Interval | None, float]:
-    """The jackknife's interval of a value, and the share of its t distribution below 0."""
-    error, df = float(jackknife_errors(replicates[:, None])[0]), len(replicates) - 1
-    if not (np.isfinite(error) and error > 0):
-        return None, 0.5
-    return t_interval(value, error, df, level), float(special.stdtr(df, -value / error))
-
-
-def _decide(
-    details: dict[str, Any],
-    value: float,
-    found: tuple[Interval | None, float],
-    a: Scored,
-    b: Scored,
-    floor: Scored | None,
-) -> None:
-    """Fills in who is ahead."""
-    x, y = a.score, b.score
-    if x.higher_is_better is None:
-        if floor is None or floor.score.value is None or x.value is None or y.value is None:
-            return
-        if list(a.units) != list(
-            floor.units
-        ):  # the floor is left-one-out along with the generators
-            return
-        value = abs(x.value - floor.score.value) - abs(y.value - floor.score.value)
-        gaps = np.abs(a.replicates - floor.replicates) - np.abs(b.replicates - floor.replicates)
-        found = _interval(value, gaps, x.level)
-        p = None if found[0] is None else 2 * min(found[1], _interval(-value, gaps, x.level)[1])
-        details |= {
-            "gap": value,
-            "gap_interval": found[0],
-            "p_difference": details["p_value"],
-            "p_value": p,
-        }
-    interval, below = found
-    sign = -value if x.higher_is_better else value
-    details["better"] = x.subject if sign < 0 else y.subject if sign > 0 else None
-    if interval is not None:
-        details["p_better"] = 1 - below if x.higher_is_better else below
-        details["decided"] = not interval[0] <= 0 <= interval[1]
 
 
 def mean_differences(
@@ -276,7 +257,8 @@ def mean_differences(
 
     Args:
         scores: of the generators, of one metric.
-        values: (n,) of each generator, image by image in one order; pairs in which one is not finite are left out.
+        values: (n,) of each generator, image by image in one order; pairs of which one is not
+            finite are skipped.
         groups: n groups, or None.
 
     Raises:
@@ -295,55 +277,23 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
     finite = np.isfinite(delta)
     kept = delta[finite]
     names = None if groups is None else [g for g, ok in zip(groups, finite, strict=True) if ok]
-    value = float(kept.mean()) if len(kept) else None
-    interval, method = mean_interval(kept, names, x.level)
-    sign = (value or 0.0) * (1 if x.higher_is_better else -1)
-    details: dict[str, Any] = {
-        "a": x.subject,
-        "b": y.subject,
-        "p_better": None,
-        "p_value": None,
-        "better": None,
-        "decided": False,
-    }
-    details["better"] = x.subject if sign > 0 else y.subject if sign < 0 else None
-    if interval is not None and value is not None:
-        df = (len(kept) if names is None else len(set(names))) - 1
-        error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
-        ahead, behind = (
-            float(special.stdtr(df, s / error)) for s in (sign, -sign)
-        )  # either tail keeps its digits
-        details |= {
-            "p_better": ahead,
-            "p_value": 2 * min(ahead, behind),
-            "decided": not interval[0] <= 0 <= interval[1],
-        }
-    note = (
-        "Undefined: no pair of images has a value"
-        if value is None
-        else ""
-        if interval
-        else "No interval: one image or one group, or no variation between them"
-    )
-    return replace(
-        x,
-        metric=f"{x.metric} difference",
-        subject=f"{x.subject} - {y.subject}",
-        value=value,
-        interval=interval,
-        interval_method=f"paired, {method}" if method else "",
-        null=None,
-        floor=None,
-        details=details,
-        note=note,
-    )
+    if not len(kept):
+        return _as_difference(x, y, None, {}, Note("undefined", {"reason": "no-images"}))
+    value, (interval, method) = float(kept.mean()), mean_interval(kept, names, x.level)
+    if interval is None:
+        note = Note("no-interval", {"reason": "few-images"})
+        return _as_difference(x, y, value, _verdict(x, y, value, (None, 0.5, 0.5)), note)
+    df = (len(kept) if names is None else len(set(names))) - 1
+    error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
+    details = _verdict(x, y, value, _test(value, error, df, x.level))
+    return _as_difference(x, y, value, details, None, interval, f"paired, {method}")
 
 
 def holm(differences: Sequence[Score]) -> list[Score]:
-    """The differences of one metric with ``p_adjusted``: two-sided p-values by Holm's step-down method over these pairs."""
+    """The differences of one metric with ``p_adjusted``, by Holm's step-down method."""
     known = [k for k, d in enumerate(differences) if d.details["p_value"] is not None]
     known.sort(key=lambda k: differences[k].details["p_value"])
-    adjusted, last = {}, 0.0
+    adjusted, last = dict[int, float](), 0.0
     for rank, k in enumerate(known):
         last = max(last, min(1.0, (len(known) - rank) * differences[k].details["p_value"]))
         adjusted[k] = last

@@ -1,31 +1,39 @@
 """Options of the four tactile metrics, and the presets that fix a whole column of them.
 
-=============  ==========  ========  =================  ===============  ====================================================================
-preset         estimator   halves    denominator        aggregate        what it is
-=============  ==========  ========  =================  ===============  ====================================================================
-paper          unbiased    random    sum                mean_of_ratios   Eq. 2-7 to the letter. Its I- and CI-TMMD have expectation 0 for any data.
-paper-tables   biased      ordered   mean_off_diagonal  mean_of_ratios   the reading whose magnitudes fit the paper's printed tables
-cmmd           biased      random    sum                mean_of_ratios   the estimator of CMMD's published code
-grouped        grouped     group     sum                ratio_of_means   the default where groups are known: whole videos stay together
-=============  ==========  ========  =================  ===============  ====================================================================
+=============  ==========  ========  =================  ===============
+============================= preset         estimator   halves    denominator        aggregate
+  what it is =============  ==========  ========  =================  ===============
+  =============================
+paper          unbiased    random    sum                mean_of_ratios   Eq. 2-7 to the letter: I-
+and
+                                                                         CI-TMMD have expectation 0
+paper-tables   biased      ordered   mean_off_diagonal  mean_of_ratios   the reading whose
+magnitudes
+                                                                         fit the printed tables
+cmmd           biased      random    sum                mean_of_ratios   as CMMD's published code
+grouped        grouped     group     sum                ratio_of_means   the default where groups
+are
+                                                                         known: videos stay whole
+=============  ==========  ========  =================  ===============
+=============================
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, TypedDict
 
-from palpate.core import PalpateError
-from palpate.metrics.engine import BACKENDS, Backend
 from palpate.metrics.inputs import (
     Normalize,
     checked_choice,
     checked_level,
     checked_number,
     checked_whole,
+    invalid,
 )
 from palpate.metrics.kernels import Kernel, Sigma, checked_kernel
 from palpate.metrics.mmd import ESTIMATORS, Estimator
+from palpate.metrics.pairs import BACKENDS, Backend
 
 Halves = Literal["group", "random", "ordered"]
 Denominator = Literal["sum", "mean", "mean_off_diagonal"]
@@ -36,23 +44,26 @@ AGGREGATES = ("mean_of_ratios", "ratio_of_means")
 
 
 class Options(TypedDict, total=False):
-    """Options of ``tmmd``, ``i_tmmd``, ``ci_tmmd``, ``d_tmmd``; each metric records those that bear on it.
+    """Options of ``tmmd``, ``i_tmmd``, ``ci_tmmd``, ``d_tmmd``; each records those that bear on it.
 
     Keys:
         preset: one of ``PRESETS``; default ``"grouped"`` where groups are known, else ``"paper"``.
         estimator, halves, denominator, aggregate: override one entry of the preset.
-        sigma: kernel bandwidth, default 10; several are averaged; ``"median"``: the median distance of the reference; ``"multi"``: five
-            bandwidths around it (:mod:`palpate.metrics.kernels`).
-        kernel: another kernel than the Gaussian of ``sigma``, e.g. :class:`palpate.metrics.kernels.Polynomial`.
+        sigma: kernel bandwidth, default 10; several are averaged; ``"median"``: the median distance
+            of the reference; ``"multi"``: five bandwidths around it
+            (:mod:`palpate.metrics.kernels`).
+        kernel: instead of the Gaussian of ``sigma``, e.g. :class:`palpate.metrics.Polynomial`.
         scale: factor on the result, default 1000.
-        normalize: ``"check"`` (default), True or False, see :func:`palpate.metrics.inputs.checked_features`.
-        backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``, see :mod:`palpate.metrics.engine`.
+        normalize: rows that are not of unit length: ``"check"`` rejects them (default), True
+            divides by the norm, False takes them as they are.
+        backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``
+            (:mod:`palpate.metrics.pairs`).
         tolerance: largest bound with which ``auto`` takes moments, default 1e-4 at scale 1000.
         block: rows of a kernel block, default 1024.
         permutations: relabelings of the permutation test of TMMD, default 999; 0 for none.
         level: coverage of intervals, default 0.95.
         min_samples: a class with fewer is excluded, at least 4, default 4.
-        seed: seed of random halves, default 0.
+        seed: of random halves, default 0.
         subject: what is scored, default ``"generated"``.
         split: digest of the split, kept with the score.
     """
@@ -102,32 +113,31 @@ class Plan:
 
 
 PRESETS: dict[str, Plan] = {
-    "paper": Plan("paper", "unbiased", "random", "sum", "mean_of_ratios"),
-    "paper-tables": Plan(
-        "paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"
-    ),
-    "cmmd": Plan("cmmd", "biased", "random", "sum", "mean_of_ratios"),
-    "grouped": Plan("grouped", "grouped", "group", "sum", "ratio_of_means"),
+    plan.preset: plan
+    for plan in (
+        Plan("paper", "unbiased", "random", "sum", "mean_of_ratios"),
+        Plan("paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"),
+        Plan("cmmd", "biased", "random", "sum", "mean_of_ratios"),
+        Plan("grouped", "grouped", "group", "sum", "ratio_of_means"),
+    )
 }
 
 
 def plan_for(options: Options, *, grouped: bool) -> Plan:
-    """The options completed.
-
-    Args:
-        options: what the caller gave.
-        grouped: whether groups are known.
+    """The options completed; ``grouped``: whether groups are known.
 
     Raises:
-        PalpateError: on an unknown word, a parameter out of range, or options that need groups where none are known.
+        PalpateError: on an unknown word, a parameter out of range, or options that need groups
+            where none are known.
     """
     preset = options.get("preset") or ("grouped" if grouped else "paper")
     checked_choice("preset", preset, tuple(PRESETS))
     given: dict[str, Any] = {k: v for k, v in options.items() if k != "preset"}
-    if unknown := sorted(set(given) - set(Options.__annotations__)):
-        must = f"Options must be among {', '.join(Options.__annotations__)}"
-        raise PalpateError(must, ", ".join(unknown), "Check the spelling")
-    plan = Plan(**{**PRESETS[preset].__dict__, **given})
+    names = [f.name for f in fields(Plan)]
+    if unknown := sorted(set(given) - set(names)):
+        must = f"must not be given: options are {', '.join(names)}"
+        raise invalid(unknown[0], must, ", ".join(unknown), "Check the spelling")
+    plan = Plan(**{**asdict(PRESETS[preset]), **given})
     checked_choice("estimator", plan.estimator, ESTIMATORS)
     checked_choice("halves", plan.halves, HALVES)
     checked_choice("denominator", plan.denominator, DENOMINATORS)
@@ -140,16 +150,8 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     checked_whole(4, min_samples=plan.min_samples)  # two for each half
     checked_level(plan.level)
     checked_kernel(plan.kernel)
-    if not grouped and "grouped" in (plan.preset, plan.estimator):
-        raise PalpateError(
-            "The grouped estimator must know the group of every sample",
-            "none",
-            'Give groups, or preset="paper"',
-        )
-    if not grouped and plan.halves == "group":
-        raise PalpateError(
-            'halves="group" must know the group of every sample',
-            "none",
-            'Give groups, or halves="random"',
-        )
+    for name, value in (("estimator", "grouped"), ("halves", "group")):
+        if not grouped and getattr(plan, name) == value:
+            must = f"must know the group of every sample for {name}={value!r}"
+            raise invalid("groups", must, "none", "Pass groups, or another preset", preset="paper")
     return plan

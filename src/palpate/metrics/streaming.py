@@ -1,121 +1,195 @@
-"""The four tactile metrics for features that come in batches, over any number of processes: update, compute, reset, merge.
+"""The four tactile metrics for features that come in batches, over any number of processes.
 
-The classes follow the contract of torchmetrics without needing it (nor torch); :mod:`palpate.metrics.torch_metric` has the same four as
-true ``torchmetrics.Metric``. Each takes generated touches with ``update(features)`` and real ones with ``update(features, real=True)``: they
-are the reference of :class:`TMMD`, and ``Score.floor`` of the others.
+The classes follow the contract of torchmetrics (update, compute, reset, merge) without needing it,
+nor torch; :mod:`palpate.metrics.torch_metric` has the same four as true ``torchmetrics.Metric``.
+Each takes generated samples with ``update(features)`` and real ones with ``update(features,
+real=True)``: they are the reference of :class:`TMMD`, and ``Score.floor`` of the others.
+``compute()`` is what the function of the same metric returns for all rows.
 
-``keep="features"`` (default) keeps the rows. ``compute()`` is what the function of the same metric returns for all of them, with groups,
-interval, null and p-value; memory grows with the rows.
-
-``keep="sums"`` keeps moments (:mod:`palpate.metrics.moments`): O(C d^2) memory, whatever the number of rows. The value is within
-``details["bound"]`` of the same statistic from all pairs. There is no interval and no p-value, as nothing can be left out. TMMD is the
-function's with ``preset="paper"`` (or ``"cmmd"``). The halves of the other three are dealt by a hash of the sample's id, or of its group
-where groups are given (whole videos to one half): one draw, whose two halves differ in size, and recorded as a setting of its own, so that it
-cannot stand in a column with the closed form. Classes with fewer than two samples in a half are excluded and named.
+Rows are kept: memory grows with them. For TMMD of sets that do not fit, see
+:func:`palpate.metrics.distance`, which reads arrays on disk.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import replace
-from typing import Any, ClassVar, Literal, Self, Unpack, cast
+from dataclasses import dataclass, field, replace
+from hashlib import blake2b
+from typing import Any, ClassVar, Self, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, PalpateError, Score, digest_json
-from palpate.metrics.inputs import checked_choice
-from palpate.metrics.presets import Options, Plan, plan_for
-from palpate.metrics.scored import RANDOM_NOTE, UNBOUNDED, Scored, with_floor
-from palpate.metrics.streaming_states import Columns, FeatureState, Layout, SumState, sized, to_host
-from palpate.metrics.tables import Table, build_table
-from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, tmmd, tmmd_of
+from palpate.core import FeatureSet, Note, PalpateError, Score, digest_json
+from palpate.core.features import is_missing
+from palpate.metrics.inputs import (
+    Normalize,
+    checked_features,
+    checked_names,
+    column,
+    invalid,
+    to_host,
+)
+from palpate.metrics.presets import Options, plan_for
+from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, reference_free, tmmd_scored
 
-Keep = Literal["features", "sums"]
-State = FeatureState | SumState
-SUMS_NOTE = 'From running sums: no interval, no p-value, and pairs of one video are not left out (keep="features" does all three)'
-HALVES_NOTE = {
-    "sample": RANDOM_NOTE,
-    "group": "Halves are whole groups, dealt once by a hash of their names: with few groups another seed gives quite another value",
-    "": "",
-}
+COLUMNS = ("ids", "labels", "groups")
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rows of one update: (n, d) float32 or float64; n ids, labels and groups, or None."""
+
+    features: NDArray[Any]
+    real: bool = False
+    ids: list[str] | None = None
+    labels: list[str] | None = None
+    groups: list[str] | None = None
+
+    @classmethod
+    def of(cls, features: Any, normalize: Normalize, *, real: bool, **columns: Any) -> Batch:
+        """A checked copy of what a caller passed: buffers are often used again.
+
+        Rows are kept as they came, widened to float32 at least.
+        """
+        name = f"The {'real' if real else 'generated'} features of this update"
+        x = checked_features(name, to_host(features), normalize=False, least=0)
+        if normalize is not False:
+            checked_features(name, x, normalize=normalize, least=0)
+        ids, groups = (checked_names(c, columns.get(c), len(x)) for c in ("ids", "groups"))
+        labels = column("labels", columns.get("labels"), len(x))
+        if labels is not None:
+            labels = ["" if is_missing(v) else str(v) for v in labels]
+        return cls(np.array(x, order="C"), bool(real), ids, labels, groups)
+
+    @property
+    def given(self) -> list[str]:
+        """Which of ids, labels and groups there are."""
+        return [name for name in COLUMNS if getattr(self, name) is not None]
+
+    def require_like(self, other: Batch) -> None:
+        """Raise where two batches cannot be rows of one array, or columns differ within one set."""
+        widths = [b.features.shape[1] for b in (other, self)]
+        if widths[0] != widths[1]:
+            must, got = "must have the same width in all updates", f"{widths[0]} and {widths[1]}"
+            raise invalid("features", must, got, "Embed all with the same encoder")
+        if len(self.features) and self.real == other.real and self.given != other.given:
+            got = " and ".join(", ".join(b.given) or "none" for b in (other, self))
+            must = "All updates of one set must give the same of ids, labels and groups"
+            raise PalpateError(must, got, "Give each always, or never")
+
+    def to_bytes(self) -> NDArray[np.uint8]:
+        """The batch as bytes: size and ``real`` as int64, then an npz; several may be joined."""
+        names = {name: np.array(getattr(self, name), dtype=str) for name in self.given}
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, features=self.features, **names)
+        head = np.array([buffer.getbuffer().nbytes, self.real], dtype="<i8").view(np.uint8)
+        return np.concatenate([head, np.frombuffer(buffer.getvalue(), dtype=np.uint8)])
+
+    @classmethod
+    def read(cls, joined: NDArray[np.uint8]) -> Iterator[Batch]:
+        """The batches of bytes that were joined."""
+        while joined.size:
+            size, real = (int(v) for v in joined[:16].view("<i8"))
+            stop = 16 + size
+            with np.load(io.BytesIO(joined[16:stop].tobytes()), allow_pickle=False) as data:
+                names = {name: data[name].tolist() for name in COLUMNS if name in data}
+                yield cls(data["features"], bool(real), **names)
+            joined = joined[stop:]
+
+
+@dataclass
+class Batches:
+    """All batches so far."""
+
+    batches: list[Batch] = field(default_factory=list)
+
+    def add(self, batch: Batch) -> None:
+        """Add a batch that fits those before."""
+        for other in self.batches[-1:] + [b for b in self.batches if b.real == batch.real][-1:]:
+            batch.require_like(other)
+        if len(batch.features):
+            self.batches.append(batch)
+
+    def reset(self, *, keep_real: bool) -> None:
+        """Forget the batches; those of real samples may stay."""
+        self.batches = [b for b in self.batches if b.real and keep_real]
+
+    def merge(self, other: Batches) -> Batches:
+        """The batches of both."""
+        merged = Batches(list(self.batches))
+        for batch in other.batches:
+            merged.add(batch)
+        return merged
+
+    def rows(self, real: bool) -> int:
+        """Rows of a set."""
+        return sum(len(b.features) for b in self.batches if b.real == real)
+
+    def feature_set(self, real: bool, encoder: str | None) -> FeatureSet | None:
+        """The rows of a set in the order of arrival, None if there are none."""
+        batches = [b for b in self.batches if b.real == real]
+        if not batches:
+            return None
+        features = np.concatenate([b.features for b in batches])
+        columns: dict[str, Any] = {
+            name: [v for b in batches for v in getattr(b, name)] for name in batches[0].given
+        }
+        columns.setdefault("ids", row_ids(features))
+        return FeatureSet(features=features, encoder=encoder, **columns)
+
+
+def row_ids(features: NDArray[Any]) -> list[str]:
+    """Ids for rows without: a digest of the row, so that neither order nor process matters.
+
+    Repeated rows are numbered.
+    """
+    seen: dict[str, int] = {}
+    ids: list[str] = []
+    for row in features:
+        name = blake2b(row.tobytes(), digest_size=12).hexdigest()
+        seen[name] = seen.get(name, -1) + 1
+        ids.append(f"{name}-{seen[name]}")
+    return ids
 
 
 class StreamingMetric:
     """What the four have in common. Instances can be pickled between any two batches.
 
     Args:
-        keep: ``"features"`` or ``"sums"``, see the module.
-        classes: for ``"sums"`` of CI- and D-TMMD: the labels there can be.
-        center: for ``"sums"``: (d,) any fixed vector near the features, the same in all processes that will be merged, e.g. the mean of the
-            real embeddings; the nearer, the smaller the bound. None: the mean of the first batch, for one process.
-        floor: for ``"sums"`` without reference: whether real touches are summed too, for ``Score.floor``.
         encoder: digest of the encoder, kept with the score.
-        reset_real_features: False: :meth:`reset` keeps real touches, which are then embedded once for a whole training.
+        reset_real_features: False: :meth:`reset` keeps real samples, which are then embedded once
+            for a whole training.
         **options: see :class:`palpate.metrics.Options`.
 
     Raises:
-        PalpateError: on options that are refused; for ``"sums"``, on what needs pairs: groups, several or median bandwidths, ordered halves.
+        PalpateError: on options that are rejected.
     """
 
     name: ClassVar[str]
-    higher_is_better: ClassVar[bool | None] = False
+    function: ClassVar[Any]
+    higher_is_better: ClassVar[bool | None] = None
     is_differentiable: ClassVar[bool] = False
     full_state_update: ClassVar[bool] = False
-    of_halves: ClassVar[bool] = True
-    by_class: ClassVar[bool] = False
+    needs_real: ClassVar[bool] = False
 
     def __init__(
         self,
         *,
-        keep: Keep = "features",
-        classes: Sequence[str] | None = None,
-        center: Any = None,
-        floor: bool = False,
         encoder: str | None = None,
         reset_real_features: bool = True,
         **options: Unpack[Options],
     ) -> None:
-        checked_choice("keep", keep, ("features", "sums"))
-        self.keep, self.encoder, self.reset_real_features, self.options = (
-            keep,
-            encoder,
-            reset_real_features,
-            options,
-        )
-        if keep == "features":
-            self.plan = plan_for(
-                options, grouped=True
-            )  # for its checks: whether groups are known is seen later
-            self.layout, self.center = None, None
-        else:
-            self.plan = plan_of_sums(options, halves=self.of_halves)
-            names = ("",) if not self.by_class else checked_classes(classes)
-            self.layout = Layout(
-                float(cast(float, self.plan.sigma)),
-                names,
-                self.of_halves,
-                2 if floor else 1,
-                self.plan.seed,
-            )
-            self.center = None if center is None else checked_center(center)
-        self.state = self.fresh()
-
-    def fresh(self) -> State:
-        """A state with nothing in it."""
-        return FeatureState() if self.layout is None else SumState(self.layout, self.center)
+        self.encoder, self.reset_real_features, self.options = encoder, reset_real_features, options
+        self.plan = plan_for(options, grouped=True)  # checks; groups are known with the rows
+        self.state = Batches()
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the settings that states depend on: metrics of one digest can share a state, whatever they compute from it."""
-        layout = (
-            None
-            if self.layout is None
-            else [self.layout.__dict__, None if self.center is None else self.center.tolist()]
-        )
-        return digest_json(
-            [self.keep, self.encoder, self.reset_real_features, self.plan.normalize, layout]
-        )
+        """SHA-256 of the settings that states depend on."""
+        return digest_json([self.encoder, self.reset_real_features, self.plan.normalize])
 
     def update(
         self,
@@ -126,25 +200,26 @@ class StreamingMetric:
         labels: Any = None,
         groups: Any = None,
     ) -> None:
-        """Adds a batch; a batch that is refused changes nothing.
+        """Add a batch; a batch that is rejected changes nothing.
 
         Args:
-            features: (n, d), n may be 0: NumPy or torch on any device (detached; kept on the host, or summed where they are); half
-                precision is widened. Rows are copied.
-            real: whether these are real touches: the reference of TMMD, the floor of the others.
-            ids: n sample ids, strings or integers; without, a digest of each row. Needed by random halves with ``keep="sums"``.
+            features: (n, d), n may be 0: NumPy or torch on any device; half precision is widened.
+            Rows
+                are copied.
+            real: whether these are real samples: the reference of TMMD, the floor of the others.
+            ids: n sample ids, strings or integers; without, a digest of each row.
             labels: n classes, for CI- and D-TMMD.
-            groups: n videos, strings or integers. Ids, labels and groups are given with every batch of a set, or with none.
+            groups: n videos, strings or integers. Ids, labels and groups are given with every batch
+            of
+                a set, or with none.
 
         Raises:
-            PalpateError: at once for rows that are NaN, infinite, zero or (``normalize="check"``) not of unit length, with their numbers in the
-                batch; another width than before; columns of another length.
+            PalpateError: at once for rows that are NaN, infinite, zero or (``normalize="check"``)
+            not
+                of unit length, another width than before, or columns of another length.
         """
-        self.state.update(
-            features,
-            self.plan.normalize,
-            **Columns(real=real, ids=ids, labels=labels, groups=groups),
-        )
+        columns: dict[str, Any] = {"real": real, "ids": ids, "labels": labels, "groups": groups}
+        self.state.add(Batch.of(features, self.plan.normalize, **columns))
 
     def compute(self) -> Score:
         """The score of all batches since the last reset.
@@ -154,282 +229,88 @@ class StreamingMetric:
         """
         return self.score_of(self.state)
 
-    def missing(self, state: State) -> bool:
+    def missing(self, state: Batches) -> bool:
         """Whether a state lacks a set that the metric needs."""
-        return not state.rows(real=False) or (not self.of_halves and not state.rows(real=True))
+        return not state.rows(False) or (self.needs_real and not state.rows(True))
 
-    def score_of(self, state: State) -> Score:
+    def score_of(self, state: Batches) -> Score:
         """The score of a state."""
         if self.missing(state):
-            must = f"{self.name} must have seen {'generated touches' if self.of_halves else 'generated and real touches'} before compute()"
-            got = f"{state.rows(real=False)} generated and {state.rows(real=True)} real"
-            raise PalpateError(
-                must,
-                got,
-                "Call update(features)"
-                + ("" if self.of_halves else " and update(features, real=True)")
-                + " first",
-            )
-        return (
-            self._from_features(state)
-            if isinstance(state, FeatureState)
-            else self._from_sums(state)
-        )
+            sets = "generated and real samples" if self.needs_real else "generated samples"
+            got = f"{state.rows(False)} generated and {state.rows(True)} real"
+            fix = "Call update(features)" + " and update(features, real=True)" * self.needs_real
+            raise PalpateError(f"{self.name} must have {sets} before compute()", got, fix)
+        generated, real = (state.feature_set(real, self.encoder) for real in (False, True))
+        assert generated is not None  # missing() looked
+        score = self._scored(generated, real)
+        repeated = len(generated.ids) - len(set(generated.ids))
+        if not repeated:
+            return score
+        return replace(score, notes=[*score.notes, Note("repeated-ids", {"count": repeated})])
+
+    def _scored(self, generated: FeatureSet, real: FeatureSet | None) -> Score:
+        return reference_free(type(self).function, generated, self.options, real).score
 
     def reset(self) -> None:
-        """Forgets all batches; with ``reset_real_features=False`` those of generated touches only."""
+        """Forget all batches; with ``reset_real_features=False`` not those of real samples."""
         self.state.reset(keep_real=not self.reset_real_features)
 
     def merge_state(self, other: Self) -> None:
-        """Adds what another metric of the same settings has seen, e.g. one that came back from a process as a pickle.
+        """Add what another metric of the same settings has seen, e.g. one unpickled from a process.
 
         Raises:
-            PalpateError: if class, settings, width or center differ.
+            PalpateError: if class, settings or width differ.
         """
-        if other is self:
-            raise PalpateError(
-                "A metric must be merged with another one",
-                "itself",
-                "Merge what other processes have seen",
-            )
-        if (
-            type(other) is not type(self)
-            or other.digest != self.digest
-            or not same_options(other.options, self.options)
-        ):
-            got = f"{type(self).__name__} and {type(other).__name__}" + (
-                " of different settings" if type(other) is type(self) else ""
-            )
-            raise PalpateError(
-                "Metrics that are merged must be of one class with the same settings",
-                got,
-                "Construct all alike",
-            )
-        self.state = cast(Any, self.state).merge(other.state)
+        require_same_settings(self, other)
+        self.state = self.state.merge(other.state)
 
     def merge(self, *others: Self) -> Self:
         """A new metric that has seen what this one and others have."""
-        out = deepcopy(self)
+        merged = deepcopy(self)
         for other in others:
-            out.merge_state(other)
-        return out
-
-    def _of(self, table: Table, generated: FeatureSet, plan: Plan) -> Scored:
-        raise NotImplementedError
-
-    def _from_features(self, state: FeatureState) -> Score:
-        """What the function gives; the median bandwidth is that of the real touches where there are any."""
-        generated, repeated = state.set_of(real=False, encoder=self.encoder)
-        real, _ = state.set_of(real=True, encoder=self.encoder)
-        assert generated is not None  # score_of looked
-        score = self._function(generated, real)
-        if repeated:
-            again = f"{repeated} row{'s' * (repeated > 1)} have the id of another (a DistributedSampler pads with repetitions): each counts"
-            score = replace(score, note=". ".join(filter(None, [score.note, again])))
-        return score
-
-    def _function(self, generated: FeatureSet, real: FeatureSet | None) -> Score:
-        plan, grouped = (
-            plan_for(self.options, grouped=generated.groups is not None),
-            generated.groups is not None,
-        )
-        one = self._of(
-            build_table(generated, None, plan, grouped=grouped, median_of=real), generated, plan
-        )
-        if real is None:
-            return one.score
-        if (real.groups is None) == grouped:
-            must = "The floor must be scored like the generated touches"
-            raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
-        return with_floor(
-            one,
-            self._of(build_table(real, None, plan, grouped=grouped, median_of=real), real, plan),
-        ).score
-
-    def _from_sums(self, state: SumState) -> Score:
-        one, by = self._one_set(state, real=False), state.checked_hash(state.hashed)
-        score = one.score
-        note = (
-            score.note
-            if score.value is None
-            else ". ".join(filter(None, [SUMS_NOTE, HALVES_NOTE[by]]))
-        )
-        one = replace(
-            one,
-            score=replace(
-                score, note=note, settings={**score.settings, "halves": f"hashed by {by}"}
-            ),
-        )
-        if state.rows(real=True):
-            why = (
-                "" if state.same_groups else "other groups, or of other numbers of samples a group,"
-            )
-            one = with_floor(one, self._one_set(state, real=True), why)
-        score = one.score
-        if self.plan.estimator != "biased":
-            return score
-        return replace(
-            score, null=None, details={k: v for k, v in score.details.items() if k != "z"}
-        )  # its center is that of equal halves
-
-    def _one_set(self, state: SumState, *, real: bool) -> Scored:
-        table, small, sizes = state.table(real=real)
-        one = self._of(
-            table,
-            sized(state.rows(real=real), labeled=self.by_class, encoder=self.encoder),
-            self.plan,
-        )
-        return replace(
-            one,
-            score=without_units(
-                one.score, {"halves": dict(zip(table.classes, sizes, strict=True))}, small
-            ),
-        )
+            merged.merge_state(other)
+        return merged
 
 
 class TMMD(StreamingMetric):
-    """TMMD of generated touches against real ones (paper, Eq. 2); the streaming form of :func:`palpate.metrics.tmmd`."""
+    """TMMD (paper, Eq. 2), the streaming form of :func:`palpate.metrics.tmmd`."""
 
-    name = "TMMD"
-    of_halves = False
+    name, higher_is_better, needs_real = "TMMD", False, True
 
-    def _function(self, generated: FeatureSet, real: FeatureSet | None) -> Score:
-        assert real is not None  # score_of looked
-        return tmmd(generated, real, **self.options)
-
-    def _from_sums(self, state: SumState) -> Score:
-        table, _, _ = state.table()
-        generated, real = (
-            sized(state.rows(real=real), encoder=self.encoder) for real in (False, True)
-        )
-        score = without_units(
-            tmmd_of(table, generated, real, self.plan).score, {"copies": None}, []
-        )
-        return replace(score, note=SUMS_NOTE if score.value is not None else score.note)
+    def _scored(self, generated: FeatureSet, real: Any) -> Score:
+        return tmmd_scored(generated, real, self.options).score
 
 
 class ITMMD(StreamingMetric):
-    """I-TMMD, between halves of the generated touches (paper, Eq. 3); the streaming form of :func:`palpate.metrics.i_tmmd`."""
+    """I-TMMD (paper, Eq. 3), the streaming form of :func:`palpate.metrics.i_tmmd`."""
 
-    name = "I-TMMD"
-    higher_is_better: ClassVar[bool | None] = None
-
-    def _of(self, table: Table, generated: FeatureSet, plan: Plan) -> Scored:
-        return i_tmmd_of(table, generated, plan)
+    name, function = "I-TMMD", i_tmmd_of
 
 
 class CITMMD(StreamingMetric):
-    """CI-TMMD, between halves of each class (paper, Eq. 4); the streaming form of :func:`palpate.metrics.ci_tmmd`."""
+    """CI-TMMD (paper, Eq. 4), the streaming form of :func:`palpate.metrics.ci_tmmd`."""
 
-    name = "CI-TMMD"
-    higher_is_better: ClassVar[bool | None] = None
-    by_class = True
-
-    def _of(self, table: Table, generated: FeatureSet, plan: Plan) -> Scored:
-        return ci_tmmd_of(table, generated, plan)
+    name, function = "CI-TMMD", ci_tmmd_of
 
 
 class DTMMD(StreamingMetric):
-    """D-TMMD, halves of a class against other classes (paper, Eq. 5-7); the streaming form of :func:`palpate.metrics.d_tmmd`."""
+    """D-TMMD (paper, Eq. 5-7), the streaming form of :func:`palpate.metrics.d_tmmd`."""
 
-    name = "D-TMMD"
-    higher_is_better: ClassVar[bool | None] = None
-    by_class = True
-
-    def _of(self, table: Table, generated: FeatureSet, plan: Plan) -> Scored:
-        return d_tmmd_of(table, generated, plan)
+    name, function = "D-TMMD", d_tmmd_of
 
 
-def plan_of_sums(options: Options, *, halves: bool) -> Plan:
-    """The options of ``keep="sums"``, or why they cannot be.
+def require_same_settings(metric: Any, other: Any) -> None:
+    """Raise where two metrics cannot be merged.
 
     Raises:
-        PalpateError: on what needs pairs of samples.
+        PalpateError: on a metric with itself, another class, or other options.
     """
-    fix = 'Use keep="features", or preset="paper" or "cmmd" and one number as sigma'
-    if "grouped" in (options.get("preset"), options.get("estimator")):
-        raise PalpateError(
-            'keep="sums" cannot leave out pairs of one group', "the grouped estimator", fix
-        )
-    sigma = options.get("sigma", 10.0)
-    if (kernel := options.get("kernel")) is not None:
-        raise PalpateError(
-            'keep="sums" has the Gaussian kernel',
-            f"kernel={kernel!r}",
-            'Pass sigma, or keep="features"',
-        )
-    if isinstance(sigma, str) or np.ndim(sigma) > 0:
-        raise PalpateError(
-            'keep="sums" must know its one bandwidth beforehand', f"sigma={sigma!r}", fix
-        )
-    bare: Options = {**options, "permutations": 0, "backend": "moments"}
-    plan = plan_for(bare, grouped=False)
-    if halves and plan.halves != "random":
-        raise PalpateError('keep="sums" deals halves by a hash', f"halves={plan.halves!r}", fix)
-    return plan
-
-
-def same_options(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether two metrics were given the same; bandwidths may stand in an array."""
-    return a.keys() == b.keys() and all(
-        np.array_equal(a[k], b[k]) if k == "sigma" else a[k] == b[k] for k in a
-    )
-
-
-def checked_classes(classes: Sequence[str] | None) -> tuple[str, ...]:
-    """Names of classes, as strings.
-
-    Raises:
-        PalpateError: if there are none, or one twice or empty.
-    """
-    names = tuple(str(c) for c in classes or ())
-    if not names or len(set(names)) < len(names) or "" in names:
-        raise PalpateError(
-            'keep="sums" must know the classes', f"{list(names)}", "Pass classes=, each name once"
-        )
-    return names
-
-
-def checked_center(center: Any) -> np.ndarray:
-    """(d,) float64.
-
-    Raises:
-        PalpateError: if it is no finite vector.
-    """
-    found = np.asarray(to_host(center), dtype=np.float64)
-    if found.ndim != 1 or not found.size or not np.isfinite(found).all():
-        raise PalpateError(
-            "center must be a finite vector (d,)",
-            f"shape {found.shape}",
-            "Pass e.g. the mean of the real embeddings",
-        )
-    return found
-
-
-def without_units(score: Score, details: Mapping[str, Any], small: Sequence[str]) -> Score:
-    """A score of sums: without what leaves out units, and with the true reason why classes are excluded."""
-    found: dict[str, Any] = {k: v for k, v in score.details.items() if k != "left_out"} | {
-        "unit": None,
-        "units": None,
-        **details,
-    }
-    for name, value in found.items():
-        if name.endswith("_interval"):
-            found[name] = None
-        elif isinstance(value, dict) and "interval" in value:
-            found[name] = {**value, "interval": None}
-    note = (
-        UNBOUNDED.replace('backend="blocked"', 'keep="features"')
-        if score.note == UNBOUNDED
-        else score.note
-    )
-    if "excluded" in found:
-        found["excluded"] = {
-            **found["excluded"],
-            **dict.fromkeys(small, "fewer than two samples in a half"),
-        }
-    if "per_class" in found:
-        found["per_class"] = {
-            name: {**of, "units": None} for name, of in found["per_class"].items()
-        }
-    return replace(score, interval=None, interval_method="", details=found, note=note)
+    a, b = metric.options, other.options
+    same = type(metric) is type(other) and metric.digest == other.digest and a.keys() == b.keys()
+    if other is metric:
+        got, fix = "itself", "Merge what other processes have seen"
+        raise PalpateError("A metric must be merged with another one", got, fix)
+    if not same or not all(np.array_equal(a[k], b[k]) for k in a):
+        must = "Metrics that are merged must be of one class with the same settings"
+        got = f"{type(metric).__name__} and {type(other).__name__}"
+        raise PalpateError(must, got, "Construct all with the same arguments")

@@ -1,25 +1,32 @@
 """One table of kernel sums for one generated set and its reference, and what is estimated from it.
 
-The pass over the pairs is made once (:func:`build_table`); a metric merges segments and computes its statistic on the totals, and
-the jackknife computes the same statistic on the totals without each unit.
+The pass over the pairs is made once (:func:`build_table`); a metric merges segments and computes
+its statistic on the totals, and the jackknife computes the same statistic on the totals without
+each unit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from palpate.core import FeatureSet
 from palpate.core.features import is_missing
-from palpate.metrics.engine import kernel_sums
-from palpate.metrics.halves import half_of, halves_bound, sample_units, self_distances, take_sets
-from palpate.metrics.inputs import checked_features, checked_names, checked_pair, copies_across
-from palpate.metrics.intervals import Interval, jackknife_errors, leave_one_out, t_interval
-from palpate.metrics.kernels import Array, Index, Kernel, gaussian
+from palpate.metrics.halves import half_of, halves_bound, sample_units, self_distances, without_set
+from palpate.metrics.inputs import (
+    Array,
+    Index,
+    checked_features,
+    checked_names,
+    checked_pair,
+    copies_across,
+)
+from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
+from palpate.metrics.kernels import Kernel, gaussian
 from palpate.metrics.mmd import largest_bound, unit_index
+from palpate.metrics.pairs import kernel_sums
 from palpate.metrics.presets import Plan
 from palpate.metrics.sums import PairSums, Totals
 
@@ -29,14 +36,15 @@ class Table:
     """Kernel sums of one generated set (and its reference): all that the four metrics need.
 
     Attributes:
-        sums: segment ``4 c + 2 (half of the class) + (half of the set)`` for class number c; the last segment is the reference.
+        sums: segment ``4 c + 2 (half of the class) + (half of the set)`` for class number c; the
+            last segment is the reference.
         classes: label of each class number; ``""`` holds samples without a label.
         unit: what the jackknife leaves out: ``"group"``, ``"sample"`` or ``"random-block"``.
         names: the name of each unit number.
         kernel: what was summed.
-        spread: (1 + C, 3) centered squares (:mod:`palpate.metrics.blocked`) of the generated set and of each class.
-        copies: generated rows that are bit for bit rows of the reference; None where they were not looked for.
-        sizes: (1 + C, 2) sizes of the halves of the set and of each class, where they are not as equal as they can be.
+        spread: (1 + C, 3) centered squares (:mod:`palpate.metrics.pairs`) of the generated set and
+            of each class.
+        copies: generated rows that are bit for bit rows of the reference.
     """
 
     sums: PairSums
@@ -46,7 +54,6 @@ class Table:
     kernel: Kernel
     spread: Array
     copies: int | None = 0
-    sizes: Array | None = None
 
     @property
     def grouped(self) -> bool:
@@ -70,9 +77,8 @@ class Table:
 
     def whole_classes(self) -> PairSums:
         """Segment c: class number c, whole."""
-        return self.sums.merge(
-            np.append(np.repeat(np.arange(len(self.classes)), 4), -1), len(self.classes)
-        )
+        classes = len(self.classes)
+        return self.sums.merge(np.append(np.repeat(np.arange(classes), 4), -1), classes)
 
 
 def build_table(
@@ -81,181 +87,163 @@ def build_table(
     plan: Plan,
     *,
     grouped: bool,
-    median_of: Any = None,
+    median_of: FeatureSet | None = None,
     further: Callable[[Table, Plan], float] | None = None,
 ) -> Table:
-    """Checks the sets and passes once over all their pairs.
+    """Check the sets and pass once over all their pairs.
 
     Args:
         generated: the set that is halved and divided into classes.
-        reference: real touches, or None where no metric needs them.
+        reference: real samples, or None where no metric needs them.
         plan: halves, seed, bandwidth, back end, normalization.
         grouped: whether the groups of the sets are the jackknife's units; else samples are.
-        further: the bound of a statistic without scale, which moments must keep within the tolerance as well: D-TMMD is a ratio.
-        median_of: the set whose median distance ``sigma="median"`` takes; else the reference, or the generated set without one.
+        median_of: the set whose median distance ``sigma="median"`` takes; else the reference, or
+            the generated set without one.
+        further: the bound of a statistic without scale, which moments must keep within the
+            tolerance as well: D-TMMD is a ratio.
 
     Raises:
-        PalpateError: on features or groups that are refused.
+        PalpateError: on features or groups that are rejected.
     """
-    own = (
-        "The generated features"
-        if plan.subject == "generated"
-        else f"The features of {plan.subject!r}"
-    )
-    copies: int | None = 0
+    name = "generated" if plan.subject == "generated" else f"The features of {plan.subject!r}"
     if reference is None:
-        parts = [checked_features(own, generated.features, normalize=plan.normalize)]
         sets = [generated]
+        parts = [checked_features(name, generated.features, normalize=plan.normalize)]
     else:
-        names = (own, "The reference features")
-        parts = list(
-            checked_pair(
-                generated.features,
-                reference.features,
-                normalize=plan.normalize,
-                least=1,
-                names=names,
-            )
-        )
-        sets, copies = [generated, reference], copies_across(*parts)
+        sets, features = [generated, reference], (generated.features, reference.features)
+        names = (name, "reference")
+        parts = [*checked_pair(*features, normalize=plan.normalize, least=1, names=names)]
     if grouped:
         groups = [checked_names("groups", s.groups, len(s.ids)) or [] for s in sets]
-        units, unit = np.concatenate(unit_index(*groups)), "group"
-        names = sorted({name for column in groups for name in column})
+        units, unit = unit_index(*groups), "group"
+        unit_names = sorted({name for group in groups for name in group})
     else:
-        units, unit, names = sample_units([str(i) for s in sets for i in s.ids], plan.seed)
-    labels = [
-        "" if is_missing(v) else str(v)
-        for v in (generated.labels if generated.labels is not None else [None] * len(generated.ids))
-    ]
-    classes = sorted(set(labels))
-    number = {name: k for k, name in enumerate(classes)}
-    label = np.array([number[v] for v in labels], dtype=np.intp)
-    ids = [str(i) for i in generated.ids]
-    halves = 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, np.zeros_like(label), plan)
-    segment = np.concatenate(
-        [halves, np.full(len(units) - len(halves), 4 * len(classes), dtype=np.intp)]
-    )
-    if plan.kernel is not None:
-        kernel = plan.kernel
-    elif median_of is None or not isinstance(plan.sigma, str):
+        ids = [str(i) for s in sets for i in s.ids]
+        units, unit, unit_names = sample_units(ids, plan.seed)
+    classes, segment = _segments(generated, plan)
+    reference_segment = 4 * len(classes)
+    segment = np.append(segment, np.full(len(units) - len(segment), reference_segment))
+    kernel = plan.kernel
+    if kernel is None and isinstance(plan.sigma, str) and median_of is not None:
+        kernel = gaussian(plan.sigma, _rows_of_median(median_of, plan), median_of.groups)
+    if kernel is None:
         kernel = gaussian(plan.sigma, parts[-1], sets[-1].groups)
-    else:
-        rows = checked_features(
-            "The features that the median distance is taken over",
-            median_of.features,
-            normalize=plan.normalize,
-        )
-        kernel = gaussian(plan.sigma, rows, median_of.groups)
 
     def bound(sums: PairSums) -> float:
-        table = Table(sums, classes, unit, names, kernel, np.zeros((0, 3)))
-        return max(
-            _bound(table, plan),
-            further(table, plan) * plan.scale / 1000 if further is not None else 0.0,
-        )
+        table = Table(sums, classes, unit, unit_names, kernel, np.zeros((0, 3)))
+        ratio = further(table, plan) * plan.scale / 1000 if further else 0.0
+        return max(_bound(table, plan), ratio)
 
-    rest = [
-        np.arange(4 * len(classes)),
-        *(np.arange(4 * c, 4 * c + 4) for c in range(len(classes))),
-    ]
-    found = kernel_sums(
+    of_class = [np.arange(4 * c, 4 * c + 4) for c in range(len(classes))]
+    sweep = kernel_sums(
         parts,
         segment,
         units,
-        segments=4 * len(classes) + 1,
+        segments=reference_segment + 1,
         kernel=kernel,
         backend=plan.backend,
         tolerance=plan.tolerance * plan.scale / 1000,
         bound=bound,
         block=plan.block,
-        spread=rest,
+        spread=[np.arange(reference_segment), *of_class],
     )
-    return Table(found.sums, classes, unit, names, kernel, found.spread, copies)
+    copies = copies_across(*parts) if reference is not None else 0
+    return Table(sweep.sums, classes, unit, unit_names, kernel, sweep.spread, copies)
+
+
+def _segments(generated: FeatureSet, plan: Plan) -> tuple[list[str], Index]:
+    """The classes, and (n,) the segment of each sample."""
+    ids = [str(i) for i in generated.ids]
+    labels = [""] * len(ids)
+    if generated.labels is not None:
+        labels = ["" if is_missing(v) else str(v) for v in generated.labels]
+    classes = sorted(set(labels))
+    label = np.searchsorted(classes, labels) if labels else np.zeros(0, dtype=np.intp)
+    whole = np.zeros_like(label)
+    return classes, 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, whole, plan)
+
+
+def _rows_of_median(median_of: FeatureSet, plan: Plan) -> Array:
+    name = "The features that the median distance is taken over"
+    return checked_features(name, median_of.features, normalize=plan.normalize)
 
 
 def _bound(table: Table, plan: Plan) -> float:
-    """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most; classes too small to be scored are left out."""
-    whole = table.set_halves()
-    own = whole.bound
-    joint = (
-        0.0
-        if not table.sums.n[table.sums.segment == table.sums.segments - 1].sum()
-        else largest_bound(table.tmmd(), plan.estimator, plan.scale)
-    )
-    known = np.isfinite(self_distances(whole.totals, plan)[0])
-    halves = halves_bound(own.totals, plan)[known] if own is not None else np.zeros(1)
-    halves = np.where(np.isfinite(halves), halves, np.inf)
-    return max(
-        joint,
-        largest_bound(table.whole_classes(), plan.estimator, plan.scale),
-        float(halves.max(initial=0.0)),
-    )
+    """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most."""
+    halves, reference = table.set_halves(), table.sums.segment == table.sums.segments - 1
+    bounds = [largest_bound(table.whole_classes(), plan.estimator, plan.scale)]
+    if reference.any():
+        bounds.append(largest_bound(table.tmmd(), plan.estimator, plan.scale))
+    if halves.bound is not None and np.isfinite(self_distances(halves.totals, plan)[0][0]):
+        bounds.append(float(halves_bound(halves.bound.totals, plan)[0]))
+    return max(b if np.isfinite(b) else np.inf for b in bounds)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A statistic with its jackknife: values (K,), standard errors (K,), their degrees of freedom, the method in words.
+    """A statistic with its jackknife.
 
-    ``replicates`` (G, K) are the values without each unit, ``units`` (G,) the units. ``without_class`` (C, 4) are the first four without each
-    class, empty with fewer than three; the errors are theirs where ``of_classes``.
+    Attributes:
+        values: (K,).
+        errors: (K,) standard errors.
+        df: their degrees of freedom.
+        method: in words.
+        replicates: (G, K) values without each unit.
+        units: (G,) units.
+        without_class: (C, 4) the first four values without each class; empty with fewer than three.
+        of_classes: whether the errors are those over classes.
     """
 
     values: Array
     errors: Array
     df: int
     method: str
-    replicates: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
-    units: Index = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+    replicates: Array = field(repr=False)
+    units: Index = field(repr=False)
     without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
     of_classes: bool = False
 
     def interval(self, k: int, level: float) -> Interval | None:
         """Interval of value k, or None where it has none."""
-        if not (np.isfinite(self.values[k]) and np.isfinite(self.errors[k]) and self.errors[k] > 0):
+        value, error = float(self.values[k]), float(self.errors[k])
+        if not (np.isfinite(value) and np.isfinite(error) and error > 0):
             return None  # no variation between units is no evidence of certainty
-        return t_interval(float(self.values[k]), float(self.errors[k]), self.df, level)
+        return t_interval(value, error, self.df, level)
 
 
 def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
     """The statistic on all samples, with its leave-one-unit-out jackknife."""
-    replicates = leave_one_out(sums.leave_one_out(), statistic)
-    df = sums.units - 1
+    replicates = np.array([statistic(t) for t in sums.leave_one_out()], dtype=np.float64)
+    df = len(sums.units) - 1
     tail = "" if unit == "group" else ", samples taken as independent"
     method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
-    return Estimate(
-        statistic(sums.totals),
-        jackknife_errors(replicates),
-        df,
-        method,
-        replicates,
-        sums.unit_order,
-    )
+    errors = jackknife_errors(replicates)
+    return Estimate(statistic(sums.totals), errors, df, method, replicates, sums.units)
 
 
 def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
-    """As :func:`estimate`, for 2C segments; where a class cannot spare a unit (two groups), the jackknife leaves out classes.
+    """As :func:`estimate`, for 2C segments; over classes where one cannot spare a unit (two
+    groups).
 
-    The interval over classes also holds the differences between classes, so it errs on the wide side. The first four values of the
-    statistic must be defined for fewer classes; only they get errors then.
+    The interval over classes also holds the differences between classes, so it errs on the wide
+    side. The first four values of the statistic must be defined for fewer classes; only they get
+    errors then.
     """
     over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
     if classes < 3:
         return over_units
-    rest = np.arange(classes)
-    found = leave_one_out(
-        (take_sets(sums.totals, rest[rest != c]) for c in rest), lambda t: statistic(t)[:4]
-    )
+    without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
     if np.isfinite(over_units.errors[0]):
-        return replace(over_units, without_class=found)
-    first = jackknife_errors(found)
-    errors = np.concatenate([first, np.full(len(over_units.values) - len(first), np.nan)])
-    method = f"leave-one-class-out jackknife, t, {classes - 1} df (a class has too few {unit}s to leave one out)"
+        return replace(over_units, without_class=without)
+    errors = np.full(len(over_units.values), np.nan)
+    errors[: without.shape[1]] = jackknife_errors(without)
+    reason = f"(a class has too few {unit}s to leave one out)"
+    method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
     return replace(
         over_units,
         errors=errors,
         df=classes - 1,
         method=method,
-        without_class=found,
+        without_class=without,
         of_classes=True,
     )

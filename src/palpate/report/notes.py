@@ -55,7 +55,75 @@ def _fid_biased(p: Mapping[str, Any], _: Style) -> str:
     return "Biased upwards, the more the fewer samples: compare at equal sizes only"
 
 
+#: Why a class, or a set, cannot be cut into halves (``details["excluded"]`` of scores).
+EXCLUDED = {
+    "few-samples": "too few samples",
+    "one-group": "all samples are of one group",
+    "single-samples": "no group has two samples",
+    "no-label": "no label",
+}
+_UNDEFINED = {
+    **EXCLUDED,
+    "few-samples": "fewer than {least} samples",
+    "no-pairs": "an average over no pairs",
+    "moments": "moments do not bound this value at this bandwidth; pass {arg:backend=blocked}",
+    "few-groups": "each set needs two groups, not all shared, for the grouped estimator",
+    "one-sample": "each set needs two samples",
+    "no-class": "no class can be cut into halves",
+    "one-class": "needs two classes that can be cut into halves, has {classes}",
+    "not-separate": "the classes do not separate (a denominator is not positive)",
+    "score": "one of the two scores is",
+    "no-images": "no pair of images has a value",
+}
+_NO_INTERVAL = {
+    "too-few": "too few groups or samples to leave one out",
+    "different-units": "the two scores share no units to leave out",
+    "no-units": "there is nothing to leave out",
+    "no-change": "leaving out a unit is undefined, or changes nothing",
+    "few-images": "one image or one group, or no variation between them",
+}
+_NO_FLOOR = {
+    "classes": "other classes",
+    "groups": "other groups",
+    "group-sizes": "other numbers of samples a group",
+    "sizes": "other numbers of samples",
+}
+
+
+def _undefined(p: Mapping[str, Any], style: Style) -> str:
+    size = f" (n = {p['n']})" if "n" in p else ""
+    labels = "" if p.get("labeled", True) else " (the samples have no labels)"
+    return "Undefined: " + _UNDEFINED[p["reason"]].format(arg=style, **p) + size + labels
+
+
+def _unstable(p: Mapping[str, Any], _: Style) -> str:
+    known = p["known_errors"]
+    why = "within two standard errors of 0" if known else "of unknown error (too few groups)"
+    names, more = ", ".join(p["classes"][:5]), len(p["classes"]) - 5
+    tail = f" and {more} more" if more > 0 else ""
+    return f"Denominators {why}, so the ratio is unreliable: {names}{tail}"
+
+
 METRICS: dict[str, Sentence] = {
+    "undefined": _undefined,
+    "no-interval": lambda p, _: f"No interval: {_NO_INTERVAL[p['reason']]}",
+    "no-floor": lambda p, _: f"No floor: real images of {_NO_FLOOR[p['reason']]} have another value",
+    "within-bound": (
+        "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments"
+    ),
+    "independent-samples": (
+        "The interval takes samples as independent; frames of one video are not: give groups"
+    ),
+    "random-halves": (
+        "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; "
+        "halves of whole videos do (preset grouped)"
+    ),
+    "collapse": "All features are equal: complete collapse, which this metric calls perfect",
+    "unstable-denominators": _unstable,
+    "repeated-ids": (
+        "Rows with the id of another row (a DistributedSampler pads with repetitions): {count}; "
+        "each counts"
+    ),
     "copied-rows": (
         "{count} of {n} generated rows equal a real row bit for bit: a copy is not a generator"
     ),
@@ -80,7 +148,84 @@ METRICS: dict[str, Sentence] = {
     ),
 }
 LEAKAGE: dict[str, Sentence] = {}
-EVALUATION: dict[str, Sentence] = {}
+
+
+def confidence(share: float) -> str:
+    """A share in [0, 1] in percent, never rounded to certainty."""
+    return "> 99.9 %" if share > 0.999 else "< 0.1 %" if share < 0.001 else f"{100 * share:.1f} %"
+
+
+def _ahead(params: Mapping[str, Any], _: Style) -> str:
+    p = params["p_adjusted"]
+    holm = "" if p is None else ", Holm p < 1e-15" if p < 1e-15 else f", Holm p = {p:.2g}"
+    share = confidence(params["confidence"])
+    return f"{params['better']} is better with {share} confidence{holm}"
+
+
+def _materials_excluded(params: Mapping[str, Any], _: Style) -> str:
+    materials = "; ".join(f"{m} ({why})" for m, why in sorted(params["materials"].items()))
+    return f"Excluded ({len(params['materials'])} of {params['total']} materials): {materials}"
+
+
+EVALUATION: dict[str, Sentence] = {
+    "few-test-groups": (
+        "A test part holds {count} {group} group(s) only: the intervals are wide, and too trusting "
+        "if anything"
+    ),
+    "materials-excluded": _materials_excluded,
+    "no-background": (
+        "{count} of {n} samples have no background: tactile images are used as they are only"
+    ),
+    "no-images": "No sample has a {column} image: no features of it",
+    "no-material": "{count} samples without a material are excluded",
+    "no-shared-group": (
+        "The given split shares no {group} between train and test: a difference is due to which of "
+        "them are in test"
+    ),
+    "repeated-splits": (
+        "{repeated} of {n} seeds gave a leak-free split that another gave: there are too few {group} "
+        "groups for more"
+    ),
+    "shared-videos": (
+        "Whole contacts are kept together, but train and test share videos: what a shared video is "
+        "worth is not in this number, and contacts of one video are less independent than the "
+        "intervals take them to be"
+    ),
+    "uneven-materials": (
+        "Materials are not equally common. Always guessing the commonest material of train scores "
+        "{share:.1%} under the given split, not chance"
+    ),
+    "val-excluded": (
+        "The validation part of the given split is excluded; the leak-free splits are made of its "
+        "train and test samples"
+    ),
+    "ahead": _ahead,
+    "below-floor": "{metric}, {subject}: below the floor of real images, so these vary less than real "
+    "ones do; that is not better",
+    "companion-skipped": "{name} skipped: {must}; got {got}",
+    "copies": "{subject}: {copies} of {n} generated rows are bit for bit rows of the reference: a copy "
+    "is not a generator",
+    "encoder-of-other-split": "The tactile encoder was trained on another split: it may have seen test "
+    "samples",
+    "encoder-without-split": "The tactile encoder comes without a record of its split",
+    "generator-of-other-split": "The generator was not trained on this split: it may have seen test "
+    "samples",
+    "kid-interval": "The spread over random subsets that others print with KID is no interval; this one is",
+    "no-differences": "No differences between generators: their rows have no ids, and differ in number",
+    "no-interval-streamed": "No interval: neither groups nor repeats are known",
+    "no-pairs": "Scores of pairs of images skipped: generated and reference share no id",
+    "outside-test-part": "{name}: {skipped} of {n} samples lie outside the split's test part, and were "
+    "skipped",
+    "resized": "Pixels are compared at {size} x {size}, the generators' size: the reference's {side} px "
+    "were resized, and smaller images score higher",
+    "row-pairs": "Row k of every generator is taken for the same sample: the rows have no ids",
+    "streamed": "Streamed, as there are too many rows to hold: TMMD alone, without interval, p-value or "
+    "companions",
+    "too-many-rows": "{name} skipped: it forms all pairs of more than {rows:,} rows; request it with "
+    "{arg:companions}",
+    "widened": "The features in {source}: {type} was widened to float32; its rounding stays",
+    "within-bound": "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments",
+}
 OTHER: dict[str, Sentence] = {"text": "{text}"}
 SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | OTHER
 

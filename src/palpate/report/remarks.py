@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from palpate.core import Score
-from palpate.report.notes import sentence
+from palpate.report.notes import EXCLUDED, sentence
 from palpate.report.text import defined
 
 #: Said of every interval over frames, in the words that the metrics use.
@@ -72,7 +72,7 @@ def left_out(score: Score) -> str:
         return ""
     reasons: dict[str, list[str]] = {}
     for name, why in excluded.items():
-        reasons.setdefault("" if name == _UNLABELED else str(why), []).append(
+        reasons.setdefault("" if name == _UNLABELED else EXCLUDED.get(why, str(why)), []).append(
             "samples without a label" if name == _UNLABELED else str(name)
         )
     room, parts = NAMES, list[str]()

@@ -190,12 +190,10 @@ def world_manifest(
         for row in contact_rows(options, plans)
     ]
     if options.layout == "hct":
-        videos = dict.fromkeys(str(row["video"]) for row in rows)
-        recordings = {video: (video.split("/", 1)[0], video.split("/", 1)[1]) for video in videos}
-        sessions = sessions_of(list(recordings.values()), _SESSION_GAP)
+        sessions = sessions_of({str(row["video"]) for row in rows}, _SESSION_GAP)
         for row in rows:
-            recording = recordings[row["video"]]
-            row |= {"session": sessions[recording], "domain": recording[0]}
+            video = str(row["video"])
+            row |= {"session": sessions[video], "domain": video.partition("/")[0]}
     return Manifest.from_rows(rows, manifest_root(options, folder or Path()), _facts(options))
 
 

@@ -39,21 +39,21 @@ from palpate.core import (
     read_json,
     write_json,
 )
+from palpate.core.shipped import Part, is_shipped, shipped_folder
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.autoencoder_training import train_autoencoder
-from palpate.diffusion.generation import Generated, generate
+from palpate.diffusion.generate import Generated, generate
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import preset_named as diffusion_preset
-from palpate.diffusion.training import train_pipeline
-from palpate.encoders.contrastive import train_clip, train_tactile
+from palpate.diffusion.recipe import train_pipeline
+from palpate.encoders.contrastive import train_clip, train_touch
 from palpate.encoders.embed import texts_of
-from palpate.encoders.encoder_set import EncoderSet, load_clip
-from palpate.encoders.models import Part, is_shipped, pick_device, shipped_folder
+from palpate.encoders.encoder_set import EncoderSet, load_clip, pick_device
 from palpate.encoders.presets import preset as encoder_preset
-from palpate.evaluation.scoring import score_generated
+from palpate.evaluation.scoring import score
 from palpate.leakage.audit import Pictures, audit_split
 from palpate.leakage.splits import describe, leak_free_split
 from palpate.report.results import Audit
@@ -101,7 +101,7 @@ class PipelineOutcome:
         manifest, split: the data and the leak-free split that was trained and scored on.
         audits: of the data set's own splits, if it has any, and of ours.
         generated: the touches made for the test part.
-        scores: see :func:`palpate.evaluation.scoring.score_generated`.
+        scores: see :func:`palpate.evaluation.score`.
         stages: by name, with digests, facts and times.
         options: what was asked for.
         models: the pretrained models that were taken, by role (``clip``, ``autoencoder``); None: trained in the run.
@@ -440,7 +440,7 @@ class _Pipeline:
             before, after = self.preset.touch_epochs
             if ready is not None:
                 start = EncoderSet.load(ready)
-                encoders = train_tactile(
+                encoders = train_touch(
                     manifest,
                     split,
                     frozen,
@@ -451,14 +451,14 @@ class _Pipeline:
                     **common,
                 )
             elif pretraining is None:
-                encoders = train_tactile(
+                encoders = train_touch(
                     manifest, split, frozen, self.encoder, folder / "training", **common
                 )
             else:
                 everything = Split.from_ids(
                     train=pretraining.ids, rule={"name": "pretraining"}, manifest=pretraining.digest
                 )
-                start = train_tactile(
+                start = train_touch(
                     pretraining,
                     everything,
                     frozen,
@@ -467,7 +467,7 @@ class _Pipeline:
                     epochs=before,
                     **common,
                 )
-                encoders = train_tactile(
+                encoders = train_touch(
                     manifest,
                     split,
                     frozen,
@@ -515,7 +515,7 @@ class _Pipeline:
                 folder / "training",
                 seed=self.options.seed,
                 background=self.options.background,
-                start=TactilePipeline.from_pretrained(start) if start else None,
+                start=TactilePipeline.load(start) if start else None,
                 cache=self.cache,
                 device=self.options.device,
                 progress=self.progress,
@@ -546,16 +546,16 @@ class _Pipeline:
             inputs | {"seed": self.options.seed} | self._digest("split", "data", "encoders"),
             build,
         )
-        return TactilePipeline.from_pretrained(stage.folder / "model")
+        return TactilePipeline.load(stage.folder / "model")
 
     def generated(self, manifest: Manifest, split: Split, pipeline: TactilePipeline) -> Generated:
         """A touch for each photo of the test part."""
 
         def build(folder: Path) -> dict[str, Any]:
             made = generate(
-                manifest.part(split, "test"),
-                model=pipeline,
-                output=folder / "touches",
+                pipeline,
+                manifest=manifest.part(split, "test"),
+                out=folder / "touches",
                 seed=self.options.seed,
                 progress=self.progress,
             )
@@ -577,18 +577,20 @@ class _Pipeline:
         """The scores of the generated touches and of the controls."""
 
         def build(folder: Path) -> dict[str, Any]:
-            scores = score_generated(
+            results = score(
+                generated.folder,
                 manifest,
-                split,
-                {"generated": generated},
-                encoders,
-                group=str(split.rule["group"]),
+                encoder=encoders,
+                split=split,
+                names=["generated"],
+                presets=("grouped", "paper"),
+                companions=("ssim", "psnr"),
                 seed=self.options.seed,
                 cache=self.cache,
                 progress=self.progress,
             )
-            write_json(folder / "scores.json", [s.to_json() for s in scores])
-            return {"scores": len(scores)}
+            write_json(folder / "scores.json", [s.to_json() for s in results])
+            return {"scores": len(results)}
 
         inputs = {"encoder": encoders.digest("tactile"), "seed": self.options.seed}
         stage = self.run.stage(

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from palpate.core import Score, rng_for
+from palpate.core.shipped import is_shipped
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generation import Generated
-from palpate.encoders.models import is_shipped
+from palpate.diffusion.generate import Generated
 from palpate.evaluation.scoring import BACKGROUND
 from palpate.report.results import Audit, GalleryItem, Results
 from palpate.studies.pipeline import PipelineOutcome
@@ -190,6 +190,6 @@ def _next_steps(outcome: PipelineOutcome) -> list[str]:
     run = Path(outcome.stages["data"].folder).parent
     return [
         f"palpate audit {run / 'data'} --split {run / 'split' / 'noleak.json'} --worst 50",
-        f"palpate generate YOUR_PHOTOS/ --model {run / 'generator' / 'model'} -o touches/",
-        f"palpate score {run / 'data'} --split {run / 'split' / 'noleak.json'} --generated YOUR_TOUCHES/ --encoder {run / 'towers' / 'towers'} -o scores.json",
+        f"palpate generate YOUR_PHOTOS/ --model {run / 'generator' / 'model'} -o YOUR_IMAGES/",
+        f"palpate score --generated YOUR_IMAGES/ --reference {run / 'data'} --split {run / 'split' / 'noleak.json'} --encoder {run / 'encoders' / 'encoders'} -o scores.json",
     ]

@@ -1,1 +1,1 @@
-"""Training: one engine for every model (options, steps, checkpoints, averaging, log)."""
+"""Training: one engine for every model."""

@@ -1,17 +1,20 @@
-"""What a data-set format is: facts about the data set, a way to recognize it, and a scan of what lies on disk.
+"""What a data-set format is: facts about it, a way to recognize it, and a scan of its files.
 
-A format is one file with ``FACTS``, ``detect`` and ``scan``, and one row in ``palpate.data.formats.FORMATS``. The scan reads
-lists and folders and returns every row with everything that is wrong; :func:`import_scanned` makes a manifest of it
-and :func:`validation` a report, so both see the same problems. A format whose frames must be decoded first (Touch and Go)
-brings its own ``run``.
+A format is one file with ``FACTS``, ``LOOKS_FOR``, ``detect``, ``scan`` and a ``FORMAT`` that joins
+them, named in ``palpate.data.formats.FORMATS``. The scan reads lists and folders and returns every
+row with everything that is wrong. :func:`finished` is what an
+import and a validation share, so both see the same problems. A format whose frames must be decoded
+first brings its own ``run``.
 """
 
 from __future__ import annotations
 
 import inspect
+import posixpath
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +22,20 @@ from palpate.core import Problem, Progress, Split, inside, quiet, read_json
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
+from palpate.data.recordings import place_of
 
-#: (place, manifest row): where a row was found, ``file:line`` or a path, and its cells by manifest column.
-Found = tuple[str, dict[str, Any]]
-#: Kinds of problems that say that something is not there; every other kind says that something is wrong.
+#: Manifest column -> cell; ``split`` may hold the part of the data set's own split.
+Cells = dict[str, Any]
+#: (place, cells): where a row was read, ``file:line`` or a path, and its cells.
+Row = tuple[str, Cells]
+#: Kinds of problems of files that are not there; every other kind means that a file or row is bad.
 MISSING = ("missing-", "unpaired")
+#: How many names a summary shows.
+FEW = 3
+MeanStd = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Facts:
     """What is known of a data set, from its publication and its public files.
 
@@ -37,125 +46,101 @@ class Facts:
         image_size: (width, height) of the tactile images as released, in pixels, or None.
         samples: how many there are, in words and with the source.
         group: what a split must keep whole, in words.
-        group_column: the manifest column that says it; audits and splits take it by themselves.
-        normalization: name -> (mean, std) of RGB in [0, 1] with what it is for; valid for the crop that the name says, no other.
+        group_column: the manifest column of that group; the default of audits and splits.
+        normalization: crop that it is valid for -> (mean, std) of RGB in [0, 1].
     """
 
     name: str
-    citation: str
-    license: str
-    url: str
-    sensor: str
-    image_size: tuple[int, int] | None
+    citation: str = "unknown"
+    license: str = "unknown"
+    url: str = "unknown"
+    sensor: str = "unknown"
+    image_size: tuple[int, int] | None = None
     samples: str
     group: str
-    normalization: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = (
-        field(default_factory=dict)
-    )
     group_column: str = "video"
+    normalization: Mapping[str, MeanStd] = field(default_factory=dict)
 
     def of_manifest(self) -> dict[str, str]:
         """The facts that a manifest keeps."""
-        about = {
-            "dataset": self.name,
-            "license": self.license,
-            "citation": self.citation,
-            "url": self.url,
-        }
-        return about | ({} if self.group_column == "video" else {"group": self.group_column})
+        facts = {"dataset": self.name, "license": self.license}
+        facts |= {"citation": self.citation, "url": self.url}
+        return facts | ({} if self.group_column == "video" else {"group": self.group_column})
 
 
-#: palpate's own world, in whichever layout.
+#: A tree that ``palpate world`` made, in whichever layout.
 WORLD = Facts(
     name="palpate's procedural world (synthetic)",
     citation="none: made by palpate world",
     license="Apache-2.0",
     url="",
     sensor="simulated",
-    image_size=None,
     samples="as world.json says",
     group="video",
 )
 
 
 def world_facts(folder: Path) -> dict[str, str]:
-    """What a tree of palpate's own world says of itself, ``{}`` for any other folder: it must never pass for the real set.
+    """Facts of a tree that ``palpate world`` made, else ``{}``; it must not pass for real data.
 
-    The blank entries take the place of the real set's license, citation and address.
+    The blank entries replace the license, citation and address of the real set.
     """
-    mark, up = folder / "world.json", folder.parent / "world.json"  # HCT's rigs lie one folder down
-    about = (
-        read_json(mark, "world record")
-        if mark.is_file()
-        else (read_json(up, "world record") if up.is_file() else {})
-    )
-    if not isinstance(about, dict) or not str(about.get("format", "")).startswith("palpate-world/"):
+    places = (folder / "world.json", folder.parent / "world.json")  # HCT's rigs are one level down
+    path = next((place for place in places if place.is_file()), None)
+    world = read_json(path, "world record") if path else {}
+    if not str(world.get("format", "")).startswith("palpate-world/"):
         return {}
-    named = {
-        "dataset": "palpate's procedural world",
-        "synthetic": "yes",
-        "digest": str(about.get("digest", "")),
-    }
-    options = about.get("options")
-    named |= (
-        {"world_seed": str(options["seed"])}
-        if isinstance(options, dict) and "seed" in options
-        else {}
-    )
-    return named | dict.fromkeys(("license", "citation", "url"), "")
+    facts = {"dataset": "palpate's procedural world", "synthetic": "yes"}
+    facts |= {"digest": str(world.get("digest", ""))}
+    if "seed" in (options := world.get("options", {})):
+        facts["world_seed"] = str(options["seed"])
+    return facts | dict.fromkeys(("license", "citation", "url"), "")
 
 
 @dataclass
 class Scan:
-    """What lies in a source.
+    """What a source holds.
 
     Attributes:
-        rows: the readable rows.
-        base: folder that their paths are relative to.
-        problems: everything that makes a row or file unusable.
-        suspicious: what looks wrong but can be used (swapped folders, counts that differ from the published ones ...).
+        base: folder that the rows' paths are relative to.
         facts: further facts for the manifest (``layout``, ``text_source`` ...).
-        parts: the data set's own splits: name -> id -> part.
-        own: name of the split that the rows' cell ``split`` tells, or empty; :func:`finished` makes it of the rows that stay.
-        rules: how each of the splits was found, for the split file.
-        inconclusive: rows left out because their label says that the material is unclear.
+        rows: the readable rows.
+        problems: everything that makes a row or file unusable.
+        suspicious: usable, but a person should look (swapped folders, unexpected counts ...).
+        splits: the data set's own splits, by name.
+        split_name, split_rule: of the split in the rows' cells ``split``, if they have any.
+        inconclusive: rows skipped because their label marks the material as unclear.
     """
 
-    rows: list[Found]
     base: Path
+    facts: dict[str, str] = field(default_factory=dict)
+    rows: list[Row] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     suspicious: list[Problem] = field(default_factory=list)
-    facts: dict[str, str] = field(default_factory=dict)
-    parts: dict[str, dict[str, str]] = field(default_factory=dict)
-    own: str = ""
-    rules: dict[str, dict[str, Any]] = field(default_factory=dict)
+    splits: dict[str, Split] = field(default_factory=dict)
+    split_name: str = ""
+    split_rule: dict[str, Any] = field(default_factory=dict)
     inconclusive: int = 0
 
+    def problem(self, where: object, kind: str, text: str) -> None:
+        """Report something that makes a row or file unusable."""
+        self.problems.append(Problem(str(where), kind, text))
 
-@dataclass(frozen=True)
-class Validation:
-    """A data set looked over without importing it.
+    def suspect(
+        self, where: object, kind: str, text: str, names: Iterable[object] | None = None
+    ) -> None:
+        """Report something to look at; with ``names`` only if there are any, with their number."""
+        names = None if names is None else list(names)
+        if names is None or names:
+            text = text if names is None else f"{text}: {few(names)}"
+            self.suspicious.append(Problem(str(where), kind, text))
 
-    Attributes:
-        format: the format's name.
-        facts: about the data set.
-        samples: usable rows.
-        missing: listed but not there, or there without a partner.
-        invalid: there but unusable.
-        suspicious: usable, but a person should look.
-    """
 
-    format: str
-    facts: Facts
-    samples: int
-    missing: Sequence[Problem]
-    invalid: Sequence[Problem]
-    suspicious: Sequence[Problem]
-
-    @property
-    def ok(self) -> bool:
-        """Whether nothing is missing or invalid."""
-        return not self.missing and not self.invalid
+def few(names: Iterable[object]) -> str:
+    """How many there are, and the first of them: ``"12: a, b, c ..."``, or ``"none"``."""
+    names = [str(name) for name in names]
+    more = " ..." if len(names) > FEW else ""
+    return f"{len(names)}: {', '.join(names[:FEW])}{more}" if names else "none"
 
 
 @dataclass(frozen=True)
@@ -165,10 +150,12 @@ class Format:
     Attributes:
         facts: about the data set; for formats of anyone's data, about the format.
         detect: whether a source looks like it; must be quick and must not raise.
-        looks_for: what ``detect`` wants to see, for the error message.
-        scan: ``scan(source, *, progress, ...) -> Scan``; further keywords are the format's own options.
-        run: ``run(source, out, *, skip_bad, check, progress, ...) -> Imported``, for formats that do more than point at images.
-        write_lists: ``write_lists(manifest, split, folder) -> files``: a split in the data set's own form, if it has one.
+        looks_for: what ``detect`` expects, for the error message.
+        scan: ``scan(source, *, progress, ...) -> Scan``; further keywords are the format's options.
+        run: ``run(source, out, *, skip_bad, check, progress, ...) -> Imported``, for formats that
+            write images instead of pointing at them.
+        write_lists: ``write_lists(manifest, split, folder) -> files``: a split in the data set's
+            own form, if it has one.
         remote: the source may be a name instead of a path on disk.
     """
 
@@ -183,12 +170,9 @@ class Format:
     @property
     def options(self) -> list[str]:
         """The format's own keywords and the common ones."""
-        own = [
-            p.name
-            for p in inspect.signature(self.run or self.scan).parameters.values()
-            if p.kind is p.KEYWORD_ONLY
-        ]
-        return own if self.run else [*dict.fromkeys([*own, "skip_bad", "check", "progress"])]
+        parameters = inspect.signature(self.run or self.scan).parameters.values()
+        names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+        return list(dict.fromkeys([*names, "skip_bad", "check", "progress"]))
 
 
 def import_scanned(
@@ -201,131 +185,112 @@ def import_scanned(
     check: Check,
     progress: Progress = quiet,
 ) -> Imported:
-    """Makes a manifest of a scan and writes it to ``out``; images stay where they are.
+    """Make a manifest of a scan and write it to ``out``; images stay where they are.
 
     Raises:
-        ProblemsError: with every bad row and file at once, unless ``skip_bad``; nothing is written.
+        ProblemsError: with every bad row and file, unless ``skip_bad``; nothing is written.
         PalpateError: if no usable row is left.
     """
     rows = finished(scan, check, progress)
     raise_if(scan.problems, skip_bad)
     require_some(len(rows), source, scan.problems)
     with removing_on_error(out) as created:
-        manifest = Manifest.from_rows(
-            (row for _, row in rows), scan.base.resolve(), {**facts, **scan.facts}
-        )
-        there = set(manifest.ids)
-        splits = {
-            name: Split(
-                {i: part for i, part in parts.items() if i in there},
-                scan.rules.get(name, {"method": "official"}),
-                manifest.digest,
-            )
-            for name, parts in scan.parts.items()
-            if there & set(parts)
-        }
-        return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious).save(
-            out, created
-        )
+        cells = (row for _, row in rows)
+        manifest = Manifest.from_rows(cells, scan.base.resolve(), {**facts, **scan.facts})
+        ids = set(manifest.ids)
+        splits: dict[str, Split] = {}
+        for name, split in scan.splits.items():
+            if parts := {i: part for i, part in split.parts.items() if i in ids}:
+                splits[name] = Split(parts, split.rule, manifest.digest)
+        imported = Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious)
+        return imported.save(out, created)
 
 
-def validation(
-    name: str, format: Format, scan: Scan, *, check: Check, progress: Progress = quiet
-) -> Validation:
-    """Sorts what a scan found into missing, invalid and suspicious."""
-    rows = finished(scan, check, progress)
-    missing = [p for p in scan.problems if p.kind.startswith(MISSING)]
-    invalid = [p for p in scan.problems if not p.kind.startswith(MISSING)]
-    return Validation(name, format.facts, len(rows), missing, invalid, scan.suspicious)
+def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:
+    """Rows with paths inside the root, whole images and unique ids; other rows become problems.
 
-
-def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Found]:
-    """The rows whose paths stay inside, whose images are whole and whose ids stand once; what is wrong with others joins the problems.
-
-    Of the rows that stay their cells ``split`` become the split ``scan.own``.
+    The cells ``split`` of the rows that remain become the split ``scan.split_name``.
     """
-    rows = checked_paths(scan.rows, scan.base, scan.problems)
-    rows = checked_images(rows, scan.base, check, scan.problems, progress)
-    rows, parts = unique(rows, scan.problems)
-    if scan.own and parts:
-        scan.parts[scan.own] = parts
-    scan.problems.sort(key=_place)
+    rows = _checked_images(scan, _checked_paths(scan), check, progress)
+    rows = _unique(scan, rows)
+    scan.problems.sort(key=place_of)
     return rows
 
 
-def checked_paths(rows: Sequence[Found], base: Path, problems: list[Problem]) -> list[Found]:
-    """Rows whose paths stay inside the root and exist, written relative to it."""
-    known: dict[str, tuple[str, str] | None] = {}
-    root = base.resolve()
-    folders: dict[
-        str, bool
-    ] = {}  # resolving a path is slow: each folder once, and files only where they are links
-    good: list[Found] = []
+def _checked_paths(scan: Scan) -> list[Row]:
+    """Rows whose images exist inside the root, with paths relative to it."""
+    root = scan.base.resolve()
 
-    def problem(given: str) -> tuple[str, str] | None:
+    @cache
+    def leaves(folder: str) -> bool:
+        return not (root / folder).resolve().is_relative_to(root)
+
+    @cache
+    def checked(given: str) -> tuple[str, str]:
+        """(path relative to the root, ""), or (kind of problem, its text)."""
         folder, _, name = given.rpartition("/")
-        if folder not in folders:
-            folders[folder] = (root / folder).resolve().is_relative_to(root)
         path = root / given
-        leaves = (
-            not folders[folder]
-            or name in ("", "..")
-            or "\\" in name
-            or given.startswith("/")
-            or path.is_symlink()
-        )
-        if leaves and inside(root, given) is None:
-            return "outside-root", f"the path {given!r} leaves the root {base}"
+        # Resolving is slow, so only unusual paths and links are resolved one by one.
+        unusual = posixpath.normpath(given) != given or Path(given).is_absolute() or "\\" in name
+        resolved = inside(root, given) if unusual or path.is_symlink() else path
+        if resolved is None or leaves(folder):
+            return "outside-root", f"the path {given!r} leaves the root {scan.base}"
         try:
-            there = path.is_file()
+            if not path.is_file():
+                return "missing-file", f"no file {given!r} in {scan.base}"
         except OSError as error:  # e.g. a name that is too long for the disk
             return "missing-file", f"{given!r} cannot be a file: {error.strerror}"
-        return None if there else ("missing-file", f"no file {given!r} in {base}")
+        return resolved.relative_to(root).as_posix() if unusual else given, ""
 
-    for where, row in rows:
-        fine = True
-        for name in IMAGE_COLUMNS:
-            given = row.get(name)
-            if given is None:
-                continue
-            if given not in known:
-                known[given] = problem(given)
-            if (found := known[given]) is not None:
-                problems.append(Problem(where, found[0], f"{name}: {found[1]}"))
-                fine = False
-            elif (
-                given.startswith(("/", "./"))
-                or "//" in given
-                or "/../" in given
-                or Path(given).is_absolute()
-            ):
-                row[name] = (root / given).resolve().relative_to(root).as_posix()
-        if fine:
+    good: list[Row] = []
+    for where, row in scan.rows:
+        results = {c: checked(row[c]) for c in IMAGE_COLUMNS if row.get(c) is not None}
+        for column, (path, text) in results.items():
+            if text:
+                scan.problem(where, path, f"{column}: {text}")
+            row[column] = path
+        if not any(text for _, text in results.values()):
             good.append((where, row))
     return good
 
 
-def unique(rows: Sequence[Found], problems: list[Problem]) -> tuple[list[Found], dict[str, str]]:
-    """Rows with their ids, each standing once; the first keeps it. An absent id is made of video and frame, else of the touch's path.
+def _checked_images(scan: Scan, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
+    """Rows whose images are whole; each file is checked and reported once, at its first row."""
+    if how == "none":
+        return rows
+    uses: Counter[str] = Counter()
+    first: dict[str, str] = {}
+    for where, row in rows:
+        for path in filter(None, map(row.get, IMAGE_COLUMNS)):
+            uses[path] += 1
+            first.setdefault(path, where)
+    bad: set[str] = set()
+    check = lambda path: check_image(scan.base / path, how)  # noqa: E731
+    for path, reason in in_threads(check, first, "checking images", progress):
+        if reason:
+            bad.add(path)
+            users = f" (used by {uses[path]} rows)" if uses[path] > 1 else ""
+            scan.problem(first[path], "bad-image", f"{path}: {reason}{users}")
+    return [row for row in rows if bad.isdisjoint(map(row[1].get, IMAGE_COLUMNS))]
 
-    Returns:
-        The rows without their cell ``split``, and id -> that cell; an id that stands in two parts is in neither.
+
+def _unique(scan: Scan, rows: list[Row]) -> list[Row]:
+    """Rows with unique ids; the first row keeps an id, and an id in two parts is in neither.
+
+    A missing id is made of video and frame, else of the path of the tactile or vision image.
     """
     seen: dict[str, tuple[str, str | None]] = {}
-    both: set[str] = set()
-    good: list[Found] = []
+    in_two: set[str] = set()
+    good: list[Row] = []
     for where, row in rows:
-        part = row.pop("split", None)
-        made = ""
+        part, hint = row.pop("split", None), ""
         if row.get("id") is None:
-            named = row.get("video") is not None and row.get("frame") is not None
-            path = row.get("tactile") or row.get("vision") or where
-            row["id"] = (
-                f"{row['video']}/{row['frame']}"
-                if named
-                else str(Path(path).with_suffix("").as_posix())
-            )
-            made = f", made of {'video and frame' if named else 'the path'} since there is none: map one (--map id=...)"
+            of_video = row.get("video") is not None and row.get("frame") is not None
+            path = Path(row.get("tactile") or row.get("vision") or where)
+            of_path = path.with_suffix("").as_posix()
+            row["id"] = f"{row['video']}/{row['frame']}" if of_video else of_path
+            made_of = "video and frame" if of_video else "the path"
+            hint = f", made of {made_of} since there is none: map a column to id"
         i = row["id"]
         if i not in seen:
             seen[i] = where, part
@@ -333,50 +298,12 @@ def unique(rows: Sequence[Found], problems: list[Problem]) -> tuple[list[Found],
             continue
         before, other = seen[i]
         if part and other and part != other:
-            both.add(i)
-            problems.append(
-                Problem(
-                    where,
-                    "two-parts",
-                    f"{i} is in {part} here and in {other} at {before}, so in no part",
-                )
-            )
+            in_two.add(i)
+            text = f"{i} is in {part} here and in {other} at {before}, so in no part"
+            scan.problem(where, "two-parts", text)
         else:
-            problems.append(
-                Problem(where, "duplicate-id", f"the id {i!r} stands at {before} already{made}")
-            )
-    return good, {i: part for i, (_, part) in seen.items() if part and i not in both}
-
-
-def checked_images(
-    rows: Sequence[Found], base: Path, how: Check, problems: list[Problem], progress: Progress
-) -> list[Found]:
-    """Rows whose images are whole; a file in use by many rows is checked once and told once, with its first row."""
-    if how == "none":
-        return list(rows)
-    first: dict[str, str] = {}
-    uses: Counter[str] = Counter()
-    for where, row in rows:
-        for name in IMAGE_COLUMNS:
-            if row.get(name) is not None:
-                first.setdefault(row[name], where)
-                uses[row[name]] += 1
-    bad: set[str] = set()
-    for done, (name, reason) in enumerate(
-        in_threads(lambda n: check_image(base / n, how), first), 1
-    ):
-        if reason:
-            bad.add(name)
-            rest = f" (used by {uses[name]} rows)" if uses[name] > 1 else ""
-            problems.append(Problem(first[name], "bad-image", f"{name}: {reason}{rest}"))
-        progress("checking images", done, len(first))
-    return [
-        (where, row)
-        for where, row in rows
-        if not any(row.get(name) in bad for name in IMAGE_COLUMNS)
-    ]
-
-
-def _place(problem: Problem) -> tuple[str, int, str]:
-    name, _, line = problem.where.rpartition(":")
-    return (name, int(line), problem.kind) if line.isdecimal() else (problem.where, 0, problem.kind)
+            scan.problem(where, "duplicate-id", f"the id {i!r} is at {before} already{hint}")
+    parts = {i: part for i, (_, part) in seen.items() if part and i not in in_two}
+    if scan.split_name and parts:
+        scan.splits[scan.split_name] = Split(parts, scan.split_rule)
+    return good

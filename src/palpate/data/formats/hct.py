@@ -1,84 +1,128 @@
-"""HCT, the human-collected half of TVL (Fu et al., 2024): a DIGIT and a camera held in one hand, pressed on things in the wild.
+"""HCT, the human-collected half of TVL (Fu et al., 2024): a DIGIT and a camera held in one hand.
 
 ::
 
     hct/
-      data1/ data2/ data3/                     one rig each: another gel, another framing (the column ``domain``)
+      data1/ data2/ data3/                     one rig each: another gel, another framing (domain)
         train.csv  test.csv                    url,tactile,tactile_background,caption
         contact.json  not_contact.json         {"tactile": [..], "vision": [..], "background": [..]}
-        finetune.json                          captions again, as talk
-        4-1702596295.70/vision/160-0.0207.jpg  folder: number, start in Unix seconds; file: frame, latency in seconds
-        4-1702596295.70/tactile/160-0.0207.jpg
-        digit_background.png                   here or in hct/: the gel where a trajectory has no picture of it
+        finetune.json                          not read: captions again, as talk
+        4-1702596295.70/vision/160-0.0207.jpg  folder: number, start in Unix seconds;
+        4-1702596295.70/tactile/160-0.0207.jpg file: frame, latency in seconds
+        digit_background.png                   here or in hct/: the gel where a trajectory has no
+                                               image of it
 
-The source may be ``hct/``, one ``dataN/``, or the folder that holds ``hct/``. Lists lie in each ``dataN/`` or, for all of them, in ``hct/`` (read
-only if no ``dataN/`` has one). Their paths start at ``dataN/`` or at ``hct/``; both are understood.
+The source may be ``hct/``, one ``dataN/``, or the folder that holds ``hct/``. The paths of a list
+are relative to its ``dataN/``, or start at ``dataN/`` or ``hct/``.
 
-- **Samples** are the rows of the lists. A ``dataN/`` without lists gives those of ``contact.json``, worded by ``finetune.json``; beside lists, frames that only
-  ``contact.json`` names are counted, and are samples without words and without part if ``contact`` is set. Frames of ``not_contact.json`` are none.
-- **video** is the whole folder name, ``data2/4-1702596295.70``: the number before the dash is used again and again. **frame** is the integer before
-  the dash of the file. **touch** is a run of consecutive frames in contact. **session** joins folders of one ``dataN`` of which each starts at most ``session_gap``
-  seconds after the one before, since neighbors may hold the same object. Captions tell no object: frames of one folder are worded differently.
-- **background**: the list's picture if it is there, else ``digit_background.png``, else of up to 15 frames of the trajectory that
-  ``not_contact.json`` names the one nearest to their median, else null.
+- **Samples** are the rows of the lists. Frames that only ``contact.json`` names are counted, and
+  are samples without words and part with ``contact``. Frames of ``not_contact.json`` are none.
+- **video** is the whole folder name, ``data2/4-1702596295.70``: the number before the dash is used
+  again and again. **frame** is the integer before the dash of the file. **contact** is a run of
+  consecutive frames in contact. **session** joins folders of one ``dataN`` of which each starts at
+  most ``session_gap`` seconds after the one before, since neighbors may hold the same object.
+  Captions are no object labels: frames of one folder are worded differently.
+- **background**: the list's image if it is there, else ``digit_background.png``, else of up to 15
+  frames of the trajectory in ``not_contact.json`` the one nearest to their median, else null.
+- **Swapped folders**: some trajectories have ``vision/`` and ``tactile/`` exchanged
+  (:mod:`palpate.data.formats.swapped`).
 - Photos of ``data3`` show the touched spot lower: TVL crops them 200 pixels further down.
 """
 
 from __future__ import annotations
 
-import os
+import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 
-from palpate.core import PalpateError, Problem, Progress, Split, inside, quiet
+from palpate.core import PalpateError, Progress, Split, inside, quiet
 from palpate.data.formats import tvl
-from palpate.data.formats.base import WORLD, Facts, Scan, world_facts
-from palpate.data.formats.hct_lists import RIG, TRAJECTORY, Reader, Row, Trajectory, located, order
-from palpate.data.frames import nearest_to_median
-from palpate.data.images import check_image
+from palpate.data.formats.base import WORLD, Cells, Facts, Format, Row, Scan, world_facts
+from palpate.data.formats.layout import read_json_file, report_missing_folders, subfolders
+from palpate.data.formats.swapped import looks, swapped
+from palpate.data.images import check_image, read_image
 from palpate.data.listing import contact_names
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import CLIMBS, Manifest
 from palpate.data.recordings import MEDIAN_OF
 
 FACTS = Facts(
-    "HCT (Touch-Vision-Language)",
-    tvl.CITATION,
-    "unknown",
-    tvl.URL,
-    "DIGIT",
-    (240, 320),
-    "39,154 in contact by contact.json, of which a user loaded 38,605 for training; 356 in the test lists",
-    "trajectory folder; stricter: folders that follow each other in time (session)",
-    tvl.NORMALIZATION,
+    name="HCT (Touch-Vision-Language)",
+    citation=tvl.CITATION,
+    url=tvl.URL,
+    sensor="DIGIT",
+    image_size=tvl.IMAGE_SIZE,
+    samples="39,154 in contact by contact.json, of which a user loaded 38,605 for training; "
+    "356 in the test lists",
+    group="trajectory folder; stricter: folders that follow each other in time (session)",
+    normalization=tvl.NORMALIZATION,
 )
-FALLBACK = "digit_background.png"
-COLUMNS = ("url", "tactile", "tactile_background", "caption")
-LOOKED_FOR = (
+LOOKS_FOR = (
     "hct/, or dataN/ folders, with trajectories such as 4-1702596295.70/vision/ and .../tactile/"
 )
-Swap = Literal["report", "mend"]
+FALLBACK = "digit_background.png"
+#: A trajectory folder: a number that is used again, and the start in Unix seconds.
+TRAJECTORY = re.compile(r"\d+-(\d+(?:\.\d+)?)")
+RIG = re.compile(r"data\d+")
+#: The stem of a frame's file: number and latency.
+FRAME = re.compile(r"(\d{1,18})(?:-.*)?")
+Swap = Literal["report", "fix"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One listed frame; paths are relative to the root, ``background`` is as listed."""
+
+    where: str
+    part: str | None
+    rig: str
+    video: str
+    number: int
+    vision: str
+    tactile: str
+    background: str | None
+    text: str | None
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Video and number."""
+        return self.video, self.number
+
+
+@dataclass
+class Lists:
+    """The lists of a tree.
+
+    Attributes:
+        samples: the frames that are samples, by video (in order of time) and number.
+        contact: every frame known to be in contact.
+        untouched: video -> its frames in ``not_contact.json``.
+        files: the lists read.
+    """
+
+    samples: list[Frame] = field(default_factory=list)
+    contact: set[tuple[str, int]] = field(default_factory=set)
+    untouched: dict[str, list[Frame]] = field(default_factory=lambda: defaultdict(list))
+    files: list[str] = field(default_factory=list)
 
 
 def detect(source: Path) -> bool:
-    """Whether a folder is HCT, one of its rigs, or holds ``hct/``: a trajectory with frames, in its place."""
+    """Whether a folder is HCT, one of its rigs, or holds ``hct/``, with frames of a trajectory."""
     root, rigs = find(source)
     return any(_has_trajectory(root / rig) for rig in rigs)
 
 
 def find(source: Path) -> tuple[Path, list[str]]:
-    """``hct/`` and the names of its rigs, from any of the three places that a user may name; no rigs if there are none."""
-    source = Path(source)
+    """``hct/`` and the names of its rigs, from any of the three places; perhaps no rigs."""
     for root in (source, source / "hct"):
-        if rigs := sorted(folder.name for folder in _folders(root) if _is_rig(folder)):
+        if rigs := [name for name in subfolders(root) if _is_rig(root / name)]:
             return root, rigs
-    if source.is_dir() and _is_rig(source):
-        return source.absolute().parent, [source.absolute().name]
-    return source, []
+    source = source.absolute()
+    return (source.parent, [source.name]) if _is_rig(source) else (source, [])
 
 
 def scan(
@@ -90,302 +134,324 @@ def scan(
     swap: Swap = "report",
     progress: Progress = quiet,
 ) -> Scan:
-    """Reads the lists and looks at the trajectories.
+    """Read the lists and look at the trajectories.
 
     Args:
         source: ``hct/``, one ``dataN/``, or the folder that holds ``hct/``.
-        lists: folder with lists to use instead of the data set's own, laid out as it (``lists/data1/train.csv``).
-        contact: take frames too that only ``contact.json`` names.
+        lists: folder with lists to use instead of the data set's own (``lists/data1/train.csv``).
+        contact: include frames that only ``contact.json`` names.
         session_gap: seconds between the starts of folders of one session.
-        swap: what to do with trajectories whose vision and touch are exchanged: report them, or also exchange their paths back.
-        progress: told how many trajectories are looked at.
+        swap: trajectories whose vision and tactile folders are swapped are reported, or ``fix``
+            also swaps their paths back.
+        progress: called with the number of trajectories looked at.
 
     Raises:
         PalpateError: if there are no trajectories, or an option has a wrong value.
     """
-    tvl.require_option("swap", swap, ("report", "mend"))
+    if swap not in ("report", "fix"):
+        raise PalpateError("must be report or fix", repr(swap), "", argument="swap")
     if session_gap < 0:
         raise PalpateError(
-            "session_gap must be 0 seconds or more", str(session_gap), "Leave it out for 60 seconds"
+            "must be 0 seconds or more", f"{session_gap}", "", argument="session_gap"
         )
-    root, rigs = find(source)
+    root, rigs = find(Path(source))
     if not rigs:
-        raise PalpateError(
-            f"{source} must be HCT: {LOOKED_FOR}", "none of these", f"Unpack it from {tvl.URL}"
-        )
-    found = Scan([], root, facts={"layout": f"hct: {', '.join(rigs)}"})
-    found.facts |= world_facts(root)
-    sensor = WORLD.sensor if "synthetic" in found.facts else FACTS.sensor
-    reader = Reader(root, rigs, found, contact)
-    rows = reader.rows(lists)
-    sessions = sessions_of({row.trajectory for row in rows}, session_gap)
-    touch = _touches(rows, reader.contact_frames)
-    rows = _present(root, rows, found.problems)
-    evidence = _exchanged(root, rows, progress)
-    mended = set(evidence) if swap == "mend" else set[Trajectory]()
-    rows = [
-        replace(row, vision=row.tactile, tactile=row.vision) if row.trajectory in mended else row
-        for row in rows
-    ]
-    for trajectory, text in evidence.items():
-        done = "; their paths were exchanged" if mended else "; --set swap=mend exchanges them back"
-        found.suspicious.append(Problem("/".join(trajectory), "swapped-folders", text + done))
-    backgrounds = _backgrounds(root, rows, reader.untouched, mended, found)
-    for row, background in zip(rows, backgrounds, strict=True):
-        video = "/".join(row.trajectory)
-        cells: dict[str, Any] = {
-            "id": f"{video}/{row.frame}",
-            "video": video,
-            "frame": row.frame,
-            "contact": touch[row.key],
-            "text": row.text,
-        }
-        cells |= {
-            "session": sessions[row.trajectory],
-            "vision": row.vision,
-            "tactile": row.tactile,
+        must = f"{source} must be HCT: {LOOKS_FOR}"
+        raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")
+    result = Scan(root, {"layout": f"hct: {', '.join(rigs)}"} | world_facts(root))
+    listed = _read_lists(result, rigs, lists, contact)
+    keys = sorted(listed.contact)
+    names = contact_names([video for video, _ in keys], [k for _, k in keys], None)
+    contacts = dict(zip(keys, names, strict=True))
+    sessions = sessions_of({frame.video for frame in listed.samples}, session_gap)
+    result.rows = [(f.where, {"vision": f.vision, "tactile": f.tactile}) for f in listed.samples]
+    report_missing_folders(result)
+    present = {where for where, _ in result.rows}
+    frames = [frame for frame in listed.samples if frame.where in present]
+    frames, fixed = _swap(result, frames, swap, progress)
+    backgrounds = _backgrounds(result, frames, listed.untouched, fixed)
+    sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
+    result.rows = []
+    for frame, background in zip(frames, backgrounds, strict=True):
+        row: Cells = {
+            "id": f"{frame.video}/{frame.number}",
+            "video": frame.video,
+            "frame": frame.number,
+            "contact": contacts[frame.key],
+            "session": sessions[frame.video],
+            "text": frame.text,
+            "vision": frame.vision,
+            "tactile": frame.tactile,
             "background": background,
+            "sensor": sensor,
+            "domain": frame.rig,
+            "split": frame.part,
         }
-        found.rows.append(
-            (row.where, cells | {"sensor": sensor, "domain": row.trajectory[0], "split": row.part})
-        )
-    if any(row.part for row in rows):
-        found.own = name = "Orig" if lists is None else "Lists"
-        found.rules[name] = {
-            "method": "official" if lists is None else "lists",
-            "files": reader.files,
-        }
-    exchange = f"{len(evidence)}, {'mended' if mended else 'as they are'}" if evidence else "none"
-    found.facts |= {"session_gap": f"{session_gap:g} s", "swapped_folders": exchange}
-    worded = dict.fromkeys(f"{r.part}.csv" if r.part else "finetune.json" for r in rows if r.text)
-    found.facts |= {"text_source": f"captions of {', '.join(sorted(worded))}" if worded else "none"}
-    if root == Path(source) / "hct" and (Path(source) / "ssvtp").is_dir():
-        found.suspicious.append(
-            Problem(
-                str(source),
-                "other-half",
-                "ssvtp/ lies beside hct/ and was not read: import it with --format ssvtp",
-            )
-        )
-    return found
+        result.rows.append((frame.where, row))
+    result.split_name = "Orig" if lists is None else "Lists"
+    method = "official" if lists is None else "lists"
+    result.split_rule = {"method": method, "files": listed.files}
+    worded = sorted({f"{frame.part}.csv" for frame in frames if frame.text})
+    result.facts["text_source"] = f"captions of {', '.join(worded)}" if worded else "none"
+    result.facts["session_gap"] = f"{session_gap:g} s"
+    if root == Path(source) / "hct" and (root.parent / "ssvtp").is_dir():
+        text = "ssvtp/ is next to hct/ and was not read: import it as the format ssvtp"
+        result.suspect(source, "other-half", text)
+    return result
 
 
-def sessions_of(trajectories: Iterable[Trajectory], gap: float) -> dict[Trajectory, str]:
-    """Trajectory -> session, named by its first folder. A folder whose name tells no time is a session of its own."""
-    found: dict[Trajectory, str] = {}
+def sessions_of(videos: Iterable[str], gap: float) -> dict[str, str]:
+    """Video -> session, named by its first video; a name without a time is its own session."""
+    sessions: dict[str, str] = {}
     last: dict[str, tuple[float, str]] = {}
-    for rig, folder in sorted(trajectories, key=order):
-        match = TRAJECTORY.fullmatch(folder)
-        name = f"{rig}/{folder}"
-        if match is not None:
-            start = float(match[1])
-            before, session = last.get(rig, (float("-inf"), name))
-            name = session if start - before <= gap else name
-            last[rig] = (start, name)
-        found[rig, folder] = name
-    return found
+    for video in sorted(videos, key=_in_time):
+        rig, start, _ = _in_time(video)
+        if start >= 0:
+            before, session = last.get(rig, (float("-inf"), ""))
+            sessions[video] = session if start - before <= gap else video
+            last[rig] = (start, sessions[video])
+        else:
+            sessions[video] = video
+    return sessions
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Writes ``dataN/<part>.csv`` with ``url,tactile,tactile_background,caption``, paths relative to ``dataN``.
+    """Write ``dataN/<part>.csv`` with ``url,tactile,tactile_background,caption``.
 
-    A background outside ``dataN`` is written relative to ``hct/``.
+    Paths are relative to ``dataN``; a background outside ``dataN`` is relative to ``hct/``.
 
     Raises:
-        PalpateError: if a sample's images do not lie below the folder of its domain.
+        PalpateError: if a sample's images are not below the folder of its domain.
     """
     files: list[Path] = []
     for part in split.counts():
         rows: dict[str, list[list[str | None]]] = defaultdict(list)
         for row in manifest.part(split, part).table.iter_rows(named=True):
             prefix = f"{row['domain']}/"
-            if row["domain"] is None or not all(
-                str(row[name]).startswith(prefix) for name in ("vision", "tactile")
-            ):
+            if not all(str(row[name]).startswith(prefix) for name in ("vision", "tactile")):
+                must = "HCT's lists need every image below the folder of its domain"
                 got = f"{row['id']!r} with domain {row['domain']!r} and photo {row['vision']!r}"
-                raise PalpateError(
-                    "HCT's lists need every image below the folder of its domain",
-                    got,
-                    "Write the split file alone",
-                )
-            paths = [
-                row[name] and row[name].removeprefix(prefix)
-                for name in ("vision", "tactile", "background")
-            ]
-            rows[row["domain"]].append([*paths, row["text"]])
-        files += [
-            tvl.write_csv(Path(folder) / domain / f"{part}.csv", COLUMNS, listed)
-            for domain, listed in sorted(rows.items())
-        ]
+                raise PalpateError(must, got, "Write the split file alone")
+            paths = [row[name] for name in ("vision", "tactile", "background")]
+            cells = [path and path.removeprefix(prefix) for path in paths]
+            rows[row["domain"]].append([*cells, row["text"]])
+        for domain, cells in sorted(rows.items()):
+            path = Path(folder) / domain / f"{part}.csv"
+            files.append(tvl.write_list(path, tvl.COLUMNS, cells))
     return files
 
 
-def _touches(
-    rows: Sequence[Row], contact: set[tuple[Trajectory, int]]
-) -> dict[tuple[Trajectory, int], str]:
-    """Frame -> touch: runs of consecutive frames over all that are known to touch something."""
-    frames = sorted(contact | {row.key for row in rows})
-    return dict(
-        zip(
-            frames,
-            contact_names(["/".join(t) for t, _ in frames], [k for _, k in frames], None),
-            strict=True,
-        )
-    )
-
-
-def _present(root: Path, rows: Sequence[Row], problems: list[Problem]) -> list[Row]:
-    """Rows whose folders are there; of the others one problem a folder, with the number of rows."""
-    lost: dict[str, list[str]] = defaultdict(list)
-    there: dict[str, bool] = {}
-
-    def missing(path: str) -> str | None:
-        folders = ["/".join(path.split("/")[:n]) for n in range(1, path.count("/") + 1)]
-        return next((f for f in folders if not there.setdefault(f, (root / f).is_dir())), None)
-
-    kept: list[Row] = []
-    for row in rows:
-        absent = missing(row.vision) or missing(row.tactile)
-        if absent is None:
-            kept.append(row)
-        else:
-            lost[absent].append(row.where)
-    for folder, places in sorted(lost.items()):
-        problems += tvl.summed(places, "missing-folder", f"no folder {folder!r} in {root}")
-    return kept
-
-
-def _exchanged(root: Path, rows: Sequence[Row], progress: Progress) -> dict[Trajectory, str]:
-    """Trajectories whose sides are exchanged, with the evidence, from the first, middle and last row of each."""
-    by: dict[Trajectory, list[Row]] = defaultdict(list)
-    for row in rows:
-        by[row.trajectory].append(row)
-    files: dict[str, tuple[list[Path], list[Path]]] = {}
-    for trajectory, own in by.items():
-        chosen = [own[k] for k in sorted({0, len(own) // 2, len(own) - 1})]
-        files["/".join(trajectory)] = (
-            [root / r.vision for r in chosen],
-            [root / r.tactile for r in chosen],
-        )
-    seen = tvl.looks(files, progress)
-    found: dict[Trajectory, str] = {}
-    for rig in sorted({rig for rig, _ in by}):
-        own = {name: seen[name] for name in seen if name.startswith(f"{rig}/")}
-        for name, text in tvl.exchanged(own, (240, 320)).items():
-            found[rig, name.removeprefix(f"{rig}/")] = text
-    return found
-
-
-def _backgrounds(
-    root: Path,
-    rows: Sequence[Row],
-    untouched: Mapping[Trajectory, Sequence[Row]],
-    mended: Collection[Trajectory],
-    found: Scan,
-) -> list[str | None]:
-    """Each row's background by the rule in the head of this file; how often each source served goes into the facts.
-
-    Of a mended trajectory the listed picture does not count, as it was made of what its folder named touch held.
-    """
-    there: dict[str, bool] = {}
-    typical: dict[Trajectory, str | None] = {}
-
-    def first(*names: str) -> str | None:
-        return next((n for n in names if there.setdefault(n, (root / n).is_file())), None)
-
-    kinds: Counter[str] = Counter()
-    chosen: list[str | None] = []
-    bare: dict[str, list[str]] = defaultdict(list)
-    for row in rows:
-        rig = row.trajectory[0]
-        listed = row.background if row.trajectory not in mended else None
-        name, kind = (first(located(listed, rig), listed) if listed else None), "as listed"
-        if name is None:
-            name, kind = first(f"{rig}/{FALLBACK}", FALLBACK), FALLBACK
-        if name is None:
-            if row.trajectory not in typical:
-                side = "vision" if row.trajectory in mended else "tactile"
-                typical[row.trajectory] = _typical(
-                    root, [getattr(frame, side) for frame in untouched.get(row.trajectory, [])]
-                )
-            name, kind = typical[row.trajectory], "untouched frame"
-        if name is None:
-            kind = "none"
-            bare[rig].append(row.where)
-        kinds[kind] += 1
-        chosen.append(name)
-    for places in bare.values():
-        found.suspicious += tvl.summed(
-            places,
-            "no-background",
-            f"no picture of the gel untouched, as none is listed and there is no {FALLBACK}",
-        )
-    found.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
-    return chosen
-
-
-@dataclass
-class _Pictures:
-    """Picture files as frames, numbered by their place."""
-
-    source: Path
-    files: Sequence[Path]
-    raw: bool = False
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        return range(len(self.files))
-
-    def has(self, k: int) -> bool:
-        return k in self.numbers
-
-    def path(self, k: int) -> Path:
-        return self.files[k]
-
-
-def _typical(root: Path, names: Sequence[str]) -> str | None:
-    """Of up to 15 whole pictures, evenly spaced over those given in the order of frames, the one nearest to their median."""
-    whole = [name for name in names if inside(root, name) and check_image(root / name) is None]
-    if not whole:
-        return None
-    some = [
-        whole[int(k)]
-        for k in np.unique(np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round())
-    ]
-    try:
-        return some[
-            nearest_to_median(_Pictures(root, [root / name for name in some]), range(len(some)))[0]
-        ]
-    except PalpateError:  # pictures of several sizes
-        return None
-
-
-def _folders(path: Path) -> list[Path]:
-    """The folders in a folder; none if it cannot be read."""
-    try:
-        return [entry for entry in path.iterdir() if entry.is_dir()]
-    except OSError:
-        return []
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
 
 
 def _is_rig(folder: Path) -> bool:
     """Whether a folder holds a trajectory, or lists under a name such as ``data1``."""
-    return _has_trajectory(folder) or (
-        RIG.fullmatch(folder.name) is not None and bool(tvl.part_lists(folder))
-    )
+    lists = RIG.fullmatch(folder.name) is not None and bool(tvl.part_lists(folder))
+    return lists or _has_trajectory(folder)
 
 
 def _has_trajectory(folder: Path) -> bool:
-    """Whether a folder holds at least one trajectory with frames."""
-    try:
-        with os.scandir(folder) as entries:
-            return any(
-                TRAJECTORY.fullmatch(e.name)
-                and any((folder / e.name / side).is_dir() for side in ("vision", "tactile"))
-                for e in entries
-            )
-    except OSError:
-        return False
+    names = (name for name in subfolders(folder) if TRAJECTORY.fullmatch(name))
+    return any({"vision", "tactile"} & set(subfolders(folder / name)) for name in names)
+
+
+def _in_time(video: str) -> tuple[str, float, str]:
+    """Sort key: rig, start (-1 if the name has none), name."""
+    rig, _, folder = video.partition("/")
+    match = TRAJECTORY.fullmatch(folder)
+    return rig, float(match[1]) if match else -1.0, folder
+
+
+def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: bool) -> Lists:
+    """The samples of all lists, and what the two JSON files add.
+
+    Raises:
+        PalpateError: if ``lists`` holds none with rows.
+    """
+    read, unlisted = Lists(), list[Frame]()
+    resting: set[tuple[str, int]] = set()
+    for rig in rigs:
+        for part, path in tvl.part_lists((result.base if lists is None else lists) / rig).items():
+            read.files.append(f"{rig}/{path.name}")
+            read.samples += _frames(result, tvl.read_list(result, path), rig, part)
+        for frame in _frames(result, _json_rows(result, rig, "not_contact"), rig, None):
+            read.untouched[frame.video].append(frame)
+            resting.add(frame.key)
+        unlisted += _frames(result, _json_rows(result, rig, "contact"), rig, None)
+    if lists is not None and not read.samples:
+        raise PalpateError(
+            "must hold lists such as data1/train.csv", str(lists), "", argument="lists"
+        )
+    known = {frame.key for frame in read.samples}
+    read.contact = known | {frame.key for frame in unlisted if frame.key not in resting}
+    both = [frame.where for frame in read.samples if frame.key in resting]
+    text = "listed, but not_contact.json calls them untouched"
+    tvl.suspect_rows(result, both, "contact-and-not", text)
+    unlisted = [frame for frame in unlisted if frame.key not in known]
+    both = [frame.where for frame in unlisted if frame.key in resting]
+    text = "in contact.json and in not_contact.json, so no samples"
+    tvl.suspect_rows(result, both, "contact-and-not", text)
+    unlisted = [frame for frame in unlisted if frame.key not in resting]
+    if contact:
+        read.samples += unlisted
+    else:
+        text = "in contact.json but in no list, so no samples; contact=True includes them"
+        tvl.suspect_rows(result, [f.where for f in unlisted], "unlisted-contact", text)
+    odd = [
+        f.where for f in read.samples if f.tactile != f"{f.video}/tactile/{f.vision.split('/')[-1]}"
+    ]
+    text = "photo and tactile image differ in trajectory or file name"
+    tvl.suspect_rows(result, odd, "unequal-names", text)
+    result.facts["not_contact"] = f"{len(resting)} frames, no samples"
+    read.samples.sort(key=lambda frame: (_in_time(frame.video), frame.number))
+    return read
+
+
+def _json_rows(result: Scan, rig: str, name: str) -> list[Row]:
+    """The rows of ``contact.json`` or ``not_contact.json``, with cells named as in the lists."""
+    path = result.base / rig / f"{name}.json"
+    data = read_json_file(result, path) if path.is_file() else None
+    if data is None:
+        return []
+    names = {"vision": "url", "tactile": "tactile", "background": "tactile_background"}
+    lists: dict[str, Any] = {}
+    if isinstance(data, dict):
+        lists = {names[key]: data[key] for key in names if key in data}
+    is_list = {isinstance(v, list) and all(isinstance(p, str) for p in v) for v in lists.values()}
+    if not {"url", "tactile"} <= set(lists) or is_list != {True}:
+        text = "not an object with lists of paths under vision and tactile"
+        result.problem(path, "bad-json", text)
+        return []
+    if len({len(paths) for paths in lists.values()}) > 1:
+        lengths = ", ".join(f"{len(paths)} {name}" for name, paths in lists.items())
+        text = f"its lists differ in length ({lengths}), so what belongs together is unknown"
+        result.problem(path, "unequal-lists", text)
+        return []
+    rows = zip(*lists.values(), strict=True)
+    return [(f"{path}:{k}", dict(zip(lists, row, strict=True))) for k, row in enumerate(rows, 1)]
+
+
+def _frames(result: Scan, rows: Iterable[Row], rig: str, part: str | None) -> list[Frame]:
+    """The frames of rows; bad rows become problems."""
+    frames: list[Frame] = []
+    for where, cells in rows:
+        url, tactile, background = (cells.get(n) for n in ("url", "tactile", "tactile_background"))
+        if not url or not tactile:
+            lacking = " and no ".join(name for name in ("url", "tactile") if not cells.get(name))
+            result.problem(where, "empty-cell", f"no {lacking} path")
+            continue
+        pieces = _located(url, rig).split("/")
+        number = FRAME.fullmatch(PurePosixPath(pieces[-1]).stem)
+        if climbing := [p for p in (url, tactile, background) if p and re.search(CLIMBS, p)]:
+            text = f"the path {climbing[0]!r} leaves the data set"
+            result.problem(where, "outside-root", text)
+        elif len(pieces) != 4:
+            text = f"the path {url!r} is not trajectory/vision/frame.jpg"
+            result.problem(where, "bad-path", text)
+        elif number is None:
+            text = f"{pieces[-1]!r} does not begin with a frame number and a dash"
+            result.problem(where, "bad-frame", text)
+        else:
+            rig_name, folder = pieces[:2]
+            paths = "/".join(pieces), _located(tactile, rig), background
+            text = tvl.clean_caption(cells.get("caption"))
+            video = f"{rig_name}/{folder}"
+            frames.append(Frame(where, part, rig_name, video, int(number[1]), *paths, text))
+    return frames
+
+
+def _located(cell: str, rig: str) -> str:
+    """A path that starts at the trajectory, ``dataN/`` or ``hct/``, relative to ``hct/``."""
+    path = PurePosixPath(cell).as_posix().removeprefix("hct/")
+    first = path.partition("/")[0]
+    return path if first == rig or RIG.fullmatch(first) else f"{rig}/{path}"
+
+
+def _swap(
+    result: Scan, frames: Sequence[Frame], swap: Swap, progress: Progress
+) -> tuple[list[Frame], set[str]]:
+    """Report swapped trajectories; with ``fix`` their frames have their paths swapped back.
+
+    Returns:
+        The frames, and the videos that were fixed.
+    """
+    by_video: dict[str, list[Frame]] = defaultdict(list)
+    for frame in frames:
+        by_video[frame.video].append(frame)
+    files: dict[str, tuple[list[Path], list[Path]]] = {}
+    for video, own in by_video.items():
+        some = [own[k] for k in sorted({0, len(own) // 2, len(own) - 1})]
+        sides = ([result.base / getattr(f, side) for f in some] for side in ("vision", "tactile"))
+        files[video] = next(sides), next(sides)
+    seen = looks(files, progress)
+    evidence: dict[str, str] = {}
+    for rig in sorted({frame.rig for frame in frames}):
+        of_rig = {video: pair for video, pair in seen.items() if video.startswith(f"{rig}/")}
+        evidence |= swapped(of_rig, tvl.IMAGE_SIZE)
+    done = "their paths were swapped back" if swap == "fix" else "swap='fix' swaps them back"
+    for video, text in evidence.items():
+        result.suspect(video, "swapped-folders", f"{text}; {done}")
+    fixed = set(evidence) if swap == "fix" else set[str]()
+    state = "fixed" if fixed else "as they are"
+    result.facts["swapped_folders"] = f"{len(evidence)}, {state}" if evidence else "none"
+    back = [
+        replace(f, vision=f.tactile, tactile=f.vision) if f.video in fixed else f for f in frames
+    ]
+    return back, fixed
+
+
+def _backgrounds(
+    result: Scan,
+    frames: Sequence[Frame],
+    untouched: Mapping[str, Sequence[Frame]],
+    fixed: Collection[str],
+) -> list[str | None]:
+    """The background of each frame by the rule above; the facts count how often each source served.
+
+    The listed image of a fixed trajectory does not count: it was made of its vision.
+    """
+    exists: dict[str, bool] = {}
+    typical: dict[str, str | None] = {}
+
+    def first(*names: str | None) -> str | None:
+        is_file = (n for n in names if n and exists.setdefault(n, (result.base / n).is_file()))
+        return next(is_file, None)
+
+    kinds: Counter[str] = Counter()
+    chosen: list[str | None] = []
+    bare: dict[str, list[str]] = defaultdict(list)
+    for frame in frames:
+        listed = frame.background if frame.video not in fixed else None
+        kind, name = "as listed", first(_located(listed, frame.rig), listed) if listed else None
+        if name is None:
+            kind, name = FALLBACK, first(f"{frame.rig}/{FALLBACK}", FALLBACK)
+        if name is None:
+            if frame.video not in typical:
+                side = "vision" if frame.video in fixed else "tactile"
+                paths = [getattr(f, side) for f in untouched.get(frame.video, [])]
+                typical[frame.video] = _typical(result.base, paths)
+            kind, name = "untouched frame", typical[frame.video]
+        if name is None:
+            kind = "none"
+            bare[frame.rig].append(frame.where)
+        kinds[kind] += 1
+        chosen.append(name)
+    for places in bare.values():
+        text = f"no image of the untouched gel, as none is listed and there is no {FALLBACK}"
+        tvl.suspect_rows(result, places, "no-background", text)
+    result.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
+    return chosen
+
+
+def _typical(root: Path, names: Sequence[str]) -> str | None:
+    """Of up to 15 evenly spaced whole images the one nearest to their median, or None."""
+    whole = [name for name in names if inside(root, name) and check_image(root / name) is None]
+    if not whole:
+        return None
+    places = np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round().astype(int)
+    some = [whole[k] for k in np.unique(places)]
+    images = [np.asarray(read_image(root / name)) for name in some]
+    if len({image.shape for image in images}) > 1:
+        return None
+    median = np.median(images, axis=0).astype(np.float32)
+    return some[int(np.argmin([np.abs(image - median).mean() for image in images]))]

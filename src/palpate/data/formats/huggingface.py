@@ -1,13 +1,19 @@
-"""Hugging Face data sets, through the library ``datasets`` (the extra ``hf``): folders and names on the hub.
+"""Hugging Face data sets, through the library ``datasets`` (the extra ``hf``).
 
-A source is a folder written by ``save_to_disk``, a folder of Parquet shards or an image folder, or (named with the format) a data set
-of the hub, ``user/name``, of Parquet shards. Nothing else is opened: no scripts, no pickles. Columns become manifest columns
-by their names or by map expressions (:mod:`palpate.data.mapping`); in an expression the value of an image is its file name, that of a
-class label its name. Images are written to ``out/images`` byte for byte as they were stored; equal ones once. A column of texts may
-name images too, as paths inside the source. The parts train, validation and test become the split ``Orig``.
+::
 
-What ``palpate export --to hf`` wrote comes back whole: the same rows in the same order, the same paths, bytes, facts and digest. It holds,
-beside the images ``vision``, ``tactile`` and ``background``, their paths as ``vision_path`` ..., the rows' places as ``palpate_row``, and
+    root/  dataset_dict.json  train/ test/ ...      a folder written by ``save_to_disk``, or
+           *.parquet  data/*.parquet                Parquet shards, or an image folder;
+    user/name                                       or a data set of the hub, of Parquet shards
+
+Columns become manifest columns by their names or by map expressions (:mod:`palpate.data.mapping`);
+in an expression an image is its file name, a class label its name. Images are written to
+``out/images`` byte for byte as they were stored, equal ones once. A column of texts may name images
+too, as paths inside the source. The parts train, validation and test become the split ``Orig``.
+
+An export of palpate (``palpate export``) comes back whole: the same rows in the same order, the
+same paths, bytes, facts and digest. It holds, next to the images ``vision``, ``tactile`` and
+``background``, their paths as ``vision_path`` ..., the places of the rows as ``palpate_row``, and
 in the description JSON with the facts.
 """
 
@@ -24,98 +30,38 @@ from typing import Any
 import polars as pl
 from PIL import Image
 
-from palpate.core import PalpateError, Problem, Progress, atomic_path, inside, quiet
-from palpate.data.formats.base import Facts, Found, Scan, import_scanned
-from palpate.data.formats.huggingface_source import ROW, Source, one_line, open_source
+from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
+from palpate.data.formats.base import Facts, Format, Row, Scan, import_scanned
+from palpate.data.formats.huggingface_source import ROW, Source, first_line, open_source
 from palpate.data.images import BROKEN, Check
 from palpate.data.imported import Imported, removing_on_error
-from palpate.data.listing import INCONCLUSIVE
 from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
 from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classes
-from palpate.data.tables import LINE
 
-LOOKED_FOR = "a folder written by datasets' save_to_disk, or of Parquet shards; a name on the hub with --format hf"
+LOOKS_FOR = (
+    "a folder written by save_to_disk of the library datasets, or of Parquet shards; for a name on "
+    "the hub say that the format is hf"
+)
 FACTS = Facts(
-    "Hugging Face data set",
-    "unknown",
-    "unknown",
-    "https://huggingface.co/docs/datasets",
-    "unknown",
-    None,
-    "as many as the data set has rows",
-    "the column video, if there is one",
+    name="Hugging Face data set",
+    url="https://huggingface.co/docs/datasets",
+    samples="as many as the data set has rows",
+    group="the column video, if there is one",
 )
 BATCH = 64
-SUFFIX_OF = {
-    "JPEG": ".jpg",
-    "MPO": ".jpg",
-    "PNG": ".png",
-    "WEBP": ".webp",
-    "BMP": ".bmp",
-    "TIFF": ".tif",
-    "GIF": ".gif",
-}
-
-
-@dataclass
-class _Pictures:
-    """Writes images to a folder, equal bytes once; with no folder it only looks at them."""
-
-    folder: Path | None
-    created: list[Path]
-    how: Check
-    known: dict[bytes, str] = field(default_factory=dict)
-    bad: dict[bytes, str] = field(default_factory=dict)
-    taken: dict[str, bytes] = field(default_factory=dict)
-
-    def put(self, data: bytes, path: str | None, otherwise: str) -> str | tuple[str, str]:
-        """Puts an image at ``path``, else where its bytes are already, else at ``otherwise`` and a suffix.
-
-        Returns:
-            Its path below the folder, or what is wrong as (kind, text).
-        """
-        mark = hashlib.blake2b(data, digest_size=16).digest()
-        if mark not in self.known and mark not in self.bad:
-            kind, reason = _looked_at(data, self.how)
-            if reason:
-                self.bad[mark] = reason
-            else:
-                self.known[mark] = path or otherwise + SUFFIX_OF.get(kind, f".{kind.lower()}")
-        if mark in self.bad:
-            return "bad-image", self.bad[mark]
-        path = path or self.known[mark]
-        if (before := self.taken.setdefault(path, mark)) != mark:
-            return "duplicate-path", f"another image of the data set has the path {path!r}"
-        if self.folder is not None and before is mark:
-            self._write(self.folder / path, data)
-        return path
-
-    def _write(self, path: Path, data: bytes) -> None:
-        if path.is_file():
-            if path.read_bytes() != data:
-                raise PalpateError(
-                    "Images of an earlier import must be the same",
-                    f"another one at {path}",
-                    "Choose another folder, or remove it",
-                )
-            return
-        self.created.append(path)
-        with atomic_path(path) as part:
-            part.write_bytes(data)
+#: Suffixes that differ from the name of Pillow's format.
+SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "TIFF": ".tif"}
+Batch = Mapping[str, list[Any]]
 
 
 def detect(source: Path) -> bool:
-    """Whether a folder was written by ``save_to_disk``, or holds Parquet shards (but no manifest)."""
-    if not source.is_dir():
-        return False
-    if (source / "dataset_dict.json").is_file() or all(
-        (source / n).is_file() for n in ("state.json", "dataset_info.json")
-    ):
+    """Whether a folder was written by ``save_to_disk`` or holds Parquet shards, but no manifest."""
+    saved = (("dataset_dict.json",), ("state.json", "dataset_info.json"))
+    if any(all((source / name).is_file() for name in names) for names in saved):
         return True
-    return not (source / "manifest.parquet").is_file() and any(
-        next((source / p).glob("*.parquet"), None) for p in (".", "data")
-    )
+    shards = any(any((source / place).glob("*.parquet")) for place in (".", "data"))
+    return source.is_dir() and shards and not (source / "manifest.parquet").is_file()
 
 
 def scan(
@@ -128,7 +74,7 @@ def scan(
     check: Check = "decode",
     progress: Progress = quiet,
 ) -> Scan:
-    """Looks a data set over without writing anything; rows carry no paths of images.
+    """Check a data set without writing anything; rows carry no paths of images.
 
     Args:
         source: folder, or name on the hub.
@@ -137,24 +83,17 @@ def scan(
         config: which configuration of the data set.
         revision: of a hub data set: branch, tag or commit.
         check: how images are checked.
-        progress: told how many rows are read.
+        progress: called with the number of rows read.
 
     Raises:
         PalpateError: if the source cannot be opened or lacks a needed column.
         MissingExtraError: if ``datasets`` is not installed.
     """
-    found = _scan(
-        open_source(source, config, revision),
-        columns,
-        classes,
-        _Pictures(None, [], check),
-        progress,
-    )
-    found.rows = [
-        (where, {k: v for k, v in row.items() if k not in IMAGE_COLUMNS})
-        for where, row in found.rows
-    ]
-    return found
+    opened = open_source(source, config, revision)
+    result = _scan(opened, columns or {}, classes, _Store(None, [], check), progress)
+    for _, row in result.rows:
+        row |= dict.fromkeys(IMAGE_COLUMNS)
+    return result
 
 
 def run(
@@ -169,7 +108,7 @@ def run(
     check: Check = "decode",
     progress: Progress = quiet,
 ) -> Imported:
-    """Imports a data set; its images go to ``out/images``, which becomes the manifest's root.
+    """Import a data set; its images go to ``out/images``, which becomes the manifest's root.
 
     Args:
         source: folder, or name on the hub.
@@ -178,79 +117,129 @@ def run(
         classes: table of classes, for labels that are bare numbers.
         config: which configuration of the data set.
         revision: of a hub data set: branch, tag or commit.
-        skip_bad: leave bad rows out and list them, instead of raising.
+        skip_bad: skip bad rows and list them, instead of raising.
         check: how images are checked.
-        progress: told how many rows are read.
+        progress: called with the number of rows read.
 
     Raises:
         PalpateError: if the source cannot be opened or lacks a needed column.
-        ProblemsError: with every bad row at once, unless ``skip_bad``; nothing is left behind.
+        ProblemsError: with every bad row, unless ``skip_bad``; nothing is left behind.
         MissingExtraError: if ``datasets`` is not installed.
     """
     opened = open_source(source, config, revision)
     with removing_on_error(out) as created:
-        found = _scan(
-            opened, columns, classes, _Pictures(Path(out) / "images", created, check), progress
-        )
-        found.base.mkdir(parents=True, exist_ok=True)
-        return import_scanned(
-            found, Path(source), Path(out), {}, skip_bad=skip_bad, check="none", progress=progress
-        )
+        store = _Store(Path(out) / "images", created, check)
+        result = _scan(opened, columns or {}, classes, store, progress)
+        result.base.mkdir(parents=True, exist_ok=True)
+        options: dict[str, Any] = {"skip_bad": skip_bad, "check": "none", "progress": progress}
+        return import_scanned(result, Path(source), Path(out), {}, **options)
+
+
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, run, remote=True)
+
+
+@dataclass
+class _Store:
+    """Writes images to a folder, equal bytes once; without a folder it only checks them."""
+
+    folder: Path | None
+    created: list[Path]
+    how: Check
+    paths: dict[bytes, str] = field(default_factory=dict)
+    reasons: dict[bytes, str] = field(default_factory=dict)
+    taken: dict[str, bytes] = field(default_factory=dict)
+
+    def put(self, data: bytes, path: str | None, default: str) -> str | tuple[str, str]:
+        """Put an image at ``path``, else where its bytes are already, else at ``default`` + suffix.
+
+        Returns:
+            Its path below the folder, or what is wrong as (kind, text).
+        """
+        digest = hashlib.blake2b(data, digest_size=16).digest()
+        if digest not in self.paths and digest not in self.reasons:
+            kind, reason = _checked(data, self.how)
+            if reason:
+                self.reasons[digest] = reason
+            else:
+                suffix = SUFFIXES.get(kind, f".{kind.lower()}")
+                self.paths[digest] = path or default + suffix
+        if digest in self.reasons:
+            return "bad-image", self.reasons[digest]
+        path = path or self.paths[digest]
+        if (before := self.taken.setdefault(path, digest)) != digest:
+            return "duplicate-path", f"another image of the data set has the path {path!r}"
+        if self.folder is not None and before is digest:
+            self._write(self.folder / path, data)
+        return path
+
+    def _write(self, path: Path, data: bytes) -> None:
+        if not path.is_file():
+            self.created.append(path)
+            with atomic_path(path) as part:
+                part.write_bytes(data)
+        elif path.read_bytes() != data:
+            must = "Images of an earlier import must be the same"
+            raise PalpateError(must, f"another one at {path}", "Choose another folder")
+
+
+def _checked(data: bytes, how: Check) -> tuple[str, str | None]:
+    """(format of an image, why it is unusable or None)."""
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            kind = str(image.format)
+            if how == "decode":
+                image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
+                image.load()
+            return kind, None
+    except Image.UnidentifiedImageError:
+        return "", "not an image" if data else "an empty file (0 bytes)"
+    except BROKEN as error:
+        return "", str(error) or type(error).__name__
 
 
 def _scan(
     source: Source,
-    columns: Mapping[str, str] | None,
+    columns: Mapping[str, str],
     classes: Path | None,
-    pictures: _Pictures,
+    store: _Store,
     progress: Progress,
 ) -> Scan:
-    """Reads all rows, putting their images where ``pictures`` does."""
-    expressions = compile_maps(columns or {}, source.names, list(SCHEMA))
-    sides = [side for side in IMAGE_COLUMNS[:2] if side in expressions.expressions]
-    if not sides:
+    """Read all rows; ``store`` takes their images."""
+    maps = compile_maps(columns, source.names, list(SCHEMA))
+    if not any(side in maps.expressions for side in IMAGE_COLUMNS[:2]):
         got = f"no vision and no tactile among {', '.join(source.names) or 'no columns'}"
-        raise PalpateError(
-            f"{source.name} must have a column for the images",
-            got,
-            "Map it: --map vision=YOUR_COLUMN",
-        )
-    known = None if classes is None else read_classes(Path(classes))
-    problems: list[Problem] = []
-    places: dict[int, int] = {}
-    found = Scan([], pictures.folder or source.folder or Path(), problems, facts=dict(source.facts))
+        must, example = f"{source.name} must have a column for the images", {"vision": "COLUMN"}
+        raise PalpateError(must, got, "Map your columns", example={"columns": example})
+    label = source.labels.get(maps.source("material") or "")
+    names = dict(enumerate(label)) if label else None
+    names = names if classes is None else read_classes(Path(classes))
+    result = Scan(store.folder or source.folder or Path(), dict(source.facts))
+    places: list[int] = []
     parts: set[str] = set()
     total = sum(len(data) for data in source.splits.values() if hasattr(data, "__len__"))
     for split, first, batch in _batches(source):
-        rows, unclear = _batch_rows(
-            source, expressions, split, first, batch, known, pictures, problems
-        )
-        found.inconclusive += unclear
-        for k, (where, row) in rows:
-            if ROW in batch:
-                places[len(found.rows)] = int(batch[ROW][k - first])
-            if split in PART_NAMES:
-                row["split"] = PART_NAMES[split]
-                parts.add(row["split"])
-            found.rows.append((where, row))
-        progress("reading rows", first + len(next(iter(batch.values()))), total)
-    if len(places) == len(found.rows):
-        found.rows = [found.rows[k] for k in sorted(places, key=places.__getitem__)]
+        reader = _BatchReader(source, maps, split, first, batch, result, store)
+        for k, row in reader.rows(names):
+            places += [int(batch[ROW][k])] if ROW in batch else []
+            if part := PART_NAMES.get(split):
+                row[1]["split"] = part
+                parts.add(split)
+            result.rows.append(row)
+        progress("reading rows", first + reader.count, total)
+    if places:  # an export of palpate: the order of its manifest
+        order = sorted(range(len(places)), key=places.__getitem__)
+        result.rows = [result.rows[k] for k in order]
     if len(parts) > 1:
-        rule = source.about.get("rule") or {
-            "method": "official",
-            "parts": sorted(s for s in source.splits if s in PART_NAMES),
-        }
-        found.own, found.rules = "Orig", {"Orig": dict(rule)}
-    words = any("text" in row for _, row in found.rows)
-    found.facts.setdefault(
-        "text_source", f"column {(columns or {}).get('text', 'text')}" if words else "none"
-    )
-    found.suspicious = odd_groups(Path(source.name), found.rows)
-    return found
+        rule = source.description.get("rule") or {"method": "official", "parts": sorted(parts)}
+        result.split_name, result.split_rule = "Orig", dict(rule)
+    worded = any("text" in row for _, row in result.rows)
+    text_source = f"column {columns.get('text', 'text')}" if worded else "none"
+    result.facts.setdefault("text_source", text_source)
+    result.suspicious = odd_groups(Path(source.name), result.rows)
+    return result
 
 
-def _batches(source: Source) -> Iterator[tuple[str, int, Mapping[str, list[Any]]]]:
+def _batches(source: Source) -> Iterator[tuple[str, int, Batch]]:
     """(part, number of its first row, cells by column).
 
     Raises:
@@ -265,125 +254,99 @@ def _batches(source: Source) -> Iterator[tuple[str, int, Mapping[str, list[Any]]
         except PalpateError:
             raise
         except Exception as error:  # of the library, or of Arrow below it
-            place = f"{source.name}/{split}".rstrip("/")
-            raise PalpateError(
-                f"{place} must be readable to its end",
-                f"{one_line(error)} after row {first}",
-                "Fetch it again",
-            ) from None
+            must = f"{source.name}/{split}".rstrip("/") + " must be readable to its end"
+            got = f"{first_line(error)} after row {first}"
+            raise PalpateError(must, got, "Fetch it again") from None
 
 
-def _batch_rows(
-    source: Source,
-    maps: ColumnMaps,
-    split: str,
-    first: int,
-    batch: Mapping[str, list[Any]],
-    classes: Mapping[int, str] | None,
-    pictures: _Pictures,
-    problems: list[Problem],
-) -> tuple[list[tuple[int, Found]], int]:
-    """The usable rows of a batch by their numbers in the part."""
-    count = len(next(iter(batch.values())))
-    where = lambda k: f"{source.name}/{split}:{first + k}".replace("/:", ":")  # noqa: E731
-    inner = {
-        target: column
-        for target in IMAGE_COLUMNS
-        if (column := maps.source(target)) is not None and column in source.images
-    }
-    plain = maps.without(list(inner))
-    texts = {
-        name: pl.Series(_texts(source, name, batch[name]), dtype=pl.String)
-        for name in plain.columns
-    }
-    cells = plain.apply(pl.DataFrame({LINE: range(first, first + count), **texts}))
-    told: list[Problem] = []
-    rows, unclear = manifest_rows(cells, count, where, classes, told)
-    inconclusive, unknown = _labels(source, plain, batch)
-    left = {where(k) for k in inconclusive | unknown.keys()}
-    problems += [p for p in told if p.where not in left]
-    problems += [Problem(where(k), "unknown-label", text) for k, text in unknown.items()]
-    rows = [(k, row) for k, row in rows if where(k) not in left]
-    unclear += len(inconclusive)
-    good: list[tuple[int, Found]] = []
-    for k, row in rows:
-        wrong: list[tuple[str, str]] = []
-        row.setdefault(
-            "id",
-            f"{row['video']}/{row['frame']}"
-            if "video" in row and "frame" in row
-            else f"{split}/{first + k:08d}".lstrip("/"),
+@dataclass
+class _BatchReader:
+    """Rows of one batch: the rows ``first`` to ``first + count - 1`` of the part ``split``."""
+
+    source: Source
+    maps: ColumnMaps
+    split: str
+    first: int
+    batch: Batch
+    result: Scan
+    store: _Store
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.batch.values())))
+
+    def rows(self, classes: Mapping[int, str] | None) -> Iterator[tuple[int, Row]]:
+        """The usable rows by their number in the batch."""
+        sources = {target: self.maps.source(target) for target in IMAGE_COLUMNS}
+        stored = {t: column for t, column in sources.items() if column in self.source.images}
+        plain = self.maps.without(list(stored))
+        texts = {n: pl.Series(self._texts(n), dtype=pl.String) for n in plain.columns}
+        table = pl.DataFrame({ROW: range(self.count)}).with_columns(**texts)
+        found, inconclusive = manifest_rows(
+            plain.apply(table), self.count, self._where, classes, self.result.problems
         )
-        for target in (t for t in IMAGE_COLUMNS if t in maps.expressions):
-            column = inner.get(target)
-            data = _bytes(source, row.get(target) if column is None else batch[column][k])
-            if isinstance(data, bytes):
-                given = (
-                    batch[f"{target}_path"][k]
-                    if source.about and f"{target}_path" in batch
-                    else None
-                )
-                safe = given if given and not re.search(CLIMBS, given) else None
-                data = pictures.put(data, safe, f"{split or 'all'}/{target}/{first + k:08d}")
-            if isinstance(data, tuple):
-                wrong.append((data[0], f"{target}: {data[1]}"))
-            elif data is not None:
-                row[target] = data
-            elif target != "background":
-                wrong.append(("missing-image", f"no {target} image"))
-        problems += [Problem(where(k), *w) for w in wrong]
-        if not wrong:
-            good.append((first + k, (where(k), row)))
-    return good, unclear
+        self.result.inconclusive += inconclusive
+        for k, row in found:
+            row.setdefault("id", self._default_id(k, row))
+            problems: list[tuple[str, str]] = []
+            for target in (t for t in IMAGE_COLUMNS if t in self.maps.expressions):
+                cell = self.batch[stored[target]][k] if target in stored else row.get(target)
+                path = self._stored(target, k, cell)
+                if isinstance(path, tuple):
+                    problems.append((path[0], f"{target}: {path[1]}"))
+                elif path is not None or target == "background":
+                    row[target] = path
+                else:
+                    problems.append(("missing-image", f"no {target} image"))
+            for kind, text in problems:
+                self.result.problem(self._where(k), kind, text)
+            if not problems:
+                yield k, (self._where(k), row)
 
+    def _where(self, k: int) -> str:
+        return f"{self.source.name}/{self.split}:{self.first + k}".replace("/:", ":")
 
-def _labels(
-    source: Source, plain: ColumnMaps, batch: Mapping[str, list[Any]]
-) -> tuple[set[int], dict[int, str]]:
-    """Rows whose material is the class -1, which is inconclusive, and row -> what is wrong with its number of a class."""
-    inconclusive: set[int] = set()
-    unknown: dict[int, str] = {}
-    for target, name in (
-        (target, name)
-        for target, expression in plain.expressions.items()
-        for name in expression.meta.root_names()
-        if name in source.labels
-    ):
-        count = len(source.labels[name])
-        for k, v in enumerate(batch[name]):
-            if v == INCONCLUSIVE and target == "material":
-                inconclusive.add(k)
-            elif v is not None and v != INCONCLUSIVE and not 0 <= v < count:
-                unknown[k] = (
-                    f"the column {name} has {count} classes, counted from 0, and none of the number {v}"
-                )
-    return inconclusive - unknown.keys(), unknown
+    def _default_id(self, k: int, row: Mapping[str, Any]) -> str:
+        if "video" in row and "frame" in row:
+            return f"{row['video']}/{row['frame']}"
+        return f"{self.split}/{self.first + k:08d}".lstrip("/")
 
+    def _texts(self, name: str) -> Sequence[str | None]:
+        """Cells as texts: an image is its file name, a class label its name.
 
-def _texts(source: Source, name: str, values: Sequence[Any]) -> list[str | None]:
-    """Cells as texts: an image is its file name, a class label its name.
+        Labels of the material that are no class (-1: unclear) stay numbers.
 
-    Raises:
-        PalpateError: if the column holds lists or objects.
-    """
-    if name in source.images:
-        return [None if v is None else text_of(v["path"]) for v in values]
-    if name in source.labels:
-        classes = source.labels[name]
-        return [
-            classes[v] if isinstance(v, int) and 0 <= v < len(classes) else None for v in values
-        ]
-    if any(isinstance(v, (list, dict, bytes)) for v in values):
-        raise PalpateError(
-            f"Columns of {source.name} must hold texts, numbers or images",
-            f"{name} with lists or objects",
-            "Map another column",
-        )
-    return [text_of(v) for v in values]
+        Raises:
+            PalpateError: if the column holds lists or objects.
+        """
+        values = self.batch[name]
+        if name in self.source.images:
+            return [None if v is None else text_of(v["path"]) for v in values]
+        if name in self.source.labels:
+            names = dict(enumerate(self.source.labels[name]))
+            is_material = name == self.maps.source("material")
+            return [names.get(v, text_of(v) if is_material else None) for v in values]
+        if any(isinstance(v, (list, dict, bytes)) for v in values):
+            must = f"Columns of {self.source.name} must hold texts, numbers or images"
+            raise PalpateError(must, f"{name} with lists or objects", "Map another column")
+        return [text_of(v) for v in values]
+
+    def _stored(self, target: str, k: int, cell: Any) -> str | tuple[str, str] | None:
+        """Path of an image in the store; else what is wrong, or None where there is no image."""
+        data = _bytes(self.source, cell)
+        if not isinstance(data, bytes):
+            return data
+        path: str | None = None
+        if self.source.description and f"{target}_path" in self.batch:
+            path = self.batch[f"{target}_path"][k]
+        safe = path if path and not re.search(CLIMBS, path) else None
+        default = f"{self.split or 'all'}/{target}/{self.first + k:08d}"
+        return self.store.put(data, safe, default)
 
 
 def _bytes(source: Source, value: Any) -> bytes | tuple[str, str] | None:
-    """The stored bytes of an image, or those of the file that it names; else what is wrong, or None where there is none."""
+    """The bytes of a stored or named image; else what is wrong, or None where there is none."""
     if isinstance(value, dict) and value.get("bytes") is not None:
         return bytes(value["bytes"])
     path = value.get("path") if isinstance(value, dict) else value
@@ -391,23 +354,6 @@ def _bytes(source: Source, value: Any) -> bytes | tuple[str, str] | None:
         return None
     place = None if source.folder is None else inside(source.folder, str(path))
     if place is None:
-        return (
-            "outside-root",
-            f"the path {path!r} leaves the data set, and the image is not stored in it",
-        )
+        text = f"the path {path!r} leaves the data set, and the image is not stored in it"
+        return "outside-root", text
     return place.read_bytes() if place.is_file() else ("missing-file", f"no file {path!r}")
-
-
-def _looked_at(data: bytes, how: Check) -> tuple[str, str | None]:
-    """(format of an image, why it is unusable or None)."""
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            kind = str(image.format)
-            if how == "decode":
-                image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
-                image.load()
-            return kind, None
-    except Image.UnidentifiedImageError:
-        return "", "not an image" if data else "an empty file (0 bytes)"
-    except BROKEN as error:
-        return "", str(error) or type(error).__name__

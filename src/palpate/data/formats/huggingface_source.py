@@ -1,4 +1,4 @@
-"""Opening Hugging Face data sets without running anything of theirs: folders, and names on the hub."""
+"""Opening Hugging Face data sets, folders and names on the hub, without running their code."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MARK = "palpate-export/1"
 ROW = "palpate_row"
 
 
-@dataclass
+@dataclass(frozen=True)
 class Source:
     """An opened data set.
 
@@ -31,26 +31,27 @@ class Source:
         images: columns of images.
         labels: columns of class labels -> the names of their classes.
         names: all columns.
-        about: what the description of an export says, or empty.
+        description: of an export of palpate, or empty.
         facts: for the manifest.
         folder: where paths of images may point to, or None.
     """
 
     name: str
     splits: Mapping[str, Any]
-    images: list[str]
+    images: Sequence[str]
     labels: Mapping[str, Sequence[str]]
-    names: list[str]
-    about: Mapping[str, Any]
+    names: Sequence[str]
+    description: Mapping[str, Any]
     facts: Mapping[str, str]
     folder: Path | None
 
 
 def open_source(source: Path, config: str | None = None, revision: str | None = None) -> Source:
-    """Opens a folder or a hub name.
+    """Open a folder or a hub name.
 
     Raises:
-        PalpateError: if there is none, it is of a kind that is not opened, or the hub cannot be reached.
+        PalpateError: if there is none, it is of a kind that is not opened, or the hub cannot be
+            reached.
         MissingExtraError: if ``datasets`` is not installed.
     """
     try:
@@ -60,70 +61,68 @@ def open_source(source: Path, config: str | None = None, revision: str | None = 
     source = Path(source)
     local = source.is_dir()
     name = source.name if local else source.as_posix()
-    if not local and (source.exists() or re.fullmatch(r"[\w.\-]+(/[\w.\-]+)?", name) is None):
-        raise PalpateError(
-            "The source must be a folder, or a name on the hub like user/name",
-            str(source),
-            "Check the path",
-        )
-    saved = local and (
-        (source / "dataset_dict.json").is_file() or (source / "state.json").is_file()
-    )
-    if not local:
-        _require_hub(name, revision)
-    try:
-        loaded = (
-            datasets.load_from_disk(str(source))
-            if saved
-            else _streamed(str(source) if local else name, config, revision, local)
-        )
-    except PalpateError:
-        raise
-    except Exception as error:  # the library raises many kinds
-        fix = (
-            "Write it again with save_to_disk, or as Parquet"
-            if local
-            else "Check the name, --set config=... and --set revision=..."
-        )
-        raise PalpateError(
-            f"The data set {name} must be whole and readable", one_line(error), fix
-        ) from None
-    splits: dict[str, Any] = (
-        {str(k): v for k, v in loaded.items()} if isinstance(loaded, dict) else {"": loaded}
-    )
+    loaded = _loaded(source, name, config, revision)
+    splits: dict[str, Any] = dict(loaded) if isinstance(loaded, dict) else {"": loaded}
     features = dict(next(iter(splits.values())).features or {}) if splits else {}
     images = [n for n, f in features.items() if isinstance(f, datasets.Image)]
     for split, data in splits.items():
         if list(data.features or {}) != list(features):
-            got = f"{split or 'one'} with {', '.join(data.features or {}) or 'none'}"
-            raise PalpateError(
-                f"All parts of {name} must have the columns {', '.join(features)}",
-                got,
-                "Import the parts one by one",
-            )
+            must = f"All parts of {name} must have the columns {', '.join(features)}"
+            got = f"{split} with {', '.join(data.features or {}) or 'none'}"
+            raise PalpateError(must, got, "Import the parts one by one")
         for image in images:
             data = data.cast_column(image, datasets.Image(decode=False))
         splits[split] = data.with_format(None)
     labels = {n: list(f.names) for n, f in features.items() if isinstance(f, datasets.ClassLabel)}
     info = next(iter(splits.values())).info
-    about = _about(info.description)
-    told = {"license": info.license, "citation": info.citation, "url": info.homepage}
-    facts = {
-        "dataset": name,
-        **{k: str(v).strip() or "unknown" for k, v in told.items()},
-        "format": "hf",
-        **about.get("facts", {}),
-    }
-    return Source(
-        name, splits, images, labels, list(features), about, facts, source if local else None
-    )
+    description = _description(info.description)
+    facts = {"dataset": name, "license": info.license, "citation": info.citation}
+    facts |= {"url": info.homepage}
+    facts = {key: str(value).strip() or "unknown" for key, value in facts.items()}
+    facts |= {"format": "hf", **description.get("facts", {})}
+    folder = source if local else None
+    return Source(name, splits, images, labels, list(features), description, facts, folder)
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of the text of an error, or its kind."""
+    lines = (line.strip() for line in str(error).splitlines())
+    return next(filter(None, lines), type(error).__name__)[:300]
+
+
+def _loaded(source: Path, name: str, config: str | None, revision: str | None) -> Any:
+    """The data set as the library opens it, without a copy in its cache.
+
+    Raises:
+        PalpateError: if it cannot be opened.
+    """
+    import datasets
+
+    local = source.is_dir()
+    if not local:
+        if source.exists() or re.fullmatch(r"[\w.\-]+(/[\w.\-]+)?", name) is None:
+            must = "The source must be a folder, or a name on the hub like user/name"
+            raise PalpateError(must, str(source), "Check the path")
+        _require_hub(name, revision)
+    try:
+        if any((source / mark).is_file() for mark in ("dataset_dict.json", "state.json")):
+            return datasets.load_from_disk(str(source))
+        return _streamed(str(source) if local else name, config, revision, local)
+    except PalpateError:
+        raise
+    except Exception as error:  # the library raises many kinds
+        fix = "Check the name, the configuration and the revision"
+        fix = "Write it again with save_to_disk, or as Parquet" if local else fix
+        must = f"The data set {name} must be whole and readable"
+        raise PalpateError(must, first_line(error), fix) from None
 
 
 def _require_hub(name: str, revision: str | None) -> None:
-    """Asks the hub once, without the library's half minute of retries.
+    """Ask the hub once, without the library's half minute of retries.
 
     Raises:
-        PalpateError: if it cannot be reached and the user did not ask for the local cache, or has no such data set.
+        PalpateError: if it cannot be reached and the local cache was not requested, or has no such
+            data set.
     """
     if os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "TRUE", "YES", "ON"):
         return
@@ -133,59 +132,39 @@ def _require_hub(name: str, revision: str | None) -> None:
     try:
         HfApi().dataset_info(name, revision=revision, timeout=20)
     except HfHubHTTPError as error:
-        got = f"the answer {one_line(error)}"
-        raise PalpateError(
-            f"The Hugging Face hub must have the data set {name}",
-            got,
-            "Check the name; for a private one log in: hf auth login",
-        ) from None
+        must = f"The Hugging Face hub must have the data set {name}"
+        fix = "Check the name; for a private one log in: hf auth login"
+        raise PalpateError(must, f"the answer {first_line(error)}", fix) from None
     except Exception as error:  # of the network library
-        raise PalpateError(
-            f"{name} is no folder here, so the Hugging Face hub must be within reach",
-            one_line(error),
-            f"Where there is a network: hf download --repo-type dataset {name} --local-dir DIR, and import DIR; with HF_HUB_OFFLINE=1 a cached copy is taken",
-        ) from None
+        must = f"{name} is no folder here, so the Hugging Face hub must be within reach"
+        fix = f"Where there is a network: hf download --repo-type dataset {name} --local-dir DIR, "
+        fix += "and import DIR; with HF_HUB_OFFLINE=1 a cached copy is taken"
+        raise PalpateError(must, first_line(error), fix) from None
 
 
 def _streamed(place: str, config: str | None, revision: str | None, local: bool) -> Any:
-    """Parquet shards or an image folder, read as they lie, without a copy in the library's cache."""
+    """Parquet shards or an image folder."""
     import datasets
 
     options: dict[str, Any] = {} if local else {"revision": revision}
     if "trust_remote_code" in inspect.signature(datasets.load_dataset_builder).parameters:
-        options["trust_remote_code"] = False  # the default of today, said for all versions
+        options["trust_remote_code"] = False  # versions that have the option differ in its default
     builder = datasets.load_dataset_builder(place, config, **options)
-    if builder.name not in (LOCAL if local else REMOTE):
-        fix = (
-            "Convert it to Parquet"
-            if local
-            else "The hub keeps a copy in Parquet: --set revision=refs/convert/parquet"
-        )
-        raise PalpateError(
-            f"{place} must be made of {' or '.join(LOCAL if local else REMOTE)} files",
-            str(builder.name),
-            fix,
-        )
+    kinds = LOCAL if local else REMOTE
+    if builder.name not in kinds:
+        must = f"{place} must be made of {' or '.join(kinds)} files"
+        if local:
+            raise PalpateError(must, str(builder.name), "Convert it to Parquet")
+        fix, example = "The hub keeps a copy in Parquet", {"revision": "refs/convert/parquet"}
+        raise PalpateError(must, str(builder.name), fix, example=example)
     return builder.as_streaming_dataset()
 
 
-def _about(description: str | None) -> Mapping[str, Any]:
-    """What the description of an export says; empty for any other."""
+def _description(text: str | None) -> dict[str, Any]:
+    """The description of an export of palpate; empty for any other."""
     try:
-        found = json.loads(description or "")
+        data = json.loads(text or "")
     except ValueError:
         return {}
-    return (
-        found
-        if isinstance(found, dict)
-        and found.get("format") == MARK
-        and isinstance(found.get("facts"), dict)
-        else {}
-    )
-
-
-def one_line(error: BaseException) -> str:
-    """The first line of what an error says, or its kind."""
-    return next(
-        (line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__
-    )[:300]
+    ours = isinstance(data, dict) and data.get("format") == MARK
+    return data if ours and isinstance(data.get("facts"), dict) else {}

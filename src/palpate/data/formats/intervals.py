@@ -1,76 +1,99 @@
-"""Interval lists: the touches of recordings as ``video,start,end,label`` lines, beside folders of recordings.
+"""Interval lists: contacts as ``video,start,end,label`` lines, next to folders of recordings.
 
-The list is any table (:mod:`palpate.data.tables`). Its columns may have other names (``NAMES``), or map expressions
-(:mod:`palpate.data.mapping`) name them; without a header the order is video, start, end, label. ``start`` and ``end`` are frame
-numbers from 0 that **both belong to the touch**; with ``half_open`` the end is the first frame after it. ``object``, ``text``,
-``session`` and ``background`` (the frame that shows the gel before the touch) are optional. A label of -1 marks contact of unclear
-material: no samples, but no background is taken from there either.
+::
 
-The recordings are those of Touch and Go: ``<video>/`` with ``video_frame/`` and ``gelsight_frame/``, or ``video.mp4`` and
-``gelsight.mp4``, in the list's folder (or ``root``), in its ``dataset/`` or ``final_dataset/``. Each interval is a touch
-``video#000k`` in the order of frames; each of its frames is a sample (``every`` thins). Backgrounds follow the rule of Touch and Go
-where the list names none. Intervals that overlap are left out, all of them: which is true is unknown.
+    root/
+      contacts.csv                     any table (:mod:`palpate.data.tables`)
+      <video>/video.mp4  gelsight.mp4, or video_frame/ gelsight_frame/, as in Touch and Go, also
+                                       under dataset/ or final_dataset/
+
+The columns may have other names (``NAMES``), or map expressions (:mod:`palpate.data.mapping`) name
+them; without a header the order is video, start, end, label. ``start`` and ``end`` are frame
+numbers from 0 that **both belong to the contact**; with ``half_open`` the end is the first frame
+after it. ``object``, ``text``, ``session`` and ``background`` (the frame that shows the gel before
+the contact) are optional. A label of -1 marks contact of unclear material: no samples, but no
+background is taken from there either.
+
+Each interval is a contact ``video#000k`` in the order of frames; each of its frames is a sample
+(``every`` thins). Backgrounds follow the rule of Touch and Go where the list names none. Intervals
+that overlap are all skipped: which is true is unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Progress, quiet
-from palpate.data.formats.base import Facts, Found, Scan
-from palpate.data.formats.interval_lists import (
-    NAMES,
-    NEEDED,
-    ORDER,
-    Interval,
-    apart,
-    is_bare,
-    numbered,
-    read_intervals,
+from palpate.core import PalpateError, Problem, Progress, Split, quiet, write_text
+from palpate.data.formats.base import Facts, Format, Scan
+from palpate.data.formats.touch_and_go import (
+    extracted,
+    require_frame_options,
+    require_videos,
+    scan_rows,
 )
-from palpate.data.formats.touch_and_go import find_videos
-from palpate.data.frames import IMAGE_FORMATS, FolderFrames, ImageFormat
+from palpate.data.frames import FolderFrames, ImageFormat
 from palpate.data.images import Check
-from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
+from palpate.data.imported import Imported, removing_on_error
 from palpate.data.listing import FrameTable
 from palpate.data.manifest import Manifest
-from palpate.data.recordings import Recordings, Row, VideoFiles
-from palpate.data.rows import odd_groups
-from palpate.data.tables import header_of
+from palpate.data.mapping import compile_maps
+from palpate.data.recordings import Recordings, Row
+from palpate.data.rows import manifest_rows, odd_groups, read_classes
+from palpate.data.tables import header_of, open_table
 
-LOOKED_FOR = f"a table with the columns {', '.join(ORDER)}, beside folders of recordings"
 FACTS = Facts(
-    "recordings of one's own with an interval list",
-    "unknown",
-    "unknown",
-    "unknown",
-    "unknown",
-    None,
-    "as many as the intervals have frames",
-    "the column video",
+    name="your own recordings with an interval list",
+    samples="as many as the intervals have frames",
+    group="the column video",
 )
+#: What the columns of an interval list are called.
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "video": ("video", "recording", "clip", "sequence", "video_id"),
+    "start": ("start", "start_frame", "first", "first_frame", "begin", "from", "onset"),
+    "end": ("end", "end_frame", "last", "last_frame", "stop", "to", "offset"),
+    "material": ("material", "label", "class", "category"),
+    "object": ("object",),
+    "text": ("text", "caption", "description"),
+    "session": ("session",),
+    "background": ("background", "background_frame"),
+}
+NEEDED = ("video", "start", "end")
+ORDER = ("video", "start", "end", "label")
+WORDS = ("material", "object", "text", "session")
+LOOKS_FOR = f"a table with the columns {', '.join(ORDER)}, next to folders of recordings"
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A contact: frames ``first`` to ``last``, both included; ``contact`` will be its name."""
+
+    where: str
+    video: str
+    first: int
+    last: int
+    words: Mapping[str, str]
+    background: int | None
+    inconclusive: bool
+    contact: str = ""
 
 
 class _Whole(Recordings):
-    """Recordings whose frames are looked at by interval, not one by one."""
+    """Recordings whose frames are checked by interval, not one by one."""
 
     def _has(self, row: Row) -> bool:
         return True
 
 
 def detect(source: Path) -> bool:
-    """Whether this is a table with a video, a start and an end, and with no paths of images; or such lines without a header."""
-    if not source.is_file():
-        return False
-    header = [name.lower() for name in header_of(source)]
+    """Whether this is a table with video, start and end and without images, or bare lines."""
+    header = [name.lower() for name in header_of(source)] if source.is_file() else []
     if {"vision", "tactile"} & set(header):
         return False
-    return all(any(name in header for name in NAMES[target]) for target in NEEDED) or is_bare(
-        header
-    )
+    return _is_bare(header) or all(set(NAMES[name]) & set(header) for name in NEEDED)
 
 
 def scan(
@@ -84,51 +107,37 @@ def scan(
     check: Check = "decode",
     progress: Progress = quiet,
 ) -> Scan:
-    """Looks a list and its recordings over without writing anything; rows carry no paths.
+    """Check a list and its recordings without writing anything.
 
     Args:
         source: the list.
         root: folder of the recordings (default: that of the list).
         columns: ``video``, ``start``, ``end``, ``material`` ... -> map expression.
-        classes: table of classes, whose numbers stand as labels.
-        half_open: ``end`` is the first frame after the touch.
-        every: take every so manieth frame of a touch, from its first.
-        check: how extracted pictures are checked; ``decode`` decodes the frames of raw videos that are in use, too.
-        progress: told what is being done.
+        classes: table of classes, whose numbers are the labels.
+        half_open: ``end`` is the first frame after the contact.
+        every: take every n-th frame of a contact, from its first.
+        check: how extracted images are checked; ``decode`` also decodes the used frames of videos.
+        progress: progress callback.
 
     Raises:
-        PalpateError: if the list or the recordings are missing, a column is lacking, or an option is out of range.
+        PalpateError: if the list or the recordings are missing, a column is lacking, or an option
+            is out of range.
     """
-    base = _root(source, root, every)
-    work = _Whole(base, base, _videos(base), {}, "jpg", None, [])
-    rows, touches, inconclusive = _prepared(
-        work, Path(source), columns, classes, half_open, every, check, progress
-    )
+    source, base = Path(source), _root(source, root)
+    work = _Whole(base, base, require_videos(base), {}, "jpg", None, [])
+    listed = _read(work, source, columns, classes, half_open)
+    rows, contacts = _prepared(work, listed, every, check, progress)
     rows = work.decode(rows, progress) if check == "decode" else rows
-    found: list[Found] = [
-        (
-            r.where,
-            {
-                "id": r.id,
-                "video": r.video,
-                "frame": r.frame,
-                "contact": r.contact,
-                **touches[r.contact].words,
-            },
-        )
-        for r in rows
-    ]
-    return Scan(
-        found,
-        base,
-        work.problems,
-        work.suspicious,
-        {"dataset": source.stem},
-        inconclusive=inconclusive,
-    )
+    result = Scan(base, {"dataset": source.stem}, scan_rows(work, rows, check))
+    for row, (_, cells) in zip(rows, result.rows, strict=True):
+        cells |= {"material": None, **contacts[row.contact].words}
+    result.facts["text_source"] = _text_source(columns, contacts)
+    result.problems, result.suspicious = work.problems, work.suspicious
+    result.inconclusive = sum(i.inconclusive for i in listed)
+    return result
 
 
-def run(
+def run(  # noqa: PLR0913 (a public verb)
     source: Path,
     out: Path,
     *,
@@ -144,211 +153,290 @@ def run(
     check: Check = "decode",
     progress: Progress = quiet,
 ) -> Imported:
-    """Imports the touches of an interval list; frames of raw videos go to ``out/images/<video>/{vision,tactile}/``.
+    """Import the contacts of an interval list.
 
     Args:
         source: the list.
-        out: folder to write to. If an import is interrupted, the same call goes on where it stopped.
+        out: folder to write to; frames of raw videos go to
+            ``out/images/<video>/{vision,tactile}/``. After an interruption the same call continues
+            where it stopped.
         root: folder of the recordings (default: that of the list).
         columns: ``video``, ``start``, ``end``, ``material`` ... -> map expression.
-        classes: table of classes, whose numbers stand as labels.
-        half_open: ``end`` is the first frame after the touch.
-        every: take every so manieth frame of a touch, from its first.
+        classes: table of classes, whose numbers are the labels.
+        half_open: ``end`` is the first frame after the contact.
+        every: take every n-th frame of a contact, from its first.
         sensor: name of the tactile sensor; null if not given.
-        skip_bad: leave bad intervals and frames out and list them, instead of raising.
+        skip_bad: skip bad intervals and frames and list them, instead of raising.
         image_format: of the cached frames.
         size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
-        check: how extracted pictures are checked.
-        progress: told what is being done.
+        check: how extracted images are checked.
+        progress: progress callback.
 
     Raises:
-        PalpateError: if the list or the recordings are missing, a column is lacking, or an option is out of range.
-        ProblemsError: with everything bad at once, unless ``skip_bad``; nothing is left behind.
+        PalpateError: if the list or the recordings are missing, a column is lacking, or an option
+            is out of range.
+        ProblemsError: with everything bad, unless ``skip_bad``; nothing is left behind.
     """
-    base = _root(source, root, every)
-    if size is not None and size < 1:
-        raise PalpateError(
-            "size must be at least 1 pixel",
-            str(size),
-            "Leave it out to keep the frames as they are",
-        )
-    if image_format not in IMAGE_FORMATS:
-        raise PalpateError(
-            f"image_format must be one of {', '.join(IMAGE_FORMATS)}",
-            repr(image_format),
-            "Choose one of these",
-        )
+    source, base = Path(source), _root(source, root)
+    require_frame_options(image_format, size)
     with removing_on_error(out) as created:
-        work = _Whole(base, Path(out), _videos(base), {}, image_format, size, created)
-        rows, touches, inconclusive = _prepared(
-            work, Path(source), columns, classes, half_open, every, check, progress
-        )
-        raise_if(work.problems, skip_bad)
-        require_some(len(rows), source, work.problems)
-        rows = work.extract(rows, progress)
-        raise_if(work.problems, skip_bad)
-        require_some(len(rows), source, work.problems)
-        words = {
-            name: FrameTable(
-                {
-                    (r.video, r.frame): touches[r.contact].words[name]
-                    for r in rows
-                    if name in touches[r.contact].words
-                },
-                [],
-            )
-            for name in ("material", "object", "text", "session")
-        }
-        text = (columns or {}).get("text", "text")
-        facts = {
-            **FACTS.of_manifest(),
-            "format": "intervals",
-            "dataset": Path(source).stem,
-            "text_source": f"column {text}" if words["text"].values else "none",
-        }
-        manifest = work.manifest(rows, facts, "", words)
-        named = manifest.table.with_columns(sensor=pl.lit(sensor, dtype=pl.String))
-        return Imported(
-            Manifest(named, manifest.root, manifest.facts),
-            work.problems,
-            {},
-            inconclusive,
-            work.suspicious,
-        ).save(out, created)
+        work = _Whole(base, Path(out), require_videos(base), {}, image_format, size, created)
+        listed = _read(work, source, columns, classes, half_open)
+        rows, contacts = _prepared(work, listed, every, check, progress)
+        rows = extracted(work, rows, source, skip_bad=skip_bad, progress=progress)
+        facts = {**FACTS.of_manifest(), "format": "intervals", "dataset": source.stem}
+        facts["text_source"] = _text_source(columns, contacts)
+        manifest = work.manifest(rows, facts, "", _words(rows, contacts))
+        table = manifest.table.with_columns(sensor=pl.lit(sensor, dtype=pl.String))
+        manifest = Manifest(table, manifest.root, manifest.facts)
+        inconclusive = sum(i.inconclusive for i in listed)
+        result = Imported(manifest, work.problems, {}, inconclusive, work.suspicious)
+        return result.save(out, created)
 
 
-def _root(source: Path, root: Path | None, every: int) -> Path:
-    if every < 1:
-        raise PalpateError(
-            "every must be at least 1", str(every), "Leave it out to take every frame"
+def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
+    """Write ``<part>.csv`` with ``video,start,end,label,object,text``.
+
+    A line is a run of consecutive frames of one contact, both ends included; the lines hold exactly
+    the samples of the part.
+
+    Raises:
+        PalpateError: if a sample has no video or frame.
+    """
+    files: list[Path] = []
+    for part in split.counts():
+        table = manifest.part(split, part).table.sort("video", "frame")
+        if len(bad := table.filter(pl.any_horizontal(pl.col("video", "frame").is_null()))["id"]):
+            must = "An interval list needs the video and frame of every sample"
+            raise PalpateError(must, f"none for {bad[0]!r}", "Write the split file alone")
+        words = ["contact", "material", "object", "text"]
+        breaks = (pl.col("frame").diff() != 1).fill_null(True)
+        run = breaks | pl.struct("video", *words).rle_id().diff().fill_null(1).cast(pl.Boolean)
+        runs = table.group_by(run.cum_sum().alias("run"), maintain_order=True).agg(
+            pl.first("video"),
+            pl.first("frame").alias("start"),
+            pl.last("frame").alias("end"),
+            pl.first("material").alias("label"),
+            pl.first("object", "text"),
         )
+        files.append(Path(folder) / f"{part}.csv")
+        write_text(files[-1], runs.drop("run").write_csv())
+    return files
+
+
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, run, write_lists)
+
+
+def _is_bare(header: list[str]) -> bool:
+    """Whether the first line of a table is an interval already, and no header."""
+    numbers = all(cell.isdecimal() for cell in header[1:3])
+    return len(header) in (3, 4) and header[0] != "" and numbers
+
+
+def _root(source: Path, root: Path | None) -> Path:
     base = Path(source).parent if root is None else Path(root)
     if not base.is_dir():
-        raise PalpateError(
-            "The folder of the recordings must exist", f"no folder {base}", "Check --root"
-        )
+        must = "must be the folder of the recordings"
+        raise PalpateError(must, f"no folder {base}", "Check the path", argument="root")
     return base
 
 
-def _videos(base: Path) -> Mapping[str, VideoFiles]:
-    """The recordings.
-
-    Raises:
-        PalpateError: if there is none.
-    """
-    if not (videos := find_videos(base)):
-        raise PalpateError(
-            f"{base} must hold recordings: folders with video.mp4 and gelsight.mp4, or video_frame/ and gelsight_frame/",
-            "none there, nor in dataset/ or final_dataset/",
-            "Name their folder: --root",
-        )
-    return videos
+def _text_source(columns: Mapping[str, str] | None, contacts: Mapping[str, Interval]) -> str:
+    worded = any("text" in contact.words for contact in contacts.values())
+    return f"column {(columns or {}).get('text', 'text')}" if worded else "none"
 
 
-def _prepared(
-    work: _Whole,
-    source: Path,
+def _words(rows: Sequence[Row], contacts: Mapping[str, Interval]) -> dict[str, FrameTable]:
+    """Manifest column -> its words by frame."""
+    tables: dict[str, FrameTable] = {name: FrameTable({}, []) for name in WORDS}
+    for row in rows:
+        for name, word in contacts[row.contact].words.items():
+            tables[name].values[row.video, row.frame] = word
+    return tables
+
+
+def _read(
+    work: Recordings,
+    path: Path,
     columns: Mapping[str, str] | None,
     classes: Path | None,
     half_open: bool,
-    every: int,
-    check: Check,
-    progress: Progress,
-) -> tuple[list[Row], dict[str, Interval], int]:
-    """Everything up to extraction: the rows, the touches by name, how many intervals are inconclusive."""
-    problems = work.problems
-    listed = read_intervals(source, dict(columns or {}), classes, half_open, problems)
-    words = odd_groups(source, [(i.where, {"video": i.video, **i.words}) for i in listed])
-    work.suspicious += [problem for problem in words if problem.kind == "word-for-null"]
+) -> list[Interval]:
+    """The well-formed intervals of the list, in its order.
+
+    Raises:
+        PalpateError: if the list is missing, or lacks a needed column.
+    """
+    header = header_of(path)
+    table = open_table(path, ORDER[: len(header)] if _is_bare(header) else None)
+    maps = dict(columns or {})
+    for target, synonyms in NAMES.items():
+        name = next((name for name in table.names if name.lower() in synonyms), None)
+        if target not in maps and target not in table.names and name is not None:
+            maps[target] = name
+    compiled = compile_maps(maps, table.names, list(NAMES))
+    absent = [name for name in NEEDED if name not in compiled.expressions]
+    if absent and not table.problems:
+        got = f"no {', '.join(absent)} among {', '.join(table.names) or 'no columns'}"
+        must, example = f"{path} must have the columns {', '.join(NEEDED)}", {absent[0]: "COLUMN"}
+        raise PalpateError(must, got, "Map your columns", example={"columns": example})
+    cells = compiled.apply(table.read(compiled.columns))
+    work.problems += table.problems
+    # Without classes, as an inconclusive contact (-1) is contact all the same.
+    rows, _ = manifest_rows(cells, len(table.lines), table.where, None, work.problems)
+    labels = None if classes is None else read_classes(Path(classes))
+    intervals: list[Interval] = []
+    for k, row in rows:
+        interval = _interval(table.where(k), row, labels, half_open)
+        if isinstance(interval, Interval):
+            intervals.append(interval)
+        else:
+            work.problems.append(Problem(table.where(k), *interval))
+    groups = [(i.where, {"video": i.video, **i.words}) for i in intervals]
+    work.suspicious += [p for p in odd_groups(path, groups) if p.kind == "word-for-null"]
+    return intervals
+
+
+def _interval(
+    where: str, row: Mapping[str, object], labels: Mapping[int, str] | None, half_open: bool
+) -> Interval | tuple[str, str]:
+    """One interval, or what is wrong with it as (kind, text)."""
+    if lacking := [name for name in NEEDED if name not in row]:
+        return "empty-cell", f"no {' and no '.join(lacking)}"
+    video, start, end = (row[name] for name in NEEDED)
+    assert isinstance(start, int)
+    assert isinstance(end, int)
+    last, background, label = end - half_open, row.get("background"), row.get("material")
+    if last < start:
+        return "bad-interval", f"the contact ends at frame {last} before it starts at {start}"
+    if background is not None and not str(background).isdecimal():
+        return "bad-frame", f"the background {background!r} is not a whole number from 0"
+    if labels is not None and label not in (None, "-1", *labels.values()):
+        number = int(str(label)) if str(label).isdecimal() else -1
+        if number not in labels:
+            return "unknown-label", f"the class {label!r} is not in the table of classes"
+        label = labels[number]
+    words = {name: str(row[name]) for name in WORDS if row.get(name)}
+    words |= {"material": str(label)} if label else {}
+    frame = None if background is None else int(str(background))
+    return Interval(where, str(video), start, last, words, frame, label == "-1")
+
+
+def _prepared(
+    work: Recordings, listed: list[Interval], every: int, check: Check, progress: Progress
+) -> tuple[list[Row], dict[str, Interval]]:
+    """Everything up to extraction: the rows, and the contacts by name.
+
+    Raises:
+        PalpateError: if ``every`` is out of range.
+    """
+    if every < 1:
+        raise PalpateError("must be at least 1", str(every), "", argument="every")
     rows = [Row(i.where, i.video, i.video, i.first, i.where, "") for i in listed]
     opened = {row.where for row in work.open(rows, progress)}
-    listed = _within(work, [i for i in listed if i.where in opened])
-    contact: dict[str, set[int]] = {}
+    listed = [i for i in listed if i.where in opened and _within(work, i)]
+    in_contact: dict[str, set[int]] = {}
     for i in listed:
-        contact.setdefault(i.video, set()).update(range(i.first, i.last + 1))
-    work.in_contact = contact
-    touches = {i.touch: i for i in numbered(apart(listed, problems))}
-    rows = [row for i in touches.values() for row in _frames(work, i, every)]
-    work.choose_backgrounds(rows, {i.touch: i.first for i in touches.values()})
+        in_contact.setdefault(i.video, set()).update(range(i.first, i.last + 1))
+    work.in_contact = in_contact
+    contacts = {i.contact: i for i in _named(_apart(listed, work.problems))}
+    rows = [row for i in contacts.values() for row in _frames(work, i, every)]
+    work.choose_backgrounds(rows, {i.contact: i.first for i in contacts.values()})
     for name in {row.contact for row in rows}:
-        _named_background(work, touches[name])
+        _take_listed_background(work, contacts[name])
     rows = work.check(rows, check, progress)
-    used = {touch.video for touch in touches.values()}
-    work.suspicious += [
-        Problem(str(work.root), "unlisted-video", f"the recording {name!r} has no usable interval")
-        for name in sorted(set(work.videos) - used)
-    ]
-    bare = sorted({r.contact for r in rows} - set(work.background_frames) - set(work.typical_of))
-    work.suspicious += [
-        Problem(
-            touches[t].where,
-            "no-background",
-            f"no frame of {touches[t].video!r} shows the gel untouched",
-        )
-        for t in bare
-    ]
-    return rows, touches, sum(i.inconclusive for i in listed)
+    for name in sorted(set(work.videos) - {i.video for i in contacts.values()}):
+        text = f"the recording {name!r} has no usable interval"
+        work.suspicious.append(Problem(str(work.root), "unlisted-video", text))
+    without = {r.contact for r in rows} - set(work.background_frames) - set(work.typical_of)
+    for i in (contacts[name] for name in sorted(without)):
+        text = f"no frame of {i.video!r} shows the untouched gel"
+        work.suspicious.append(Problem(i.where, "no-background", text))
+    return rows, contacts
 
 
-def _within(work: Recordings, listed: list[Interval]) -> list[Interval]:
-    """The intervals that lie within their recordings."""
-    good: list[Interval] = []
+def _within(work: Recordings, interval: Interval) -> bool:
+    """Whether an interval and its background are within the recording; if not, it is a problem."""
+    length = min(map(len, work.frames[interval.video].values()))
+    furthest = max(interval.last, interval.background or 0)
+    if furthest >= length:
+        what = "the contact" if interval.last >= length else "its background"
+        text = f"{what} reaches frame {furthest} of {interval.video!r}: both modalities have "
+        text += f"{length} frames, counted from 0"
+        work.problems.append(Problem(interval.where, "beyond-end", text))
+    return furthest < length
+
+
+def _apart(listed: list[Interval], problems: list[Problem]) -> list[Interval]:
+    """The intervals that share no frame with another, sorted by video and frame."""
+    first: dict[object, Interval] = {}
     for i in listed:
-        length = min(len(frames) for frames in work.frames[i.video].values())
-        if max(i.last, i.background or 0) >= length:
-            what = "the touch" if i.last >= length else "its background"
-            text = f"{what} reaches frame {max(i.last, i.background or 0)} of {i.video!r}, whose sides have {length} frames in common, counted from 0"
-            work.problems.append(Problem(i.where, "beyond-end", text))
-        else:
-            good.append(i)
-    return good
+        key = (i.video, i.first, i.last, tuple(i.words.items()))
+        if (before := first.setdefault(key, i)) is not i:
+            text = f"the same interval is at {before.where} already"
+            problems.append(Problem(i.where, "duplicate-row", text))
+    ordered = sorted(first.values(), key=lambda i: (i.video, i.first, i.last))
+    overlaps: dict[str, tuple[Interval, Interval]] = {}
+    widest: Interval | None = None  # of those before, the one that reaches furthest
+    for i in ordered:
+        if widest is None or widest.video != i.video:
+            widest = i
+        elif i.first <= widest.last:
+            overlaps[i.where] = i, widest
+            overlaps.setdefault(widest.where, (widest, i))
+        widest = i if i.last > widest.last else widest
+    for i, other in overlaps.values():
+        text = f"frames {i.first} to {i.last} of {i.video!r} overlap with "
+        text += f"{other.first} to {other.last} at {other.where}"
+        problems.append(Problem(i.where, "overlap", text))
+    return [i for i in ordered if i.where not in overlaps]
 
 
-def _frames(work: Recordings, touch: Interval, every: int) -> list[Row]:
-    """A row for each frame of a touch that both sides have; one problem for those that a side lacks."""
-    rows: list[Row] = []
-    lacking: dict[str, list[int]] = {}
-    for k in range(touch.first, touch.last + 1, every):
-        without = [side for side, frames in work.frames[touch.video].items() if not frames.has(k)]
-        for side in without:
-            lacking.setdefault(side, []).append(k)
-        if not without:
-            rows.append(
-                Row(touch.where, f"{touch.video}/{k:010d}", touch.video, k, touch.touch, "")
+def _named(listed: Sequence[Interval]) -> Iterator[Interval]:
+    """The conclusive intervals with the names of their contacts."""
+    count: dict[str, int] = {}
+    for i in listed:
+        if not i.inconclusive:
+            count[i.video] = count.get(i.video, 0) + 1
+            yield replace(i, contact=f"{i.video}#{count[i.video]:04d}")
+
+
+def _frames(work: Recordings, interval: Interval, every: int) -> list[Row]:
+    """A row for each frame that both modalities have; one problem for those that one lacks."""
+    video, numbers = interval.video, range(interval.first, interval.last + 1, every)
+    missing: set[int] = set()
+    for modality, source in work.frames[video].items():
+        lacking = [k for k in numbers if not source.has(k)]
+        leaves = isinstance(source, FolderFrames) and not source.leaving.isdisjoint(lacking)
+        if lacking:
+            text = (
+                f"no {modality} image of {len(lacking)} of the frames of {interval.contact}, the "
             )
-    for side, missing in lacking.items():
-        source = work.frames[touch.video][side]
-        leaving = isinstance(source, FolderFrames) and any(k in source.leaving for k in missing)
-        text = f"no {side} picture of {len(missing)} of the frames of {touch.touch}, the first of them {missing[0]}, in {source.source}"
-        work.problems.append(
-            Problem(
-                touch.where,
-                "outside-root" if leaving else "missing-file",
-                text + ": a link that leaves it" * leaving,
-            )
-        )
-    return rows
+            text += f"first of them {lacking[0]}, in {source.source}"
+            text += ": a link that leaves it" * leaves
+            kind = "outside-root" if leaves else "missing-file"
+            work.problems.append(Problem(interval.where, kind, text))
+        missing.update(lacking)
+    return [
+        Row(interval.where, f"{video}/{k:010d}", video, k, interval.contact, "")
+        for k in numbers
+        if k not in missing
+    ]
 
 
-def _named_background(work: Recordings, touch: Interval) -> None:
-    """Puts the background that the list names in place of the rule's."""
-    if touch.background is None:
+def _take_listed_background(work: Recordings, interval: Interval) -> None:
+    """Take the background that the list names, if it names one, instead of the rule's."""
+    frame, contact = interval.background, interval.contact
+    if frame is None:
         return
-    frames = work.frames[touch.video]["tactile"]
-    if not frames.has(touch.background):
-        work.problems.append(
-            Problem(
-                touch.where,
-                "missing-file",
-                f"no picture of the background, frame {touch.background}, in {frames.source}",
-            )
-        )
+    source = work.frames[interval.video]["tactile"]
+    if not source.has(frame):
+        text = f"no image of the background, frame {frame}, in {source.source}"
+        work.problems.append(Problem(interval.where, "missing-file", text))
         return
-    if touch.background in work.in_contact.get(touch.video, set()):
-        text = (
-            f"the listed background, frame {touch.background} of {touch.video!r}, lies in a touch"
-        )
-        work.suspicious.append(Problem(touch.where, "background-in-touch", text))
-    work.background_frames[touch.touch] = touch.background
-    work.backgrounds[touch.touch] = frames.path(touch.background)
-    work.typical_of.pop(touch.touch, None)
+    if frame in work.in_contact[interval.video]:
+        text = f"the listed background, frame {frame} of {interval.video!r}, is in a contact"
+        work.suspicious.append(Problem(interval.where, "background-in-touch", text))
+    work.background_frames[contact] = frame
+    work.backgrounds[contact] = source.path(frame)
+    work.typical_of.pop(contact, None)

@@ -1,272 +1,195 @@
-"""SSVTP (Kerr et al., 2022) as TVL distributes it: 4,587 single presses of a DIGIT on cloth and household things, worded by people.
+"""SSVTP (Kerr et al., 2022) as TVL distributes it: 4,587 presses of a DIGIT, worded by people.
 
 ::
 
     ssvtp/
       train.csv  test.csv                     url,tactile,caption
-      images_rgb/image_437_rgb.jpg            the id is what stands between image_ and _rgb
+      images_rgb/image_437_rgb.jpg            the id is between image_ and _rgb
       images_tac/image_437_tac.jpg
       text/labels_437.txt                     first line: the caption
-      tac_background.png                      the gel untouched, if the user put it there; TVL ships it with its code
-      finetune.json  synonyms.json            not read: captions as talk; words that an evaluation takes for equal
+      tac_background.png                      the untouched gel, if the user put it there; TVL
+                                              ships it with its code
+      finetune.json  synonyms.json            not read: captions as talk; words that an evaluation
+                                              takes for equal
 
-The source may be ``ssvtp/`` or a folder that holds it. Touch and text are found by the id of the photo, since the lists lack the column ``tactile`` or
-misname files in places. A listed path that disagrees is reported, and stands in only where the derived file is absent. Without lists every
-photo with its touch is a sample, and there is no part.
+The source may be ``ssvtp/`` or a folder that holds it. Tactile image and text are found by the id
+of the photo, since the lists lack the column ``tactile`` or misname files in places; a listed path
+that disagrees is reported. Without lists every photo with its tactile image is a sample, and there
+is no part.
 
-There is no recording, no object and no time in this set: ``video`` and ``frame`` are null, and near-duplicates are all that
-tells which samples belong together. The caption is the text file's first line, else the list's.
+There is no recording, no object and no time in this set: ``video`` and ``frame`` are null, and only
+near-duplicates say which samples belong together. The caption is the first line of the text file,
+else the list's.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections import defaultdict
 from pathlib import Path, PurePosixPath
-from typing import Any
 
-from palpate.core import PalpateError, Problem, Progress, Split, quiet
+from palpate.core import PalpateError, Progress, Split, quiet
 from palpate.data.formats import tvl
-from palpate.data.formats.base import Facts, Found, Scan
-from palpate.data.images import SUFFIXES
+from palpate.data.formats.base import Facts, Format, Scan
+from palpate.data.formats.layout import Images, file_names, natural, paired
 from palpate.data.manifest import CLIMBS, Manifest
 
 FACTS = Facts(
-    "SSVTP (Touch-Vision-Language)",
-    "J. Kerr, H. Huang, A. Wilcox, R. Hoque, J. Ichnowski, R. Calandra, K. Goldberg: Self-Supervised Visuo-Tactile Pretraining to Locate and "
-    "Follow Garment Features. 2022, arXiv 2209.13042. With captions: " + tvl.CITATION,
-    "unknown",
-    tvl.URL,
-    "DIGIT",
-    (240, 320),
-    "4,587 by TVL's paper; 46 in the test list",
-    "none is given: clusters of near-duplicates",
-    tvl.NORMALIZATION,
+    name="SSVTP (Touch-Vision-Language)",
+    citation="J. Kerr, H. Huang, A. Wilcox, R. Hoque, J. Ichnowski, R. Calandra, K. Goldberg: "
+    "Self-Supervised Visuo-Tactile Pretraining to Locate and Follow Garment Features. 2022, "
+    f"arXiv 2209.13042. With captions: {tvl.CITATION}",
+    url=tvl.URL,
+    sensor="DIGIT",
+    image_size=tvl.IMAGE_SIZE,
+    samples="4,587 by TVL's paper; 46 in the test list",
+    group="none is given: clusters of near-duplicates",
+    normalization=tvl.NORMALIZATION,
 )
-FOLDERS = {"vision": ("images_rgb", "rgb"), "tactile": ("images_tac", "tac")}
-NAME = re.compile(r"image_(.+?)(?:_rgb|_tac)?")
-BACKGROUND = "tac_background.png"
+LOOKS_FOR = "ssvtp/, or images_rgb/ with image_<id>_rgb.jpg and images_tac/ with image_<id>_tac.jpg"
 COLUMNS = ("url", "tactile", "caption")
-LOOKED_FOR = (
-    "ssvtp/, or images_rgb/ with image_<id>_rgb.jpg and images_tac/ with image_<id>_tac.jpg"
-)
+BACKGROUND = "tac_background.png"
 
 
 def detect(source: Path) -> bool:
-    """Whether a folder is SSVTP, or holds it in ``ssvtp/`` and no ``hct/`` beside it, which would be read instead."""
+    """Whether a folder is SSVTP or holds ``ssvtp/``, without ``hct/``, which goes first."""
     root = find(source)
-    return root is not None and (root == Path(source) or not (Path(source) / "hct").is_dir())
+    return root is not None and (root == source or not (source / "hct").is_dir())
 
 
 def find(source: Path) -> Path | None:
     """``ssvtp/``, from there or from the folder that holds it."""
-    both = [name for name, _ in FOLDERS.values()]
-    return next(
-        (
-            root
-            for root in (Path(source), Path(source) / "ssvtp")
-            if all((root / name).is_dir() for name in both)
-        ),
-        None,
-    )
+    for root in (source, source / "ssvtp"):
+        if (root / "images_rgb").is_dir() and (root / "images_tac").is_dir():
+            return root
+    return None
 
 
 def scan(source: Path, *, lists: Path | None = None, progress: Progress = quiet) -> Scan:
-    """Reads the lists, or the folders where there are none, and finds each sample's files by its id.
+    """Read the lists, or the folders where there are none, and find the files of each sample.
 
     Args:
         source: ``ssvtp/`` or the folder that holds it.
         lists: folder with lists to use instead of the data set's own.
-        progress: told how many rows are read.
+        progress: called with the number of lists read.
 
     Raises:
         PalpateError: if the two image folders are not there, or ``lists`` holds none.
     """
-    root = find(source)
+    root = find(Path(source))
     if root is None:
-        raise PalpateError(
-            f"{source} must be SSVTP: {LOOKED_FOR}", "none of these", f"Unpack it from {tvl.URL}"
-        )
-    found = Scan([], root, facts={"layout": "ssvtp"})
-    there = tvl.part_lists(lists if lists is not None else root)
-    if lists is not None and not there:
-        raise PalpateError(f"{lists} must hold train.csv or test.csv", "neither", "Check the path")
-    work = _Work(root, found)
-    for part, path in there.items():
-        rows = tvl.read_csv(path, found.problems, COLUMNS)
-        for done, (where, cells) in enumerate(rows, 1):
-            if (row := work.row(where, cells)) is not None:
-                found.rows.append((where, row | {"split": part}))
-            progress(f"reading {path.name}", done, len(rows))
-    used = {str(row[side]) for _, row in found.rows for side in FOLDERS}
-    if not there:
-        found.rows += work.unlisted()
-    elif more := sorted(work.files["vision"] - used):
-        found.suspicious.append(
-            Problem(str(root / more[0]), "unlisted", f"{len(more)} photos stand in no list")
-        )
-    if there:
-        found.own = name = "Orig" if lists is None else "Lists"
-        found.rules[name] = {
-            "method": "official" if lists is None else "lists",
-            "files": [path.name for path in there.values()],
-        }
-    found.rows.sort(key=lambda row: _order(row[1]["id"]))
-    work.finish()
-    return found
+        must = f"{source} must be SSVTP: {LOOKS_FOR}"
+        raise PalpateError(must, "none of these", f"Unpack it from {tvl.URL}")
+    paths = tvl.part_lists(root if lists is None else Path(lists))
+    if lists is not None and not paths:
+        raise PalpateError("must hold train.csv or test.csv", str(lists), "", argument="lists")
+    result = Scan(root, {"layout": "ssvtp"})
+    vision, tactile = (_images(result, side) for side in ("rgb", "tac"))
+    captions: dict[str, str | None] = {}
+    if paths:
+        result.split_name = "Orig" if lists is None else "Lists"
+        method = "official" if lists is None else "lists"
+        result.split_rule = {"method": method, "files": [p.name for p in paths.values()]}
+        for done, (part, path) in enumerate(paths.items()):
+            progress("reading lists", done, len(paths))
+            _read_list(result, path, part, (vision, tactile), captions)
+        unlisted = [vision.path(key) for key in vision.files if key not in captions]
+        result.suspect(root, "unlisted", "photos in no list", unlisted)
+    else:
+        for key in paired(result, tactile, vision):
+            row = {"id": f"ssvtp/{key}", "vision": vision.path(key), "tactile": tactile.path(key)}
+            result.rows.append((str(root / vision.path(key)), row))
+    _add_words(result, captions)
+    background = BACKGROUND if (root / BACKGROUND).is_file() else None
+    for _, row in result.rows:
+        row |= {"background": background, "sensor": FACTS.sensor}
+    result.facts["backgrounds"] = background or f"none: put {BACKGROUND} into ssvtp/ to have one"
+    result.rows.sort(key=lambda row: natural(row[1]["id"].removeprefix("ssvtp/")))
+    return result
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Writes ``<part>.csv`` with ``url,tactile,caption``, paths relative to ``ssvtp/``."""
+    """Write ``<part>.csv`` with ``url,tactile,caption``, paths relative to ``ssvtp/``."""
     files: list[Path] = []
     for part in split.counts():
         rows = manifest.part(split, part).table.select("vision", "tactile", "text").rows()
-        files.append(tvl.write_csv(Path(folder) / f"{part}.csv", COLUMNS, rows))
+        files.append(tvl.write_list(Path(folder) / f"{part}.csv", COLUMNS, rows))
     return files
 
 
-@dataclass
-class _Work:
-    """Makes rows, and remembers what disagreed.
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
 
-    Attributes:
-        root: ``ssvtp/``.
-        found: what goes to the caller.
-        files: the pictures on disk by side, relative to the root.
-        misnamed, worded, wordless: places of rows with other paths than derived, with other words than the text file's, and without any.
-        sources: where captions came from.
-    """
 
-    root: Path
-    found: Scan
-    files: dict[str, set[str]] = field(default_factory=dict)
-    misnamed: list[str] = field(default_factory=list)
-    worded: list[str] = field(default_factory=list)
-    wordless: list[str] = field(default_factory=list)
-    sources: set[str] = field(default_factory=set)
+def _images(result: Scan, side: str) -> Images[str]:
+    """Id -> file of the images of one side."""
+    place = f"images_{side}"
+    names = file_names(result.base / place)
+    matches = [(re.fullmatch(rf"image_(.+)_{side}\.\w+", name), name) for name in names]
+    misnamed = [name for match, name in matches if not match]
+    result.suspect(place, "unknown-name", f"not named image_<id>_{side}", misnamed)
+    return Images(place, {match[1]: name for match, name in matches if match})
 
-    def __post_init__(self) -> None:
-        for side, (folder, _) in FOLDERS.items():
-            names = sorted(
-                path.name
-                for path in (self.root / folder).iterdir()
-                if tvl.is_picture(path.name) and not path.name.startswith(".")
-            )
-            self.files[side] = {f"{folder}/{name}" for name in names}
-        self.background = BACKGROUND if (self.root / BACKGROUND).is_file() else None
 
-    def row(self, where: str, cells: Mapping[str, str | None]) -> dict[str, Any] | None:
-        """The manifest row of a listed one, or None with a problem."""
-        listed = {"vision": cells.get("url"), "tactile": cells.get("tactile")}
-        if not listed["vision"]:
-            self.found.problems.append(Problem(where, "empty-cell", "no url path"))
-            return None
-        for cell in listed.values():
-            if cell and re.search(CLIMBS, cell):
-                self.found.problems.append(
-                    Problem(where, "outside-root", f"the path {cell!r} leaves the data set")
-                )
-                return None
-        given = {
-            side: PurePosixPath(cell).as_posix().removeprefix("ssvtp/") if cell else None
-            for side, cell in listed.items()
-        }
-        path = PurePosixPath(str(given["vision"]))
-        match = NAME.fullmatch(path.stem)
-        if match is None:
-            self.found.problems.append(
-                Problem(where, "bad-path", f"{path.name!r} is not image_<id>_rgb.jpg")
-            )
-            return None
-        derived = {side: self._derived(side, match[1], path.suffix) for side in FOLDERS}
-        if any(cell and cell != derived[side] for side, cell in given.items()):
-            self.misnamed.append(where)
-        paths = {
-            side: given[side]
-            if name not in self.files[side] and given[side] in self.files[side]
-            else name
-            for side, name in derived.items()
-        }
-        return self._cells(where, match[1], paths, tvl.clean_caption(cells.get("caption")))
-
-    def unlisted(self) -> list[Found]:
-        """Rows of all photos that have a touch; single ones are problems."""
-        by_id: dict[str, dict[str, str]] = {}
-        for side, names in self.files.items():
-            for name in sorted(names):
-                match = re.fullmatch(rf"image_(.+)_{FOLDERS[side][1]}", PurePosixPath(name).stem)
-                if match is None:
-                    self.misnamed.append(str(self.root / name))
-                else:
-                    by_id.setdefault(match[1], {}).setdefault(side, name)
-        rows: list[Found] = []
-        for key, paths in by_id.items():
-            if len(paths) < len(FOLDERS):
-                (name,) = paths.values()
-                self.found.problems.append(
-                    Problem(
-                        str(self.root / name),
-                        "unpaired",
-                        f"no picture of the id {key!r} on the other side",
-                    )
-                )
-            else:
-                rows.append(
-                    (
-                        str(self.root / paths["vision"]),
-                        self._cells(str(self.root / paths["vision"]), key, paths, None),
-                    )
-                )
-        return rows
-
-    def finish(self) -> None:
-        """Sums up what disagreed."""
-        told = self.found.suspicious
-        told += tvl.summed(
-            self.misnamed, "misnamed-path", "other files are named than the photo's id tells"
-        )
-        told += tvl.summed(
-            self.worded, "two-captions", "the text file has other words than the list, and counts"
-        )
-        told += tvl.summed(
-            self.wordless, "no-text", "neither a text file nor a caption in the list"
-        )
-        self.found.facts["text_source"] = ", ".join(sorted(self.sources)) or "none"
-        self.found.facts["backgrounds"] = (
-            self.background or f"none: put {BACKGROUND} into ssvtp/ to have one"
-        )
-
-    def _derived(self, side: str, key: str, suffix: str) -> str:
-        """The file of an id, with the listed suffix or, if only that is there, with another."""
-        folder, tail = FOLDERS[side]
-        names = [f"{folder}/image_{key}_{tail}{s}" for s in (suffix, *SUFFIXES)]
-        return next((name for name in names if name in self.files[side]), names[0])
-
-    def _cells(
-        self, where: str, key: str, paths: Mapping[str, str | None], caption: str | None
-    ) -> dict[str, Any]:
-        file = self.root / "text" / f"labels_{key}.txt"
-        text = None
-        if file.is_file():
-            lines = file.read_bytes().decode("utf-8-sig", errors="replace").splitlines()
-            text = tvl.clean_caption(lines[0]) if lines else None
-        if text and caption and text != caption:
-            self.worded.append(where)
-        if text or caption:
-            self.sources.add("text/labels_<id>.txt" if text else "column caption")
+def _read_list(
+    result: Scan,
+    path: Path,
+    part: str,
+    sides: tuple[Images[str], Images[str]],
+    captions: dict[str, str | None],
+) -> None:
+    """Add the rows of one list; ``captions`` gets the caption of each listed id."""
+    vision, tactile = sides
+    misnamed: list[str] = []
+    for where, cells in tvl.read_list(result, path, COLUMNS):
+        listed = {name: cells.get(name) for name in ("url", "tactile")}
+        name = PurePosixPath(listed["url"] or "").name
+        match = re.fullmatch(r"image_(.+?)(?:_rgb|_tac)?\.\w+", name)
+        if not listed["url"]:
+            result.problem(where, "empty-cell", "no url path")
+        elif climbing := [c for c in listed.values() if c and re.search(CLIMBS, c)]:
+            text = f"the path {climbing[0]!r} leaves the data set"
+            result.problem(where, "outside-root", text)
+        elif match is None:
+            result.problem(where, "bad-path", f"{name!r} is not image_<id>_rgb.jpg")
         else:
-            self.wordless.append(where)
-        return {
-            "id": f"ssvtp/{key}",
-            **paths,
-            "text": text or caption,
-            "background": self.background,
-            "sensor": FACTS.sensor,
-        }
+            key = match[1]
+            paths = {
+                "vision": f"images_rgb/{vision.files.get(key, f'image_{key}_rgb.jpg')}",
+                "tactile": f"images_tac/{tactile.files.get(key, f'image_{key}_tac.jpg')}",
+            }
+            both = zip(listed.values(), paths.values(), strict=True)
+            if any(c and PurePosixPath(c).stem != PurePosixPath(p).stem for c, p in both):
+                misnamed.append(where)
+            captions.setdefault(key, tvl.clean_caption(cells.get("caption")))
+            result.rows.append((where, {"id": f"ssvtp/{key}", **paths, "split": part}))
+    text = "the files have other names than the id of the photo gives"
+    tvl.suspect_rows(result, misnamed, "misnamed-path", text)
 
 
-def _order(name: str) -> tuple[int, str]:
-    """By number where the id is one."""
-    key = name.removeprefix("ssvtp/")
-    return (int(key), key) if re.fullmatch(r"[0-9]{1,18}", key) else (-1, key)
+def _add_words(result: Scan, captions: dict[str, str | None]) -> None:
+    """Add the text of each row, from its text file or else from its list."""
+    sources: set[str] = set()
+    places: defaultdict[str, list[str]] = defaultdict(list)
+    for where, row in result.rows:
+        key = row["id"].removeprefix("ssvtp/")
+        caption = captions.get(key)
+        text = _first_line(result.base / "text" / f"labels_{key}.txt")
+        row["text"] = text or caption
+        if text or caption:
+            sources.add("text/labels_<id>.txt" if text else "column caption")
+        else:
+            places["no-text"].append(where)
+        if text and caption and text != caption:
+            places["two-captions"].append(where)
+    result.facts["text_source"] = ", ".join(sorted(sources)) or "none"
+    text = "the text file has other words than the list, and is taken"
+    tvl.suspect_rows(result, places["two-captions"], "two-captions", text)
+    text = "neither a text file nor a caption in the list"
+    tvl.suspect_rows(result, places["no-text"], "no-text", text)
+
+
+def _first_line(path: Path) -> str | None:
+    if not path.is_file():
+        return None
+    lines = path.read_text("utf-8-sig", errors="replace").splitlines()
+    return tvl.clean_caption(lines[0]) if lines else None

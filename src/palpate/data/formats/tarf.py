@@ -1,55 +1,61 @@
-"""TaRF, Tactile-Augmented Radiance Fields (Dou, Yang, Liu, Loquercio, Owens; CVPR 2024): DIGIT touches located in 13 scanned scenes.
+"""TaRF, Tactile-Augmented Radiance Fields (Dou, Yang, Liu, Loquercio, Owens; CVPR 2024).
 
-::
+DIGIT touches located in 13 scanned scenes::
 
     root/
-      vision/<scene>_<scale>/<idx>.jpg      a view of the touched place, rendered at one or several scales
+      vision/<scene>_<scale>/<idx>.jpg      a view of the touched place, rendered at some scales
       touch/<scene>_40_30/<idx>.jpg         640x480
-      touch_bg/<scene>_40_30/bg.jpg         the gel untouched, one a scene; the public code names it <scene>_colmap_40_50
+      touch_bg/<scene>_40_30/bg.jpg         the untouched gel, one a scene; the public code
+                                            names the folder <scene>_colmap_40_50
       depth/<scene>_<scale>/<idx>.npy       meters; not imported
-      split_interval.json                   {"train|val|test": [["<scene>_40_30", "<idx>"], ..]}; not in the public code
+      split_interval.json                   {"train|val|test": [["<scene>_40_30", "<idx>"], ..]};
+                                            not in the public code
 
-A scene is one recording, and the group: with 13 of them, leave scenes out. Of several scales of the views that of the touch is taken,
-unless ``scale`` names another. An index is a frame number, so ``7`` and ``0007`` are the same.
+A scene is one recording, and the group: with 13 of them, leave scenes out. The views of the scale
+of the touch are read unless ``scale`` names another. An index is a frame number, so ``7`` and
+``0007`` are the same.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
-from palpate.core import PARTS, PalpateError, Problem, Progress, Split, quiet, write_json
-from palpate.data.formats.base import Facts, Scan
-from palpate.data.formats.numbered import (
-    Entry,
+from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.data.formats.base import Facts, Format, Scan, few
+from palpate.data.formats.layout import (
+    Pair,
     assign,
-    few,
+    is_pair_list,
     natural,
     numbered,
+    paired,
+    read_json_file,
     read_pairs,
     require_folder,
     subfolders,
-    tell,
+    write_pairs,
 )
 from palpate.data.manifest import Manifest
 
-SCENES = (
-    "conference_room",
-    "clothes",
-    "office_1",
-    "office_2",
-    "stairs",
-    "table_outdoor",
-    "workroom",
-    "bench",
-    "snow",
-    "bus_stop",
-    "chair_outdoor",
-    "table_indoor",
-    "lounge",
+FACTS = Facts(
+    name="TaRF",
+    citation="Y. Dou, F. Yang, Y. Liu, A. Loquercio, A. Owens: Tactile-Augmented Radiance Fields. "
+    "CVPR, 2024",
+    license="no license found",
+    url="https://github.com/Dou-Yiming/TaRF",
+    sensor="DIGIT",
+    image_size=(640, 480),
+    samples="not published; 13 scenes (named in the public code)",
+    group="video (= scene); there are few, so leave whole scenes out in turn",
 )
-#: Names that the public code's ``touch_bg`` folders give to scenes; for office_2 it has none that is surely the same.
+LOOKS_FOR = "vision/ and touch/ with folders named <scene>_40_30"
+_SCENES = (
+    "conference_room clothes office_1 office_2 stairs table_outdoor workroom bench snow bus_stop "
+    "chair_outdoor table_indoor lounge"
+)
+SCENES = frozenset(_SCENES.split())
+#: Names of scenes in the ``touch_bg`` folders of the public code; that of office_2 is uncertain.
 BACKGROUND_NAMES = {
     "bench": "bench_outdoor_1",
     "bus_stop": "bus_stop_1",
@@ -58,247 +64,139 @@ BACKGROUND_NAMES = {
     "table_indoor": "table_indoor_2",
     "workroom": "workroom_1",
 }
-SCALED = r"(?P<scene>.+)_(?P<scale>[0-9]+_[0-9]+)"
-TOUCH_SCALE = "40_30"
+SCALED = r"(.+)_([0-9]+_[0-9]+)"
+TACTILE_SCALE = "40_30"
 LIST = "split_interval.json"
-FACTS = Facts(
-    "TaRF",
-    "Y. Dou, F. Yang, Y. Liu, A. Loquercio, A. Owens: Tactile-Augmented Radiance Fields. CVPR, 2024",
-    "no license found",
-    "https://github.com/Dou-Yiming/TaRF",
-    "DIGIT",
-    (640, 480),
-    "not published; 13 scenes (named in the public code)",
-    "video (= scene); there are few, so leave whole scenes out in turn",
-)
-LOOKED_FOR = "vision/ and touch/ with folders named <scene>_40_30"
 
 
 def detect(source: Path) -> bool:
     """Whether both sides have folders that end in a scale."""
-    return source.is_dir() and all(_scaled(source / side) for side in ("vision", "touch"))
+    return all(_scenes(source / side) for side in ("vision", "touch"))
 
 
 def scan(source: Path, *, scale: str | None = None, progress: Progress = quiet) -> Scan:
-    """Pairs every touch with the view of its number.
+    """Pair every tactile image with the view of its number.
 
     Args:
         source: the folder with ``vision/`` and ``touch/``.
         scale: of the views, ``"40_30"``; default: that of the touch, else the only one there is.
-        progress: told how many scenes are read.
+        progress: called with the number of scenes read.
 
     Raises:
-        PalpateError: if a side is missing, or the scale of the views is in doubt or absent.
+        PalpateError: if a side is missing, or the scale of the views is ambiguous or absent.
     """
-    root = Path(source)
-    require_folder(root, FACTS.name)
-    touch, vision = _scaled(root / "touch"), _scaled(root / "vision")
-    for side, found in (("touch", touch), ("vision", vision)):
-        if not found:
-            raise PalpateError(
-                f"{root / side} must hold folders named <scene>_40_30",
-                few(subfolders(root / side)),
-                f"Fetch the data from {FACTS.url}",
-            )
-    out = Scan([], root, facts={"layout": "vision/, touch/, touch_bg/", "text_source": "none"})
+    root = require_folder(source, FACTS.name)
+    tactile, vision = _scenes(root / "touch"), _scenes(root / "vision")
+    for side, scenes in (("touch", tactile), ("vision", vision)):
+        if not scenes:
+            must = f"{root / side} must hold folders named <scene>_40_30"
+            raise PalpateError(must, few(subfolders(root / side)), f"Fetch it from {FACTS.url}")
+    result = Scan(root, {"layout": "vision/, touch/, touch_bg/", "text_source": "none"})
     ids: dict[tuple[str, int], str] = {}
-    for done, scene in enumerate(sorted(touch, key=natural)):
-        progress("reading scenes", done, len(touch))
-        scales = touch[scene]
-        own = TOUCH_SCALE if TOUCH_SCALE in scales else scales[0]
-        if others := [s for s in scales if s != own]:
-            out.suspicious.append(
-                Problem(
-                    f"touch/{scene}",
-                    "other-scale",
-                    f"touches at {', '.join(others)} are left out: {own} is read",
-                )
-            )
-        _scene(out, scene, own, _view_scale(scene, vision.get(scene, []), own, scale), ids)
-    bare = sorted(set(vision) - set(touch))
-    out.problems += [
-        Problem(f"vision/{scene}", "missing-folder", f"no touch folder of the scene {scene!r}")
-        for scene in bare
-    ]
-    known = {*SCENES, *BACKGROUND_NAMES.values()}
-    if unknown := sorted(s for s in touch if s.removesuffix("_colmap") not in known):
-        out.suspicious.append(
-            Problem(
-                "touch",
-                "unknown-scene",
-                f"scenes that the publication does not name: {few(unknown)}",
-            )
-        )
+    used: set[str] = set()
+    for done, scene in enumerate(sorted({*tactile, *vision}, key=natural)):
+        progress("reading scenes", done, len(tactile))
+        scales = tactile.get(scene, [])
+        default = TACTILE_SCALE if TACTILE_SCALE in scales or not scales else scales[0]
+        others = [s for s in scales if s != default]
+        result.suspect(f"touch/{scene}", "other-scale", f"only {default} is read; skipped", others)
+        view = _view_scale(scene, vision.get(scene, []), default, scale)
+        used |= {view} if scene in tactile and scene in vision else set()
+        _scene(result, scene, default, view, ids)
+    known = SCENES.union(BACKGROUND_NAMES.values())
+    unknown = [s for s in sorted(tactile) if s.removesuffix("_colmap") not in known]
+    text = "scenes that the publication does not name"
+    result.suspect("touch", "unknown-scene", text, unknown)
+    names = [name for side in ("touch", "vision") for name in subfolders(root / side)]
+    odd = [name for name in names if not re.fullmatch(SCALED, name)]
+    result.suspect(root, "unknown-folder", "skipped, as not named <scene>_<scale>", odd)
     if depth := subfolders(root / "depth"):
-        out.facts["depth"] = f"{len(depth)} folders of .npy files, not imported"
-    if odd := [
-        n
-        for side in ("touch", "vision")
-        for n in subfolders(root / side)
-        if re.fullmatch(SCALED, n) is None
-    ]:
-        out.suspicious.append(
-            Problem(
-                str(root),
-                "unknown-folder",
-                f"folders not named <scene>_<scale> are left out: {few(odd)}",
-            )
-        )
-    out.facts["vision_scale"] = ", ".join(
-        sorted(
-            {
-                str(row["vision"]).split("/")[1].rpartition(f"{row['video']}_")[2]
-                for _, row in out.rows
-            }
-        )
-    )
-    _split(out, ids)
-    return out
+        result.facts["depth"] = f"{len(depth)} folders of .npy files, not imported"
+    result.facts["vision_scale"] = ", ".join(sorted(used))
+    if (root / LIST).is_file() and (data := read_json_file(result, root / LIST)) is not None:
+        _read_list(result, data, ids)
+    return result
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Writes ``split_interval.json``, with all three parts, as the public loader asks for each by name.
+    """Write ``split_interval.json`` with all three parts, which the public loader expects.
 
     Raises:
-        PalpateError: if a touch does not lie in ``touch/<scene>_<scale>/``.
+        PalpateError: if a tactile image is not in ``touch/<scene>_<scale>/``.
     """
-    lists: dict[str, list[list[str]]] = {part: [] for part in PARTS}
-    for part in split.counts():
-        for name in manifest.part(split, part).column("tactile"):
-            path = Path(str(name))
-            if re.fullmatch(SCALED, path.parent.name) is None:
-                raise PalpateError(
-                    "A list of TaRF needs touches in touch/<scene>_40_30/",
-                    str(name),
-                    "Write the split file alone",
-                )
-            lists[part].append([path.parent.name, path.stem])
-    write_json(Path(folder) / LIST, lists)
-    return [Path(folder) / LIST]
+    pattern = r"touch/(.+_[0-9]+_[0-9]+)/([^/]+)\.\w+"
+    return write_pairs(manifest, split, Path(folder) / LIST, pattern)
 
 
-def _scaled(side: Path) -> dict[str, list[str]]:
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
+
+
+def _scenes(side: Path) -> dict[str, list[str]]:
     """Scene -> its scales, of the folders in ``touch/`` or ``vision/``."""
-    found: dict[str, list[str]] = {}
+    scenes: dict[str, list[str]] = {}
     for name in subfolders(side):
         if match := re.fullmatch(SCALED, name):
-            found.setdefault(match["scene"], []).append(match["scale"])
-    return found
+            scenes.setdefault(match[1], []).append(match[2])
+    return scenes
 
 
-def _view_scale(scene: str, there: list[str], own: str, wanted: str | None) -> str | None:
-    """Which scale of a scene's views is read; None if it has none.
+def _view_scale(scene: str, scales: list[str], default: str, requested: str | None) -> str:
+    """Which scale of a scene's views is read.
 
     Raises:
-        PalpateError: if several are there and none is that of the touch, or the one asked for is absent.
+        PalpateError: if several are there and none is the default, or the requested one is absent.
     """
-    if not there:
-        return None
-    if wanted is not None and wanted not in there:
-        raise PalpateError(
-            f"The views of {scene!r} must have the scale {wanted}",
-            ", ".join(there),
-            "Choose one of these as scale",
-        )
-    if wanted is None and own not in there and len(there) > 1:
-        raise PalpateError(
-            f"Of several scales of the views of {scene!r} one must be named",
-            ", ".join(there),
-            f"Pass scale={there[0]!r}",
-        )
-    return wanted or (own if own in there else there[0])
+    if requested is not None and scales and requested not in scales:
+        got = f"{requested!r}; the views of {scene!r} have {', '.join(scales)}"
+        raise PalpateError("must be a scale of all views", got, "", argument="scale")
+    if requested is None and default not in scales and len(scales) > 1:
+        must = f"must name one of the scales of the views of {scene!r}"
+        example = {"scale": scales[0]}
+        raise PalpateError(must, ", ".join(scales), "", argument="scale", example=example)
+    return requested or (default if default in scales or not scales else scales[0])
 
 
 def _scene(
-    out: Scan, scene: str, own: str, view: str | None, ids: dict[tuple[str, int], str]
+    result: Scan, scene: str, scale: str, view_scale: str, ids: dict[tuple[str, int], str]
 ) -> None:
-    """Adds the pairs of one scene; ids of touches without a view are kept for the list."""
-    at = f"touch/{scene}_{own}"
-    touches, views = numbered(out.base / at), numbered(out.base / "vision" / f"{scene}_{view}")
-    tell(touches, at, out.problems, out.suspicious)
-    tell(views, f"vision/{scene}_{view}", out.problems, out.suspicious)
-    background = _background(out.base, scene, own)
-    if background is None:
-        out.suspicious.append(
-            Problem(
-                at,
-                "no-background",
-                f"no touch_bg/{scene}_{own}/bg.jpg and no other background of this scene",
-            )
-        )
-    if not touches.files:
-        out.problems.append(Problem(at, "missing-frames", "the folder has no touch"))
-    elif view is None:
-        out.problems.append(
-            Problem(
-                at,
-                "missing-folder",
-                f"no vision folder of this scene: {len(touches.files)} touches without a view",
-            )
-        )
-    for k, name in touches.files.items():
-        ids[scene, k] = f"{scene}/{Path(name).stem}"
-        row: dict[str, Any] = {
+    """Add the pairs of one scene; the list may also name tactile images without a view."""
+    tactile = numbered(result, f"touch/{scene}_{scale}")
+    vision = numbered(result, f"vision/{scene}_{view_scale}")
+    ids |= {(scene, k): f"{scene}/{Path(name).stem}" for k, name in tactile.files.items()}
+    background = _background(result.base, scene, scale)
+    if background is None and tactile.files:
+        result.suspect(tactile.place, "no-background", "no touch_bg/ image of this scene")
+    for k in paired(result, tactile, vision):
+        row = {
             "id": ids[scene, k],
             "video": scene,
             "frame": k,
-            "vision": f"vision/{scene}_{view}/{views.files.get(k)}",
-            "tactile": f"{at}/{name}",
+            "vision": vision.path(k),
+            "tactile": tactile.path(k),
             "background": background,
             "sensor": FACTS.sensor,
         }
-        if k in views.files:
-            out.rows.append((row["tactile"], row))
-        elif view is not None:
-            out.problems.append(
-                Problem(
-                    row["tactile"],
-                    "unpaired",
-                    f"no view of the number {k} in vision/{scene}_{view}",
-                )
-            )
-    out.problems += [
-        Problem(f"vision/{scene}_{view}/{name}", "unpaired", f"no touch of the number {k} in {at}")
-        for k, name in views.files.items()
-        if k not in touches.files
-    ]
+        result.rows.append((tactile.path(k), row))
 
 
-def _background(root: Path, scene: str, own: str) -> str | None:
+def _background(root: Path, scene: str, scale: str) -> str | None:
     plain = scene.removesuffix("_colmap")
-    names = [
-        f"{scene}_{own}",
-        *(f"{name}_colmap_40_50" for name in (plain, BACKGROUND_NAMES.get(plain, plain))),
-    ]
-    return next(
-        (f"touch_bg/{n}/bg.jpg" for n in names if (root / "touch_bg" / n / "bg.jpg").exists()), None
-    )
+    colmap = [f"{name}_colmap_40_50" for name in (plain, BACKGROUND_NAMES.get(plain, plain))]
+    paths = [f"touch_bg/{name}/bg.jpg" for name in (f"{scene}_{scale}", *colmap)]
+    return next((path for path in paths if (root / path).exists()), None)
 
 
-def _split(out: Scan, ids: dict[tuple[str, int], str]) -> None:
-    """``Orig`` of the JSON list, if it is there."""
-    path = out.base / LIST
-    if not path.is_file():
+def _read_list(result: Scan, data: object, ids: dict[tuple[str, int], str]) -> None:
+    """``Orig`` of the JSON list."""
+    path = result.base / LIST
+    if not is_pair_list(data):
+        result.problem(path, "bad-json", 'not {"train|val|test": [[scene, index], ..]}')
         return
-    before = len(out.problems)
-    entries = read_pairs(path, out.problems)
-    if entries is None:
-        if len(out.problems) == before:
-            out.problems.append(
-                Problem(str(path), "bad-list", 'not {"train|val|test": [[scene, index], ..]}')
-            )
-        return
-    known: list[tuple[Entry, tuple[str, int]]] = []
-    for entry in entries:
-        if re.fullmatch("[0-9]+", entry.second) is None:
-            out.problems.append(
-                Problem(entry.where, "bad-frame", f"the index {entry.second!r} is no integer")
-            )
+    pairs: list[tuple[Pair, tuple[str, int]]] = []
+    for pair in read_pairs(result, path, data):
+        if pair.second.isdecimal():
+            scene = re.sub(r"_[0-9]+_[0-9]+$", "", pair.first)
+            pairs.append((pair, (scene, int(pair.second))))
         else:
-            known.append((entry, (re.sub(r"_[0-9]+_[0-9]+$", "", entry.first), int(entry.second))))
-    out.parts["Orig"] = assign(path, known, ids, out.problems)
-    out.rules["Orig"] = {"method": "official", "files": [LIST]}
-    if rest := len(ids) - len({key for _, key in known} & set(ids)):
-        out.suspicious.append(
-            Problem(str(path), "unlisted", f"{rest} of {len(ids)} touches are in no part")
-        )
+            result.problem(pair.where, "bad-frame", f"the index {pair.second!r} is not an integer")
+    result.splits["Orig"] = assign(result, path, pairs, ids)

@@ -1,4 +1,4 @@
-"""Touch and Go (Yang, Ma, Zhang, Zhu, Yuan, Owens; NeurIPS 2022): 640x480 video of a scene and of a GelSight in step.
+"""Touch and Go (Yang, Ma, Zhang, Zhu, Yuan, Owens; NeurIPS 2022): a scene and a GelSight.
 
 ::
 
@@ -7,23 +7,26 @@
       category_reference.txt     Rock: 15
       train.txt  test.txt        the official split, lines as in label.txt (optional)
       captions.csv  objects.csv  frame,text and frame,object, by the user (optional)
-      dataset/<video>/video.mp4        gelsight.mp4          raw, or
+      dataset/<video>/video.mp4        gelsight.mp4          raw, 640x480, in step; or
       dataset/<video>/video_frame/     gelsight_frame/       extracted, 0000000000.jpg ...
 
-The videos may also lie under ``final_dataset/`` or in the root itself. A frame's number is its position in both videos,
-so it is valid up to the shorter one. The background of a touch is the gel 4 frames before the touch begins; if the
-sensor is in contact there, the nearest earlier frame where it is not; if there is none, of up to 15 frames
-outside all touches the one nearest to their median; else null.
+The videos may also be under ``final_dataset/`` or in the root itself. The number of a frame is its
+position in both videos, so it is valid up to the shorter one. The background of a contact is the
+gel 4 frames before it begins; if the sensor is in contact there, the nearest earlier frame where it
+is not; if there is none, of up to 15 frames outside all contacts the one nearest to their median;
+else null.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet
-from palpate.data.formats.base import WORLD, Facts, Scan, world_facts
+from palpate.data.formats.base import WORLD, Facts, Format, Row, Scan, world_facts
+from palpate.data.formats.layout import require_folder, subfolders
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
 from palpate.data.images import Check
 from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
@@ -37,81 +40,56 @@ from palpate.data.listing import (
     write_list,
 )
 from palpate.data.manifest import Manifest
-from palpate.data.recordings import Recordings, Row, VideoFiles, first_frames, rows_of, thin
+from palpate.data.recordings import Recordings, VideoFiles, first_frames, rows_of, thin
+from palpate.data.recordings import Row as FrameRow
 
 FACTS = Facts(
-    "Touch and Go",
-    "F. Yang, C. Ma, J. Zhang, J. Zhu, W. Yuan, A. Owens: Touch and Go: Learning from Human-Collected Vision and Touch. "
-    "NeurIPS Datasets and Benchmarks, 2022",
-    "CC BY 4.0",
-    "https://touch-and-go.github.io",
-    "GelSight'17",
-    (640, 480),
-    "121,861 frames of 126 videos in the official lists; label.txt names about twice as many",
-    "video",
-    {"touch, 50 images (T3)": ((0.51808, 0.50300, 0.51457), (0.13893, 0.11343, 0.13497))},
+    name="Touch and Go",
+    citation="F. Yang, C. Ma, J. Zhang, J. Zhu, W. Yuan, A. Owens: Touch and Go: Learning from "
+    "Human-Collected Vision and Touch. NeurIPS Datasets and Benchmarks, 2022",
+    license="CC BY 4.0",
+    url="https://touch-and-go.github.io",
+    sensor="GelSight'17",
+    image_size=(640, 480),
+    samples="121,861 frames of 126 videos in the official lists; label.txt has about twice as many",
+    group="video",
+    normalization={
+        "touch, 50 images (T3)": ((0.51808, 0.50300, 0.51457), (0.13893, 0.11343, 0.13497))
+    },
 )
-CATEGORIES: dict[int, str] = dict(
-    enumerate(
-        (
-            "Concrete",
-            "Plastic",
-            "Glass",
-            "Wood",
-            "Metal",
-            "Brick",
-            "Tile",
-            "Leather",
-            "Synthetic Fabric",
-            "Natural Fabric",
-            "Rubber",
-            "Paper",
-            "Tree",
-            "Grass",
-            "Soil",
-            "Rock",
-            "Gravel",
-            "Sand",
-            "Plants",
-            "Others",
-        )
-    )
+LOOKS_FOR = (
+    "label.txt (or train.txt, test.txt), and videos under dataset/, final_dataset/ or the folder "
+    "itself"
 )
+_NAMES = (
+    "Concrete, Plastic, Glass, Wood, Metal, Brick, Tile, Leather, Synthetic Fabric, Natural Fabric,"
+    " Rubber, Paper, Tree, Grass, Soil, Rock, Gravel, Sand, Plants, Others"
+)
+CATEGORIES: dict[int, str] = dict(enumerate(_NAMES.split(", ")))
 #: Part of the official split -> its list.
 OFFICIAL = {"train": "train.txt", "test": "test.txt"}
 PLACES = ("dataset", "final_dataset", ".")
-SIDES = {"vision": ("video_frame", "video.mp4"), "tactile": ("gelsight_frame", "gelsight.mp4")}
-LOOKED_FOR = "label.txt (or train.txt, test.txt), and videos under dataset/, final_dataset/ or the folder itself"
+MODALITIES = {"vision": ("video_frame", "video.mp4"), "tactile": ("gelsight_frame", "gelsight.mp4")}
 
 
 def detect(source: Path) -> bool:
-    """Whether a folder looks like Touch and Go: a list and a recording."""
-    return (
-        source.is_dir()
-        and any((source / n).is_file() for n in ("label.txt", "train.txt", "test.txt"))
-        and bool(find_videos(source))
-    )
+    """Whether a folder has a list and a recording."""
+    lists = ("label.txt", *OFFICIAL.values())
+    return any((source / name).is_file() for name in lists) and bool(find_videos(source))
 
 
 def find_videos(root: Path) -> dict[str, VideoFiles]:
-    """Recordings by name, under ``dataset/``, ``final_dataset/`` or the root; extracted frames go before the raw video."""
-    found: dict[str, VideoFiles] = {}
+    """Recordings by name; extracted frames go before the raw video."""
+    videos: dict[str, VideoFiles] = {}
     for place in PLACES:
-        base = Path(root) / place
-        for folder in sorted(base.iterdir()) if base.is_dir() else []:
-            if folder.name in found or not folder.is_dir():
-                continue
-            sides = {
-                side: folder / frames
-                if (folder / frames).is_dir()
-                else folder / video
-                if (folder / video).is_file()
-                else None
-                for side, (frames, video) in SIDES.items()
-            }
-            if any(sides.values()):
-                found[folder.name] = VideoFiles(folder.name, sides["vision"], sides["tactile"])
-    return found
+        for name in subfolders(root / place):
+            paths: dict[str, Path | None] = {}
+            for modality, (frames, video) in MODALITIES.items():
+                folder, file = (root / place / name / part for part in (frames, video))
+                paths[modality] = folder if folder.is_dir() else file if file.is_file() else None
+            if any(paths.values()):
+                videos.setdefault(name, VideoFiles(name, **paths))
+    return videos
 
 
 def import_touch_and_go(
@@ -127,95 +105,49 @@ def import_touch_and_go(
     seed: int = 0,
     progress: Progress = quiet,
 ) -> Imported:
-    """Reads Touch and Go and writes ``out/manifest.parquet``, ``out/splits/Orig.json`` and the frames of raw videos.
+    """Write ``out/manifest.parquet``, ``out/splits/Orig.json`` and the frames of raw videos.
 
     Args:
         root: the data set.
-        out: folder to write to. Frames of raw videos go to ``out/images/<video>/{vision,tactile}/``; extracted frames
-            stay where they are. If an import is interrupted, the same call goes on where it stopped.
-        labels: frame lists; default ``label.txt``, else ``train.txt`` and ``test.txt``, at the root.
-        skip_bad: leave bad rows out and list them, instead of raising.
+        out: folder to write to. Frames of raw videos go to
+            ``out/images/<video>/{vision,tactile}/``; extracted frames stay where they are. After an
+            interruption the same call continues where it stopped.
+        labels: frame lists; default ``label.txt``, else ``train.txt`` and ``test.txt``.
+        skip_bad: skip bad rows and list them, instead of raising.
         image_format: of the cached frames.
         size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
         check: how extracted images are checked.
-        max_per_contact: take that many evenly spaced frames of a contact.
-        seed: with ``max_per_contact``: 0 takes the middle of each of the equal stretches, any other a random place in them.
-        progress: told what is being done.
+        max_per_contact: keep that many evenly spaced frames of a contact.
+        seed: with ``max_per_contact``: 0 takes the middle of each of the equal stretches, any other
+            a random place in them.
+        progress: progress callback.
 
     Returns:
-        The manifest, sorted by video and frame. Its root is the data set's if all recordings are extracted; if some are raw it is
-        ``out``, and used frames of the others are linked (or copied) there.
+        The manifest, sorted by video and frame. Its root is the data set's if all recordings are
+        extracted; if some are raw it is ``out``, and frames of the others are linked there.
 
     Raises:
-        PalpateError: if the root, the list or the recordings are missing, or ``out`` holds frames of other settings.
+        PalpateError: if the root, the list or the recordings are missing, or ``out`` holds frames
+            of other settings.
         ProblemsError: with everything bad in the whole data set; nothing is left behind.
     """
-    root, out = Path(root), Path(out)
+    root, out = require_folder(root, FACTS.name), Path(out)
+    require_frame_options(image_format, size)
     if max_per_contact is not None and max_per_contact < 1:
-        raise PalpateError(
-            "max_per_contact must be at least 1",
-            str(max_per_contact),
-            "Leave it out to take every frame",
-        )
-    if size is not None and size < 1:
-        raise PalpateError(
-            "size must be at least 1 pixel",
-            str(size),
-            "Leave it out to keep the frames as they are",
-        )
-    if image_format not in IMAGE_FORMATS:
-        raise PalpateError(
-            f"image_format must be one of {', '.join(IMAGE_FORMATS)}",
-            repr(image_format),
-            "Choose one of these",
-        )
-    videos = _require_videos(root)
-    table = root / "category_reference.txt"
-    categories = {
-        k: v
-        for k, v in (read_categories(table) if table.is_file() else CATEGORIES).items()
-        if k >= 0
-    }
-    lists = _require_lists(root, labels)
-    listed = read_lists(lists, root=root, skip_bad=True, categories=categories)
-    official = listed if lists == [root / name for name in OFFICIAL.values()] else _official(root)
-    texts, objects = _optional(root / "captions.csv"), _optional(root / "objects.csv")
-    rows = rows_of(listed)
+        got = str(max_per_contact)
+        raise PalpateError("must be at least 1", got, "", argument="max_per_contact")
+    videos = require_videos(root)
+    lists = _read_lists(root, labels)
     with removing_on_error(out) as created:
-        work = Recordings(
-            root, out, videos, _contacts(root, listed, official), image_format, size, created
-        )
-        work.problems += [
-            p
-            for part in (listed, None if official is listed else official, texts, objects)
-            if part
-            for p in part.skipped
-        ]
-        starts = first_frames(rows)
-        rows = work.open(thin(rows, max_per_contact, seed), progress)
-        work.choose_backgrounds(rows, starts)
-        rows = work.check(rows, check, progress)
-        _look(work, rows, listed)
-        raise_if(work.problems, skip_bad)
-        require_some(len(rows), root, work.problems)
-        rows = work.extract(rows, progress)
-        raise_if(work.problems, skip_bad)
-        require_some(len(rows), root, work.problems)
-        facts = _facts(root, categories) | {"text_source": "captions.csv" if texts else "none"}
-        manifest = work.manifest(
-            rows,
-            facts,
-            WORLD.sensor if "synthetic" in facts else FACTS.sensor,
-            {"text": texts, "object": objects},
-        )
-        found = Imported(
-            manifest,
-            work.problems,
-            _splits(manifest, official),
-            listed.inconclusive,
-            work.suspicious,
-        )
-        return found.save(out, created)
+        work = Recordings(root, out, videos, lists.in_contact, image_format, size, created)
+        rows = thin(rows_of(lists.listed), max_per_contact, seed)
+        rows = _prepared(work, lists, rows, check, progress)
+        rows = extracted(work, rows, root, skip_bad=skip_bad, progress=progress)
+        sensor = WORLD.sensor if "synthetic" in lists.facts else FACTS.sensor
+        manifest = work.manifest(rows, lists.facts, sensor, lists.words)
+        splits, inconclusive = _splits(manifest, lists.official), lists.listed.inconclusive
+        result = Imported(manifest, work.problems, splits, inconclusive, work.suspicious)
+        return result.save(out, created)
 
 
 def scan(
@@ -225,177 +157,197 @@ def scan(
     check: Check = "decode",
     progress: Progress = quiet,
 ) -> Scan:
-    """Looks a data set over without writing anything: lists, recordings, frames and pictures.
+    """Check a data set without writing anything: lists, recordings, frames and images.
 
-    With ``check="decode"`` the frames in use are decoded as an import would, those of raw videos too. Rows carry no paths, as frames of raw videos have none yet.
+    With ``check="decode"`` the frames in use are decoded as an import would, those of raw videos
+    too. Rows carry paths only if every recording is extracted and ``check`` is ``none``.
 
     Raises:
         PalpateError: if the root, the list or the recordings are missing.
     """
-    root = Path(root)
-    videos = _require_videos(root)
-    lists = _require_lists(root, labels)
-    table = root / "category_reference.txt"
-    categories = {
-        k: v
-        for k, v in (read_categories(table) if table.is_file() else CATEGORIES).items()
-        if k >= 0
-    }
-    listed = read_lists(lists, root=root, skip_bad=True, categories=categories)
-    official = listed if lists == [root / name for name in OFFICIAL.values()] else _official(root)
-    rows = rows_of(listed)
-    work = Recordings(root, root, videos, _contacts(root, listed, official), "jpg", None, [])
-    work.problems += listed.skipped + (
-        official.skipped if official and official is not listed else []
-    )
-    starts = first_frames(rows)
-    rows = work.open(rows, progress)
-    work.choose_backgrounds(rows, starts)
-    rows = work.check(rows, check, progress)
-    _look(work, rows, listed)
+    root = require_folder(root, FACTS.name)
+    videos = require_videos(root)
+    lists = _read_lists(root, labels)
+    work = Recordings(root, root, videos, lists.in_contact, "jpg", None, [])
+    rows = _prepared(work, lists, rows_of(lists.listed), check, progress)
     rows = work.decode(rows, progress) if check == "decode" else rows
-    found = [
-        (
-            r.where,
-            {
-                "id": r.id,
-                "video": r.video,
-                "frame": r.frame,
-                "contact": r.contact,
-                "material": r.material,
-            },
-        )
-        for r in rows
-    ]
-    return Scan(
-        found,
-        root,
-        work.problems,
-        work.suspicious,
-        _facts(root, categories),
-        inconclusive=listed.inconclusive,
-    )
+    result = Scan(root, lists.facts, scan_rows(work, rows, check))
+    result.problems, result.suspicious = work.problems, work.suspicious
+    result.inconclusive = lists.listed.inconclusive
+    return result
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Writes ``<part>.txt`` with a ``video/0000000033.jpg,3`` line a sample, as the official lists are.
+    """Write ``<part>.txt`` with a ``video/0000000033.jpg,3`` line a sample, as the official lists.
 
-    The classes are those of the manifest's fact ``classes``, which an import with another table than the published one writes, else
-    the published ones. A material that is none of them keeps its number if it is one (bare lists without a category table).
+    The classes are those of the manifest's fact ``classes``, which an import with another table
+    than the published one writes, else the published ones. A material that is none of them keeps
+    its number if it is one (bare lists without a category table).
 
     Raises:
         PalpateError: if a sample has no video or frame, or a material that is no class.
     """
-    classes: dict[str, str] = (
-        json.loads(manifest.facts["classes"]) if "classes" in manifest.facts else {}
-    )
-    ids = {name: int(k) for k, name in (classes or CATEGORIES).items()}
+    classes: dict[str, str] = json.loads(manifest.facts.get("classes", "{}"))
+    ids: dict[str | None, int] = {name: int(k) for k, name in (classes or CATEGORIES).items()}
+    ids[None] = INCONCLUSIVE
+    columns = ("id", "video", "frame", "material")
     files: list[Path] = []
     for part in split.counts():
         rows: list[tuple[str, int]] = []
-        for row in (
-            manifest.part(split, part)
-            .table.select("id", "video", "frame", "material")
-            .iter_rows(named=True)
-        ):
-            name = row["material"]
-            label = (
-                INCONCLUSIVE
-                if name is None
-                else ids.get(name, int(name) if str(name).isdecimal() else None)
-            )
-            if row["video"] is None or row["frame"] is None or label is None:
-                got = f"{row['id']!r} with video {row['video']!r}, frame {row['frame']!r} and material {name!r}"
-                raise PalpateError(
-                    "A frame list needs the video, frame and class of every sample",
-                    got,
-                    "Write the split file alone",
-                )
-            rows.append((f"{row['video']}/{row['frame']:010d}.jpg", label))
+        for i, video, frame, name in manifest.part(split, part).table.select(columns).iter_rows():
+            label = int(name) if name not in ids and str(name).isdecimal() else ids.get(name)
+            if video is None or frame is None or label is None:
+                must = "A frame list needs the video, frame and class of every sample"
+                got = f"{i!r} with video {video!r}, frame {frame!r} and material {name!r}"
+                raise PalpateError(must, got, "Write the split file alone")
+            rows.append((f"{video}/{frame:010d}.jpg", label))
         files.append(Path(folder) / f"{part}.txt")
         write_list(files[-1], rows)
     return files
 
 
-def _look(work: Recordings, rows: Sequence[Row], listed: FrameList) -> None:
-    """Tells recordings in no list, and touches without a picture of the gel."""
-    unlisted = sorted(set(work.videos) - set(listed.contact["video"]))
-    work.suspicious += [
-        Problem(str(work.root), "unlisted-video", f"the recording {name!r} is in no list")
-        for name in unlisted
-    ]
-    bare = sorted({r.contact for r in rows} - set(work.background_frames) - set(work.typical_of))
-    work.suspicious += [
-        Problem(touch, "no-background", "no frame of its recording shows the gel untouched")
-        for touch in bare
-    ]
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, import_touch_and_go, write_lists)
 
 
-def _facts(root: Path, categories: Mapping[int, str]) -> dict[str, str]:
-    """Name and license of the data, and its classes if they are not the published ones.
+# --- Steps that interval lists share
 
-    Palpate's own world comes in this layout, and must never pass for the real set.
+
+def require_videos(root: Path) -> dict[str, VideoFiles]:
+    """The recordings.
+
+    Raises:
+        PalpateError: if there is none.
     """
-    classes = (
-        {}
-        if categories == CATEGORIES
-        else {"classes": json.dumps({str(k): name for k, name in categories.items()})}
-    )
-    return {**FACTS.of_manifest(), **world_facts(root), "format": "touch-and-go", **classes}
-
-
-def _require_videos(root: Path) -> dict[str, VideoFiles]:
-    if not root.is_dir():
-        raise PalpateError(
-            "The data set's folder must exist", f"no folder {root}", "Check the path"
-        )
     videos = find_videos(root)
     if not videos:
-        raise PalpateError(
-            f"{root} must hold recordings: folders with video.mp4 and gelsight.mp4, or video_frame/ and gelsight_frame/",
-            "none under " + ", ".join("the folder itself" if p == "." else f"{p}/" for p in PLACES),
-            f"Download the videos from {FACTS.url}",
-        )
+        must = f"{root} must hold recordings: folders with video.mp4 and gelsight.mp4, or "
+        must += "video_frame/ and gelsight_frame/"
+        got = "none there, nor in dataset/ or final_dataset/"
+        raise PalpateError(must, got, f"Check the folder, or fetch videos from {FACTS.url}")
     return videos
 
 
-def _require_lists(root: Path, labels: Sequence[Path] | Path | None) -> list[Path]:
-    """The lists to read: those given, else ``label.txt``, else the official two."""
+def require_frame_options(image_format: str, size: int | None) -> None:
+    """Check the options of extracted frames.
+
+    Raises:
+        PalpateError: if one is out of range.
+    """
+    if size is not None and size < 1:
+        raise PalpateError("must be at least 1 pixel", str(size), "", argument="size")
+    if image_format not in IMAGE_FORMATS:
+        must = f"must be one of {', '.join(IMAGE_FORMATS)}"
+        raise PalpateError(must, repr(image_format), "", argument="image_format")
+
+
+def extracted(
+    work: Recordings, rows: list[FrameRow], source: Path, *, skip_bad: bool, progress: Progress
+) -> list[FrameRow]:
+    """The rows whose frames are there after extracting those of raw videos.
+
+    Raises:
+        ProblemsError: if something is bad and not ``skip_bad``, or no row is left.
+    """
+    raise_if(work.problems, skip_bad)
+    require_some(len(rows), source, work.problems)
+    rows = work.extract(rows, progress)
+    raise_if(work.problems, skip_bad)
+    require_some(len(rows), source, work.problems)
+    return rows
+
+
+def scan_rows(work: Recordings, rows: Sequence[FrameRow], check: Check) -> list[Row]:
+    """Rows of a scan; with paths if they are still to be checked and the frames are files."""
+    cells = work.cells(rows, work.root.resolve())
+    if check != "none" or work.layout(rows) != "extracted":
+        for row in cells:
+            row |= dict.fromkeys((*MODALITIES, "background"))
+    return [(row.where, cell) for row, cell in zip(rows, cells, strict=True)]
+
+
+# --- Lists
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """What the lists at the root hold.
+
+    Attributes:
+        listed: the samples.
+        official: the official lists, joined, if both are there.
+        words: manifest column -> its words by frame.
+        in_contact: recording -> the frames that any list calls a contact.
+        facts: for the manifest.
+    """
+
+    listed: FrameList
+    official: FrameList | None
+    words: Mapping[str, FrameTable | None]
+    in_contact: Mapping[str, set[int]]
+    facts: dict[str, str]
+
+    @property
+    def problems(self) -> list[Problem]:
+        """All bad lines, each once."""
+        tables = [self.listed, *self.words.values()]
+        tables += [self.official] if self.official is not self.listed else []
+        return [problem for table in tables if table for problem in table.skipped]
+
+
+def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
+    """Read the lists given, else ``label.txt``, else the official two, and what is next to them.
+
+    Raises:
+        PalpateError: if there is none.
+    """
+    every, official_paths = root / "label.txt", [root / name for name in OFFICIAL.values()]
     if labels is not None:
-        return [Path(labels)] if isinstance(labels, (str, Path)) else [Path(p) for p in labels]
-    if (root / "label.txt").is_file():
-        return [root / "label.txt"]
-    lists = [root / name for name in OFFICIAL.values() if (root / name).is_file()]
-    if not lists:
-        raise PalpateError(
-            f"{root} must hold label.txt, or train.txt and test.txt",
-            "none of them",
-            "Put a list there, or name it: --labels FILE",
-        )
-    return lists
+        paths = [Path(labels)] if isinstance(labels, (str, Path)) else [Path(p) for p in labels]
+    else:
+        paths = [every] if every.is_file() else [p for p in official_paths if p.is_file()]
+    if not paths:
+        must = f"{root} must hold label.txt, or train.txt and test.txt"
+        raise PalpateError(must, "none of them", "Put a list there", example={"labels": "list.txt"})
+    table = root / "category_reference.txt"
+    categories = read_categories(table) if table.is_file() else CATEGORIES
+    categories = {k: name for k, name in categories.items() if k >= 0}
+    listed = read_lists(paths, root=root, skip_bad=True, categories=categories)
+    official: FrameList | None = listed
+    if paths != official_paths:
+        both = all(path.is_file() for path in official_paths)
+        official = read_lists(official_paths, root=root, skip_bad=True) if both else None
+    contacts = [listed, *([official] if official else [])]
+    if every.is_file() and every not in paths:
+        contacts.append(read_lists([every], root=root, skip_bad=True))
+    in_contact: dict[str, set[int]] = {}
+    for frames in contacts:
+        for (video,), group in frames.contact.group_by("video"):
+            in_contact.setdefault(str(video), set()).update(group["frame"].to_list())
+    tables = {"text": root / "captions.csv", "object": root / "objects.csv"}
+    words = {c: read_frame_table(path) if path.is_file() else None for c, path in tables.items()}
+    facts = {**FACTS.of_manifest(), **world_facts(root), "format": "touch-and-go"}
+    facts["text_source"] = "captions.csv" if words["text"] else "none"
+    if categories != CATEGORIES:
+        facts["classes"] = json.dumps({str(k): name for k, name in categories.items()})
+    return _Lists(listed, official, words, in_contact, facts)
 
 
-def _official(root: Path) -> FrameList | None:
-    """The official lists, joined, if both lie at the root; labels do not matter here."""
-    paths = [root / name for name in OFFICIAL.values()]
-    return read_lists(paths, root=root, skip_bad=True) if all(p.is_file() for p in paths) else None
-
-
-def _optional(path: Path) -> FrameTable | None:
-    return read_frame_table(path) if path.is_file() else None
-
-
-def _contacts(root: Path, listed: FrameList, official: FrameList | None) -> dict[str, set[int]]:
-    """By recording, the frames that any list at hand calls a touch."""
-    lists = [listed, *([official] if official else [])]
-    known = set(listed.rows["source"].unique())
-    if (every := root / "label.txt").is_file() and str(every) not in known:
-        lists.append(read_lists([every], root=root, skip_bad=True))
-    found: dict[str, set[int]] = {}
-    for part in lists:
-        for (video,), group in part.contact.group_by("video"):
-            found.setdefault(str(video), set()).update(group["frame"].to_list())
-    return found
+def _prepared(
+    work: Recordings, lists: _Lists, rows: list[FrameRow], check: Check, progress: Progress
+) -> list[FrameRow]:
+    """The usable rows, up to extraction; what is wrong is added to ``work``."""
+    work.problems += lists.problems
+    rows = work.open(rows, progress)
+    work.choose_backgrounds(rows, first_frames(rows_of(lists.listed)))
+    rows = work.check(rows, check, progress)
+    for video in sorted(set(work.videos) - set(lists.listed.contact["video"])):
+        text = f"the recording {video!r} is in no list"
+        work.suspicious.append(Problem(str(work.root), "unlisted-video", text))
+    without = {r.contact for r in rows} - set(work.background_frames) - set(work.typical_of)
+    for contact in sorted(without):
+        text = "no frame of its recording shows the untouched gel"
+        work.suspicious.append(Problem(contact, "no-background", text))
+    return rows
 
 
 def _splits(manifest: Manifest, official: FrameList | None) -> dict[str, Split]:
@@ -403,11 +355,10 @@ def _splits(manifest: Manifest, official: FrameList | None) -> dict[str, Split]:
     if official is None:
         return {}
     part_of = {name: part for part, name in OFFICIAL.items()}
-    parts = {
-        (r["video"], r["frame"]): part_of[Path(r["source"]).name]
-        for r in official.rows.iter_rows(named=True)
-    }
-    table = manifest.table.select("id", "video", "frame").iter_rows()
-    found = {i: parts[video, frame] for i, video, frame in table if (video, frame) in parts}
+    columns = ("video", "frame", "source")
+    rows = official.rows.select(columns).iter_rows()
+    parts = {(video, frame): part_of[Path(source).name] for video, frame, source in rows}
+    samples = manifest.table.select("id", "video", "frame").iter_rows()
+    listed = {i: parts[video, k] for i, video, k in samples if (video, k) in parts}
     rule = {"method": "official", "files": list(OFFICIAL.values())}
-    return {"Orig": Split(found, rule, manifest.digest)} if found else {}
+    return {"Orig": Split(listed, rule, manifest.digest)} if listed else {}

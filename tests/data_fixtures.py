@@ -1,4 +1,4 @@
-"""Small data sets in the true on-disk layouts, whose frames carry their own number."""
+"""Images, videos and folders of frames that carry their own number."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -78,21 +78,19 @@ def tree(folder: Path) -> set[str]:
 
 
 @dataclass(frozen=True)
-class Forged:
-    """A small data set that a forge wrote, all of it below the folder that the forge was given.
+class Tree:
+    """A small data set, all of it below the folder that its maker was given.
 
     Attributes:
         source: what a user would name: a folder or a table.
-        samples: how many samples an import must find in it.
+        samples: how many samples an import must give.
         options: options of the import that it needs; paths below the folder follow a copied tree.
-        auto: whether the format must be recognized by look; False only where nothing on disk tells it (a remote name).
-        remove: takes away what one sample needs, given the source; default: deletes the touch image of the last sample.
-        cut: spoils it instead; default: cuts that file in half.
+        remove: removes what one sample needs, given the source; default: deletes the tactile image of the last sample.
+        cut: damages it instead; default: cuts that file in half.
     """
 
     source: Path
     samples: int
     options: Mapping[str, object] = field(default_factory=dict)
-    auto: bool = True
     remove: Callable[[Path], None] | None = None
     cut: Callable[[Path], None] | None = None

@@ -1,0 +1,292 @@
+"""What formats share: folders of images by name, pairs of equal names, and JSON lists of pairs.
+
+The number of an image is an integer, so ``frame10.jpg`` comes after ``frame9.jpg``, and ``7.jpg``
+and ``0007.jpg`` are one frame. Nothing is skipped silently: duplicate numbers, images of another
+name and images without a partner are reported.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path, PurePosixPath
+from typing import Any, Generic, TypeGuard, TypeVar
+
+from palpate.core import PARTS, PalpateError, Split, inside, write_json
+from palpate.data.formats.base import Row, Scan
+from palpate.data.images import SUFFIXES
+from palpate.data.manifest import CLIMBS, Manifest
+
+#: The frames of a manifest have 64 bits, so a longer number is none.
+DIGITS = 18
+NUMBER = r"([0-9]+)"
+K = TypeVar("K", int, str)
+
+
+@dataclass(frozen=True)
+class Images(Generic[K]):
+    """The images of one folder.
+
+    Attributes:
+        place: the folder, relative to the root.
+        files: key (frame number or stem) -> file name, in order.
+    """
+
+    place: str
+    files: dict[K, str] = field(default_factory=dict)
+
+    def path(self, key: K) -> str:
+        """Path of an image, relative to the root."""
+        return f"{self.place}/{self.files[key]}"
+
+
+def numbered(
+    scan: Scan,
+    place: str,
+    pattern: str = NUMBER,
+    *,
+    steady: bool = False,
+    suffixes: Sequence[str] = SUFFIXES,
+) -> Images[int]:
+    """The images of a folder by number; an absent folder has none.
+
+    Args:
+        scan: duplicate numbers become its problems, images without a number are suspicious.
+        place: folder relative to the root; its subfolders are not read.
+        pattern: of the whole stem, with one group: the number.
+        steady: report gaps in the numbers, unless more numbers are missing than there are.
+        suffixes: of images, in lower case; other files are not images.
+    """
+    files: dict[int, str] = {}
+    unnumbered: list[str] = []
+    for name in file_names(scan.base / place, suffixes):
+        match = re.fullmatch(pattern, name.rpartition(".")[0])
+        if match is None or len(match[1]) > DIGITS:
+            unnumbered.append(name)
+        elif (before := files.setdefault(int(match[1]), name)) != name:
+            scan.problem(f"{place}/{name}", "duplicate-frame", f"{before} has the same number")
+    scan.suspect(place, "unknown-name", "images that carry no frame number", unnumbered)
+    if steady and files:
+        gaps = range(min(files), max(files) + 1)
+        if 0 < len(gaps) - len(files) < len(files):
+            text = f"numbers that are missing between {gaps[0]} and {gaps[-1]}"
+            scan.suspect(place, "frame-gap", text, (k for k in gaps if k not in files))
+    return Images(place, {k: files[k] for k in sorted(files)})
+
+
+def named(scan: Scan, place: str) -> Images[str]:
+    """The images of a folder by stem, in natural order; a PNG goes before another form."""
+    names = sorted(file_names(scan.base / place), key=lambda n: n.lower().endswith(".png"))
+    files = {name.rpartition(".")[0]: name for name in names}
+    return Images(place, {stem: files[stem] for stem in sorted(files, key=natural)})
+
+
+def paired(scan: Scan, tactile: Images[K], vision: Images[K]) -> list[K]:
+    """The keys that both folders have, in order; images without a partner are problems.
+
+    A folder without any images is one problem, not one for each image of its partner.
+    """
+    for images, partner, side in ((tactile, vision, "vision"), (vision, tactile, "tactile")):
+        if images.files and not partner.files:
+            kind = "missing-frames" if (scan.base / partner.place).is_dir() else "missing-folder"
+            text = f"no {side} images here, for {len(images.files)} in {images.place}"
+            scan.problem(partner.place, kind, text)
+        elif partner.files:
+            for key in images.files.keys() - partner.files.keys():
+                text = f"no {side} image {key!r} in {partner.place}"
+                scan.problem(images.path(key), "unpaired", text)
+    return [key for key in tactile.files if key in vision.files]
+
+
+def report_missing_folders(scan: Scan) -> None:
+    """Drop rows of folders that are not there or outside the root, with one problem a folder.
+
+    A user may have fetched a part of a data set; the first missing folder on the way is named.
+    """
+
+    @cache
+    def missing(folder: str) -> tuple[str, str] | None:
+        """(kind of problem, its text)."""
+        if inside(scan.base, folder) is None:
+            return "outside-root", f"the folder {folder!r} leaves the root {scan.base}"
+        parents = PurePosixPath(folder).parents
+        for place in (*map(str, reversed(parents)), folder):
+            if not (scan.base / place).is_dir():
+                return "missing-folder", f"no folder {place!r} in {scan.base}"
+        return None
+
+    places: dict[tuple[str, str], list[str]] = {}
+    rows: list[Row] = []
+    for where, row in scan.rows:
+        folders = (str(row[name]).rpartition("/")[0] for name in ("vision", "tactile"))
+        if lost := next(filter(None, map(missing, folders)), None):
+            places.setdefault(lost, []).append(where)
+        else:
+            rows.append((where, row))
+    for (kind, text), wheres in places.items():
+        scan.problem(wheres[0], kind, f"{count_rows(wheres)}: {text}")
+    scan.rows = rows
+
+
+def count_rows(places: Sequence[str]) -> str:
+    """``"1 row"``, ``"3 rows"``."""
+    return f"{len(places)} row{'s' * (len(places) != 1)}"
+
+
+def file_names(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[str]:
+    """Sorted names of the images in a folder, hidden ones aside; an unreadable folder has none."""
+    return sorted(
+        entry.name
+        for entry in _entries(folder)
+        if entry.name.lower().endswith(tuple(suffixes)) and not entry.is_dir()
+    )
+
+
+def subfolders(folder: Path) -> list[str]:
+    """Names of the folders in a folder, in natural order; an unreadable folder has none."""
+    return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as entries:
+            return [entry for entry in entries if not entry.name.startswith(".")]
+    except OSError:
+        return []
+
+
+def natural(name: str) -> tuple[int, int, str]:
+    """Sort key: integers by value, before other names."""
+    return (0, int(name), name) if re.fullmatch(NUMBER, name) else (1, 0, name)
+
+
+def require_folder(source: Path, name: str) -> Path:
+    """The source, if it is a folder.
+
+    Raises:
+        PalpateError: if it is missing or a file.
+    """
+    source = Path(source)
+    if not source.is_dir():
+        got = f"the file {source}" if source.exists() else f"nothing at {source}"
+        raise PalpateError(f"The source of {name} must be a folder", got, "Check the path")
+    return source
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One entry of a JSON list: where it is, its part, and its two names."""
+
+    where: str
+    part: str
+    first: str
+    second: str
+
+
+def read_json_file(scan: Scan, path: Path) -> Any:
+    """A JSON file of any content, or None with a problem."""
+    try:
+        return json.loads(path.read_bytes().decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        scan.problem(path, "bad-json", f"not JSON: {error}")
+        return None
+
+
+def is_pair_list(data: Any) -> TypeGuard[dict[str, list[Any]]]:
+    """Whether JSON data is ``{"train": [..], "val": .., "test": ..}``."""
+    return (
+        isinstance(data, dict)
+        and not set(PARTS).isdisjoint(data)
+        and all(isinstance(rows, list) for rows in data.values())
+    )
+
+
+def read_pairs(scan: Scan, path: Path, data: dict[str, list[Any]]) -> list[Pair]:
+    """The well-formed entries of ``{"train": [[folder, name], ..], ..}``; names may be integers."""
+    pairs: list[Pair] = []
+    for part, rows in data.items():
+        if part not in PARTS:
+            text = f"the part {part!r} ({len(rows)} entries) is none of {', '.join(PARTS)}"
+            scan.problem(path, "unknown-part", text)
+            continue
+        for k, row in enumerate(rows):
+            where = f"{path} {part}[{k}]"
+            names = [str(n).strip() for n in row] if isinstance(row, list) else []
+            if len(names) != 2 or not all(isinstance(n, (str, int)) for n in row):
+                scan.problem(where, "bad-line", f"{str(row)[:80]} is not a pair of names")
+            elif any(re.search(rf"{CLIMBS}|[/\\]|^$", n) for n in names):
+                scan.problem(where, "outside-root", f"{names!r} are not plain names")
+            else:
+                pairs.append(Pair(where, part, *names))
+    return pairs
+
+
+def assign(
+    scan: Scan, path: Path, pairs: Iterable[tuple[Pair, Hashable]], ids: Mapping[Any, str]
+) -> Split:
+    """The split of a JSON list; missing, duplicate and ambiguous entries are problems.
+
+    Args:
+        scan: takes the problems. A sample in two parts is in neither.
+        path: the list.
+        pairs: each entry with the key of its sample, (folder, name).
+        ids: key -> id of every sample on disk, whether usable or not.
+    """
+    folders = {folder for folder, _ in ids}
+    lost: Counter[str] = Counter()
+    seen: dict[str, Pair] = {}
+    in_two: set[str] = set()
+    for pair, key in pairs:
+        name = f"{pair.first}/{pair.second}"
+        i = ids.get(key)
+        if i is None and isinstance(key, tuple) and key[0] not in folders:
+            lost[pair.first] += 1
+        elif i is None:
+            scan.problem(pair.where, "missing-file", f"{name} is listed but not there")
+        elif (before := seen.setdefault(i, pair)) is not pair and before.part == pair.part:
+            scan.problem(pair.where, "duplicate-row", f"{name} is listed twice")
+        elif before is not pair:
+            in_two.add(i)
+            scan.problem(pair.where, "two-parts", f"{name} is in {before.part}, too")
+    for name, count in lost.items():
+        scan.problem(path, "missing-folder", f"no folder {name!r}, with {count} listed entries")
+    if unlisted := len(ids) - len(seen):
+        scan.suspect(path, "unlisted", f"{unlisted} of {len(ids)} samples are in no part")
+    parts = {i: pair.part for i, pair in seen.items() if i not in in_two}
+    return Split(parts, {"method": "official", "files": [path.name]})
+
+
+def write_pairs(
+    manifest: Manifest,
+    split: Split,
+    file: Path,
+    pattern: str,
+    convert: Callable[[str], int | str] = str,
+) -> list[Path]:
+    """Write ``{"train": [[folder, name], ..], "val": .., "test": ..}`` of the tactile images.
+
+    Args:
+        manifest: of the samples.
+        split: their parts.
+        file: to write to.
+        pattern: of a tactile path, with two groups: folder and name.
+        convert: how a folder or name is written.
+
+    Raises:
+        PalpateError: if the path of a sample does not match.
+    """
+    lists: dict[str, list[list[int | str]]] = {part: [] for part in PARTS}
+    for part in split.counts():
+        for path in manifest.part(split, part).column("tactile"):
+            match = re.fullmatch(pattern, path)
+            if match is None:
+                must = "The lists of this data set need tactile images in its folders"
+                raise PalpateError(must, path, "Write the split file alone")
+            lists[part].append([convert(name) for name in match.groups()])
+    write_json(file, lists)
+    return [file]

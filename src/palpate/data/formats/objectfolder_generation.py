@@ -1,0 +1,128 @@
+"""The cross-generation benchmark of ObjectFolder-Real (Gao et al., CVPR 2023), of 50 objects.
+
+::
+
+    root/
+      touch/<object>/<contact>.png   vision/<object>/<contact>.png
+      touch_ref/touch_ref.png        the untouched gel, one for all
+      vision_ref/<object>.png        not imported
+      *.json                         {"train|val|test": [[object, contact], ..]}
+
+The contacts of an object are in no order of time, so ``video`` and ``frame`` are null and the
+object is the group. One list gives the split ``Orig``; several (cross-contact, cross-object) give
+one split each, named as the file. Cross-contact shares every object between train and test.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.data.formats.base import Facts, Format, Scan
+from palpate.data.formats.layout import (
+    assign,
+    is_pair_list,
+    named,
+    natural,
+    paired,
+    read_json_file,
+    read_pairs,
+    require_folder,
+    subfolders,
+    write_pairs,
+)
+from palpate.data.formats.objectfolder import CITATION, LICENSE, SENSOR
+from palpate.data.formats.objectfolder import FACTS as OBJECTFOLDER
+from palpate.data.manifest import Manifest
+
+FACTS = Facts(
+    name="ObjectFolder-Real, visuo-tactile cross-generation",
+    citation=CITATION,
+    license=LICENSE,
+    url="https://github.com/objectfolder/visuo-tactile-cross-generation",
+    sensor=OBJECTFOLDER.sensor,
+    samples="50,000 pairs: 1,000 of each of 50 objects (stated by the benchmark)",
+    group="object; cross-contact shares every object, cross-object none",
+    group_column="object",
+)
+LOOKS_FOR = "touch/, vision/ and touch_ref/ or vision_ref/"
+BACKGROUND = "touch_ref/touch_ref.png"
+
+
+def detect(source: Path) -> bool:
+    """Whether both sides and a folder of references are there."""
+    folders = set(subfolders(source))
+    return {"touch", "vision"} <= folders and not folders.isdisjoint({"touch_ref", "vision_ref"})
+
+
+def scan(source: Path, *, progress: Progress = quiet) -> Scan:
+    """Pair the images of the benchmark.
+
+    Args:
+        source: the folder with ``touch/`` and ``vision/``.
+        progress: called with the number of objects read.
+
+    Raises:
+        PalpateError: if a side is missing.
+    """
+    root = require_folder(source, FACTS.name)
+    sides = {side: subfolders(root / side) for side in ("touch", "vision")}
+    if empty := [side for side, objects in sides.items() if not objects]:
+        must = f"{root} must hold {LOOKS_FOR}"
+        raise PalpateError(must, f"no objects in {empty[0]}/", f"See {FACTS.url}")
+    result = Scan(root, {"layout": "cross-generation benchmark", "text_source": "none"})
+    background = BACKGROUND if (root / BACKGROUND).exists() else None
+    if background is None:
+        result.suspect("touch_ref", "no-background", "no touch_ref.png, so no backgrounds")
+    ids: dict[tuple[str, str], str] = {}
+    objects = sorted({*sides["touch"], *sides["vision"]}, key=natural)
+    for done, name in enumerate(objects):
+        progress("reading objects", done, len(objects))
+        tactile, vision = (named(result, f"{side}/{name}") for side in ("touch", "vision"))
+        ids |= {(name, contact): f"{name}/{contact}" for contact in tactile.files}
+        for contact in paired(result, tactile, vision):
+            row = {
+                "id": ids[name, contact],
+                "object": name,
+                "vision": vision.path(contact),
+                "tactile": tactile.path(contact),
+                "background": background,
+                "sensor": SENSOR,
+            }
+            result.rows.append((tactile.path(contact), row))
+    _read_lists(result, ids)
+    return result
+
+
+def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
+    """Write ``split.json``, ``{"train": [[object, contact], ..], ..}``, integers as such.
+
+    Raises:
+        PalpateError: if a tactile image is not in ``touch/<object>/``.
+    """
+
+    def convert(name: str) -> int | str:
+        return int(name) if name.isdecimal() and str(int(name)) == name else name
+
+    pattern = r"touch/([^/]+)/([^/]+)\.\w+"
+    return write_pairs(manifest, split, Path(folder) / "split.json", pattern, convert)
+
+
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
+
+
+def _read_lists(result: Scan, ids: dict[tuple[str, str], str]) -> None:
+    """The parts of every JSON list at the root."""
+    lists: dict[Path, dict[str, list[Any]]] = {}
+    for path in sorted(result.base.glob("*.json")):
+        data = read_json_file(result, path)
+        if is_pair_list(data):
+            lists[path] = data
+        elif data is not None:
+            text = 'skipped, as not {"train|val|test": [[object, contact], ..]}'
+            result.suspect(path, "unknown-file", text)
+    for path, data in lists.items():
+        pairs = [(pair, (pair.first, pair.second)) for pair in read_pairs(result, path, data)]
+        name = "Orig" if len(lists) == 1 else path.stem
+        result.splits[name] = assign(result, path, pairs, ids)

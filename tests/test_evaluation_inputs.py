@@ -1,0 +1,346 @@
+"""What can be scored: every kind of source gives the same samples; ids, labels and groups are aligned by id."""
+
+import json
+import pickle
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from PIL import Image
+
+from palpate.core import FeatureSet, PalpateError, Split
+from palpate.data.manifest import Manifest
+from palpate.evaluation.embedding_files import read_embeddings
+from palpate.evaluation.inputs import read, read_inputs
+from score_calls import paint
+
+N = 4
+ROWS = ["v0/1", "007", 'odd "name", [x]', "grün"]
+MATERIALS, VIDEO = ["Wood", "Wood", "Brick", ""], ["v0", "v0", "v1", "v1"]
+X = np.random.default_rng(0).normal(size=(N, 3)).astype(np.float32)
+
+
+def safetensors(path: Path, x: np.ndarray, kind: str, metadata=None, **entry) -> Path:
+    """A .safetensors file by its specification, independent of the reader."""
+    data = x.tobytes()
+    described = {"dtype": kind, "shape": list(x.shape), "data_offsets": [0, len(data)], **entry}
+    text = json.dumps({"features": described, "__metadata__": metadata or {}}).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + data)
+    return path
+
+
+def write(folder: Path, kind: str) -> Path:
+    path = folder / f"x.{kind.split('-')[0]}"
+    columns = {"ids": ROWS, "labels": MATERIALS, "groups": VIDEO}
+    if kind == "npz":
+        FeatureSet(ROWS, X, MATERIALS, VIDEO, "e" * 64).save(path)
+    elif kind == "safetensors":
+        metadata = {n: json.dumps(c) for n, c in columns.items()} | {"encoder": "e" * 64}
+        safetensors(path, X, "F32", metadata)
+    else:
+        names = ("material", "video") if kind == "parquet-list" else ("label", "group")
+        schema = {"features": pl.List(pl.Float32)} if kind == "parquet-list" else {}
+        values = {"features": X.tolist()} if schema else {f"f{k}": X[:, k] for k in (2, 0, 1)}
+        table = {"id": ROWS, **dict(zip(names, (MATERIALS, VIDEO), strict=True)), **values}
+        frame = pl.DataFrame(table, schema_overrides=schema)
+        frame.write_parquet(path, metadata={"encoder": "e" * 64})
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npz", "safetensors", "parquet-list", "parquet-columns"])
+def test_every_kind_of_file_gives_the_same_embeddings(tmp_path, kind):
+    samples = read(write(tmp_path, kind), "x")
+    assert (samples.ids, samples.labels, samples.groups) == (ROWS, MATERIALS, VIDEO)
+    assert (samples.encoder, samples.numbered, samples.features.dtype) == ("e" * 64, False, "f4")
+    assert np.array_equal(samples.features, X)
+
+
+@pytest.mark.parametrize("kind", ["tensor", "list", "polars", "pandas", "FeatureSet"])
+def test_every_kind_of_object_gives_the_same_embeddings(kind):
+    table = {"id": ROWS, "features": X.tolist(), "material": MATERIALS, "video": VIDEO}
+    if kind == "tensor":
+        source = pytest.importorskip("torch").from_numpy(X).requires_grad_()
+    elif kind == "pandas":
+        source = pytest.importorskip("pandas").DataFrame(table)
+    else:
+        source = {
+            "list": [list(map(float, row)) for row in X],
+            "polars": pl.DataFrame(table),
+            "FeatureSet": FeatureSet(ROWS, X, MATERIALS, VIDEO),
+        }[kind]
+    samples = read(source, "x")
+    assert np.allclose(samples.features, X, atol=1e-7)
+    known = (ROWS, MATERIALS, VIDEO) if kind not in ("tensor", "list") else (list("0123"), None, None)
+    assert (samples.ids, samples.labels, samples.groups) == known
+
+
+@pytest.mark.parametrize("kind", ["folder", "files", "PIL", "uint8", "tensor", "frame", "manifest"])
+def test_every_kind_of_source_gives_the_same_images(tmp_path, kind):
+    folder = tmp_path / "real"
+    images = np.stack([*paint(folder, ["a", "b", "c"], 0).values()])
+    paths = [folder / f"{n}.png" for n in "abc"]
+    rows = [{"id": n, "tactile": f"{n}.png"} for n in "abc"]
+    source = {
+        "folder": lambda: folder,
+        "files": lambda: paths,
+        "PIL": lambda: [Image.open(p) for p in paths],
+        "uint8": lambda: images,
+        "tensor": lambda: pytest.importorskip("torch").from_numpy(images / 255).permute(0, 3, 1, 2),
+        "frame": lambda: pl.DataFrame({"id": list("abc"), "tactile": list(map(str, paths))}),
+        "manifest": lambda: Manifest.from_rows(rows, folder),
+    }[kind]()
+    samples = read(source, "x")
+    assert samples.numbered == (kind in ("PIL", "uint8", "tensor"))
+    assert samples.ids == (list("012") if samples.numbered else list("abc"))
+    assert samples.side == 32
+    assert np.array_equal(samples.pixels(32, tmp_path, lambda *_: None), images)
+
+
+def test_half_precision_is_widened_and_named(tmp_path):
+    upper = (X.view(np.uint32) >> 16).astype(np.uint16)  # what bfloat16 keeps
+    wide = read_embeddings(safetensors(tmp_path / "x.safetensors", upper, "BF16"))
+    assert wide.widened == "bfloat16"
+    assert np.array_equal(wide.features.view(np.uint32), X.view(np.uint32) & 0xFFFF0000)
+    np.save(tmp_path / "x.npy", X.astype(np.float16))
+    wide = read_embeddings(tmp_path / "x.npy")
+    assert (wide.widened, wide.features.dtype) == ("float16", np.float32)
+    np.save(tmp_path / "y.npy", X)
+    assert isinstance(read(tmp_path / "y.npy", "y").features, np.memmap)
+
+
+def test_files_of_the_safetensors_package_are_read(tmp_path):
+    numpy = pytest.importorskip("safetensors.numpy")
+    tensors = {"other": np.ones(5), "features": X.astype(np.float64)}
+    numpy.save_file(tensors, tmp_path / "b.safetensors", {"ids": json.dumps(ROWS)})
+    embeddings = read_embeddings(tmp_path / "b.safetensors")
+    assert (embeddings.ids, embeddings.labels) == (ROWS, None)
+    assert np.array_equal(embeddings.features, X.astype(np.float64))
+
+
+def test_no_pickle_is_ever_loaded(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "exploded",))
+
+    np.save(tmp_path / "x.npy", np.array([Bomb()], dtype=object), allow_pickle=True)
+    np.savez(tmp_path / "x.npz", features=np.array([Bomb()], dtype=object))
+    for name in ("x.pkl", "raw.npy"):
+        (tmp_path / name).write_bytes(pickle.dumps(Bomb()))
+    for name in ("x.npy", "x.npz", "x.pkl", "raw.npy"):
+        with pytest.raises(PalpateError, match="pickle"):
+            read(tmp_path / name, "x")
+    assert not (tmp_path / "exploded").exists()
+
+
+def damaged(folder: Path) -> list[str]:
+    """Files that are no embeddings; their names."""
+    contents = {
+        "short.safetensors": b"\x00\x01",
+        "huge.safetensors": (1 << 60).to_bytes(8, "little") + b"{}",
+        "text.safetensors": (4).to_bytes(8, "little") + b"oops",
+        "cut.npz": b"PK\x03\x04 cut",
+        "cut.npy": b"\x93NUMPY\x01\x00",
+        "no.parquet": b"PAR1 nothing",
+        "empty.npy": b"",
+        "x.txt": b"1 2 3",
+    }
+    for name, data in contents.items():
+        (folder / name).write_bytes(data)
+    entries = {
+        "beyond": {"data_offsets": [0, 4800], "shape": [400, 3]},
+        "size": {"shape": [4, 4]},
+        "negative": {"shape": [-4, -3]},
+        "start": {"data_offsets": [-8, 40]},
+        "kind": {"dtype": "I32"},
+        "rows": {"shape": [0, 3], "data_offsets": [0, 0]},
+    }
+    for name, entry in entries.items():
+        safetensors(folder / f"{name}.safetensors", X, "F32", **entry)
+    for name, metadata in {"ids": {"ids": '{"a": 1}'}, "about": {"ids": "[1"}}.items():
+        safetensors(folder / f"{name}.safetensors", X, "F32", metadata)
+    np.savez(folder / "foreign.npz", x=X)
+    np.savez(folder / "repeated.npz", features=X, ids=np.array(["a", "a", "b", "c"]))
+    np.savez(folder / "length.npz", features=X, ids=np.array(["a", "b"]))
+    np.savez_compressed(folder / "secret.npz", features=X)
+    data = bytearray((folder / "secret.npz").read_bytes())
+    data[6] = data[data.index(b"PK\x01\x02") + 8] = 1  # marked as encrypted
+    (folder / "secret.npz").write_bytes(data)
+    assert zipfile.is_zipfile(folder / "secret.npz")
+    arrays = {"integers": np.arange(6).reshape(2, 3), "flat": np.zeros(4, np.float32)}
+    arrays |= {"none": np.zeros((0, 3), np.float32), "wide": np.zeros((3, 0), np.float32)}
+    for name, array in arrays.items():
+        np.save(folder / f"{name}.npy", array)
+    two = {"id": ["a", "b"]}
+    tables = {
+        "gap": {**two, "f0": [1.0, 2.0], "f2": [1.0, 2.0]},
+        "ragged": {**two, "features": [[1.0, 2.0], [1.0]]},
+        "null": {**two, "features": [[1.0, 2.0], None]},
+        "hole": {**two, "f0": [1.0, None]},
+        "noid": {"features": [[1.0, 2.0]]},
+        "binary": {"id": [b"\xff", b"a"], "features": [[1.0], [1.0]]},
+    }
+    for name, table in tables.items():
+        pl.DataFrame(table).write_parquet(folder / f"{name}.parquet")
+    names = [*contents, *(f"{n}.safetensors" for n in (*entries, "ids", "about"))]
+    names += [f"{n}.npz" for n in ("foreign", "repeated", "length", "secret")]
+    return names + [f"{n}.npy" for n in arrays] + [f"{n}.parquet" for n in tables]
+
+
+def test_damaged_and_foreign_files_are_named(tmp_path):
+    for name in [*damaged(tmp_path), "absent.npy"]:
+        with pytest.raises(PalpateError, match=name.replace(".", r"\.")):
+            read(tmp_path / name, "x")
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        (np.zeros((2, 3), int), "floats"),
+        (np.full((2, 4, 4, 3), 2.0), r"floats in \[0, 1\]"),
+        (["a", "b"], "nothing at a"),
+        (3, "shape"),
+        (np.zeros((0, 4, 4, 3), np.uint8), "There must be samples"),
+    ],
+)
+def test_other_objects_are_rejected(source, words):
+    with pytest.raises(PalpateError, match=words):
+        aligned(source, X)
+
+
+def aligned(generated, reference, **keywords):
+    options = {"names": None, "labels": None, "groups": None, "group": "auto", "split": None}
+    return read_inputs(generated, reference, reserved=("reference",), **options | keywords)
+
+
+def sets(ids=ROWS, labels=None, groups=None) -> FeatureSet:
+    return FeatureSet(ids, X[: len(ids)], labels, groups)
+
+
+TABLE = pl.DataFrame({"id": ROWS, "material": list("abab"), "video": list("wwxx"), "contact": list("0123")})
+
+
+@pytest.mark.parametrize(
+    ("keywords", "labels", "groups", "kind"),
+    [
+        ({"labels": TABLE}, list("abab"), list("wwxx"), "video"),
+        ({"labels": TABLE, "group": "contact"}, list("abab"), list("0123"), "contact"),
+        ({"groups": TABLE.select("id", "contact"), "group": "contact"}, MATERIALS, list("0123"), "contact"),
+        ({"groups": TABLE.select("id", group="contact")}, MATERIALS, list("0123"), "group"),
+        ({"labels": dict(zip(ROWS, "wxyz", strict=True))}, list("wxyz"), VIDEO, "video"),
+        ({"labels": TABLE.select("id", "material"), "groups": TABLE}, list("abab"), list("wwxx"), "video"),
+        ({}, MATERIALS, VIDEO, "video"),
+    ],
+)
+def test_labels_and_groups_come_from_the_keywords_then_the_source_then_the_reference(
+    keywords, labels, groups, kind
+):
+    inputs = aligned(sets(), sets(ROWS, MATERIALS, VIDEO), **keywords)
+    for samples in (inputs.reference, *inputs.generators.values()):
+        assert (samples.labels, samples.groups) == (labels, groups)
+    assert inputs.group == kind
+
+
+def test_files_of_labels_give_ids_to_rows_without(tmp_path):
+    TABLE.write_csv(tmp_path / "c.csv")
+    TABLE.write_parquet(tmp_path / "c.parquet")
+    for file in ("c.csv", "c.parquet"):
+        inputs = aligned(X, X, labels=tmp_path / file)
+        assert inputs.generators["generated"].ids == inputs.reference.ids == ROWS
+        assert inputs.reference.groups == list("wwxx")
+    inputs = aligned(X, X, labels=list("abab"), groups=list("wwxx"))
+    assert (inputs.reference.labels, inputs.reference.groups) == (list("abab"), list("wwxx"))
+
+
+@pytest.mark.parametrize(
+    ("generated", "keywords", "words"),
+    [
+        (sets(), {"group": "contact"}, "`group` must be known for every input. Got 'contact' and video"),
+        (sets(ROWS[:3] + ["x"]), {}, "gives labels and groups by id. Got 1 of 4 without, first 'x'"),
+        (sets(), {"labels": TABLE[:3]}, "Got 1 of 4 of .* without, first 'grün'"),
+        (sets(), {"labels": TABLE.with_columns(id=pl.lit("z"))}, "must occur once"),
+        (sets(), {"labels": {"z": "m"}}, "must hold ids of the samples"),
+        (sets(), {"labels": TABLE.select("material")}, "must have a column id"),
+        (sets(), {"groups": TABLE, "group": "object"}, "must have a column id, and object"),
+        (sets(), {"labels": "absent.csv"}, "absent.csv must be a CSV or Parquet file"),
+        (X[:3], {"labels": TABLE}, "as many rows"),
+        (sets(list("abcd"), None, VIDEO), {"groups": TABLE.select("id", "contact"), "group": "contact"}, "known for every"),
+        (sets(list("abcd"), None, VIDEO), {"groups": TABLE.select("id", group="contact")}, "one kind"),
+        (np.ones((3, 5)), {}, "one width. Got 5 and 3"),
+        (FeatureSet(ROWS, X, None, None, "f" * 64), {}, "one encoder"),
+        (np.zeros((2, 8, 8, 3), np.uint8), {}, "both be images, or both embeddings"),
+        ([sets(), sets()], {"names": ["a"]}, "`names` must name every generator. Got 1 for 2"),
+        ([sets(), sets()], {"names": ["a", "a"]}, "must differ"),
+        ({"reference": sets()}, {}, "`names` must not be 'reference'"),
+        ([], {}, "`generated` must hold something"),
+    ],
+)  # fmt: skip
+def test_what_is_known_of_some_samples_only_is_an_error(generated, keywords, words):
+    reference = FeatureSet(ROWS, X, MATERIALS, VIDEO, "e" * 64)
+    with pytest.raises(PalpateError, match=words):
+        aligned(generated, reference, **keywords)
+
+
+def test_a_split_selects_the_test_part_of_every_set():
+    split = Split.from_ids(train=ROWS[:2], test=ROWS[2:], rule={"group": "contact"}, manifest="m" * 64)
+    inputs = aligned({"all": sets(), "own": sets(list("abcd"))}, sets(ROWS, MATERIALS), split=split)
+    assert inputs.reference.ids == inputs.generators["all"].ids == ROWS[2:]
+    assert (inputs.train.ids, inputs.group) == (ROWS[:2], "contact")
+    assert inputs.generators["own"].ids == list("abcd")  # ids of its own cannot be parted
+    [note] = inputs.notes
+    assert (note.code, note.params["skipped"]) == ("outside-test-part", 2)
+    with pytest.raises(PalpateError, match=r"every sample of the split's test part\. Got 1 of 2 missing"):
+        aligned({"some": sets(ROWS[:3])}, sets(), split=split)
+    with pytest.raises(PalpateError, match="must go with a reference that has ids"):
+        aligned(X, X, split=split)
+
+
+def test_images_pair_by_relative_name_whatever_the_suffix(tmp_path):
+    names = ["a/1", "b [x]/1", "grün/\n1", "b/x.y"]
+    paint(tmp_path / "real", names, 0, ".bmp")
+    paint(tmp_path / "made", [*reversed(names)], 1)
+    paint(tmp_path / "made", [".hidden/1"], 1)
+    inputs = aligned(tmp_path / "made", tmp_path / "real")
+    assert sorted(inputs.generators["made"].ids) == sorted(inputs.reference.ids) == sorted(names)
+    listed = Manifest.from_rows([{"id": f"{n}.bmp", "tactile": f"{n}.bmp"} for n in names], tmp_path / "real")
+    inputs = aligned(tmp_path / "made", listed)
+    assert sorted(inputs.generators["made"].ids) == sorted(listed.ids)
+    paint(tmp_path / "made", ["a/1"], 2, ".bmp")
+    with pytest.raises(PalpateError, match=r"differ in name, suffixes aside\. Got 'a/1\.bmp' and 'a/1\.png'"):
+        aligned(tmp_path / "made", listed)
+
+
+def test_images_take_videos_and_materials_of_the_reference_by_id(tmp_path):
+    rows = [{"id": i, "tactile": "x", "video": i[0], "material": i[0].upper()} for i in ("c/1", "a/0", "b/1")]
+    real = Manifest.from_rows(rows, tmp_path)
+    paint(tmp_path / "made", ["a/0", "b/1"], 0)
+    samples = aligned(tmp_path / "made", real).generators["made"]
+    assert (samples.ids, samples.groups, samples.labels) == (["a/0", "b/1"], ["a", "b"], ["A", "B"])
+
+
+@pytest.mark.parametrize("name", ["1.png", "../../real/1.png", "/etc/hostname"])
+def test_a_folder_of_generate_may_not_name_files_outside_it(tmp_path, name):
+    pytest.importorskip("torch")
+    paint(tmp_path / "out" / "images", ["1"], 1)
+    index = {"format": "palpate-generated/1", "complete": True, "settings": {"split": "s"}, "digest": ""}
+    index |= {"notice": "", "skipped": [], "images": {"a": name}}
+    (tmp_path / "out" / "index.json").write_text(json.dumps(index))
+    if name == "1.png":
+        samples = read(tmp_path / "out", "x")
+        assert (samples.ids, samples.generator) == (["a"], {"split": "s"})
+    else:
+        with pytest.raises(PalpateError, match="must lie in images/"):
+            read(tmp_path / "out", "x")
+
+
+def test_paths_that_are_not_utf8_are_rejected(tmp_path):
+    odd = tmp_path / "p\udcff"
+    try:
+        odd.mkdir()
+    except (OSError, UnicodeError):
+        pytest.skip("file names of this system are UTF-8")
+    with pytest.raises(PalpateError, match="Paths of images must be UTF-8"):
+        read(odd, "x")
+    np.save(odd / "x.npy", X)
+    assert aligned(odd / "x.npy", X).generators.keys() == {"x"}
