@@ -1,6 +1,8 @@
 """The public face of palpate.metrics: names, signatures, and what every function takes."""
 
 import inspect
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from palpate import metrics
 from palpate.core import FeatureSet, PalpateError
 from palpate.metrics import cmmd, fid, kid, prdc, precision_recall, tmmd
+from palpate.report.notes import SENTENCES
 
 ROWS = "ids=None, groups=None, reference_ids=None, reference_groups=None, encoder=None"
 ONE_SET = "generated, *, ids=None, labels=None, groups=None, encoder=None, **options"
@@ -138,3 +141,11 @@ def test_precision_and_recall_are_the_first_two_of_prdc():
     x, y = sets()
     assert [s.metric for s in precision_recall(x, y)] == ["Precision", "Recall"]
     assert precision_recall(x, y, 5) == prdc(x, y)[:2]
+
+
+def test_every_note_has_a_sentence():
+    folder = Path(metrics.__file__).parent
+    source = "".join(path.read_text(encoding="utf-8") for path in folder.glob("*.py"))
+    codes = set(re.findall(r'Note\(\s*"([a-z-]+)"', source))
+    assert len(codes) > 10
+    assert codes - set(SENTENCES) == set()

@@ -213,25 +213,23 @@ def measure_contacts(
     generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
 ) -> Contacts:
     """Every contact metric of each pair; arguments and errors as :func:`contact_scores`."""
-    pairs = _ContactPairs.of(generated, reference, background, **options)
-    n = len(pairs.reference)
+    pairs, real, markers, least = checked = _checked(generated, reference, background, **options)
+    n = len(real)
     values, empty = ({name: np.full(n, np.nan) for name in METRICS} for _ in range(2))
     energy, area = np.full(n, np.nan), np.zeros(n)
-    for contact in pairs:
-        i = contact.index
-        generated_mask = mask_of(*pairs.generated[i], pairs.least)[0]
-        overlap = (contact.mask & generated_mask).sum() / (contact.mask | generated_mask).sum()
-        row = _compare(contact.generated, contact.reference, contact.kept)
-        gel = _compare(np.zeros_like(contact.reference), contact.reference, contact.kept)
+    for i, x, y, kept, mask in _in_contact(*checked):
+        generated_mask = mask_of(*pairs[i], least)[0]
+        row = {"contact IoU": (mask & generated_mask).sum() / (mask | generated_mask).sum()}
+        row |= _compare(x, y, kept)
+        gel = {"contact IoU": 0.0} | _compare(np.zeros_like(y), y, kept)
         for metric in METRICS:
-            values[metric][i] = row.get(metric, overlap)
-            empty[metric][i] = gel.get(metric, 0.0)
-        energy[i], area[i] = row["per_real_energy"], contact.mask.mean()
+            values[metric][i], empty[metric][i] = row[metric], gel[metric]
+        energy[i], area[i] = row["per_real_energy"], mask.mean()
     given = options.get("generated_background") is not None
     settings = {
-        "markers": pairs.markers,
-        "least": round(float(pairs.least), 6),
-        "size": pairs.reference.size,
+        "markers": markers,
+        "least": round(float(least), 6),
+        "size": real.size,
         "generated_background": "own" if given else "real",
         "background": background_digest(background),
     }
@@ -257,61 +255,49 @@ def contact_images(
     generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
 ) -> ContactImages:
     """The contact of each pair as images; arguments and errors as :func:`contact_scores`."""
-    pairs = _ContactPairs.of(generated, reference, background, **options)
-    shape = pairs.reference.reference.pixels.shape
-    images = ContactImages(
-        np.full(shape, 0.5, np.float32), np.full(shape, 0.5, np.float32), np.zeros(shape[:3], bool)
-    )
-    for contact in pairs:
-        i, kept = contact.index, contact.kept
-        images.mask[i] = kept
-        images.generated[i][kept] = np.clip(0.5 + contact.generated[kept], 0, 1)
-        images.reference[i][kept] = np.clip(0.5 + contact.reference[kept], 0, 1)
-    return images
+    checked = _checked(generated, reference, background, **options)
+    shape = checked[1].reference.pixels.shape
+    images = [np.full(shape, 0.5, np.float32) for _ in range(2)]
+    masks = np.zeros(shape[:3], bool)
+    for i, x, y, kept, _ in _in_contact(*checked):
+        masks[i] = kept
+        for image, difference in zip(images, (x, y), strict=True):
+            image[i][kept] = np.clip(0.5 + difference[kept], 0, 1)
+    return ContactImages(images[0], images[1], masks)
 
 
-@dataclass(frozen=True)
-class _Contact:
-    """One pair: differences (h, w, c), the pixels to compare (h, w), and the whole real mask."""
+def _checked(
+    generated: Any,
+    reference: Any,
+    background: Any,
+    *,
+    generated_background: Any = None,
+    markers: Markers = "skip",
+    least: float = LEAST,
+) -> tuple[Pairs, Pairs, Markers, float]:
+    """Generated and real images, each with its background; errors as :func:`contact_scores`."""
+    checked_choice("markers", markers, ("skip", "keep"))
+    check_least(least)
+    real = image_pairs(reference, background, arguments=("reference", "background"))
+    require_side(real.size, WINDOW, "contact metrics")
+    image_pairs(generated, reference)
+    if generated_background is None:
+        return image_pairs(generated, background), real, markers, least
+    names = ("generated", "generated_background")
+    return image_pairs(generated, generated_background, arguments=names), real, markers, least
 
-    index: int
-    generated: Array
-    reference: Array
-    kept: Mask
-    mask: Mask
 
-
-@dataclass(frozen=True)
-class _ContactPairs:
-    """Checked tactile images with their backgrounds; iterates over the pairs that show contact."""
-
-    generated: Pairs
-    reference: Pairs
-    markers: Markers
-    least: float
-
-    @classmethod
-    def of(
-        cls, generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
-    ) -> _ContactPairs:
-        markers, least = options.get("markers", "skip"), options.get("least", LEAST)
-        checked_choice("markers", markers, ("skip", "keep"))
-        check_least(least)
-        real = image_pairs(reference, background, arguments=("reference", "background"))
-        require_side(real.size, WINDOW, "contact metrics")
-        image_pairs(generated, reference)
-        gel = options.get("generated_background")
-        names = ("generated", "background" if gel is None else "generated_background")
-        pairs = image_pairs(generated, background if gel is None else gel, arguments=names)
-        return cls(pairs, real, markers, least)
-
-    def __iter__(self) -> Iterator[_Contact]:
-        pairs = zip(self.generated, self.reference, strict=True)
-        for i, ((x, x_gel), (y, y_gel)) in enumerate(pairs):
-            mask, markers = mask_of(y, y_gel, self.least)
-            kept = mask & ~markers if self.markers == "skip" else mask
-            if kept.any():
-                yield _Contact(i, x - x_gel, y - y_gel, kept, mask)
+def _in_contact(
+    generated: Pairs, reference: Pairs, markers: Markers, least: float
+) -> Iterator[tuple[int, Array, Array, Mask, Mask]]:
+    """Of every pair that shows contact: its number, the two differences (h, w, c) to the
+    background, the pixels to compare and the whole real mask (h, w).
+    """
+    for i, ((x, x_gel), (y, y_gel)) in enumerate(zip(generated, reference, strict=True)):
+        mask, near_marker = mask_of(y, y_gel, least)
+        kept = mask & ~near_marker if markers == "skip" else mask
+        if kept.any():
+            yield i, x - x_gel, y - y_gel, kept, mask
 
 
 def _compare(x: Array, y: Array, kept: Mask) -> dict[str, float]:

@@ -374,21 +374,24 @@ def _infinity(sets: Sequence[_Parted], count: int, value: float, seed: int) -> f
 
 @dataclass(frozen=True)
 class _Parts:
-    """Rows of both sets in ``count`` blocks of whole units.
+    """Rows of both sets in blocks of whole units.
 
     Attributes:
         block: the block of every row, (n,) and (m,).
-        count: number of blocks.
+        names: of the blocks; a block that is one group has its name.
         unit: ``"group"`` or ``"row"``.
         units: how many of them there are.
-        names: of the blocks; a block that is one group has its name.
     """
 
     block: tuple[Index, Index]
-    count: int
+    names: Sequence[str]
     unit: str
     units: int
-    names: Sequence[str]
+
+    @property
+    def count(self) -> int:
+        """Number of blocks."""
+        return len(self.names)
 
     @property
     def left_out(self) -> str:
@@ -398,12 +401,12 @@ class _Parts:
     @property
     def method(self) -> str:
         """The interval method, in words."""
-        what = f"leave-one-{self.left_out}-out jackknife"
+        blocks = ""
         if self.unit == "row":
-            what += f", {self.count} random blocks of rows, taken as independent"
+            blocks = f", {self.count} random blocks of rows, taken as independent"
         elif self.left_out == "block":
-            what += f", {self.count} random blocks of whole groups ({self.units} groups)"
-        return f"{what}, t, {self.count - 1} df"
+            blocks = f", {self.count} random blocks of whole groups ({self.units} groups)"
+        return f"leave-one-{self.left_out}-out jackknife{blocks}, t, {self.count - 1} df"
 
 
 def _draw_parts(generated: FeatureSet, reference: FeatureSet, most: int, seed: int) -> _Parts:
@@ -412,11 +415,11 @@ def _draw_parts(generated: FeatureSet, reference: FeatureSet, most: int, seed: i
     rng = rng_for(seed, "fid blocks")
     groups = [checked_names("groups", s.groups, len(s.ids)) for s in (generated, reference)]
     if groups[0] is None or groups[1] is None:
-        count = min(most, n, m)
-        drawn = rng.permutation(n) % count, rng.permutation(m) % count
-        return _Parts(drawn, count, "row", n + m, _numbered(count))
+        names = [f"block {b}" for b in range(min(most, n, m))]
+        drawn = rng.permutation(n) % len(names), rng.permutation(m) % len(names)
+        return _Parts(drawn, names, "row", n + m)
     names, unit = np.unique(groups[0] + groups[1], return_inverse=True)
-    units, block, blocks = len(names), np.arange(len(names)), [str(name) for name in names]
+    units, block, names = len(names), np.arange(len(names)), [str(name) for name in names]
     if units > most:
         # the largest group first into the block that has least, ties at random: nearly equal sizes
         counts = [np.bincount(u, minlength=units) / len(u) for u in (unit[:n], unit[n:])]
@@ -424,10 +427,5 @@ def _draw_parts(generated: FeatureSet, reference: FeatureSet, most: int, seed: i
         for u in order[np.argsort(-size[order], kind="stable")]:
             block[u] = int(load.argmin())
             load[block[u]] += size[u]
-        blocks = _numbered(most)
-    drawn = block[unit[:n]], block[unit[n:]]
-    return _Parts(drawn, min(units, most), "group", units, blocks)
-
-
-def _numbered(count: int) -> list[str]:
-    return [f"block {b}" for b in range(count)]
+        names = [f"block {b}" for b in range(most)]
+    return _Parts((block[unit[:n]], block[unit[n:]]), names, "group", units)

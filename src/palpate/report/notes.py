@@ -143,9 +143,6 @@ METRICS: dict[str, Sentence] = {
     ),
     "fid-biased": _fid_biased,
     "fid-difference-biased": "Of FID at this size, whose biases need not be equal",
-    "kid-interval": (
-        "The spread over random subsets that others print with KID is no interval; this one is"
-    ),
 }
 LEAKAGE: dict[str, Sentence] = {}
 
