@@ -53,7 +53,7 @@ def test_folders_without_metadata_are_compared_by_their_pictures(folders, capsys
         "identical sample",
         "identical bytes",
         "near-duplicate vision",
-        "near-duplicate touch",
+        "near-duplicate tactile",
     }
     assert data["group"] == "none"
     assert kinds["identical bytes"]["flagged"] == 1
@@ -83,7 +83,10 @@ def test_a_damaged_picture_is_named_and_the_others_are_compared(folders, capsys)
     assert status == 0
     vision = next(s for s in data["signals"] if s["kind"] == "near-duplicate vision")
     assert (vision["checked"], vision["flagged"]) == (28, 1)
-    assert any("b1.png" in note or "2 " in note for note in vision["notes"])
+    assert any(
+        note["code"] == "images-unreadable" and note["params"]["count"] == 2
+        for note in vision["notes"]
+    )
 
 
 def test_a_page_a_table_and_json_are_written_whole(folders, capsys):
@@ -167,12 +170,12 @@ def test_rows_without_a_video_are_told_and_a_table_is_read_as_it_is(tmp_path, ca
     pl.DataFrame(rows[2:]).write_csv(tmp_path / "b.csv")
     status, data, _ = run(capsys, tmp_path / "a.csv", tmp_path / "b.csv", "--no-images")
     assert (status, data["leaked_fraction"], data["gap_min"]) == (0, 0.5, 2)
-    assert sum("have no video" in note for note in data["notes"]) == 2
+    assert [note["code"] for note in data["notes"]] == ["group-nulls"] * 2
 
 
 def test_touches_of_lists_are_numbered_together(real_data, capsys):
     lists = real_data / "touch_and_go" / "lists"
-    _, data, _ = run(capsys, lists / "train.txt", lists / "test.txt", "--group", "contact")
+    _, data, _ = run(capsys, lists / "train.txt", lists / "test.txt", "--by", "contact")
     assert (data["groups_train"], data["groups_test"], data["groups_shared"]) == (
         3378,
         1113,
@@ -225,7 +228,7 @@ def test_an_impact_that_cannot_be_measured_does_not_lose_the_audit(
         tmp_path / "a.json",
     )
     assert status == 0
-    assert any("could not be measured" in note for note in data["notes"])
+    assert "impact-failed" in [note["code"] for note in data["notes"]]
     assert json.loads((tmp_path / "a.json").read_text())["test_samples"] == 8
     assert not list(tmp_path.glob(".*.work"))
 
@@ -242,12 +245,13 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
         ([one], "TRAIN and TEST"),
         ([one, one, "--split", split], "TRAIN and TEST"),
         ([lines, tmp_path / "gone.txt"], "nothing at"),
-        ([lines, lines, "--impact"], "--impact needs"),
+        ([lines, lines, "--impact"], "--impact needs samples with a split"),
+        ([lines, lines, "--group", "video"], "--by"),
         ([one, "--split", split, "--false-positives", "0.7"], "--false-positives"),
         ([one, "--split", split, "--near-frames", "-1"], "--near-frames"),
         ([one, "--split", split, "--encoder", tmp_path / "none"], "encoders"),
         ([lines, tmp_path / "bad.txt"], "1 problem"),
-        ([one, "--split", split, "--group", "object", "--no-images"], "object"),
+        ([one, "--split", split, "--by", "object", "--no-images"], "object"),
     ]:
         status, _, err = run(capsys, *args)
         assert status == 2, args
@@ -266,7 +270,7 @@ def test_plain_folders_of_pictures_are_photos(folders, capsys):
     shutil.rmtree(folders / "b" / "tactile")
     status, data, _ = run(capsys, folders / "a", folders / "b")
     assert (status, data["leaking_samples"]) == (0, 1)
-    assert any("Only one side has pictures of touch" in note for note in data["notes"])
+    assert {"code": "images-of-one-part", "params": {"modality": "tactile"}} in data["notes"]
     (folders / "empty").mkdir()
     assert run(capsys, folders / "a", folders / "empty")[0] == 2
 

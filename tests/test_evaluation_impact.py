@@ -27,7 +27,7 @@ from palpate.evaluation.impact_scores import (
     tabulate,
     thin,
 )
-from palpate.leakage.splits import leak_free_split
+from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.results import Impact
 
 
@@ -266,7 +266,7 @@ def test_a_run_is_the_explicit_one() -> None:
     assert size == 72
     hits: list[list[float]] = []
     plans = [
-        leak_free_split(manifest, train=72 / 108, group="video", seed=s).split for s in (0, 1, 2)
+        leak_free_split(manifest, train=72 / 108, by="video", seed=s) for s in (0, 1, 2)
     ]
     assert [p.digest for p in plans] == list(found.clean_splits)
     for parts in (split, *plans):
@@ -391,7 +391,7 @@ def test_tactile_minus_background_is_the_difference(small_manifest: Manifest) ->
 
 def test_a_leak_free_split_is_not_charged() -> None:
     manifest = videos(3, 6, 4)
-    split = leak_free_split(manifest, train=0.66, group="video", seed=9).split
+    split = leak_free_split(manifest, train=0.66, by="video", seed=9)
     found = impact(manifest, split, features={"v": one_hot(manifest.column("video"))}, seeds=(0,))
     assert ("shares no video" in found.headline, "worth" in found.headline) == (True, False)
     assert found.rows[0].cost == pytest.approx(0, abs=0.02)

@@ -134,7 +134,7 @@ def test_an_audit_finds_exactly_the_leak_that_the_world_reports(layout, look, le
     truth = {row.pop("id"): row for row in csv.DictReader(lines)}
     assert set(truth) == set(split.ids("test"))
     for group in ("video", "contact", *(["object"] if layout == "frames" else [])):
-        result = audit(imported.manifest, split=split, group=group, images=False)
+        result = audit(imported.manifest, split=split, by=group, images=False)
         shared = sum(int(row[f"{group}_in_train"]) for row in truth.values())
         assert result.test_samples_in_shared_groups == shared
         assert result.groups_shared == counts[f"{group}s_shared"]

@@ -62,6 +62,8 @@ RENAMED: dict[tuple[str, str], str] = {
     ("train generator", "--encoders"): "--clip",
     ("train generator", "--towers"): "--clip",
     ("split", "--group"): "--by",
+    ("audit", "--group"): "--by",
+    ("audit", "--processes"): "--threads",
     ("import", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("validate", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",

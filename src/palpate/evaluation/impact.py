@@ -49,8 +49,8 @@ from palpate.evaluation.impact_scores import (
     tabulate,
     thin,
 )
-from palpate.leakage.audit import GROUPS
-from palpate.leakage.splits import choose_group, leak_free_split
+from palpate.leakage.groups import GROUPS, choose_group
+from palpate.leakage.splitting import split as leak_free_split
 from palpate.metrics.probe import fit_probe
 from palpate.report.results import Impact, ImpactRow
 
@@ -205,8 +205,8 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
         must, fix = "The impact of a leak needs materials", "Fill the manifest's column material"
         raise PalpateError(must, "none in train and test", fix)
     pool = manifest.take([ids[k] for k in rows])
-    column, reason = choose_group(pool) if group == "auto" else (group, "")
-    notes = [Note("text", {"text": reason})] if reason else []
+    column, reason = choose_group(pool) if group == "auto" else (group, None)
+    notes = [reason] if reason else []
     if len(rows) < len(inside):
         notes.append(Note("no-material", {"count": len(inside) - len(rows)}))
     if "val" in split.parts.values():
@@ -220,12 +220,12 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     rows, here, owners, given = _without(excluded, here, rows, here, owners, given)
     share = given.count("train") / len(given)
     kept = manifest.take([ids[k] for k in rows])
-    plans = [leak_free_split(kept, train=share, group=column, seed=s) for s in seeds]
-    parts = [given, *([p.split.parts[i] for i in kept.ids] for p in plans)]
+    plans = [leak_free_split(kept, train=share, by=column, seed=s) for s in seeds]
+    parts = [given, *([p.parts[i] for i in kept.ids] for p in plans)]
     late = _incomparable(here, owners, parts, column)
     rows, here, owners, *parts = _without(late, here, rows, here, owners, *parts)
     excluded |= late
-    digests = [split.digest, *(p.split.digest for p in plans)]
+    digests = [split.digest, *(p.digest for p in plans)]
     splits = [
         _Parts(d, *(np.flatnonzero(np.array(p) == part) for part in ("train", "test")))
         for d, p in zip(digests, parts, strict=True)
@@ -241,7 +241,7 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
         "left_out": excluded,
         **_sizes(splits, owner, material),
     }
-    settings["deviation"] = [round(p.deviation, 5) for p in plans]
+    settings["deviation"] = [round(p.rule["deviation"], 5) for p in plans]
     notes += _qualifications(settings, excluded, len(plans) - len(set(digests[1:])))
     ids = [ids[k] for k in rows]
     return _Design(ids, np.array(rows), material, owner, materials, groups, splits, notes, settings)

@@ -1,4 +1,4 @@
-"""The exact signals of a leak, sample by sample: the same sample, the same bytes, the same group, a near frame.
+"""The exact signals of a leak, sample by sample: same sample, same bytes, same group, near frame.
 
 Each gives every test sample a score in [0, 1] and a flag:
 
@@ -6,35 +6,65 @@ Each gives every test sample a score in [0, 1] and a flag:
 signal               score                                                  flagged
 ===================  =====================================================  ==================
 identical sample     1 if the id, or the video and frame, are in train      score 1
-identical bytes      1 if a picture's file equals one of a train sample     score 1
+identical bytes      1 if an image file equals one of a train sample        score 1
 shared group         1 if the video (object, session ...) is in train       score 1
 time gap             ``2^(-gap / near)``, gap in frames within the video    gap <= near
 ===================  =====================================================  ==================
 
-The pictures' signals, whose thresholds are calibrated on the data, are in ``near``.
+The signals of the images' content, whose thresholds are calibrated, are in ``near``.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import Progress, quiet
+from palpate.core import Note, Progress, quiet
 from palpate.data.images import in_threads
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import MODALITIES, Manifest
 from palpate.report.results import CAUSES, LeakPair, Signal
 
-#: One second of video at 30 frames a second.
-NEAR_FRAMES = 30
-#: Pictures that are compared byte by byte; backgrounds are shared on purpose.
-PICTURES = ("vision", "tactile")
-CHUNK = 1 << 20
+Ints = NDArray[np.int64]
+#: Pairs kept for each cause that is no leak.
+HARMLESS_PAIRS = 3
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """The nearest train frame of the same video.
+
+    Attributes:
+        row: (n,) its row in train; -1 where there is none.
+        frames: (n,) its distance; -1 where there is none.
+    """
+
+    row: Ints
+    frames: Ints
+
+
+def nearest_in_video(train: pl.DataFrame, test: pl.DataFrame) -> Gaps:
+    """For each test row the nearest train row of the same video."""
+    row, gap = np.full(test.height, -1, np.int64), np.full(test.height, -1, np.int64)
+    base, queries = (
+        table.select("video", "frame", frame_of=pl.col("frame"))
+        .with_row_index(name)
+        .drop_nulls()
+        .sort("frame")
+        for table, name in ((train, "train"), (test, "test"))
+    )
+    nearest = queries.join_asof(
+        base, on="frame", by="video", strategy="nearest", check_sortedness=False
+    ).drop_nulls("train")
+    at = nearest["test"].to_numpy()
+    row[at] = nearest["train"].to_numpy()
+    gap[at] = (nearest["frame"] - nearest["frame_of_right"]).abs().to_numpy()
+    return Gaps(row, gap)
 
 
 @dataclass(frozen=True)
@@ -42,267 +72,187 @@ class Flags:
     """One signal over all test samples, in their order.
 
     Attributes:
-        kind: the signal's name, as in :class:`palpate.core.Signal`.
-        score: (n,) in [0, 1]; NaN where the sample could not be looked at.
+        kind: the signal's name, as in :class:`palpate.report.results.Signal`.
+        score: (n,) in [0, 1]; NaN where the sample could not be checked.
         flag: (n,) whether it leaks by this signal.
-        nearest: (n,) row of the train sample that it leaks from, or is most like; -1 where there is none.
+        nearest: (n,) row of the train sample that it leaks from, or is most similar to; -1 for
+            none.
         threshold: score from which a sample is flagged.
-        counts: whether flagged samples count as leaking; a shared group that was not asked about is told but not counted.
-        false_positives, edges, unrelated, found: see :class:`palpate.core.Signal`.
-        cause: (n,) one of ``CAUSES`` or '' where the score is below the threshold; None for exact signals.
-        notes: sentences for people.
+        counts: whether flagged samples count as leaking.
+        false_positives, edges, unrelated, matches: see :class:`palpate.report.results.Signal`.
+        cause: (n,) one of ``CAUSES``, or '' below the threshold; None for exact signals.
+        notes: what a reader must know.
     """
 
     kind: str
     score: NDArray[np.float32]
     flag: NDArray[np.bool_]
-    nearest: NDArray[np.int64]
+    nearest: Ints
     threshold: float = 1.0
     counts: bool = True
     false_positives: float | None = None
     edges: Sequence[float] = ()
     unrelated: Sequence[int] = ()
-    found: Sequence[int] = ()
+    matches: Sequence[int] = ()
     cause: NDArray[np.str_] | None = None
-    notes: Sequence[str] = field(default_factory=list)
-
-    @property
-    def key(self) -> str:
-        """The name of its columns in a table: lower case, words joined by underscores."""
-        return self.kind.replace("-", "_").replace(" ", "_")
+    notes: Sequence[Note] = ()
 
     def columns(self, ids: NDArray[np.object_]) -> dict[str, pl.Series]:
-        """Score, flag, nearest train id and, where there are several, the cause, as table columns."""
-        near = (
-            [str(ids[k]) if k >= 0 else None for k in self.nearest.tolist()]
-            if (self.nearest >= 0).any()
-            else [None] * len(self.flag)
-        )
-        out = {
-            f"{self.key}_score": pl.Series(self.score, dtype=pl.Float32).fill_nan(None),
-            f"{self.key}_flag": pl.Series(self.flag),
-            f"{self.key}_nearest": pl.Series(near, dtype=pl.String),
+        """Score, flag, nearest train id and, where known, the cause, as table columns."""
+        key = self.kind.replace("-", "_").replace(" ", "_")
+        near = [str(ids[k]) if k >= 0 else None for k in self.nearest.tolist()]
+        columns = {
+            f"{key}_score": pl.Series(self.score, dtype=pl.Float32).fill_nan(None),
+            f"{key}_flag": pl.Series(self.flag),
+            f"{key}_nearest": pl.Series(near, dtype=pl.String),
         }
         if self.cause is not None:
-            out[f"{self.key}_cause"] = pl.Series(self.cause.tolist(), dtype=pl.String).replace(
-                "", None
-            )
-        return out
+            causes = pl.Series(self.cause.tolist(), dtype=pl.String)
+            columns[f"{key}_cause"] = causes.replace("", None)
+        return columns
 
-    def summary(
-        self,
-        train: Manifest,
-        test: Manifest,
-        gaps: NDArray[np.int64],
-        rows: NDArray[np.int64],
-        worst: int,
-    ) -> Signal:
-        """The signal as a result; ``gaps`` and ``rows`` are the nearest frames in time, to tell a pair's own gap."""
+    def summary(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> Signal:
+        """The signal as a result."""
         causes: dict[str, int] = {}
         if self.cause is not None:
             causes = {name: n for name in CAUSES if (n := int((self.cause == name).sum()))}
         return Signal(
-            self.kind,
-            int(np.isfinite(self.score).sum()),
-            int(self.flag.sum()),
-            self.threshold,
-            self.false_positives,
-            [float(e) for e in self.edges],
-            [int(n) for n in self.unrelated],
-            [int(n) for n in self.found],
-            causes,
-            self._worst(train, test, gaps, rows, worst),
-            list(self.notes),
-            self.counts,
+            kind=self.kind,
+            checked=int(np.isfinite(self.score).sum()),
+            flagged=int(self.flag.sum()),
+            threshold=self.threshold,
+            false_positives=self.false_positives,
+            edges=list(self.edges),
+            unrelated=list(self.unrelated),
+            matches=list(self.matches),
+            causes=causes,
+            worst=self._worst(train, test, gaps, worst),
+            notes=list(self.notes),
+            counts=self.counts,
         )
 
-    def _worst(
-        self,
-        train: Manifest,
-        test: Manifest,
-        gaps: NDArray[np.int64],
-        rows: NDArray[np.int64],
-        worst: int,
-    ) -> list[LeakPair]:
-        """The strongest pairs, one a group first; where pictures look alike for another cause, a few of those last."""
-        strong = _varied(np.flatnonzero(self.flag & (self.nearest >= 0)), self.score, test, worst)
+    def _worst(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> list[LeakPair]:
+        """The strongest pairs, one a video first; then a few of each cause that is no leak."""
+        paired = self.nearest >= 0
+        chosen = _varied(np.flatnonzero(self.flag & paired), self.score, test, worst)
         if self.cause is not None:
             for name in CAUSES[1:]:
-                strong += _varied(
-                    np.flatnonzero((self.cause == name) & (self.nearest >= 0)),
-                    self.score,
-                    test,
-                    min(3, worst),
-                )
-        pairs: list[LeakPair] = []
-        for k in strong:
-            j = int(self.nearest[k])
-            a, b = test.table.row(k, named=True), train.table.row(j, named=True)
-            known = (
-                a["video"] is not None
-                and a["video"] == b["video"]
-                and None not in (a["frame"], b["frame"])
-            )
-            gap = (
-                abs(int(a["frame"]) - int(b["frame"]))
-                if known
-                else int(gaps[k])
-                if rows[k] == j and gaps[k] >= 0
-                else None
-            )
-            cause = str(self.cause[k]) if self.cause is not None else ""
-            pairs.append(
-                LeakPair(test.ref(a), train.ref(b), gap, round(float(self.score[k]), 4), cause)
-            )
-        return pairs
+                rows = np.flatnonzero((self.cause == name) & paired)
+                chosen += _varied(rows, self.score, test, min(HARMLESS_PAIRS, worst))
+        return [self._pair(train, test, gaps, k) for k in chosen]
+
+    def _pair(self, train: Manifest, test: Manifest, gaps: Gaps, k: int) -> LeakPair:
+        j = int(self.nearest[k])
+        a, b = test.table.row(k, named=True), train.table.row(j, named=True)
+        gap = None
+        if a["video"] == b["video"] and None not in (a["video"], a["frame"], b["frame"]):
+            gap = abs(a["frame"] - b["frame"])
+        cause = str(self.cause[k]) if self.cause is not None else ""
+        score = round(float(self.score[k]), 4)
+        return LeakPair(test.ref(a), train.ref(b), gap, score, cause)
 
 
-def identical_samples(
-    train: Manifest, test: Manifest, gaps: NDArray[np.int64], rows: NDArray[np.int64]
-) -> Flags:
-    """Test samples whose id, or whose video and frame, are in train.
-
-    Args:
-        train: the samples to compare with.
-        test: the samples to judge.
-        gaps: (n,) distance to the nearest train frame of the same video, -1 where there is none.
-        rows: (n,) its row in train.
-    """
+def identical_samples(train: Manifest, test: Manifest, gaps: Gaps) -> Flags:
+    """Test samples whose id, or whose video and frame, are in train."""
     place = {name: k for k, name in enumerate(train.ids)}
     same = np.array([place.get(name, -1) for name in test.ids], np.int64)
-    nearest = np.where(same >= 0, same, np.where(gaps == 0, rows, -1))
+    nearest = np.where(same >= 0, same, np.where(gaps.frames == 0, gaps.row, -1))
     flag = nearest >= 0
     return Flags("identical sample", flag.astype(np.float32), flag, nearest)
 
 
 def shared_group(train: Manifest, test: Manifest, column: str, *, counts: bool) -> Flags | None:
-    """Test samples whose group is in train; None if either side does not know the column at all.
+    """Test samples whose group is in train; None if either part does not know the column at all.
 
-    Rows without a group score NaN: nothing is known of them.
+    Rows without a group score NaN.
     """
     a, b = train.table[column], test.table[column]
     if a.null_count() == len(a) or b.null_count() == len(b):
         return None
-    known = b.is_not_null().to_numpy()
     shared = b.is_in(a.drop_nulls().unique().implode()).fill_null(False).to_numpy()
-    score = np.where(known, shared, np.nan).astype(np.float32)
+    score = np.where(b.is_not_null().to_numpy(), shared, np.nan).astype(np.float32)
     notes = [
-        f"{n} test samples have no {column}: nothing is known of them."
-        for n in [int((~known).sum())]
-        if n
-    ]
-    notes += [
-        f"{n} train samples have no {column}: what they share is not seen."
-        for n in [a.null_count()]
+        Note("signal-nulls", {"count": n, "part": part, "group": column})
+        for part, n in (("test", b.null_count()), ("train", a.null_count()))
         if n
     ]
     if not counts and shared.any():
-        notes.append(
-            f"Told, but not counted as a leak: the {column} is not what this audit was asked to keep apart."
-        )
-    return Flags(
-        f"shared {column}", score, shared, np.full(len(b), -1, np.int64), counts=counts, notes=notes
-    )
+        notes.append(Note("signal-not-counted", {"group": column}))
+    none = np.full(len(b), -1, np.int64)
+    return Flags(f"shared {column}", score, shared, none, counts=counts, notes=notes)
 
 
-def time_gap(
-    gaps: NDArray[np.int64], rows: NDArray[np.int64], near: int = NEAR_FRAMES
-) -> Flags | None:
-    """Nearness in time to the nearest train frame of the same video; None where no test sample has one.
+def time_gap(gaps: Gaps, near: int) -> Flags | None:
+    """Nearness to the nearest train frame of the same video; None where no test sample has one.
 
     Args:
-        gaps: (n,) distance in frames, -1 where there is none.
-        rows: (n,) row of that frame in train.
+        gaps: the nearest train frames.
         near: flagged up to this many frames; the score halves with each further ``near``.
     """
-    if not (gaps >= 0).any():
+    known = gaps.frames >= 0
+    if not known.any():
         return None
-    score = np.where(gaps >= 0, np.exp2(-gaps / max(near, 1)), 0.0).astype(np.float32)
+    score = np.where(known, np.exp2(-gaps.frames / max(near, 1)), 0.0).astype(np.float32)
     return Flags(
         "time gap",
         score,
-        (gaps >= 0) & (gaps <= near),
-        rows,
+        known & (gaps.frames <= near),
+        gaps.row,
         threshold=0.5 if near else 1.0,
-        notes=[f"Flagged up to {near} frames; the score is 2^(-gap/{near})."]
-        if near
-        else ["Flagged at a gap of 0 frames only."],
+        notes=[Note("near-frames", {"frames": near})],
     )
 
 
 def identical_bytes(train: Manifest, test: Manifest, progress: Progress = quiet) -> Flags | None:
-    """Test samples one of whose pictures is, byte for byte, a picture of a train sample; None without pictures on both sides.
+    """Test samples with an image file that is, byte for byte, one of a train sample.
 
-    Only files of equal size are read. Of several equal train files the first row counts.
+    None without images in both parts. Only files of equal size are read. Of several equal train
+    files the first row counts.
     """
-    first: dict[Path, int] = {}
-    for column in PICTURES:
-        for k, name in enumerate(train.column(column)):
-            if name is not None:
-                first.setdefault(train.path(name), k)
-    used = [
-        (k, test.path(name))
-        for column in PICTURES
-        for k, name in enumerate(test.column(column))
-        if name is not None
-    ]
-    sizes = {path: _size(path) for path in {*first, *(path for _, path in used)}}
-    if not first or not any(sizes[path] > 0 for _, path in used):
+    base, queries = _files(train), _files(test)
+    sizes = {path: _size(path) for _, path in (*base, *queries)}
+    if not base or not any(sizes[path] > 0 for _, path in queries):
         return None
-    both = {sizes[p] for p in first} & {sizes[p] for _, p in used} - {-1, 0}
-    doubtful = sorted(p for p, size in sizes.items() if size in both)
-    digests: dict[Path, str | None] = {}
-    for done, (path, value) in enumerate(in_threads(_digest, doubtful), 1):
-        digests[path] = value
-        progress("comparing files", done, len(doubtful))
-    owner: dict[str, int] = {}
-    for path, k in first.items():
-        if (value := digests.get(path)) is not None:
-            owner[value] = min(k, owner.get(value, k))
+    common = {sizes[p] for _, p in base} & {sizes[p] for _, p in queries} - {-1, 0}
+    candidates = sorted(path for path, size in sizes.items() if size in common)
+    digests = dict(in_threads(_digest, candidates, "comparing files", progress))
+    first: dict[str, int] = {}
+    for row, path in sorted(base):
+        if digest := digests.get(path):
+            first.setdefault(digest, row)
     nearest = np.full(len(test), -1, np.int64)
-    seen = np.zeros(len(test), bool)
-    for k, path in used:
-        seen[k] |= sizes[path] >= 0
-        if nearest[k] < 0 and (value := digests.get(path)) is not None:
-            nearest[k] = owner.get(value, -1)
+    checked = np.zeros(len(test), bool)
+    for row, path in queries:
+        checked[row] |= sizes[path] >= 0
+        if nearest[row] < 0:
+            nearest[row] = first.get(digests.get(path) or "", -1)
     flag = nearest >= 0
-    empty = sum(sizes[p] == 0 for p in sizes)
-    notes = [f"{empty} files are empty (0 bytes) and were not compared."] if empty else []
-    return Flags(
-        "identical bytes",
-        np.where(seen, flag, np.nan).astype(np.float32),
-        flag,
-        nearest,
-        notes=notes,
-    )
+    score = np.where(checked, flag, np.nan).astype(np.float32)
+    empty = sum(size == 0 for size in sizes.values())
+    notes = [Note("empty-files", {"count": empty})] if empty else []
+    return Flags("identical bytes", score, flag, nearest, notes=notes)
 
 
 def signal_table(
-    test: Manifest, train: Manifest, found: Sequence[Flags], gaps: NDArray[np.int64]
+    test: Manifest, train: Manifest, flags: Sequence[Flags], gaps: Gaps
 ) -> pl.DataFrame:
-    """Every signal of every test sample: ``id, video, frame, material, leaking, gap`` and the columns of each signal."""
+    """A row for each test sample: ``id, video, frame, material, leaking, gap`` and every signal."""
     ids = np.array(train.ids, object)
-    columns: Mapping[str, pl.Series] = {
-        name: series for flags in found for name, series in flags.columns(ids).items()
-    }
-    gap = pl.Series(gaps).replace(-1, None)
+    columns = {name: series for f in flags for name, series in f.columns(ids).items()}
     return test.table.select("id", "video", "frame", "material").with_columns(
-        leaking=pl.Series(leaking(found, len(test))), gap=gap, **columns
+        leaking=pl.Series(leaking(flags, len(test))),
+        gap=pl.Series(gaps.frames).replace(-1, None),
+        **columns,
     )
 
 
-def leaking(found: Sequence[Flags], count: int) -> NDArray[np.bool_]:
+def leaking(flags: Sequence[Flags], count: int) -> NDArray[np.bool_]:
     """(count,) whether any signal that counts flags the sample."""
-    out = np.zeros(count, bool)
-    for flags in found:
-        if flags.counts:
-            out |= flags.flag
-    return out
+    counted = [f.flag for f in flags if f.counts]
+    return np.any(counted, axis=0) if counted else np.zeros(count, bool)
 
 
-def _varied(
-    rows: NDArray[np.int64], score: NDArray[np.float32], test: Manifest, most: int
-) -> list[int]:
+def _varied(rows: Ints, score: NDArray[np.float32], test: Manifest, most: int) -> list[int]:
     """Up to ``most`` rows by falling score, the best of each video first."""
     order = rows[np.argsort(-score[rows], kind="stable")].tolist()
     videos = test.table["video"]
@@ -311,9 +261,17 @@ def _varied(
         if len(best) >= most:
             break
         best.setdefault(videos[k], k)
-    first = list(best.values())
-    taken = set(first)
-    return [*first, *(k for k in order if k not in taken)][:most]
+    return list(dict.fromkeys([*best.values(), *order]))[:most]
+
+
+def _files(manifest: Manifest) -> list[tuple[int, Path]]:
+    """(row, file) of all images but backgrounds, which are shared on purpose."""
+    return [
+        (row, manifest.path(name))
+        for column in MODALITIES
+        for row, name in enumerate(manifest.column(column))
+        if name is not None
+    ]
 
 
 def _size(path: Path) -> int:
@@ -326,11 +284,8 @@ def _size(path: Path) -> int:
 
 def _digest(path: Path) -> str | None:
     """BLAKE2b of a file's bytes; None if it cannot be read."""
-    found = hashlib.blake2b(digest_size=16)
     try:
         with path.open("rb") as file:
-            while block := file.read(CHUNK):
-                found.update(block)
+            return hashlib.file_digest(file, "blake2b").hexdigest()
     except OSError:
         return None
-    return found.hexdigest()

@@ -7,7 +7,7 @@ template cannot do (plurals, optional parts), the entry is a function of the par
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -144,7 +144,124 @@ METRICS: dict[str, Sentence] = {
     "fid-biased": _fid_biased,
     "fid-difference-biased": "Of FID at this size, whose biases need not be equal",
 }
-LEAKAGE: dict[str, Sentence] = {}
+
+
+def _few(names: Sequence[Any]) -> str:
+    """The first names in brackets, if there are any."""
+    return f" ({'; '.join(map(str, names))})" if names else ""
+
+
+def _rows_skipped(params: Mapping[str, Any], _: Style) -> str:
+    return f"{params['count']} bad rows were skipped{_few(params['problems'][:3])}"
+
+
+def _blank_images(params: Mapping[str, Any], _: Style) -> str:
+    where = {
+        "photo": "",
+        "default": ", a default, since too few backgrounds are known",
+        "video": f", from {params['pairs']} pairs of backgrounds of one video",
+        "similar": f", from {params['pairs']} pairs of backgrounds most similar to each other",
+    }[params["source"]]
+    what = "photos" if params["source"] == "photo" else "tactile images"
+    shows = "nothing at all" if params["source"] == "photo" else "no more than untouched gel does"
+    return (
+        f"{params['count']} of {params['of']} {what} show {shows}"
+        f" (strength under {params['limit']:.2f} gray levels{where})"
+    )
+
+
+def _median_backgrounds(params: Mapping[str, Any], _: Style) -> str:
+    names = {"video": "their video", "sensor": "their sensor", "all": "all frames"}
+    medians = [f"{params[k]} take the median of {name}" for k, name in names.items() if params[k]]
+    return f"Tactile images without a recorded background: {'; '.join(medians)}"
+
+
+def _threshold(params: Mapping[str, Any]) -> str:
+    lowest = " (the lowest that is allowed; the data alone would set it lower)"
+    return f"Threshold {params['threshold']:.3f}{lowest if params['lowest'] else ''} from"
+
+
+def _threshold_other_videos(params: Mapping[str, Any], _: Style) -> str:
+    return (
+        f"{_threshold(params)} the best matches of {params['samples']} samples in other videos, for"
+        f" {params['rate']:.2%} of unrelated samples; {params['over']:.2%} of those lie over it"
+    )
+
+
+def _threshold_random_pairs(params: Mapping[str, Any], _: Style) -> str:
+    return (
+        f"{_threshold(params)} random pairs (in blocks of {params['block']}), carried over to the"
+        f" best of {params['images']} train images, for {params['rate']:.2%} of unrelated samples"
+    )
+
+
+def _near_frames(params: Mapping[str, Any], _: Style) -> str:
+    near = params["frames"]
+    if not near:
+        return "Flagged at a gap of 0 frames only"
+    return f"Flagged up to {near} frames; the score is 2^(-gap/{near})"
+
+
+def _listed(template: str) -> Sentence:
+    """A template whose ``{materials}`` is a list."""
+    return lambda params, _: template.format(
+        **{**params, "materials": ", ".join(params["materials"])}
+    )
+
+
+LEAKAGE: dict[str, Sentence] = {
+    "backgrounds-unreadable": lambda p, _: (
+        f"{p['count']} background images cannot be read{_few(p['files'])}; medians replace them"
+    ),
+    "blank-images": _blank_images,
+    "copies-across-videos": "{count} of {of} are so similar that they are taken for copies across videos and do not set the threshold",
+    "empty-files": "{count} files are empty (0 bytes) and were not compared",
+    "group-few": "There are fewer than {parts} {group}s: whole contacts are kept together instead, and train and test share a {group}",
+    "group-instead": "The manifest knows no videos: the {group} is kept whole",
+    "group-materials": (
+        "Only {enough} of {materials} materials occur in {parts} or more {group}s, too few for the {group} to be the group: whole contacts are"
+        " kept together instead. Train and test then share {group}s, so scores are optimistic for new places"
+    ),
+    "group-near-only": "The manifest knows no videos: near-duplicates alone are kept together",
+    "group-nulls": "{count} {part} samples have no {group}: they cannot be audited by group and count as not shared",
+    "group-of-data-set": "The data set says so: the {group} is kept whole",
+    "images-absent": "{count} of {of} samples have no {modality} image and were not compared",
+    "images-of-one-part": "Only one part has {modality} images: they were not compared",
+    "images-unreadable": lambda p, _: (
+        f"{p['count']} {p['modality']} images cannot be read and were not compared{_few(p['files'])}"
+    ),
+    "impact-failed": "What leaking costs could not be measured: {reason}",
+    "median-backgrounds": _median_backgrounds,
+    "missing-materials": _listed(
+        "Could be in every part, but not together with the others: {materials}"
+    ),
+    "near-frames": _near_frames,
+    "no-group": "Neither videos nor objects, sessions or contacts are known: only samples and images were compared",
+    "no-materials": "No sample has a material: only the sizes of the parts are balanced",
+    "rare-materials": _listed("In fewer than {parts} groups, so not in every part: {materials}"),
+    "rows-skipped": _rows_skipped,
+    "samples-in-no-part": "{count} of {of} samples of the manifest are in no part of the split",
+    "signal-not-counted": "Reported, but not counted as a leak: the audit is not by {group}",
+    "signal-nulls": "{count} {part} samples have no {group}: nothing is known of them",
+    "single-groups": "{count} samples have no {group}: each is a group by itself unless another column or a near-duplicate joins it",
+    "split-of-other-manifest": "The split was made for another manifest (the digests differ)",
+    "threshold-default": lambda p, _: (
+        f"Fewer than {p['fewest']} pairs are known to be unrelated: the threshold {p['threshold']} is a default, not calibrated to {p['rate']:.2%}"
+    ),
+    "threshold-few-videos": "Train has too few samples of two known videos to measure how similar unrelated images are",
+    "threshold-other-videos": _threshold_other_videos,
+    "threshold-random-pairs": _threshold_random_pairs,
+    "threshold-untrusted": (
+        "Best matches in other videos would set the threshold to {threshold:.3f}: many recordings of train are copies of one another, or these"
+        " features cannot separate images. Random pairs set it instead"
+    ),
+    "validation-leaks": "{count} {group} groups of the validation part occur in train or test as well: choosing a checkpoint on it leaks",
+    "videos-without-samples": lambda p, _: (
+        f"{len(p['videos'])} of the record's {p['of']} videos have no sample here, first {p['videos'][0]}"
+    ),
+}
+
+
 
 
 def confidence(share: float) -> str:

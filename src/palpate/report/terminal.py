@@ -18,6 +18,11 @@ def results_text(results: Results) -> str:
 def audit_text(audit: Audit) -> str:
     """The finding, a line for each signal, and the notes."""
     lines = [audit_line(audit)]
+    if audit.groups_in_all:
+        lines.append(f"  {audit.groups_shared} of {audit.groups_in_all} {audit.group} groups are shared")
+    if audit.gap_min is not None:
+        gaps = f"{audit.gap_min} to {audit.gap_max} frames, median {audit.gap_median}"
+        lines.append(f"  gap to the nearest train frame of the video: {gaps}")
     width = max((len(signal.kind) for signal in audit.signals), default=0)
     for signal in audit.signals:
         share = f"{signal.flagged} of {signal.checked} ({percent(signal.fraction)})"

@@ -54,8 +54,8 @@ from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, pick_device
 from palpate.encoders.presets import preset as encoder_preset
 from palpate.evaluation.scoring import score
-from palpate.leakage.audit import Pictures, audit_split
-from palpate.leakage.splits import describe, leak_free_split
+from palpate.leakage.auditing import audit as audit_split
+from palpate.leakage.splitting import split as leak_free_split
 from palpate.report.results import Audit
 from palpate.sim import WorldOptions, write_world
 from palpate.studies.inputs import fresh, reconstruction, repeats, require_unseen, stamp_of
@@ -271,32 +271,26 @@ class _Pipeline:
         own = sorted((self.run.stages["data"].folder / "splits").glob("*.json"))
 
         def build(folder: Path) -> dict[str, Any]:
-            plan = leak_free_split(
-                manifest, train=self.preset.train, group=self.options.group, seed=self.options.seed
+            made = leak_free_split(
+                manifest, train=self.preset.train, by=self.options.group, seed=self.options.seed
             )
-            plan.split.save(folder / "noleak.json")
-            look: dict[str, Any] = {
-                "pictures": Pictures(cache=self.cache),
-                "progress": self.progress,
-            }
+            made.save(folder / "noleak.json")
+            options: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
             audits = [
-                audit_split(manifest, Split.load(path), name=path.stem, **look)
+                audit_split(manifest, split=path, name=path.stem, by="video", **options)
                 for path in own
                 if Split.load(path).ids("test")
             ]
-            name = "NoLeak" if plan.group == "video" else f"NoLeak by {plan.group}"
-            audits.append(audit_split(manifest, plan.split, group=plan.group, name=name, **look))
-            if plan.group != "video" and not manifest.table["video"].null_count():
+            group = str(made.rule["group"])
+            name = "NoLeak" if group == "video" else f"NoLeak by {group}"
+            audits.append(audit_split(manifest, split=made, by=group, name=name, **options))
+            if group != "video" and not manifest.table["video"].null_count():
+                name = f"{name}, seen by video"
                 audits.append(
-                    audit_split(
-                        manifest,
-                        plan.split,
-                        group="video",
-                        name=f"NoLeak by {plan.group}, seen by video",
-                    )
+                    audit_split(manifest, split=made, by="video", name=name, images=False)
                 )
-            write_json(folder / "audits.json", [dataclasses.asdict(a) for a in audits])
-            return dict(describe(plan))
+            write_json(folder / "audits.json", [a.to_json() for a in audits])
+            return {"digest": made.digest, "counts": made.counts(), "rule": dict(made.rule)}
 
         inputs = {
             "manifest": manifest.digest,

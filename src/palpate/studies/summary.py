@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from palpate.core import Score, rng_for
@@ -11,6 +11,7 @@ from palpate.core.shipped import is_shipped
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generate import Generated
 from palpate.evaluation.scoring import BACKGROUND
+from palpate.report.notes import sentence
 from palpate.report.results import Audit, GalleryItem, Results
 from palpate.studies.pipeline import PipelineOutcome
 
@@ -146,11 +147,7 @@ def _notes(outcome: PipelineOutcome) -> list[str]:
     if outcome.manifest.facts.get("synthetic"):
         notes.append(SYNTHETIC)
     notes += _model_notes(outcome)
-    rule: Mapping[str, object] = outcome.split.rule
-    if rule.get("reason"):
-        notes.append(str(rule["reason"]))
-    if rare := outcome.stages["split"].facts.get("materials_in_too_few_groups"):
-        notes.append(f"Materials in too few groups to be in both parts: {', '.join(rare)}.")
+    notes += [sentence(note) + "." for note in outcome.split.notes]
     if outcome.manifest.table["text"].null_count():
         notes.append(LABEL_TEXT)
     blank = _find(outcome.scores, "material accuracy", BACKGROUND)

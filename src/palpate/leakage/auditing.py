@@ -1,0 +1,392 @@
+"""The audit of a split: which test samples are not new to a model that was trained on train.
+
+For a test sample at frame f of video v, with F_v the train frames of v, the *gap* is ``min |f -
+g|`` over ``g in F_v``. Frames of one contact are similar within about a second (30 frames at 30
+fps), frames of one video within many, so a small gap means that the test image was almost seen in
+training (paper, section 5).
+
+Ids, videos and frame numbers are enough, so two bare list files can be audited; images show leaks
+that no metadata reveals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from palpate.core import Note, PalpateError, Progress, Split, quiet
+from palpate.data.manifest import MODALITIES, Manifest
+from palpate.leakage.groups import GROUPS
+from palpate.leakage.inputs import Data, read_all, require
+from palpate.leakage.signals import (
+    Flags,
+    Gaps,
+    identical_bytes,
+    identical_samples,
+    leaking,
+    nearest_in_video,
+    shared_group,
+    signal_table,
+    time_gap,
+)
+from palpate.report.results import MATRIX_ROWS, Audit, Impact, LeakPair
+
+#: In place of a group where none is known and images alone are compared.
+NO_GROUP = "none"
+#: Right-open bins of the gap histogram, in frames; 30 frames are one second of Touch and Go.
+GAP_EDGES = (0, 1, 3, 10, 30, 60, 90, 150, 300, 600, 900, 1800, 3600)
+
+#: (samples, modality) -> (n, d) embeddings in their order.
+Embed = Callable[[Manifest, str], Any]
+#: (samples, split, group, name of the split) -> what the leak costs.
+MeasureImpact = Callable[[Manifest, Split, str, str], Impact]
+
+
+@dataclass(frozen=True)
+class _Options:
+    """How two parts are compared; see :func:`audit`."""
+
+    by: str
+    near_frames: int
+    images: bool
+    modalities: Sequence[str]
+    false_positives: float
+    encoder: Embed | None
+    worst: int
+    cache: Path | None
+    threads: int | None
+    progress: Progress
+
+
+def audit(  # noqa: PLR0913
+    train_or_data: Data,
+    test: Data = None,
+    *,
+    split: Split | str | Path | None = None,
+    pretrain: Data = None,
+    by: str = "auto",
+    near_frames: int = 30,
+    images: bool = True,
+    modalities: Sequence[str] = ("vision", "tactile"),
+    false_positives: float = 0.001,
+    encoder: Embed | None = None,
+    impact: MeasureImpact | None = None,
+    name: str | None = None,
+    worst: int = 12,
+    cache: str | Path | None = None,
+    threads: int | None = None,
+    root: str | Path | None = None,
+    skip_bad: bool = False,
+    progress: Progress = quiet,
+) -> Audit:
+    """Audit the test part of a split against its train part.
+
+    Args:
+        train_or_data: the train samples, or with ``split`` all samples: a manifest, a path (list of
+            ``video/frame.jpg,label`` lines, table, manifest, folder), or a polars or pandas frame.
+        test: the test samples, likewise.
+        split: a split of ``train_or_data``, instead of ``test``.
+        pretrain: what an encoder was pretrained on, which the test part is compared with as well;
+            its audit is in ``others``.
+        by: what train and test must not share: a column, or ``auto`` for the video or what is known
+            instead of it.
+        near_frames: a gap of up to this many frames within a video is a leak by itself.
+        images: compare image files and their content, not only tables.
+        modalities: the images to compare.
+        false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
+        encoder: function (samples, modality) -> embeddings, to compare instead of the images.
+        impact: function (samples, split, group, name) -> :class:`Impact`; needs ``split``.
+        name: heading; default: the names of the inputs, or of the split.
+        worst: how many of the strongest pairs to keep for each signal.
+        cache: folder that keeps decoded images.
+        threads: that decode images; default: the number of cores, 16 at most.
+        root: where the paths of tables start; default: the folder of the table.
+        skip_bad: skip bad rows of lists and tables, and note them.
+        progress: callback.
+
+    Returns:
+        The audit; ``to_frame()`` is the table of all signals with a row for each test sample.
+
+    Raises:
+        PalpateError: on an option out of range, an unknown group, an id that the data lacks, or an
+            empty part.
+        ProblemsError: with every bad row of all inputs, unless ``skip_bad``.
+    """
+    if (test is None) == (split is None):
+        raise PalpateError(
+            "An audit takes train and test samples, or samples with a split",
+            "both" if split is not None else "neither test samples nor a split",
+            "Pass one of them",
+        )
+    require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", by)
+    require(near_frames >= 0, "near_frames", "must be at least 0", near_frames, 30)
+    require(worst >= 0, "worst", "must be at least 0", worst, 12)
+    known = set(modalities) <= set(MODALITIES)
+    require(known, "modalities", "must be among vision, tactile", list(modalities), ["vision"])
+    rate = false_positives
+    require(0 < rate <= 0.1, "false_positives", "must lie in (0, 0.1]", rate, 0.001)
+    require(not (impact and test is not None), "impact", "needs samples with a split", "no split")
+    sources = [x for x in (train_or_data, test, pretrain) if x is not None]
+    parts, notes = read_all(sources, skip_bad, progress, root)
+    options = _Options(
+        by,
+        near_frames,
+        images,
+        modalities,
+        false_positives,
+        encoder,
+        worst,
+        None if cache is None else Path(cache),
+        threads,
+        progress,
+    )
+    if split is None:
+        title = name or f"{_name(train_or_data, 'train')} / {_name(test, 'test')}"
+        result = _compare(parts[0], parts[1], None, options, title)
+        test_part = parts[1]
+    else:
+        whole, parted = parts[0], split if isinstance(split, Split) else Split.load(Path(split))
+        test_part, val = whole.part(parted, "test"), whole.part(parted, "val")
+        title = name or str(parted.rule.get("name") or _name(split, "split"))
+        result = _compare(whole.part(parted, "train"), test_part, val, options, title)
+        notes += _split_notes(whole, parted, val, result.group)
+        result = replace(result, split=parted.digest)
+        if impact is not None:
+            try:
+                result = replace(result, impact=impact(whole, parted, result.group, title))
+            except PalpateError as error:  # the audit itself must not be lost
+                notes.append(Note("impact-failed", {"reason": str(error)}))
+    if pretrain is not None:
+        against = _compare(
+            parts[-1], test_part, None, options, f"{_name(pretrain, 'pretraining')} / test"
+        )
+        result = replace(result, others=[replace(against, against="pretraining")])
+    return replace(result, notes=[*result.notes, *notes])
+
+
+def _name(source: Any, default: str) -> str:
+    if not isinstance(source, (str, Path)):
+        return default
+    return Path(source).stem if default == "split" else Path(source).name
+
+
+def _split_notes(whole: Manifest, split: Split, val: Manifest, group: str) -> list[Note]:
+    """What a reader must know of the split itself."""
+    notes: list[Note] = []
+    if split.manifest is not None and split.manifest != whole.digest:
+        notes.append(Note("split-of-other-manifest"))
+    if unused := len(whole) - len(split.parts):
+        notes.append(Note("samples-in-no-part", {"count": unused, "of": len(whole)}))
+    if len(val) and group != NO_GROUP:
+        others = whole.part(split, "train", "test").column(group)
+        if shared := set(val.column(group)) & set(others) - {None}:
+            notes.append(Note("validation-leaks", {"count": len(shared), "group": group}))
+    return notes
+
+
+def known_group(train: Manifest, test: Manifest) -> str:
+    """What the data set names, else the first of video, object, session and contact.
+
+    Returns:
+        A column of which both parts know some values, or ``NO_GROUP``.
+    """
+    named = [str(m.facts["group"]) for m in (test, train) if m.facts.get("group") in GROUPS]
+    candidates = (*named, "video", "object", "session", "contact")
+    return next((c for c in candidates if _known(train, c) and _known(test, c)), NO_GROUP)
+
+
+def _known(manifest: Manifest, column: str) -> bool:
+    return manifest.table[column].null_count() < len(manifest)
+
+
+def _group(train: Manifest, test: Manifest, options: _Options) -> str:
+    """The group to audit by.
+
+    Raises:
+        PalpateError: on an empty part, or a group that a part does not know at all.
+    """
+    for part, samples in (("train", train), ("test", test)):
+        if not len(samples):
+            raise PalpateError(
+                f"The {part} part must hold samples", "none", "Check the split or list file"
+            )
+    group = known_group(train, test) if options.by == "auto" else options.by
+    comparable = any(_known(train, c) and _known(test, c) for c in MODALITIES)
+    if group == NO_GROUP and options.images and comparable:
+        return group
+    if group == NO_GROUP or not (_known(train, group) and _known(test, group)):
+        raise PalpateError(
+            f"Both parts must know the {'video' if group == NO_GROUP else group} of some samples",
+            "a column of nulls",
+            "Audit by another group, or compare images, which needs no group",
+            example={"by": "auto"},
+        )
+    return group
+
+
+def _compare(
+    train: Manifest, test: Manifest, val: Manifest | None, options: _Options, name: str
+) -> Audit:
+    """Audit one part against another."""
+    group = _group(train, test, options)
+    a, b = train.table, test.table
+    groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
+    shared = sorted(groups[0] & groups[1])
+    in_shared = int(b[group].is_in(shared).fill_null(False).sum()) if shared else 0
+    gaps = nearest_in_video(a, b)
+    flags = _signals(train, test, group, gaps, options)
+    leaks = leaking(flags, len(test))
+    timed = gaps.frames[gaps.frames >= 0]
+    last = int(timed.max()) if timed.size else 0
+    edges = [e for e in GAP_EDGES if e <= last] + [last + 1] if timed.size else []
+    pairs = _worst_pairs(train, test, group, gaps, options.worst)
+    signals = [f.summary(train, test, gaps, options.worst) for f in flags]
+    return Audit(
+        name=name,
+        group=group,
+        train_samples=a.height,
+        test_samples=b.height,
+        groups_train=len(groups[0]),
+        groups_test=len(groups[1]),
+        groups_shared=len(shared),
+        test_samples_in_shared_groups=in_shared,
+        leaked_fraction=round(in_shared / b.height, 5),
+        identical_samples=int(flags[0].flag.sum()),
+        gap_min=int(timed.min()) if timed.size else None,
+        gap_median=_plain(float(np.median(timed))) if timed.size else None,
+        gap_max=last if timed.size else None,
+        gap_edges=edges,
+        gap_counts=np.histogram(timed, edges)[0].tolist() if edges else [],
+        worst=pairs,
+        materials=_materials(a, b, group),
+        notes=_notes(train, test, group, options),
+        signals=[replace(s, worst=pairs) if s.kind == "time gap" else s for s in signals],
+        leaking_samples=int(leaks.sum()),
+        matrix=_matrix(
+            {"train": a, "val": b.clear() if val is None else val.table, "test": b}, group, leaks
+        ),
+        groups_in_all=len(groups[0] | groups[1]),
+        table=signal_table(test, train, flags, gaps),
+    )
+
+
+def _notes(train: Manifest, test: Manifest, group: str, options: _Options) -> list[Note]:
+    notes = [Note("no-group")] if group == NO_GROUP else []
+    for part, samples in (("train", train), ("test", test)):
+        if group != NO_GROUP and (nulls := samples.table[group].null_count()):
+            notes.append(Note("group-nulls", {"count": nulls, "part": part, "group": group}))
+    for modality in options.modalities if options.images else ():
+        if _known(train, modality) != _known(test, modality):
+            notes.append(Note("images-of-one-part", {"modality": modality}))
+    return notes
+
+
+def _signals(
+    train: Manifest, test: Manifest, group: str, gaps: Gaps, options: _Options
+) -> list[Flags]:
+    """Every signal that can be checked, the exact ones first."""
+    flags: list[Flags | None] = [identical_samples(train, test, gaps)]
+    if options.images:
+        flags.append(identical_bytes(train, test, options.progress))
+    if group != NO_GROUP:
+        columns = dict.fromkeys([group, "video", "object", "session"])
+        flags += [shared_group(train, test, c, counts=c == group) for c in columns]
+    flags.append(time_gap(gaps, options.near_frames))
+    for modality in options.modalities if options.images else ():
+        if _known(train, modality) and _known(test, modality):
+            flags.append(_near_duplicates(train, test, modality, options))
+    return [f for f in flags if f is not None]
+
+
+def _near_duplicates(train: Manifest, test: Manifest, modality: str, options: _Options) -> Flags:
+    from palpate.leakage.near import near_duplicates
+
+    features = None
+    if options.encoder is not None:
+        features = options.encoder(train, modality), options.encoder(test, modality)
+    return near_duplicates(
+        train,
+        test,
+        modality,
+        false_positives=options.false_positives,
+        features=features,
+        cache=options.cache,
+        threads=options.threads,
+        progress=options.progress,
+    )
+
+
+def _matrix(
+    parts: Mapping[str, pl.DataFrame], group: str, leaks: NDArray[np.bool_]
+) -> list[dict[str, Any]]:
+    """Samples of each group by part, shared groups with most test samples first."""
+    if group == NO_GROUP:
+        return []
+    flagged = {"test": pl.Series(leaks)}
+    long = pl.concat(
+        t.select(
+            group=pl.col(group),
+            leaking=flagged.get(part, pl.lit(False)),
+            **{p: pl.lit(int(p == part)) for p in parts},
+        )
+        for part, t in parts.items()
+    ).drop_nulls("group")
+    rows = (
+        long.group_by("group")
+        .agg(pl.col("train", "val", "test", "leaking").sum())
+        .with_columns(
+            shared=(pl.col("train") > 0) & (pl.col("test") > 0),
+            size=pl.sum_horizontal("train", "val", "test"),
+        )
+        .sort("shared", "test", "size", "group", descending=[True, True, True, False])
+        .head(MATRIX_ROWS)
+    )
+    return list(rows.select("group", *parts, "leaking").iter_rows(named=True))
+
+
+def _plain(value: float) -> float | int:
+    """A whole median as an int, so that 304.0 reads 304."""
+    return int(value) if value.is_integer() else value
+
+
+def _worst_pairs(
+    train: Manifest, test: Manifest, group: str, gaps: Gaps, count: int
+) -> list[LeakPair]:
+    """The test samples nearest to train: the nearest of each video first, then others, by gap."""
+    timed = np.flatnonzero(gaps.frames >= 0)
+    order = timed[np.argsort(gaps.frames[timed], kind="stable")].tolist()
+    videos = test.table["video"].to_list()
+    first: dict[str, int] = {}
+    for k in order:
+        first.setdefault(videos[k], k)
+    chosen = list(dict.fromkeys([*first.values(), *order]))[:count]
+    pairs = [(k, int(gaps.row[k]), int(gaps.frames[k])) for k in chosen]
+    if not pairs and group != NO_GROUP:  # no frames: a shared group is still a pair worth showing
+        first_of = [
+            dict(zip(m.column(group)[::-1], range(len(m))[::-1], strict=True))
+            for m in (test, train)
+        ]
+        shared = sorted((first_of[0].keys() & first_of[1].keys()) - {None})
+        pairs = [(first_of[0][g], first_of[1][g], None) for g in shared[:count]]
+    row = lambda m, k: m.ref(m.table.row(k, named=True))  # noqa: E731
+    return [LeakPair(row(test, k), row(train, j), gap) for k, j, gap in pairs]
+
+
+def _materials(train: pl.DataFrame, test: pl.DataFrame, group: str) -> list[dict[str, Any]]:
+    """Samples and groups of each material in both parts."""
+    groups = pl.col(group).drop_nulls().n_unique() if group != NO_GROUP else pl.lit(0)
+    train, test = (
+        t.drop_nulls("material")
+        .group_by("material")
+        .agg(pl.len().alias(part), groups.cast(pl.Int64).alias(f"groups_{part}"))
+        for part, t in (("train", train), ("test", test))
+    )
+    both = train.join(test, on="material", how="full", coalesce=True).fill_null(0).sort("material")
+    columns = ("material", "train", "test", "groups_train", "groups_test")
+    return list(both.select(columns).iter_rows(named=True))

@@ -1,0 +1,151 @@
+"""Groups that a split keeps whole: connected components of samples that share something.
+
+Two samples are joined if they have the same value in one of the named columns (video, object ...),
+or the same label in one of the links (clusters of near-duplicates). A group is named by the
+smallest value of the first column in it, so that a group of one video has the video's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from palpate.core import Note, PalpateError
+from palpate.data.manifest import Manifest
+
+#: Columns that a split can keep whole, and by which a split can be audited.
+GROUPS = ("video", "contact", "object", "session", "domain", "sensor")
+Nulls = Literal["raise", "single"]
+Ints = NDArray[np.int64]
+
+
+def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, Note | None]:
+    """The column to keep whole: what the data set names, else the video.
+
+    Where most materials occur in too few videos, it is the contact.
+
+    Returns:
+        The column, and a note that says why, unless it is simply the video.
+
+    Raises:
+        PalpateError: if neither videos nor contacts nor objects are known.
+    """
+    table = manifest.table
+    named = manifest.facts.get("group")
+    candidates = [named] if named in GROUPS else []
+    known = [
+        group
+        for group in (*candidates, "video", "object", "contact")
+        if table.height and not table[group].null_count()
+    ]
+    if not known:
+        raise PalpateError(
+            "A leak-free split needs the video, object or contact of every sample",
+            "nulls in each of these columns",
+            "Import a table that has one, or keep near-duplicates together",
+            example={"near": "both"},
+        )
+    first = known[0]
+    if first != "contact" and "contact" in known:
+        if table[first].n_unique() < parts:
+            return "contact", Note("group-few", {"group": first, "parts": parts})
+        materials = table.drop_nulls("material").group_by("material").agg(pl.col(first).n_unique())
+        enough = int((materials[first] >= parts).sum())
+        if 2 * enough < materials.height:
+            params = {"group": first, "parts": parts, "enough": enough}
+            return "contact", Note("group-materials", params | {"materials": materials.height})
+    if first == "video":
+        return first, None
+    return first, Note("group-of-data-set" if first == named else "group-instead", {"group": first})
+
+
+def components(
+    manifest: Manifest, by: Sequence[str], links: Sequence[Any] = (), *, nulls: Nulls = "raise"
+) -> list[str]:
+    """The group of each sample.
+
+    Args:
+        manifest: (n) samples.
+        by: columns whose values must not be shared between parts.
+        links: (n,) integer labels each; samples with the same label, if not negative, stay
+            together.
+        nulls: ``raise`` on a null in a column of ``by``; with ``single`` it joins nothing.
+
+    Returns:
+        n names, in row order; ``sample:<id>`` for samples without any value.
+
+    Raises:
+        PalpateError: on an unknown column, on nulls unless ``single``, and on links of another
+            length.
+    """
+    table, n = manifest.table, len(manifest)
+    for column in by:
+        if column not in GROUPS:
+            raise PalpateError(
+                f"must be among {', '.join(GROUPS)}",
+                repr(column),
+                "Choose one or several of these",
+                argument="by",
+                example={"by": "video"},
+            )
+        empty = table[column].null_count()
+        if empty and (nulls == "raise" or empty == n):
+            raise PalpateError(
+                f"Every sample needs a {column} to be split by it",
+                f"{empty} of {n} samples without",
+                "Fill the column, choose another one"
+                + ("" if empty == n else ", or let each such sample be a group by itself"),
+                example={} if empty == n else {"nulls": "single"},
+            )
+    labels = [table[c].rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1 for c in by]
+    for link in links:
+        label = np.asarray(link)
+        if label.shape != (n,) or label.dtype.kind not in "iu":
+            raise PalpateError(
+                f"must be {n} integers, one a sample",
+                f"{label.dtype} of shape {label.shape}",
+                "Compute the labels on this manifest",
+                argument="near",
+            )
+        labels.append(label.astype(np.int64))
+    return _names(manifest, by, _joined(labels, n))
+
+
+def _joined(labels: Sequence[Ints], n: int) -> Ints:
+    """Components of the graph between n samples and their labels, as numbers."""
+    rows, columns, nodes = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], n
+    for label in labels:
+        known = np.flatnonzero(label >= 0)
+        values, place = np.unique(label[known], return_inverse=True)
+        rows.append(known)
+        columns.append(place + nodes)
+        nodes += len(values)
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    graph = coo_matrix((np.ones(len(row), np.int8), (row, column)), (nodes, nodes))
+    return connected_components(graph, directed=False)[1][:n].astype(np.int64)
+
+
+def _names(manifest: Manifest, by: Sequence[str], component: Ints) -> list[str]:
+    """A name for each sample's component: the smallest value of the first column that has one."""
+    prefix = ["" if k == 0 else f"{c}:" for k, c in enumerate(by)]
+    candidates = [
+        pl.concat_str(pl.lit(p), pl.col(c).min()) for p, c in zip(prefix, by, strict=True)
+    ]
+    named = (
+        manifest.table.with_columns(component=pl.Series(component))
+        .group_by("component")
+        .agg(name=pl.coalesce(*candidates, pl.concat_str(pl.lit("sample:"), pl.col("id").min())))
+    )
+    # A video may be called like another column's group.
+    number = pl.int_range(pl.len()).over("name")
+    named = named.sort("component").with_columns(
+        name=pl.when(number > 0).then(pl.format("{}'{}", "name", number)).otherwise("name")
+    )
+    names = dict(named.iter_rows())
+    return [names[k] for k in component.tolist()]

@@ -1,0 +1,271 @@
+"""Leak-free splits: whole groups go to one part, and every material keeps its share.
+
+Groups are connected components (:mod:`palpate.leakage.groups`). Of all assignments of groups to
+parts, one with the smallest largest deviation of any material's share from the wanted one is taken
+(:mod:`palpate.leakage.program`). Folds are parts of equal share. Materials in fewer groups than
+there are parts are named and go along.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from palpate.core import Note, PalpateError, Progress, Split, quiet
+from palpate.data.manifest import MODALITIES, Manifest
+from palpate.leakage.groups import Ints, Nulls, choose_group, components
+from palpate.leakage.inputs import Data, read, require
+from palpate.leakage.noleak import HCT_GROUPS, published, require_hct
+from palpate.leakage.program import EXACT, RESOLUTION, Optimum, Problem, draw, optimize
+
+RULE_VERSION = 3
+#: The group in rules where near-duplicates alone are kept together.
+LINKED = "near-duplicates"
+#: The largest group must leave the other parts at least this fraction of what they want.
+LEAST_FILL = 0.25
+
+
+@overload
+def split(data: Data, *, seed: int = 0, folds: None = None, **options: Any) -> Split: ...
+@overload
+def split(
+    data: Data, *, seed: int | Sequence[int] = 0, folds: int | None = None, **options: Any
+) -> list[Split]: ...
+def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
+    data: Data,
+    *,
+    by: str | Sequence[str] = "auto",
+    train: float = 0.8,
+    val: float = 0.0,
+    seed: int | Sequence[int] = 0,
+    folds: int | None = None,
+    near: Any = None,
+    noleak: str | None = None,
+    nulls: Nulls = "raise",
+    tolerance: float = 0.0,
+    cache: str | Path | None = None,
+    skip_bad: bool = False,
+    progress: Progress = quiet,
+) -> Split | list[Split]:
+    """Make a split in which no group is in two parts and every material keeps its share.
+
+    Args:
+        data: a manifest, a path (manifest, list, table, folder), several lists, or a data frame;
+            with ``noleak="touch-and-go"`` None splits the videos of the record.
+        by: one or several columns to keep whole; samples that share any of them stay together.
+            ``auto`` takes what the data set names, else the video, else what is known instead.
+        train: wanted share of the train part, in (0, 1).
+        val: wanted share of the validation part, in [0, 1); test gets the remainder.
+        seed: another seed gives another split of the same quality; several seeds give several.
+        folds: make so many folds; split k tests fold k (and, with ``val``, validates on fold
+            k + 1). The shares are then those of the folds.
+        near: keep near-duplicate images together: ``vision``, ``tactile``, ``both``, or an array
+            with a label for each sample (negative: none).
+        noleak: the published split of ``touch-and-go``, or the same rule for ``hct``.
+        nulls: ``raise`` if a sample has no value in a column of ``by``, or let it be a ``single``.
+        tolerance: how far the largest deviation may be above the smallest possible one, for splits
+            that differ more.
+        cache: folder that keeps decoded images for ``near``.
+        skip_bad: skip bad rows of lists and tables, and note them.
+        progress: callback.
+
+    Returns:
+        A split; with ``folds`` or several seeds a list. Its rule holds what was achieved:
+        ``deviation`` (the largest, in [0, 1]), ``bound`` (no split by these groups has a smaller
+        one), ``status``, ``limiting`` (the material that deviates most), ``rare`` and ``missing``
+        (materials that are not in every part).
+
+    Raises:
+        PalpateError: on shares out of range, unknown or null groups, fewer groups than parts, or
+            one group too large to be split off.
+    """
+    _check(train, val, folds, tolerance, noleak)
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    if noleak == "touch-and-go":
+        manifest, notes = (None, []) if data is None else read(data, skip_bad, progress)
+        return published(manifest, train, val, seeds[0], notes)
+    manifest, notes = read(data, skip_bad, progress)
+    rule: dict[str, Any] = {"name": "NoLeak"}
+    if noleak == "hct":
+        by, rule = HCT_GROUPS, {"name": "HCT-NoLeak", "session_gap": require_hct(manifest)}
+    links, near_facts = near_links(manifest, near, cache, progress)
+    shares = {"train": train, "val": val, "test": 1 - train - val}
+    if folds is not None:
+        shares = {f"fold {k}": 1 / folds for k in range(folds)}
+    shares = {part: round(share, 12) for part, share in shares.items() if share > 1e-9}
+    columns, reason = _columns(manifest, by, links, len(shares))
+    groups = components(manifest, columns, links, nulls=nulls)
+    names, materials, problem = _problem(manifest, groups, columns, list(shares.values()))
+    optimum = optimize(problem)
+    rule |= {
+        "method": "whole groups, smallest largest deviation of any material's share",
+        "version": RULE_VERSION,
+        "group": columns[0] if columns else LINKED,
+        "by": list(columns),
+        "near": near_facts,
+        "nulls": nulls,
+        "groups": len(names),
+        "shares": shares,
+        "tolerance": tolerance,
+    }
+    notes += reason
+    part_names = [list(shares)] if folds is None else _fold_parts(folds, val > 0)
+    splits: list[Split] = []
+    for number in seeds if folds is None else seeds[:1]:
+        assignment = draw(problem, optimum, number, tolerance)
+        facts = rule | {"seed": number}
+        facts |= _achieved(problem, optimum, assignment, [*materials, "all samples"], list(shares))
+        for fold, parts in enumerate(part_names):
+            if folds is not None:
+                shares = {p: parts.count(p) / folds for p in dict.fromkeys(parts)}
+                name = f"NoLeak fold {fold} of {folds}"
+                facts |= {"name": name, "folds": folds, "fold": fold, "shares": shares}
+            where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
+            of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
+            more = [*notes, *_notes(manifest, facts)]
+            splits.append(Split(of, dict(facts), manifest.digest, more))
+    return splits[0] if isinstance(seed, int) and folds is None else splits
+
+
+def _check(
+    train: float, val: float, folds: int | None, tolerance: float, noleak: str | None
+) -> None:
+    if folds is None and not (0 < train < 1 and 0 <= val < 1 and 1 - train - val > 1e-9):
+        raise PalpateError(
+            "The shares of train and val must be positive and leave room for test",
+            f"train {train}, val {val}",
+            "Choose smaller shares",
+            example={"train": 0.8, "val": 0.1},
+        )
+    least = 2 + (val > 0)
+    require(0 <= tolerance < 1, "tolerance", "must lie in [0, 1)", tolerance, 0.01)
+    require(folds is None or folds >= least, "folds", f"must be at least {least}", folds, 5)
+    known = noleak in (None, "touch-and-go", "hct")
+    require(known, "noleak", "must be touch-and-go or hct", noleak, "touch-and-go")
+
+
+def near_links(
+    manifest: Manifest, near: Any, cache: str | Path | None, progress: Progress
+) -> tuple[list[Any], dict[str, Any] | None]:
+    """Labels of near-duplicate clusters, and their description for the rule."""
+    if near is None:
+        return [], None
+    if not isinstance(near, str):
+        return [near], {"labels": 1}
+    known = near in (*MODALITIES, "both")
+    require(known, "near", "must be vision, tactile or both", near, "both")
+    from palpate.leakage.near import near_groups
+
+    modalities = list(MODALITIES) if near == "both" else [near]
+    for modality in modalities:
+        if manifest.table[modality].null_count() == len(manifest):
+            raise PalpateError(
+                f"Near-duplicates need {modality} images",
+                "samples without any",
+                "Import the data set first: palpate import",
+            )
+    folder = None if cache is None else Path(cache)
+    links = [near_groups(manifest, m, cache=folder, progress=progress) for m in modalities]
+    return links, {"modalities": modalities}
+
+
+def _columns(
+    manifest: Manifest, by: str | Sequence[str], links: Sequence[Any], parts: int
+) -> tuple[list[str], list[Note]]:
+    """The columns to keep whole, and why."""
+    if by != "auto":
+        return list(dict.fromkeys([by] if isinstance(by, str) else by)), []
+    known = (not manifest.table[c].null_count() for c in ("video", "object", "contact"))
+    if links and not any(known):
+        return [], [Note("group-near-only")]
+    column, reason = choose_group(manifest, parts)
+    return [column], [reason] if reason else []
+
+
+def _problem(
+    manifest: Manifest, groups: Sequence[str], columns: Sequence[str], target: Sequence[float]
+) -> tuple[list[str], list[str], Problem]:
+    """The names of groups and of materials, and the samples by both with the wanted shares.
+
+    Raises:
+        PalpateError: if there are fewer groups than parts, or the largest group leaves the other
+            parts less than ``LEAST_FILL`` of what they want.
+    """
+    kind = " and ".join(columns) or LINKED
+    names = sorted(set(groups))
+    if len(names) < len(target):
+        raise PalpateError(
+            f"A split into {len(target)} parts needs at least as many groups",
+            f"{len(names)} {kind} group(s)",
+            "Choose a finer group",
+            example={"by": "contact"},
+        )
+    materials: list[str] = sorted(manifest.table["material"].drop_nulls().unique())
+    row, column = ({name: k for k, name in enumerate(x)} for x in (names, materials))
+    counts = np.zeros((len(names), len(materials) + 1), np.int64)
+    for group, material in zip(groups, manifest.column("material"), strict=True):
+        counts[row[group], -1] += 1
+        if material is not None:
+            counts[row[group], column[material]] += 1
+    biggest = int(counts[:, -1].argmax())
+    largest, wanted = float(counts[biggest, -1] / len(groups)), 1 - max(target)
+    if 1 - largest < LEAST_FILL * wanted:
+        raise PalpateError(
+            f"The smaller parts must get at least {LEAST_FILL:.0%} of their wanted {wanted:.1%}",
+            f"{kind} {names[biggest]!r} with {largest:.1%} of all samples, which leaves them"
+            f" {1 - largest:.2%} at best",
+            "Choose a finer group, thin that group out, or choose a larger train share",
+        )
+    return names, materials, Problem(counts, np.array(target))
+
+
+def _achieved(
+    problem: Problem, optimum: Optimum, assignment: Ints, columns: list[str], parts: list[str]
+) -> dict[str, Any]:
+    """What an assignment achieves, recounted from whole samples."""
+    deviations = problem.deviations(assignment)
+    deviation = float(deviations.max())
+    bound = min(optimum.bound, deviation)
+    status = f"within {deviation - bound:.5f} of the optimum"
+    if deviation - bound <= EXACT:
+        status = "optimal"
+    elif deviation <= RESOLUTION + EXACT:
+        status = f"below the resolution of {RESOLUTION:g}"
+    missing = np.argwhere(problem.missing(assignment)).tolist()
+    return {
+        "deviation": round(deviation, 6),
+        "bound": round(bound, 6),
+        "status": status,
+        "limiting": columns[int(deviations.max(0).argmax())],
+        "rare": [columns[m] for m in np.flatnonzero(~problem.possible[:-1])],
+        "missing": [f"{columns[m]}: {parts[p]}" for p, m in missing],
+    }
+
+
+def _notes(manifest: Manifest, facts: dict[str, Any]) -> list[Note]:
+    """What a reader must know of a split with these facts."""
+    counts = {c: manifest.table[c].null_count() for c in facts["by"]}
+    notes = [Note("single-groups", {"count": n, "group": c}) for c, n in counts.items() if n]
+    if not manifest.table["material"].count():
+        notes.append(Note("no-materials"))
+    parts = facts.get("folds") or len(facts["shares"])
+    if facts["rare"]:
+        notes.append(Note("rare-materials", {"materials": facts["rare"], "parts": parts}))
+    if facts["missing"]:
+        notes.append(Note("missing-materials", {"materials": facts["missing"]}))
+    return notes
+
+
+def _fold_parts(folds: int, val: bool) -> list[list[str]]:
+    """For each split the part of each fold."""
+    rows: list[list[str]] = []
+    for fold in range(folds):
+        parts = ["train"] * folds
+        if val:
+            parts[(fold + 1) % folds] = "val"
+        parts[fold] = "test"
+        rows.append(parts)
+    return rows

@@ -1,0 +1,136 @@
+"""Images as thumbnails of 32 x 32 pixels in YCbCr, 3 kB each.
+
+Each distinct file is decoded once, a JPEG at the smallest scale that libjpeg offers above 48 pixels
+(Pillow's ``draft``). Equal thumbnails are kept once. Files that are cut, empty or no images are
+listed, not raised: an audit goes on without them. With a cache, thumbnails are written in pieces of
+1,024 files, so that a run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
+from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, read_image
+
+VERSION = 3
+SIDE = 32
+#: Files of one cached piece.
+PIECE = 1024
+#: A JPEG is decoded at no less than this: libjpeg's reduction aliases, and differently after a
+#: shift.
+DRAFT = 48
+#: Modes that need no rule of :func:`palpate.data.images.read_image`.
+PLAIN = ("YCbCr", "RGB", "L")
+
+#: Thumbnails of some files, and which of the files cannot be read, with the reason.
+Decoded = tuple[NDArray[np.uint8], dict[int, str]]
+
+
+@dataclass(frozen=True)
+class Thumbnails:
+    """Different images, decoded.
+
+    Attributes:
+        row: (n,) the thumbnail of each path; -1 without a path or where it cannot be read.
+        pixels: (u, 32, 32, 3) YCbCr, 0 to 255, all different.
+        unreadable: path -> reason.
+    """
+
+    row: NDArray[np.int64]
+    pixels: NDArray[np.uint8]
+    unreadable: dict[str, str]
+
+
+def thumbnail(path: Path) -> NDArray[np.uint8] | str:
+    """One image, (32, 32, 3) YCbCr; or why it cannot be read."""
+    try:
+        with Image.open(path) as image:
+            image.draft("YCbCr", (DRAFT, DRAFT))
+            image.load()
+            if image.mode in PLAIN and not image.has_transparency_data:
+                upright = ImageOps.exif_transpose(image) if image.info.get("exif") else image
+                small = upright.resize((SIDE, SIDE), Image.Resampling.BILINEAR)
+                return np.asarray(small.convert("YCbCr"))
+        small = read_image(path).resize((SIDE, SIDE), Image.Resampling.BILINEAR)
+        return np.asarray(small.convert("YCbCr"))
+    except PalpateError as error:
+        return error.got
+    except BROKEN as error:
+        return check_image(path) or str(error) or type(error).__name__
+
+
+def thumbnails(
+    paths: Sequence[Path | None],
+    *,
+    cache: Path | None = None,
+    threads: int | None = None,
+    progress: Progress = quiet,
+) -> Thumbnails:
+    """Decode every distinct path once.
+
+    Args:
+        paths: (n,) files; None where a sample has no image.
+        cache: folder for the pieces; their names change with paths, file sizes and modification
+            times, so another split of the same files uses them. None keeps nothing.
+        threads: that decode; default: the number of cores, 16 at most.
+        progress: called with the number of files done.
+    """
+    files = sorted({path for path in paths if path is not None})
+    rows: dict[bytes, int] = {}
+    different: list[NDArray[np.uint8]] = []
+    row_of: dict[Path | None, int] = {None: -1}
+    unreadable: dict[str, str] = {}
+    for start in range(0, len(files), PIECE):
+        progress("decoding images", start, len(files))
+        piece = files[start : start + PIECE]
+        pixels, reasons = _piece(piece, cache, threads)
+        unreadable.update({str(piece[k]): reason for k, reason in sorted(reasons.items())})
+        for k, path in enumerate(piece):
+            if k in reasons:
+                row_of[path] = -1
+                continue
+            row_of[path] = rows.setdefault(pixels[k].tobytes(), len(rows))
+            if row_of[path] == len(different):
+                different.append(pixels[k].copy())
+    progress("decoding images", len(files), len(files))
+    row = np.array([row_of[path] for path in paths], np.int64)
+    empty = np.zeros((0, SIDE, SIDE, 3), np.uint8)
+    return Thumbnails(row, np.stack(different) if different else empty, unreadable)
+
+
+def _piece(files: Sequence[Path], cache: Path | None, threads: int | None) -> Decoded:
+    """Thumbnails of some files, from the cache if they are there."""
+    if cache is None:
+        return _decode(files, threads)
+    key = digest_json([VERSION, [[str(path), *file_stamp(path)] for path in files]])
+    stored = cache / f"thumbnails-{short(key)}.npz"
+    try:
+        with np.load(stored, allow_pickle=False) as piece:
+            reasons = zip(piece["bad"].tolist(), piece["why"].tolist(), strict=True)
+            return piece["pixels"], dict(reasons)
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        pixels, bad = _decode(files, threads)  # absent or damaged
+    with atomic_path(stored) as part, open(part, "wb") as file:
+        np.savez(
+            file, pixels=pixels, bad=np.array(list(bad), int), why=np.array([*bad.values()], str)
+        )
+    return pixels, bad
+
+
+def _decode(files: Sequence[Path], threads: int | None) -> Decoded:
+    pixels, reasons = np.zeros((len(files), SIDE, SIDE, 3), np.uint8), dict[int, str]()
+    decoded = in_threads(lambda k: thumbnail(files[k]), range(len(files)), threads=threads)
+    for k, result in decoded:
+        if isinstance(result, str):
+            reasons[k] = result
+        else:
+            pixels[k] = result
+    return pixels, reasons
