@@ -43,9 +43,9 @@ def make_lists(folder):
 
 
 def ours(train, test):
-    from palpate.leakage.audit import audit_lists
+    from palpate.leakage import audit as audit_lists
 
-    audit, _ = audit_lists(train, test)
+    audit = audit_lists(train, test)
     return [
         audit.test_samples,
         audit.groups_shared,

@@ -20,9 +20,10 @@ from PIL import Image
 from scipy import ndimage
 
 from palpate.leakage.background import planar
-from palpate.leakage.descriptors import DRAFT, search_vectors, thumbnail
+from palpate.leakage.correlation import band_pass, even
 from palpate.leakage.pool import FLOOR, quantized
-from palpate.leakage.verify import band_pass, even
+from palpate.leakage.similarity import search_vectors
+from palpate.leakage.thumbnails import DRAFT, thumbnail
 
 CHUNK = 64
 

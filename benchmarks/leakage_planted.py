@@ -3,7 +3,7 @@
     python benchmarks/leakage_planted.py --seeds 20
     python benchmarks/leakage_planted.py --seeds 20 --flat        # with Glass: prints without any texture among the unrelated touches
 
-Each seed forges a train and a test part (tests/leakage_forge.py: 60 videos of 9 kinds of surface, 128 px, 4 samples each) and plants near-duplicates (brightness
+Each seed makes a train and a test part (tests/leakage_fixtures.py: 60 videos of 9 kinds of surface, 128 px, 4 samples each) and plants near-duplicates (brightness
 +-5 %, JPEG quality 60, shifts up to 4 px, and combinations) across videos, the same sample, the same bytes, shared videos and frames 3 apart. Near-duplicates are
 judged twice: with videos known, and with all metadata dropped. Rows that are near-duplicates by nature (same bytes, same sample) count as such; frames 3
 apart, which may or may not be, are left out of that judgment. Peak memory is the process's.
@@ -22,9 +22,9 @@ import polars as pl
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from leakage_forge import MATERIALS, forge
+from leakage_fixtures import MATERIALS, forge
 from palpate.data.manifest import Manifest
-from palpate.leakage.audit import Pictures, inspect_parts
+from palpate.leakage import audit
 from palpate.leakage.near import near_duplicates
 
 DROPPED = ("video", "contact", "object", "session", "material", "sensor", "domain")
@@ -44,14 +44,12 @@ def counts(flag, truth, use=None):
     )
 
 
-def judge(leaky, processes):
+def judge(leaky, threads):
     """Kind -> (true positives, false positives, false negatives), and missed changes."""
     truth = {kind: leaky.truth(kind) for kind in leaky.planted}
     same, copied = truth["identical sample"], truth["identical bytes"]
     alike, spared = truth["near-duplicate"] | same | copied, truth["time gap"]
-    found = inspect_parts(
-        leaky.train, leaky.test, group="video", pictures=Pictures(processes=processes)
-    ).table
+    found = audit(leaky.train, leaky.test, by="video", threads=threads).to_frame()
     column = lambda name: found[name].to_numpy().astype(bool)  # noqa: E731
     out = {
         "identical sample": counts(column("identical_sample_flag"), same),
@@ -63,7 +61,7 @@ def judge(leaky, processes):
     for modality in ("vision", "tactile"):
         known = column(f"near_duplicate_{modality}_flag")
         hidden = near_duplicates(
-            anonymous(leaky.train), anonymous(leaky.test), modality, processes=processes
+            anonymous(leaky.train), anonymous(leaky.test), modality, threads=threads
         ).flag
         out[f"near-duplicate {modality}, videos known"] = counts(known, alike, ~spared)
         out[f"near-duplicate {modality}, no metadata"] = counts(hidden, alike, ~spared)
@@ -83,7 +81,7 @@ def main():
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--look", default="gelsight", choices=("gelsight", "digit"))
     parser.add_argument("--flat", action="store_true")
-    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     materials = (*MATERIALS, "Glass") if options.flat else MATERIALS
     total, missed, samples, seconds = {}, Counter(), 0, 0.0
@@ -94,7 +92,7 @@ def main():
             )
             samples += len(leaky.test)
             start = time.perf_counter()
-            found, lost = judge(leaky, options.processes)
+            found, lost = judge(leaky, options.threads)
             seconds += time.perf_counter() - start
         missed.update(lost)
         for kind, row in found.items():
