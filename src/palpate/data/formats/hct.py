@@ -263,11 +263,7 @@ def _in_time(video: str) -> tuple[str, float, str]:
 
 
 def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: bool) -> Lists:
-    """The samples of all lists, and what the two JSON files add.
-
-    Raises:
-        PalpateError: if ``lists`` holds none with rows.
-    """
+    """The samples of all lists, and what the two JSON files add."""
     read, unlisted = Lists(), list[Frame]()
     resting: set[tuple[str, int]] = set()
     for rig in rigs:

@@ -110,16 +110,7 @@ def run(
 ) -> Imported:
     """Import a data set; its images go to ``out/images``, which becomes the manifest's root.
 
-    Args:
-        source: folder, or name on the hub.
-        out: folder to write to.
-        columns: manifest column -> map expression over the data set's columns.
-        classes: table of classes, for labels that are bare numbers.
-        config: which configuration of the data set.
-        revision: of a hub data set: branch, tag or commit.
-        skip_bad: skip bad rows and list them, instead of raising.
-        check: how images are checked.
-        progress: called with the number of rows read.
+    The options are those of :func:`scan`; ``skip_bad`` skips and lists bad rows.
 
     Raises:
         PalpateError: if the source cannot be opened or lacks a needed column.
@@ -240,11 +231,7 @@ def _scan(
 
 
 def _batches(source: Source) -> Iterator[tuple[str, int, Batch]]:
-    """(part, number of its first row, cells by column).
-
-    Raises:
-        PalpateError: if a file of the data set breaks off.
-    """
+    """(part, number of its first row, cells by column)."""
     for split, data in source.splits.items():
         first = 0
         try:
@@ -279,7 +266,7 @@ class _BatchReader:
     def rows(self, classes: Mapping[int, str] | None) -> Iterator[tuple[int, Row]]:
         """The usable rows by their number in the batch."""
         sources = {target: self.maps.source(target) for target in IMAGE_COLUMNS}
-        stored = {t: column for t, column in sources.items() if column in self.source.images}
+        stored = {t: c for t, c in sources.items() if c and c in self.source.images}
         plain = self.maps.without(list(stored))
         texts = {n: pl.Series(self._texts(n), dtype=pl.String) for n in plain.columns}
         table = pl.DataFrame({ROW: range(self.count)}).with_columns(**texts)
@@ -291,7 +278,8 @@ class _BatchReader:
             row.setdefault("id", self._default_id(k, row))
             problems: list[tuple[str, str]] = []
             for target in (t for t in IMAGE_COLUMNS if t in self.maps.expressions):
-                cell = self.batch[stored[target]][k] if target in stored else row.get(target)
+                column = stored.get(target)
+                cell = self.batch[column][k] if column else row.get(target)
                 path = self._stored(target, k, cell)
                 if isinstance(path, tuple):
                     problems.append((path[0], f"{target}: {path[1]}"))
@@ -316,9 +304,6 @@ class _BatchReader:
         """Cells as texts: an image is its file name, a class label its name.
 
         Labels of the material that are no class (-1: unclear) stay numbers.
-
-        Raises:
-            PalpateError: if the column holds lists or objects.
         """
         values = self.batch[name]
         if name in self.source.images:

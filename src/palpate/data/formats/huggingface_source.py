@@ -91,11 +91,7 @@ def first_line(error: BaseException) -> str:
 
 
 def _loaded(source: Path, name: str, config: str | None, revision: str | None) -> Any:
-    """The data set as the library opens it, without a copy in its cache.
-
-    Raises:
-        PalpateError: if it cannot be opened.
-    """
+    """The data set as the library opens it, without a copy in its cache."""
     import datasets
 
     local = source.is_dir()
@@ -118,12 +114,7 @@ def _loaded(source: Path, name: str, config: str | None, revision: str | None) -
 
 
 def _require_hub(name: str, revision: str | None) -> None:
-    """Ask the hub once, without the library's half minute of retries.
-
-    Raises:
-        PalpateError: if it cannot be reached and the local cache was not requested, or has no such
-            data set.
-    """
+    """Ask the hub once, without the library's half minute of retries."""
     if os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "TRUE", "YES", "ON"):
         return
     from huggingface_hub import HfApi

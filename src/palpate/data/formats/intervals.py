@@ -153,24 +153,11 @@ def run(  # noqa: PLR0913 (a public verb)
     check: Check = "decode",
     progress: Progress = quiet,
 ) -> Imported:
-    """Import the contacts of an interval list.
+    """Import the contacts of an interval list; options as in :func:`scan`.
 
-    Args:
-        source: the list.
-        out: folder to write to; frames of raw videos go to
-            ``out/images/<video>/{vision,tactile}/``. After an interruption the same call continues
-            where it stopped.
-        root: folder of the recordings (default: that of the list).
-        columns: ``video``, ``start``, ``end``, ``material`` ... -> map expression.
-        classes: table of classes, whose numbers are the labels.
-        half_open: ``end`` is the first frame after the contact.
-        every: take every n-th frame of a contact, from its first.
-        sensor: name of the tactile sensor; null if not given.
-        skip_bad: skip bad intervals and frames and list them, instead of raising.
-        image_format: of the cached frames.
-        size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
-        check: how extracted images are checked.
-        progress: progress callback.
+    Frames of raw videos go to ``out/images/<video>/{vision,tactile}/`` as ``image_format``, their
+    shorter side reduced to ``size`` pixels; after an interruption the same call continues.
+    ``sensor`` names the tactile sensor; ``skip_bad`` skips and lists bad intervals and frames.
 
     Raises:
         PalpateError: if the list or the recordings are missing, a column is lacking, or an option
@@ -262,11 +249,7 @@ def _read(
     classes: Path | None,
     half_open: bool,
 ) -> list[Interval]:
-    """The well-formed intervals of the list, in its order.
-
-    Raises:
-        PalpateError: if the list is missing, or lacks a needed column.
-    """
+    """The well-formed intervals of the list, in its order."""
     header = header_of(path)
     table = open_table(path, ORDER[: len(header)] if _is_bare(header) else None)
     maps = dict(columns or {})
@@ -325,11 +308,7 @@ def _interval(
 def _prepared(
     work: Recordings, listed: list[Interval], every: int, check: Check, progress: Progress
 ) -> tuple[list[Row], dict[str, Interval]]:
-    """Everything up to extraction: the rows, and the contacts by name.
-
-    Raises:
-        PalpateError: if ``every`` is out of range.
-    """
+    """Everything up to extraction: the rows, and the contacts by name."""
     if every < 1:
         raise PalpateError("must be at least 1", str(every), "", argument="every")
     rows = [Row(i.where, i.video, i.video, i.first, i.where, "") for i in listed]

@@ -15,12 +15,12 @@ and are skipped.
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.data.formats.base import Facts, Format, Scan, few
 from palpate.data.formats.layout import numbered, require_folder, subfolders
+from palpate.data.tables import open_table
 
 CITATION = (
     "R. Gao et al.: The ObjectFolder Benchmark: Multisensory Learning with Neural and Real "
@@ -128,11 +128,7 @@ def _object(result: Scan, name: str, material: str | None) -> None:
 
 
 def _materials(result: Scan, given: Path | None) -> dict[int, str]:
-    """Object -> material from the table; empty without one.
-
-    Raises:
-        PalpateError: if the named table is missing, or has other columns.
-    """
+    """Object -> material from the table; empty without one."""
     path = result.base / METADATA if given is None else Path(given)
     if not path.is_file():
         if given is None:
@@ -141,22 +137,19 @@ def _materials(result: Scan, given: Path | None) -> dict[int, str]:
         raise PalpateError(
             "must be a table of materials", f"no file {path}", fix, argument="metadata"
         )
-    reader = csv.DictReader(path.read_text("utf-8-sig", errors="replace").splitlines())
-    header = reader.fieldnames or []
-    if not {"Index", "Material"} <= set(header):
+    table = open_table(path)
+    if not {"Index", "Material"} <= set(table.names):
         must = f"{path} must have the columns Index, Name, Material"
-        raise PalpateError(must, ", ".join(header) or "none", "Fetch it again")
+        raise PalpateError(must, ", ".join(table.names) or "none", "Fetch it again")
     materials: dict[int, str] = {}
-    for cells in reader:
-        where, index, material = f"{path}:{reader.line_num}", cells["Index"], cells["Material"]
-        if None in cells or None in cells.values():
-            result.problem(where, "bad-row", f"not {len(header)} cells")
-        elif not index.strip().isdecimal() or not material.strip():
+    for line, index, material in table.read(["Index", "Material"]).iter_rows():
+        where = f"{path}:{line}"
+        if not material or not str(index).isdecimal():
             text = f"{index!r}, {material!r} is not an object and its material"
             result.problem(where, "bad-line", text)
-        elif (before := materials.setdefault(int(index), material.strip())) != material.strip():
-            text = f"object {index.strip()} is {before} on an earlier line"
-            result.problem(where, "two-labels", text)
+        elif (before := materials.setdefault(int(index), material)) != material:
+            result.problem(where, "two-labels", f"object {index} is {before} on an earlier line")
+    result.problems += table.problems
     unknown = sorted(set(materials.values()) - set(MATERIALS))
     result.suspect(path, "unknown-material", f"other than {', '.join(MATERIALS)}", unknown)
     result.facts["materials"] = path.name

@@ -149,11 +149,7 @@ def _read_table(
     names: str | None,
     classes: Mapping[int, str] | None,
 ) -> None:
-    """Add the rows of a table.
-
-    Raises:
-        PalpateError: if it has no column of images.
-    """
+    """Add the rows of a table."""
     table = open_table(path, None if names is None else [name.strip() for name in names.split(",")])
     broken = bool(table.problems) and not table.names
     compiled = compile_maps({} if broken else maps, table.names, TARGETS)
@@ -208,11 +204,7 @@ def _add_files(
 
 
 def _pairs(result: Scan) -> dict[str, Cells]:
-    """Path of the tactile image below its folder -> the paths of both images below the source.
-
-    Raises:
-        PalpateError: if there is not exactly one folder of each side.
-    """
+    """Path of the tactile image below its folder -> the paths of both images below the source."""
     sides: list[Images[str]] = []
     for side, names in SIDES.items():
         folders = _folders(result.base, side)

@@ -96,17 +96,12 @@ def scan(source: Path, *, scale: str | None = None, progress: Progress = quiet) 
     used: set[str] = set()
     for done, scene in enumerate(sorted({*tactile, *vision}, key=natural)):
         progress("reading scenes", done, len(tactile))
-        scales = tactile.get(scene, [])
-        default = TACTILE_SCALE if TACTILE_SCALE in scales or not scales else scales[0]
-        others = [s for s in scales if s != default]
-        result.suspect(f"touch/{scene}", "other-scale", f"only {default} is read; skipped", others)
-        view = _view_scale(scene, vision.get(scene, []), default, scale)
+        view = _view_scale(scene, vision.get(scene, []), scale)
         used |= {view} if scene in tactile and scene in vision else set()
-        _scene(result, scene, default, view, ids)
+        _scene(result, scene, view, ids)
     known = SCENES.union(BACKGROUND_NAMES.values())
-    unknown = [s for s in sorted(tactile) if s.removesuffix("_colmap") not in known]
-    text = "scenes that the publication does not name"
-    result.suspect("touch", "unknown-scene", text, unknown)
+    unknown = [scene for scene in sorted(tactile) if scene.removesuffix("_colmap") not in known]
+    result.suspect("touch", "unknown-scene", "scenes not named in the publication", unknown)
     names = [name for side in ("touch", "vision") for name in subfolders(root / side)]
     odd = [name for name in names if not re.fullmatch(SCALED, name)]
     result.suspect(root, "unknown-folder", "skipped, as not named <scene>_<scale>", odd)
@@ -140,30 +135,29 @@ def _scenes(side: Path) -> dict[str, list[str]]:
     return scenes
 
 
-def _view_scale(scene: str, scales: list[str], default: str, requested: str | None) -> str:
-    """Which scale of a scene's views is read.
-
-    Raises:
-        PalpateError: if several are there and none is the default, or the requested one is absent.
-    """
+def _view_scale(scene: str, scales: list[str], requested: str | None) -> str:
+    """Which scale of a scene's views is read."""
     if requested is not None and scales and requested not in scales:
         got = f"{requested!r}; the views of {scene!r} have {', '.join(scales)}"
         raise PalpateError("must be a scale of all views", got, "", argument="scale")
-    if requested is None and default not in scales and len(scales) > 1:
+    if requested is None and TACTILE_SCALE not in scales and len(scales) > 1:
         must = f"must name one of the scales of the views of {scene!r}"
         example = {"scale": scales[0]}
         raise PalpateError(must, ", ".join(scales), "", argument="scale", example=example)
-    return requested or (default if default in scales or not scales else scales[0])
+    default = scales[0] if scales and TACTILE_SCALE not in scales else TACTILE_SCALE
+    return requested or default
 
 
-def _scene(
-    result: Scan, scene: str, scale: str, view_scale: str, ids: dict[tuple[str, int], str]
-) -> None:
+def _scene(result: Scan, scene: str, view_scale: str, ids: dict[tuple[str, int], str]) -> None:
     """Add the pairs of one scene; the list may also name tactile images without a view."""
-    tactile = numbered(result, f"touch/{scene}_{scale}")
+    tactile = numbered(result, f"touch/{scene}_{TACTILE_SCALE}")
     vision = numbered(result, f"vision/{scene}_{view_scale}")
     ids |= {(scene, k): f"{scene}/{Path(name).stem}" for k, name in tactile.files.items()}
-    background = _background(result.base, scene, scale)
+    plain = scene.removesuffix("_colmap")
+    names = [f"{scene}_{TACTILE_SCALE}", f"{plain}_colmap_40_50"]
+    names.append(f"{BACKGROUND_NAMES.get(plain, plain)}_colmap_40_50")
+    paths = [f"touch_bg/{name}/bg.jpg" for name in names]
+    background = next((path for path in paths if (result.base / path).exists()), None)
     if background is None and tactile.files:
         result.suspect(tactile.place, "no-background", "no touch_bg/ image of this scene")
     for k in paired(result, tactile, vision):
@@ -177,13 +171,6 @@ def _scene(
             "sensor": FACTS.sensor,
         }
         result.rows.append((tactile.path(k), row))
-
-
-def _background(root: Path, scene: str, scale: str) -> str | None:
-    plain = scene.removesuffix("_colmap")
-    colmap = [f"{name}_colmap_40_50" for name in (plain, BACKGROUND_NAMES.get(plain, plain))]
-    paths = [f"touch_bg/{name}/bg.jpg" for name in (f"{scene}_{scale}", *colmap)]
-    return next((path for path in paths if (root / path).exists()), None)
 
 
 def _read_list(result: Scan, data: object, ids: dict[tuple[str, int], str]) -> None:

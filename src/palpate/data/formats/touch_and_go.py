@@ -295,11 +295,7 @@ class _Lists:
 
 
 def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
-    """Read the lists given, else ``label.txt``, else the official two, and what is next to them.
-
-    Raises:
-        PalpateError: if there is none.
-    """
+    """Read the lists given, else ``label.txt``, else the official two, and what is next to them."""
     every, official_paths = root / "label.txt", [root / name for name in OFFICIAL.values()]
     if labels is not None:
         paths = [Path(labels)] if isinstance(labels, (str, Path)) else [Path(p) for p in labels]
@@ -351,7 +347,7 @@ def _prepared(
 
 
 def _splits(manifest: Manifest, official: FrameList | None) -> dict[str, Split]:
-    """``Orig``: the official parts of the samples at hand, matched by recording and frame number."""
+    """``Orig``: the official parts of the samples at hand, by recording and frame number."""
     if official is None:
         return {}
     part_of = {name: part for part, name in OFFICIAL.items()}

@@ -269,11 +269,7 @@ def _read_lists(result: Scan, lists: dict[tuple[str, str], Path], progress: Prog
 
 
 def _read_recordings(result: Scan, progress: Progress) -> None:
-    """Rows of the folders that hold frames.
-
-    Raises:
-        PalpateError: if there are none.
-    """
+    """Rows of the folders that hold frames."""
     places: dict[str, dict[str, str]] = {"touch": {}, "vision": {}}
     for folder, names in _walk(result.base):
         if any(re.fullmatch(FRAME, name.rpartition(".")[0]) for name in names):
