@@ -85,7 +85,8 @@ class Tree:
         source: what a user would name: a folder or a table.
         samples: how many samples an import must give.
         options: options of the import that it needs; paths below the folder follow a copied tree.
-        remove: removes what one sample needs, given the source; default: deletes the tactile image of the last sample.
+        remove: removes what one sample needs, given the source; default: deletes the tactile image
+            of the last sample.
         cut: damages it instead; default: cuts that file in half.
     """
 

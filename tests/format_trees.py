@@ -1,9 +1,10 @@
-"""A small tree of every data-set format in its true on-disk layout, for the contract over all formats.
+"""A small tree of every data-set format in its true on-disk layout, for the contract test.
 
-To add a format write ``make_<name>(folder) -> Tree`` here and add it to ``TREES``. Rules: at least six
-samples; every image at least 32 pixels wide and of its own content; everything below ``folder``; no
-problems (the contract spoils copies of it); the last sample by manifest order uses its tactile image
-alone. Then ``pytest tests/test_data_contract.py -k <name>`` says whether the format keeps the contract.
+To add a format write ``make_<name>(folder) -> Tree`` here and add it to ``TREES``. Rules: at least
+six samples; every image at least 32 pixels wide and of its own content; everything below
+``folder``; no problems (the contract spoils copies of it); the last sample by manifest order uses
+its tactile image alone. Then ``pytest tests/test_data_contract.py -k <name>`` says whether the
+format keeps the contract.
 """
 
 import csv
@@ -89,7 +90,7 @@ def make_visgel(folder: Path) -> Tree:
 
 
 def make_visgel_recordings(folder: Path) -> Tree:
-    """The tree that T3 reads: touch alone, two recordings of four frames, the first the reference."""
+    """The tree that T3 reads: touch alone, two recordings of four frames with the reference."""
     root = folder / "data_seen"
     names = [f"{rec}/frame{k:04d}.jpg" for rec in ("2/rec", "10/rec") for k in range(4)]
     write_images(root, names)
@@ -97,7 +98,7 @@ def make_visgel_recordings(folder: Path) -> Tree:
 
 
 def make_objectfolder(folder: Path) -> Tree:
-    """Objects 2, 10 and 17 with trials of five, three and two images, and the table of materials."""
+    """Objects 2, 10 and 17 with trials of two to five images, and the table of materials."""
     root = folder / "objectfolder"
     trials = {"2/tactile_data/1": range(5), "2/tactile_data/2": range(9, 12)}
     trials |= {"10/tactile_data/1": range(3), "17/tactile_data/3": range(2)}
@@ -125,7 +126,7 @@ def make_objectfolder_generation(folder: Path) -> Tree:
 
 
 def make_ycb_slide(folder: Path) -> Tree:
-    """Two objects with two logs each of three frames, touch and webcam; and a simulated log of two."""
+    """Two objects with two logs each of three frames, and a simulated log of two."""
     root = folder / "ycb"
     logs = [f"real/{o}/dataset_{k}" for o, k in product(("004_sugar_box", "055_baseball"), (0, 4))]
     for side, start in (("frames", 1), ("webcam_frames", 33)):
@@ -178,7 +179,7 @@ def hf_kinds() -> dict:
 
 
 def save_hf(folder: Path, rows: list[dict], **kinds) -> Path:
-    """Save rows by their cell ``part`` as a Hugging Face folder; other columns than ``kinds`` are texts."""
+    """Save rows by their cell ``part`` as a Hugging Face folder; columns not in ``kinds`` are texts."""
     import datasets
 
     features = datasets.Features({n: kinds.get(n, datasets.Value("string")) for n in rows[0]})
@@ -306,7 +307,7 @@ def write_contacts(path: Path, rows: Sequence[Sequence[str]]) -> None:
 
 
 def make_hct(folder: Path) -> Tree:
-    """Two rigs of three trajectories with four frames, one of each in test, and two untouched ones."""
+    """Two rigs of three trajectories with four frames, one of them in test, and two untouched."""
     root = folder / "hct"
     for r, rig in enumerate((root / "data1", root / "data2")):
         parts: dict[str, list[list[str]]] = {"train": [], "test": []}

@@ -1,4 +1,4 @@
-"""The contract that every data-set format keeps, on a tree in its true layout (``format_trees.py``)."""
+"""The contract that every data-set format keeps, on a tree in its true layout."""
 
 import shutil
 from dataclasses import replace
@@ -165,7 +165,7 @@ def test_a_bad_image_is_reported_and_skipped_alone(name, folder, made, whole, tm
 
 def test_a_doubled_id_and_a_climbing_path_are_problems(name, made):
     result = FORMATS[name].scan(made.source, **made.options)
-    where, row = result.rows[-1]
+    _, row = result.rows[-1]
     result.rows += [("again", dict(row)), ("outside", {**row, "id": "x", "tactile": "../x.png"})]
     assert len(finished(result, "none")) == made.samples
     kinds = {p.where: p.kind for p in result.problems}

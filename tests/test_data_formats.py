@@ -1,4 +1,4 @@
-"""TaRF, ObjectFolder-Real in both layouts, YCB-Slide: rows known by hand, and everything bad reported."""
+"""TaRF, ObjectFolder-Real in both layouts, YCB-Slide: rows known by hand, all problems reported."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Hugging Face data sets: what was exported comes back whole; foreign ones by maps; nothing runs, leaves the folder or is half written."""
+"""Hugging Face data sets: exports come back whole, others by maps; nothing of theirs is run."""
 
 import json
 import subprocess
@@ -39,7 +39,7 @@ def test_a_foreign_set_keeps_its_bytes_parts_and_labels(source, tmp_path, form):
         (source / "data").mkdir(parents=True)
         for part, data in loaded.items():
             data.to_parquet(str(source / "data" / f"{part}-00000-of-00001.parquet"))
-    found = import_dataset(source, tmp_path / "out", columns=MAPS)
+    result = import_dataset(source, tmp_path / "out", columns=MAPS)
     manifest = Manifest.load(tmp_path / "out").require_valid()
     assert manifest.ids == [f"data1/0-17.{k // 4}/{k}" for k in range(8)]
     assert manifest.column("frame") == list(range(8))
@@ -47,9 +47,9 @@ def test_a_foreign_set_keeps_its_bytes_parts_and_labels(source, tmp_path, form):
     assert [p.read_bytes() for p in manifest.paths("vision")] == [r["rgb"]["bytes"] for r in rows]
     assert [p.read_bytes() for p in manifest.paths("tactile")] == [r["gel"]["bytes"] for r in rows]
     assert {p.suffix for p in manifest.paths("vision")} == {".png"}
-    assert found.splits["Orig"].counts() == {"train": 5, "val": 3}
-    assert found.facts["format"] == "hf"
-    assert (found.facts["dataset"], found.facts["text_source"]) == (source.name, "none")
+    assert result.splits["Orig"].counts() == {"train": 5, "val": 3}
+    assert result.facts["format"] == "hf"
+    assert (result.facts["dataset"], result.facts["text_source"]) == (source.name, "none")
 
 
 @pytest.mark.parametrize("parted", [False, True])
@@ -132,12 +132,12 @@ def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_ma
     rows = hf_rows()
     for row in rows:
         row["gel"] = rows[0]["gel"]
-    found = import_dataset(
+    result = import_dataset(
         save_hf(tmp_path / "mine", rows, **kinds()),
         tmp_path / "out",
         columns=MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"},
     )
-    assert set(found.manifest.column("tactile")) == {"train/tactile/00000000.jpg"}
+    assert set(result.manifest.column("tactile")) == {"train/tactile/00000000.jpg"}
     export_dataset(small_manifest, tmp_path / "hf", to="hf")
     loaded = datasets.load_from_disk(str(tmp_path / "hf"))
     outside = {"tactile_path": [f"../../{k}.png" for k in range(len(small_manifest))]}
@@ -152,7 +152,7 @@ def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_ma
     assert not [*tmp_path.glob("*.png"), *(tmp_path / "out2").glob("*.png")]
 
 
-def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_path):
+def test_bad_rows_are_reported_with_their_place_and_images_outside_are_rejected(tmp_path):
     rows = hf_rows()
     secret = tmp_path / "secret.jpg"
     secret.write_bytes(rows[0]["gel"]["bytes"])
@@ -173,16 +173,16 @@ def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_p
     maps = MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"}
     with pytest.raises(ProblemsError) as caught:
         import_dataset(source, tmp_path / "out", columns=maps)
-    told = sorted((p.where, p.kind) for p in caught.value.problems)
-    assert told == [
+    reported = sorted((p.where, p.kind) for p in caught.value.problems)
+    assert reported == [
         ("mine/train:1", "missing-image"),
         ("mine/train:2", "bad-image"),
         ("mine/train:3", "bad-image"),
         ("mine/train:4", "bad-frame"),
     ]
     assert not (tmp_path / "out").exists()
-    looked = validate_dataset(source, columns=maps)
-    assert sorted((p.where, p.kind) for p in [*looked.missing, *looked.invalid]) == told
+    report = validate_dataset(source, columns=maps)
+    assert sorted((p.where, p.kind) for p in [*report.missing, *report.invalid]) == reported
     assert len(import_dataset(source, tmp_path / "out", columns=maps, skip_bad=True).manifest) == 4
     texts = [
         {"part": "all", "image": str(secret)},
@@ -191,17 +191,17 @@ def test_bad_rows_are_told_with_their_place_and_images_outside_are_refused(tmp_p
     ]
     save_hf(tmp_path / "texts", texts)
     (tmp_path / "texts" / "in.jpg").write_bytes(secret.read_bytes())
-    found = import_dataset(
+    result = import_dataset(
         tmp_path / "texts", tmp_path / "out2", columns={"tactile": "image"}, skip_bad=True
     )
-    assert [(p.where, p.kind) for p in found.skipped] == [
+    assert [(p.where, p.kind) for p in result.skipped] == [
         ("texts/all:0", "outside-root"),
         ("texts/all:2", "missing-file"),
     ]
-    assert found.manifest.ids == ["all/00000001"]
+    assert result.manifest.ids == ["all/00000001"]
 
 
-def test_what_cannot_be_opened_is_told(source, tmp_path, monkeypatch):
+def test_what_cannot_be_opened_is_reported(source, tmp_path, monkeypatch):
     with pytest.raises(
         PalpateError, match="no vision and no tactile among part, path, kind, rgb, gel"
     ):
@@ -231,15 +231,14 @@ def test_what_cannot_be_opened_is_told(source, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_hub_out_of_reach_is_told_at_once_with_what_to_do(tmp_path, monkeypatch):
+def test_a_hub_out_of_reach_is_reported_at_once_with_what_to_do(tmp_path, monkeypatch):
     def unreachable(*_, **__):
         raise OSError("Name or service not known")
 
     monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
     monkeypatch.setattr("huggingface_hub.HfApi.dataset_info", unreachable)
     with pytest.raises(
-        PalpateError,
-        match=r"hub must be within reach.*hf download --repo-type dataset user/name --local-dir DIR",
+        PalpateError, match=r"hub must be within reach.*hf download --repo-type dataset user/name"
     ):
         import_dataset("user/name", tmp_path / "out", format="hf")
 
@@ -248,21 +247,21 @@ def test_an_id_of_two_parts_is_in_neither_and_parts_follow_the_kept_row(tmp_path
     rows = hf_rows()
     rows[5]["path"] = rows[1]["path"]  # of validation: the id of a row of train
     rows[2]["path"] = rows[1]["path"]  # twice in train
-    found = import_dataset(
+    result = import_dataset(
         save_hf(tmp_path / "mine", rows, **kinds()),
         tmp_path / "out",
         columns=MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"},
         skip_bad=True,
     )
-    assert [(p.where, p.kind) for p in found.skipped] == [
+    assert [(p.where, p.kind) for p in result.skipped] == [
         ("mine/train:2", "duplicate-id"),
         ("mine/validation:0", "two-parts"),
     ]
-    assert found.splits["Orig"].counts() == {"train": 3, "val": 2}
-    assert "data1/0-17.0/1" in found.manifest.ids
+    assert result.splits["Orig"].counts() == {"train": 3, "val": 2}
+    assert "data1/0-17.0/1" in result.manifest.ids
 
 
-def test_numbers_that_are_no_class_are_told_and_minus_one_is_inconclusive(tmp_path):
+def test_numbers_that_are_no_class_are_reported_and_minus_one_is_inconclusive(tmp_path):
     rows = hf_rows()
     rows[1]["kind"], rows[2]["kind"], rows[6]["kind"] = 7, -1, -2
     source = save_hf(tmp_path / "mine", rows, **kinds() | {"kind": datasets.Value("int64")})
@@ -272,20 +271,18 @@ def test_numbers_that_are_no_class_are_told_and_minus_one_is_inconclusive(tmp_pa
         info = json.loads(path.read_text())
         info["features"]["kind"] = {"names": ["Wood", "Rock"], "_type": "ClassLabel"}
         path.write_text(json.dumps(info))
-    looked = validate_dataset(source, columns=MAPS)
-    told = [("mine/train:1", "unknown-label"), ("mine/validation:1", "unknown-label")]
-    assert sorted((p.where, p.kind) for p in looked.invalid) == told
-    assert looked.samples == 5
-    found = import_dataset(source, tmp_path / "out", columns=MAPS, skip_bad=True)
-    assert sorted((p.where, p.kind) for p in found.skipped) == told
-    assert found.inconclusive == 1
-    assert found.manifest.column("frame") == [0, 3, 4, 5, 7]
-    assert None not in found.manifest.column("material")
+    report = validate_dataset(source, columns=MAPS)
+    reported = [("mine/train:1", "unknown-label"), ("mine/validation:1", "unknown-label")]
+    assert sorted((p.where, p.kind) for p in report.invalid) == reported
+    assert report.samples == 5
+    result = import_dataset(source, tmp_path / "out", columns=MAPS, skip_bad=True)
+    assert sorted((p.where, p.kind) for p in result.skipped) == reported
+    assert result.inconclusive == 1
+    assert result.manifest.column("frame") == [0, 3, 4, 5, 7]
+    assert None not in result.manifest.column("material")
 
 
-def test_without_the_extra_the_error_says_what_to_install(
-    small_manifest, source, tmp_path, monkeypatch
-):
+def test_a_missing_extra_says_what_to_install(small_manifest, source, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "datasets", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'palpate\[hf\]'"):
         import_dataset(source, tmp_path / "out", columns=MAPS)
@@ -295,5 +292,6 @@ def test_without_the_extra_the_error_says_what_to_install(
 
 
 def test_formats_load_without_datasets():
-    code = "import sys, palpate.data.importing, palpate.data.exporting; assert not {'datasets', 'torch', 'pyarrow'} & set(sys.modules)"
+    code = "import sys, palpate.data.importing, palpate.data.exporting; "
+    code += "assert not {'datasets', 'torch', 'pyarrow'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""Interval lists: the same samples as frame lists of the same touches, raw or extracted, and every kind of bad line."""
+"""Interval lists: the same samples as frame lists of the same contacts, and every bad line."""
 
 import numpy as np
 import polars as pl
@@ -31,7 +31,7 @@ def shown(manifest, column):
 
 
 @pytest.mark.parametrize("raw", [False, True])
-def test_intervals_give_what_a_frame_list_of_the_same_touches_gives(tmp_path, raw):
+def test_intervals_give_what_a_frame_list_of_the_same_contacts_gives(tmp_path, raw):
     root = recording(tmp_path / "tag", "a", raw=raw)
     (root / "list.csv").write_text(LIST)
     frames = (
@@ -41,21 +41,21 @@ def test_intervals_give_what_a_frame_list_of_the_same_touches_gives(tmp_path, ra
     )
     (root / "label.txt").write_text("\n".join(f"a/{k:010d}.jpg,{c}" for k, c in frames))
     (root / "classes.txt").write_text("Wood: 3\nRock: 15\n")
-    found = import_dataset(
+    result = import_dataset(
         root / "list.csv", tmp_path / "out", classes=root / "classes.txt", sensor="GelSight'17"
     )
-    wanted = import_touch_and_go(root, tmp_path / "tag_out")
-    assert found.manifest.require_valid().digest == wanted.manifest.digest
-    assert found.inconclusive == 1  # intervals here, frames there
+    expected = import_touch_and_go(root, tmp_path / "tag_out")
+    assert result.manifest.require_valid().digest == expected.manifest.digest
+    assert result.inconclusive == 1  # intervals here, frames there
     assert (
-        shown(found.manifest, "tactile")
-        == shown(found.manifest, "vision")
+        shown(result.manifest, "tactile")
+        == shown(result.manifest, "vision")
         == [*range(10, 16), *range(17, 20)]
     )
-    assert shown(found.manifest, "background") == [6] * 6 + [9] * 3
-    assert found.facts["format"] == "intervals"
-    looked = validate_dataset(root / "list.csv", classes=root / "classes.txt")
-    assert (looked.ok, looked.samples, looked.format) == (True, 9, "intervals")
+    assert shown(result.manifest, "background") == [6] * 6 + [9] * 3
+    assert result.facts["format"] == "intervals"
+    report = validate_dataset(root / "list.csv", classes=root / "classes.txt")
+    assert (report.ok, report.samples, report.format) == (True, 9, "intervals")
 
 
 @pytest.mark.parametrize(
@@ -108,18 +108,18 @@ def test_words_backgrounds_root_and_thinning(tmp_path):
     assert manifest.column("material") == [None] * 4
 
 
-def test_what_looks_wrong_is_told_by_import_and_validation(tmp_path):
+def test_what_looks_wrong_is_reported_by_import_and_validation(tmp_path):
     recording(tmp_path, "a")
     recording(tmp_path, "spare")
     (tmp_path / "l.csv").write_text("video,start,end,background\na,10,16,2\na,20,22,15\n")
-    found = import_dataset(tmp_path / "l.csv", tmp_path / "out")
-    told = [(p.where, p.kind) for p in found.suspicious]
-    assert told == [
+    result = import_dataset(tmp_path / "l.csv", tmp_path / "out")
+    reported = [(p.where, p.kind) for p in result.suspicious]
+    assert reported == [
         (f"{tmp_path / 'l.csv'}:3", "background-in-touch"),
         (str(tmp_path), "unlisted-video"),
     ]
-    assert "frame 15 of 'a'" in found.suspicious[0].text
-    assert list(validate_dataset(tmp_path / "l.csv").suspicious) == found.suspicious
+    assert "frame 15 of 'a'" in result.suspicious[0].text
+    assert list(validate_dataset(tmp_path / "l.csv").suspicious) == result.suspicious
 
 
 def test_validation_decodes_raw_videos(tmp_path):
@@ -132,14 +132,14 @@ def test_validation_decodes_raw_videos(tmp_path):
     third = (len(data) - start) // 3
     data[start + third : start + 2 * third] = b"\xff" * third
     path.write_bytes(bytes(data))
-    looked = validate_dataset(root / "l.csv")
-    assert [p.kind for p in looked.invalid] == ["bad-video"]
+    report = validate_dataset(root / "l.csv")
+    assert [p.kind for p in report.invalid] == ["bad-video"]
     with pytest.raises(ProblemsError) as caught:
         import_dataset(root / "l.csv", tmp_path / "out")
-    assert list(caught.value.problems) == list(looked.invalid)
+    assert list(caught.value.problems) == list(report.invalid)
 
 
-def test_every_bad_interval_is_told_by_its_line(tmp_path):
+def test_every_bad_interval_is_reported_by_its_line(tmp_path):
     root = recording(tmp_path / "d", "a")
     recording(root, "b")
     (root / "b" / "gelsight_frame" / "0000000031.jpg").unlink()
@@ -165,22 +165,20 @@ def test_every_bad_interval_is_told_by_its_line(tmp_path):
     (root / "l.csv").write_text("video,start,end,label\n" + "\n".join(line for line, _ in lines))
     with pytest.raises(ProblemsError) as caught:
         import_dataset(root / "l.csv", tmp_path / "out")
-    told = [(p.where, p.kind) for p in caught.value.problems]
-    assert sorted(told) == sorted(
+    reported = [(p.where, p.kind) for p in caught.value.problems]
+    assert sorted(reported) == sorted(
         (f"{root / 'l.csv'}:{n}", kind) for n, (_, kind) in enumerate(lines, 2) if kind
     )
     assert f"overlap with 8 to 12 at {root / 'l.csv'}:4" in next(
         p.text for p in caught.value.problems if p.where.endswith(":3")
     )
     assert not (tmp_path / "out").exists()
-    looked = validate_dataset(root / "l.csv")
-    assert sorted((p.where, p.kind) for p in [*looked.missing, *looked.invalid]) == sorted(told)
-    found = import_dataset(root / "l.csv", tmp_path / "out", skip_bad=True)
-    assert [
-        (v, f)
-        for v, f in zip(found.manifest.column("video"), found.manifest.column("frame"), strict=True)
-    ] == [*(("a", k) for k in (1, 2, 3, 15)), ("b", 30), ("b", 32), ("b", 34), ("b", 36)]
-    assert looked.samples == len(found.manifest)
+    report = validate_dataset(root / "l.csv")
+    assert sorted((p.where, p.kind) for p in [*report.missing, *report.invalid]) == sorted(reported)
+    result = import_dataset(root / "l.csv", tmp_path / "out", skip_bad=True)
+    frames = result.manifest.table.select("video", "frame").rows()
+    assert frames == [*(("a", k) for k in (1, 2, 3, 15)), *(("b", k) for k in (30, 32, 34, 36))]
+    assert report.samples == len(result.manifest)
 
 
 def test_overlaps_are_those_of_a_slow_search(tmp_path):
@@ -201,8 +199,8 @@ def test_overlaps_are_those_of_a_slow_search(tmp_path):
             for j, (c, d) in enumerate(spans)
             if j != k and a <= d and c <= b
         }
-        looked = validate_dataset(root / "l.csv", check="none")
-        assert {int(p.where.rpartition(":")[2]) - 2 for p in looked.invalid} == slow
+        report = validate_dataset(root / "l.csv", check="none")
+        assert {int(p.where.rpartition(":")[2]) - 2 for p in report.invalid} == slow
 
 
 def test_lists_of_a_split_hold_its_samples_and_come_back(tmp_path):
@@ -241,7 +239,7 @@ def test_the_real_clips_by_intervals_are_those_by_frames(real_data, tmp_path):
     pytest.importorskip("av", reason="PyAV is not installed")
     root = real_data / "touch_and_go" / "clips"
     frame = pl.col("frame")
-    touches = (
+    contacts = (
         read_list(root / "label.txt")
         .manifest.table.group_by("contact", maintain_order=True)
         .agg(
@@ -251,13 +249,13 @@ def test_the_real_clips_by_intervals_are_those_by_frames(real_data, tmp_path):
             label=pl.col("material").first(),
         )
     )
-    assert touches.height == 17
-    touches.drop("contact").write_csv(tmp_path / "touches.csv")
-    found = import_dataset(
-        tmp_path / "touches.csv", tmp_path / "out", root=root, sensor="GelSight'17", size=64
+    assert contacts.height == 17
+    contacts.drop("contact").write_csv(tmp_path / "contacts.csv")
+    result = import_dataset(
+        tmp_path / "contacts.csv", tmp_path / "out", root=root, sensor="GelSight'17", size=64
     )
-    assert len(found.manifest) == 436
+    assert len(result.manifest) == 436
     assert (
-        found.manifest.digest
+        result.manifest.digest
         == import_touch_and_go(root, tmp_path / "tag", size=64).manifest.digest
     )

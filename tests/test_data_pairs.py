@@ -1,4 +1,4 @@
-"""Pairs: tables of four kinds and folders, with every bad row reported; formats recognized by their files."""
+"""Pairs: tables of four kinds and folders, with every bad row reported; recognizing formats."""
 
 import json
 from functools import partial
@@ -381,7 +381,7 @@ def test_a_folder_of_one_kind_of_images(tmp_path):
     maps = {"video": "split_part(path, '/', 1)", "sensor": "'DIGIT'"}
     result = import_dataset(root, tmp_path / "out2", side="vision", columns=maps)
     assert rows_of(result, "video", "sensor") == [(v, "DIGIT") for v in ("a.jpg", "b", "b")]
-    with pytest.raises(PalpateError, match="say what they show. E.g. side="):
+    with pytest.raises(PalpateError, match=r"say what they show\. E\.g\. side="):
         import_dataset(root, tmp_path / "out3")
 
 

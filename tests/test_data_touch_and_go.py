@@ -1,4 +1,4 @@
-"""Touch and Go: every layout, every kind of bad input told at once, resume, backgrounds, and the real clips."""
+"""Touch and Go: every layout, every kind of bad input, resume, backgrounds, and the real clips."""
 
 import shutil
 
@@ -16,13 +16,13 @@ from palpate.data.manifest import Manifest
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
-#: Touches of every forged recording of 40 frames: label 3 from 10 to 15, label 15 from 17 to 19.
+#: Contacts of every made recording of 40 frames: label 3 from 10 to 15, label 15 from 17 to 19.
 LINES = [f"{{}}/{k:010d}.jpg,3" for k in range(10, 16)] + [
     f"{{}}/{k:010d}.jpg,15" for k in range(17, 20)
 ]
 
 
-def forge(root, *, raw=(), extracted=(), place="dataset", lines=None):
+def make(root, *, raw=(), extracted=(), place="dataset", lines=None):
     """A data set whose frames show their number; the sensor's show it too."""
     for name in raw:
         write_video(root / place / name / "video.mp4", 42)
@@ -51,9 +51,9 @@ def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
         "extracted": {"extracted": ("a", "b")},
         "mixed": {"raw": ("a",), "extracted": ("b",)},
     }
-    root = forge(tmp_path / "tag", place=place, **names[layout])
-    found = import_touch_and_go(root, tmp_path / "out")
-    manifest = found.manifest.require_valid()
+    root = make(tmp_path / "tag", place=place, **names[layout])
+    result = import_touch_and_go(root, tmp_path / "out")
+    manifest = result.manifest.require_valid()
     frames = [*range(10, 16), *range(17, 20)] * 2
     assert manifest.ids == [f"{v}/{k:010d}" for v, k in zip("a" * 9 + "b" * 9, frames, strict=True)]
     assert manifest.column("frame") == frames
@@ -63,9 +63,9 @@ def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
     assert shown(manifest, "tactile") == frames
     # 4 before 10 is 6; 4 before 17 is 13, in a touch, so back to 9
     assert shown(manifest, "background") == ([6] * 6 + [9] * 3) * 2
-    assert found.facts["layout"] == layout
-    assert found.facts["license"] == "CC BY 4.0"
-    assert found.facts["text_source"] == "none"
+    assert result.facts["layout"] == layout
+    assert result.facts["license"] == "CC BY 4.0"
+    assert result.facts["text_source"] == "none"
     assert manifest.column("text") == [None] * 18
     roots = {"raw": tmp_path / "out", "extracted": root, "mixed": tmp_path / "out"}
     assert manifest.root == roots[layout].resolve()
@@ -76,15 +76,15 @@ def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
 
 
 def test_extracted_frames_go_before_the_raw_video(tmp_path):
-    root = forge(tmp_path, extracted=("a",))
+    root = make(tmp_path, extracted=("a",))
     (root / "dataset" / "a" / "video.mp4").write_bytes(b"")
     assert find_videos(root)["a"].vision == root / "dataset" / "a" / "video_frame"
     assert import_touch_and_go(root, tmp_path / "out").facts["layout"] == "extracted"
 
 
 def spoil(root):
-    """One of each kind of bad input; returns the problems that must be found, as (line, kind, word)."""
-    forge(root, raw=("good", "cut", "nomoov"), extracted=("ext",))
+    """One of each kind of bad input; returns the expected problems."""
+    make(root, raw=("good", "cut", "nomoov"), extracted=("ext",))
     cut = root / "dataset" / "cut" / "gelsight.mp4"
     cut.write_bytes(cut.read_bytes()[: cut.stat().st_size * 2 // 3])
     nomoov = root / "dataset" / "nomoov" / "video.mp4"
@@ -98,7 +98,7 @@ def spoil(root):
         "\n".join(
             [
                 "good/0000000010.jpg,3",  # 1
-                "good/0000000041.jpg,3",  # 2: within the 42 of the photo, behind the 40 of the touch
+                "good/0000000041.jpg,3",  # 2: beyond the 40 tactile frames
                 "cut/0000000010.jpg,3",  # 3
                 "cut/0000000011.jpg,3",  # 4
                 "nomoov/0000000010.jpg,3",  # 5
@@ -137,36 +137,36 @@ def spoil(root):
     ]
 
 
-def test_everything_bad_is_told_at_once_and_nothing_is_left(tmp_path):
-    wanted = spoil(tmp_path / "tag")
+def test_everything_bad_is_reported_at_once_and_nothing_remains(tmp_path):
+    expected = spoil(tmp_path / "tag")
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(tmp_path / "tag", tmp_path / "out")
     assert [(p.where, p.kind) for p in caught.value.problems] == [
-        (f"{f}:{n}", kind) for f, n, kind, _ in wanted
+        (f"{f}:{n}", kind) for f, n, kind, _ in expected
     ]
-    for problem, (_, _, _, word) in zip(caught.value.problems, wanted, strict=True):
+    for problem, (_, _, _, word) in zip(caught.value.problems, expected, strict=True):
         assert word in problem.text
     assert not (tmp_path / "out").exists()
 
 
-def test_skip_bad_imports_the_rest_and_lists_the_same(tmp_path):
-    wanted = spoil(tmp_path / "tag")
-    found = import_touch_and_go(tmp_path / "tag", tmp_path / "out", skip_bad=True)
-    assert [(p.where, p.kind) for p in found.skipped] == [
-        (f"{f}:{n}", kind) for f, n, kind, _ in wanted
+def test_skip_bad_imports_the_others_and_lists_the_same(tmp_path):
+    expected = spoil(tmp_path / "tag")
+    result = import_touch_and_go(tmp_path / "tag", tmp_path / "out", skip_bad=True)
+    assert [(p.where, p.kind) for p in result.skipped] == [
+        (f"{f}:{n}", kind) for f, n, kind, _ in expected
     ]
-    assert found.manifest.ids == ["ext/0000000014", "good/0000000010", "good/0000000039"]
-    assert found.manifest.column("text") == [None, "hard", None]
-    assert found.inconclusive == 1
-    found.manifest.require_valid()
+    assert result.manifest.ids == ["ext/0000000014", "good/0000000010", "good/0000000039"]
+    assert result.manifest.column("text") == [None, "hard", None]
+    assert result.inconclusive == 1
+    result.manifest.require_valid()
 
 
 def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatch):
-    root = forge(tmp_path / "tag", raw=("a", "b"))
+    root = make(tmp_path / "tag", raw=("a", "b"))
     original = recordings.VideoFrames.extract
 
-    def fail(self, wanted, created, stop):
-        original(self, {10, 11} if "b" in self.source.parts else wanted, created, stop)
+    def fail(self, expected, created, stop):
+        original(self, {10, 11} if "b" in self.source.parts else expected, created, stop)
         if "b" in self.source.parts:
             raise PalpateError(
                 "the video must be whole", "frame 12 of 40 cannot be decoded", "fetch it"
@@ -180,13 +180,13 @@ def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatc
         (f"{root / 'label.txt'}:10", "bad-video")
     }
     assert tree(tmp_path / "out") == set()
-    found = import_touch_and_go(root, tmp_path / "out", skip_bad=True)
-    assert found.manifest.column("video") == ["a"] * 9 + ["b"] * 2
-    found.manifest.require_valid()
+    result = import_touch_and_go(root, tmp_path / "out", skip_bad=True)
+    assert result.manifest.column("video") == ["a"] * 9 + ["b"] * 2
+    result.manifest.require_valid()
 
 
 def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
-    root = forge(tmp_path / "tag", raw=("a", "b", "c"))
+    root = make(tmp_path / "tag", raw=("a", "b", "c"))
     whole = import_touch_and_go(root, tmp_path / "whole")
 
     def stop(what, done, total, remark=""):
@@ -208,11 +208,11 @@ def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
         )
 
 
-def test_cached_frames_of_other_settings_are_refused(tmp_path):
-    root = forge(tmp_path / "tag", raw=("a",))
-    found = import_touch_and_go(root, tmp_path / "out", size=32, image_format="png")
-    assert read_image(found.manifest.paths("tactile")[0]).size == (32, 32)
-    assert found.manifest.column("tactile")[0].endswith("0000000010.png")
+def test_cached_frames_of_other_settings_are_rejected(tmp_path):
+    root = make(tmp_path / "tag", raw=("a",))
+    result = import_touch_and_go(root, tmp_path / "out", size=32, image_format="png")
+    assert read_image(result.manifest.paths("tactile")[0]).size == (32, 32)
+    assert result.manifest.column("tactile")[0].endswith("0000000010.png")
     before = tree(tmp_path / "out")
     with pytest.raises(PalpateError, match="same settings"):
         import_touch_and_go(root, tmp_path / "out")
@@ -223,14 +223,14 @@ def test_cached_frames_of_other_settings_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["raw", "extracted"])
-def test_background_is_a_typical_frame_where_the_recording_begins_with_a_touch_else_null(
+def test_background_is_a_typical_frame_where_the_recording_begins_with_a_contact_else_null(
     tmp_path, layout
 ):
     lines = [f"a/{k:010d}.jpg,3" for k in range(0, 8)] + [f"b/{k:010d}.jpg,3" for k in range(40)]
-    root = forge(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
-    found = import_touch_and_go(root, tmp_path / "out")
-    manifest = found.manifest.require_valid()
-    assert found.facts["backgrounds"] == "none 1, typical 1"
+    root = make(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
+    result = import_touch_and_go(root, tmp_path / "out")
+    manifest = result.manifest.require_valid()
+    assert result.facts["backgrounds"] == "none 1, typical 1"
     assert manifest.column("background")[8:] == [None] * 40
     frames = [
         round(x) for x in np.linspace(12, 39, 15)
@@ -243,45 +243,45 @@ def test_background_is_a_typical_frame_where_the_recording_begins_with_a_touch_e
 
 
 def test_a_mixed_import_can_be_moved_as_one_folder(tmp_path):
-    root = forge(tmp_path / "tag", raw=("a",), extracted=("b",))
-    found = import_touch_and_go(root, tmp_path / "out.partial")
+    root = make(tmp_path / "tag", raw=("a",), extracted=("b",))
+    result = import_touch_and_go(root, tmp_path / "out.partial")
     (tmp_path / "out.partial").rename(tmp_path / "out")
     shutil.rmtree(root)
     again = Manifest.load(tmp_path / "out").require_valid()
-    assert again.digest == found.manifest.digest
+    assert again.digest == result.manifest.digest
     assert shown(again, "tactile") == shown(again, "vision") == again.column("frame")
 
 
 def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):
     lines = ["a/0000000020.jpg,3", "a/0000000016.jpg,-1", "a/0000000015.jpg,-1"]
-    root = forge(tmp_path / "tag", extracted=("a",), lines=lines)
-    found = import_touch_and_go(root, tmp_path / "o1")
-    assert shown(found.manifest, "background") == [14]
+    root = make(tmp_path / "tag", extracted=("a",), lines=lines)
+    result = import_touch_and_go(root, tmp_path / "o1")
+    assert shown(result.manifest, "background") == [14]
     (root / "only.txt").write_text("a/0000000020.jpg,3")
-    found = import_touch_and_go(root, tmp_path / "o2", labels=root / "only.txt")
-    assert shown(found.manifest, "background") == [14]
-    assert found.inconclusive == 0
+    result = import_touch_and_go(root, tmp_path / "o2", labels=root / "only.txt")
+    assert shown(result.manifest, "background") == [14]
+    assert result.inconclusive == 0
 
 
 def test_official_split_captions_and_objects(tmp_path):
-    root = forge(tmp_path / "tag", extracted=("a", "b"))
+    root = make(tmp_path / "tag", extracted=("a", "b"))
     (root / "train.txt").write_text(
         "\n".join(f"a/{k:010d}.jpg,3" for k in range(10, 16)) + "\nelsewhere/0000000001.jpg,3"
     )
     (root / "test.txt").write_text("b/17.jpg,15\nb/0000000018.jpg,15")
     (root / "captions.csv").write_text("a/0000000010.jpg,hard, cold\n")
     (root / "objects.csv").write_text("frame,object\nb/0000000019.jpg,wall\n")
-    found = import_touch_and_go(root, tmp_path / "out")
-    orig = found.splits["Orig"]
+    result = import_touch_and_go(root, tmp_path / "out")
+    orig = result.splits["Orig"]
     assert orig.ids("train") == [f"a/{k:010d}" for k in range(10, 16)]
     assert orig.ids("test") == ["b/0000000017", "b/0000000018"]
-    assert orig.manifest == found.manifest.digest
+    assert orig.manifest == result.manifest.digest
     assert Split.load(tmp_path / "out" / "splits" / "Orig.json").digest == orig.digest
-    rows = {r["id"]: r for r in found.manifest.table.iter_rows(named=True)}
+    rows = {r["id"]: r for r in result.manifest.table.iter_rows(named=True)}
     assert rows["a/0000000010"]["text"] == "hard, cold"
     assert rows["a/0000000011"]["text"] is None
     assert rows["b/0000000019"]["object"] == "wall"
-    assert found.facts["text_source"] == "captions.csv"
+    assert result.facts["text_source"] == "captions.csv"
     (root / "label.txt").unlink()
     (root / "train.txt").write_text("a/0000000010.jpg,3\nx,3\na/0000000011.jpg,-2")
     with pytest.raises(
@@ -293,14 +293,14 @@ def test_official_split_captions_and_objects(tmp_path):
         (f"{root / 'train.txt'}:3", "unknown-label"),
     ]
     (root / "train.txt").write_text("a/0000000010.jpg,3")
-    found = import_touch_and_go(root, tmp_path / "out2")
-    assert found.manifest.ids == ["a/0000000010", "b/17", "b/0000000018"]
-    assert found.splits["Orig"].counts() == {"train": 1, "test": 2}
+    result = import_touch_and_go(root, tmp_path / "out2")
+    assert result.manifest.ids == ["a/0000000010", "b/17", "b/0000000018"]
+    assert result.splits["Orig"].counts() == {"train": 1, "test": 2}
 
 
 def test_max_per_contact_takes_evenly_spaced_frames(tmp_path):
     lines = [f"a/{k:010d}.jpg,3" for k in range(10, 30)] + ["a/0000000035.jpg,3"]
-    root = forge(tmp_path / "tag", extracted=("a",), lines=lines)
+    root = make(tmp_path / "tag", extracted=("a",), lines=lines)
     take = lambda **kw: import_touch_and_go(root, tmp_path / "out", **kw).manifest.column("frame")  # noqa: E731
     assert take(max_per_contact=1) == [20, 35]
     assert take(max_per_contact=4) == [12, 17, 22, 27, 35]
@@ -327,8 +327,8 @@ def test_missing_root_list_and_recordings_are_named(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_link_out_of_the_data_set_is_told(tmp_path):
-    forge(tmp_path / "real", extracted=("a",))
+def test_a_link_out_of_the_data_set_is_reported(tmp_path):
+    make(tmp_path / "real", extracted=("a",))
     root = tmp_path / "tag"
     (root / "dataset").mkdir(parents=True)
     shutil.copy(tmp_path / "real" / "label.txt", root)
@@ -338,8 +338,8 @@ def test_a_link_out_of_the_data_set_is_told(tmp_path):
     assert [p.kind for p in caught.value.problems] == ["outside-root"]
 
 
-def test_one_frame_that_links_out_of_the_data_set_is_told_or_skipped(tmp_path):
-    forge(tmp_path, extracted=("a",))
+def test_one_frame_that_links_out_of_the_data_set_is_reported_or_skipped(tmp_path):
+    make(tmp_path, extracted=("a",))
     frames = tmp_path / "dataset" / "a" / "gelsight_frame"
     listed = (tmp_path / "label.txt").read_text().split(",")[0].split("/")[1]
     (tmp_path.parent / f"{tmp_path.name}-outside.jpg").write_bytes((frames / listed).read_bytes())
@@ -355,16 +355,16 @@ def test_one_frame_that_links_out_of_the_data_set_is_told_or_skipped(tmp_path):
 
 @pytest.mark.slow
 def test_the_five_real_clips(real_data, tmp_path):
-    found = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path / "out")
-    table = found.manifest.require_valid().table
+    result = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path / "out")
+    table = result.manifest.require_valid().table
     assert (table.height, table["contact"].n_unique(), table["video"].n_unique()) == (436, 17, 5)
     counts = dict(table["material"].value_counts().iter_rows())
     assert counts == {"Rock": 124, "Wood": 111, "Concrete": 88, "Brick": 58, "Grass": 55}
     assert table["background"].null_count() == 0
-    assert found.facts["backgrounds"] == "frame 17"
-    # At the height of each touch the gel differs from its background more than at the touch's first frame.
+    assert result.facts["backgrounds"] == "frame 17"
+    # The gel differs from its background more at the height of a contact than at its start.
     for (_,), group in table.sort("frame").group_by("contact"):
-        gel = lambda p: np.asarray(Image.open(found.manifest.path(p)), np.float32)  # noqa: E731
+        gel = lambda p: np.asarray(Image.open(result.manifest.path(p)), np.float32)  # noqa: E731
         rest = gel(group["background"][0])
         change = [np.abs(gel(p) - rest).mean() for p in group["tactile"]]
         assert max(change) > change[0], group["contact"][0]

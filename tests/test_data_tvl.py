@@ -1,4 +1,4 @@
-"""HCT and SSVTP: the official test rows with their measured facts, every dialect of the lists, lists written and read back, SSVTP."""
+"""HCT and SSVTP: the official test rows with their measured facts, and every dialect of lists."""
 
 import json
 import shutil
@@ -9,11 +9,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pytest
 
+from format_trees import TVL_COLUMNS as COLUMNS
+from format_trees import gel, make_hct, make_ssvtp, photo, put, write_csv
 from palpate.core import PalpateError, ProblemsError, Split
-from palpate.data.formats.base import Scan
 from palpate.data.formats import hct, ssvtp, tvl
+from palpate.data.formats.base import Scan
 from palpate.data.importing import import_dataset, write_lists
-from format_trees import TVL_COLUMNS as COLUMNS, make_hct, make_ssvtp, gel, photo, put, write_csv
 
 
 @pytest.fixture
@@ -22,7 +23,7 @@ def tree(tmp_path):
 
 
 @pytest.fixture
-def presses(tmp_path):
+def ssvtp_tree(tmp_path):
     return make_ssvtp(tmp_path / "in").source
 
 
@@ -38,12 +39,12 @@ def read(source, out, **options):
     return import_dataset(source, out, **options)
 
 
-# ---------------------------------------------------------------- the official test rows
+# --- The official test rows
 
 
 @pytest.fixture(scope="module")
 def official(real_data, tmp_path_factory):
-    """The 402 official test rows at their real paths, with small pictures; and what was listed."""
+    """The 402 official test rows at their real paths, with small images; and what was listed."""
     items = json.loads((real_data / "tvl" / "test_items.json").read_text())
     root = tmp_path_factory.mktemp("tvl")
     sample = tmp_path_factory.mktemp("bytes")
@@ -73,10 +74,10 @@ def official(real_data, tmp_path_factory):
 
 def test_the_official_hct_rows_have_their_measured_facts(official, tmp_path):
     root, items = official
-    found = read(root, tmp_path / "out", check="none")
-    table = found.manifest.table
-    assert found.facts["format"] == "hct"
-    assert len(found.manifest) == 356
+    result = read(root, tmp_path / "out", check="none")
+    table = result.manifest.table
+    assert result.facts["format"] == "hct"
+    assert len(result.manifest) == 356
     assert set(zip(table["vision"], table["tactile"], strict=True)) == {
         (i["image_fp"][4:], i["tactile_fp"][4:]) for i in items if i["image_fp"].startswith("hct/")
     }
@@ -113,12 +114,12 @@ def test_the_official_hct_rows_have_their_measured_facts(official, tmp_path):
         if len(own) > 1
     }
     assert (sum(len(w) > 1 for w in words.values()), len(words)) == (63, 65)
-    assert found.splits["Orig"].counts() == {"test": 356}
-    assert {p.kind for p in found.suspicious} == {"no-background", "other-half"}
+    assert result.splits["Orig"].counts() == {"test": 356}
+    assert {p.kind for p in result.suspicious} == {"no-background", "other-half"}
 
 
 def test_the_official_folders_join_into_sessions(official, tmp_path):
-    """Of neighboring folders 82 % start less than a minute apart in data2, 34 % in data3: so many joints have the sessions."""
+    """Of neighboring folders 82 % start less than a minute apart in data2, 34 % in data3."""
     table = read(official[0], tmp_path / "out", check="none").manifest.table
     joined = {}
     for rig in ("data2", "data3"):
@@ -135,11 +136,11 @@ def test_the_official_folders_join_into_sessions(official, tmp_path):
 
 def test_the_official_ssvtp_rows_and_all_adjectives(official, tmp_path):
     root, _ = official
-    found = read(root, tmp_path / "out", format="ssvtp", check="none")
-    assert len(found.manifest) == 46
-    assert set(found.manifest.column("video")) == {None}
-    assert found.facts["text_source"] == "column caption"
-    both = found.manifest.column("text") + read(
+    result = read(root, tmp_path / "out", format="ssvtp", check="none")
+    assert len(result.manifest) == 46
+    assert set(result.manifest.column("video")) == {None}
+    assert result.facts["text_source"] == "column caption"
+    both = result.manifest.column("text") + read(
         root, tmp_path / "hct", check="none"
     ).manifest.column("text")
     words = {word for text in both for word in text.split(", ")}
@@ -149,7 +150,7 @@ def test_the_official_ssvtp_rows_and_all_adjectives(official, tmp_path):
     assert all(word == word.strip().lower() and "." not in word and word for word in words)
 
 
-# ---------------------------------------------------------------- lists in every dialect
+# --- Lists in every dialect
 
 
 def rewrite(root: Path, dialect: str) -> None:
@@ -212,12 +213,12 @@ DIALECTS = [
 
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_lists_of_every_dialect_say_the_same(tree, tmp_path, dialect):
-    wanted = read(tree, tmp_path / "before")
+    expected = read(tree, tmp_path / "before")
     rewrite(tree, dialect)
-    found = read(tree, tmp_path / "after")
-    assert found.manifest.digest == wanted.manifest.digest
-    assert found.splits["Orig"].digest == wanted.splits["Orig"].digest
-    assert found.suspicious == []
+    result = read(tree, tmp_path / "after")
+    assert result.manifest.digest == expected.manifest.digest
+    assert result.splits["Orig"].digest == expected.splits["Orig"].digest
+    assert result.suspicious == []
 
 
 def test_the_source_may_be_any_of_three_folders(tree, tmp_path, monkeypatch):
@@ -241,14 +242,14 @@ def test_the_source_may_be_any_of_three_folders(tree, tmp_path, monkeypatch):
             read(tmp_path, tmp_path / "out", format=name)
 
 
-# ---------------------------------------------------------------- writing lists
+# --- Writing lists
 
 
-@pytest.mark.parametrize("forge", [make_hct, make_ssvtp])
+@pytest.mark.parametrize("make", [make_hct, make_ssvtp])
 @pytest.mark.parametrize("seed", range(3))
-def test_written_lists_read_back_as_the_same_split(tmp_path, forge, seed):
-    root = forge(tmp_path / "in").source
-    if forge is make_hct:  # one trajectory with a background above dataN, one without
+def test_written_lists_read_back_as_the_same_split(tmp_path, make, seed):
+    root = make(tmp_path / "in").source
+    if make is make_hct:  # one trajectory with a background above dataN, one without
         videos = sorted({p.parent for p in root.glob("data*/*/vision")})
         (videos[0] / "background.png").rename(root / "digit_background.png")
     before = read(root, tmp_path / "before").manifest
@@ -268,19 +269,19 @@ def test_written_lists_read_back_as_the_same_split(tmp_path, forge, seed):
         read(root, tmp_path / "out", lists=tmp_path / "nowhere")
 
 
-def test_lists_of_hct_need_rows_of_its_rigs(presses, tmp_path):
-    manifest = read(presses, tmp_path / "a").manifest
+def test_lists_of_hct_need_rows_of_its_rigs(ssvtp_tree, tmp_path):
+    manifest = read(ssvtp_tree, tmp_path / "a").manifest
     with pytest.raises(PalpateError, match="below the folder of its domain"):
         hct.write_lists(manifest, Split(dict.fromkeys(manifest.ids, "train")), tmp_path / "lists")
 
 
-# ---------------------------------------------------------------- SSVTP
+# --- SSVTP
 
 
-def test_ssvtp_finds_touch_and_text_by_the_id_and_tells_what_disagrees(presses, tmp_path):
-    whole = read(presses, tmp_path / "whole").manifest
+def test_ssvtp_finds_files_and_text_by_the_id_and_reports_what_disagrees(ssvtp_tree, tmp_path):
+    whole = read(ssvtp_tree, tmp_path / "whole").manifest
     write_csv(
-        presses / "train.csv",
+        ssvtp_tree / "train.csv",
         ("url", "tactile", "caption"),
         [
             [
@@ -304,54 +305,56 @@ def test_ssvtp_finds_touch_and_text_by_the_id_and_tells_what_disagrees(presses, 
             ["images_rgb/image_1001_rgb.jpg", "", ""],
         ],
     )
-    found = read(presses, tmp_path / "found")
-    assert found.manifest.digest == whole.digest
-    assert [(p.where, p.kind, p.text.split(" row")[0]) for p in found.suspicious] == [
-        (f"{presses / 'train.csv'}:2", "misnamed-path", "3"),
-        (f"{presses / 'train.csv'}:2", "two-captions", "1"),
+    result = read(ssvtp_tree, tmp_path / "result")
+    assert result.manifest.digest == whole.digest
+    assert [(p.where, p.kind, p.text.split(" row")[0]) for p in result.suspicious] == [
+        (f"{ssvtp_tree / 'train.csv'}:2", "misnamed-path", "3"),
+        (f"{ssvtp_tree / 'train.csv'}:2", "two-captions", "1"),
     ]
-    assert "text/labels_<id>.txt" in found.facts["text_source"]
+    assert "text/labels_<id>.txt" in result.facts["text_source"]
 
 
 @pytest.mark.parametrize(
     "rows", [None, ("url", "caption"), ("", "tactile", "caption"), ("url",), ()]
 )
-def test_ssvtp_lists_of_every_width(presses, tmp_path, rows):
-    whole = read(presses, tmp_path / "whole").manifest
+def test_ssvtp_lists_of_every_width(ssvtp_tree, tmp_path, rows):
+    whole = read(ssvtp_tree, tmp_path / "whole").manifest
     cells = [
         dict(zip(("url", "tactile", "caption"), r, strict=False))
         for r in [
             [v, t, ""] for v, t in zip(whole.column("vision"), whole.column("tactile"), strict=True)
         ]
     ]
-    (presses / "test.csv").unlink()
+    (ssvtp_tree / "test.csv").unlink()
     if rows is None:  # no list at all
-        (presses / "train.csv").unlink()
+        (ssvtp_tree / "train.csv").unlink()
     elif rows == ():  # no header
-        write_csv(presses / "train.csv", None, [[c["url"], c["tactile"]] for c in cells])
+        write_csv(ssvtp_tree / "train.csv", None, [[c["url"], c["tactile"]] for c in cells])
     else:
-        write_csv(presses / "train.csv", rows, [[c[name or "url"] for name in rows] for c in cells])
-    found = read(presses, tmp_path / "found")
-    assert found.manifest.digest == whole.digest
-    assert found.splits["Orig"].counts() == {"train": 9} if rows is not None else not found.splits
+        write_csv(
+            ssvtp_tree / "train.csv", rows, [[c[name or "url"] for name in rows] for c in cells]
+        )
+    result = read(ssvtp_tree, tmp_path / "result")
+    assert result.manifest.digest == whole.digest
+    assert result.splits["Orig"].counts() == {"train": 9} if rows is not None else not result.splits
 
 
-def test_ssvtp_counts_its_losses(presses, tmp_path):
-    (presses / "images_tac" / "image_12_tac.jpg").unlink()
-    (presses / "images_rgb" / "image_21_rgb.jpg").unlink()
-    (presses / "images_rgb" / "image_437_rgb.jpg").write_bytes(b"")
-    (presses / "text" / "labels_4210.txt").unlink()
+def test_ssvtp_counts_its_losses(ssvtp_tree, tmp_path):
+    (ssvtp_tree / "images_tac" / "image_12_tac.jpg").unlink()
+    (ssvtp_tree / "images_rgb" / "image_21_rgb.jpg").unlink()
+    (ssvtp_tree / "images_rgb" / "image_437_rgb.jpg").write_bytes(b"")
+    (ssvtp_tree / "text" / "labels_4210.txt").unlink()
     for line in (
         "images_rgb/photo.jpg,x,y",
         "../image_1_rgb.jpg,x,y",
         "images_rgb/image_3_rgb.jpg,,again",
         ",x,y",
     ):
-        with (presses / "train.csv").open("a") as file:
+        with (ssvtp_tree / "train.csv").open("a") as file:
             file.write(f"{line}\n")
     with pytest.raises(ProblemsError) as caught:
-        read(presses, tmp_path / "out")
-    wanted = {
+        read(ssvtp_tree, tmp_path / "out")
+    expected = {
         "missing-file": 2,
         "bad-image": 1,
         "bad-path": 1,
@@ -359,52 +362,52 @@ def test_ssvtp_counts_its_losses(presses, tmp_path):
         "duplicate-id": 1,
         "empty-cell": 1,
     }
-    assert kinds(caught.value.problems) == wanted
-    found = read(presses, tmp_path / "out", skip_bad=True)
-    assert len(found.manifest) == 6
-    assert found.suspicious == []
+    assert kinds(caught.value.problems) == expected
+    result = read(ssvtp_tree, tmp_path / "out", skip_bad=True)
+    assert len(result.manifest) == 6
+    assert result.suspicious == []
     assert (
-        dict(zip(found.manifest.ids, found.manifest.column("text"), strict=True))["ssvtp/4210"]
+        dict(zip(result.manifest.ids, result.manifest.column("text"), strict=True))["ssvtp/4210"]
         == "fabric, coarse, deformable"
     )
     for name in ("train", "test"):
-        (presses / f"{name}.csv").unlink()
+        (ssvtp_tree / f"{name}.csv").unlink()
     with pytest.raises(ProblemsError) as caught:
-        read(presses, tmp_path / "out2")
+        read(ssvtp_tree, tmp_path / "out2")
     assert kinds(caught.value.problems) == {"unpaired": 2, "bad-image": 1}
 
 
-def test_an_ssvtp_sample_of_two_lists_is_told_and_is_in_no_part(presses, tmp_path):
-    whole = read(presses, tmp_path / "whole")
+def test_an_ssvtp_sample_of_two_lists_is_reported_and_is_in_no_part(ssvtp_tree, tmp_path):
+    whole = read(ssvtp_tree, tmp_path / "whole")
     (both,) = [i for i in whole.manifest.ids if i == "ssvtp/3"]
     assert whole.splits["Orig"].parts[both] == "train"
-    with (presses / "test.csv").open("a") as file:
+    with (ssvtp_tree / "test.csv").open("a") as file:
         file.write("images_rgb/image_3_rgb.jpg,x\n")
     with pytest.raises(ProblemsError, match="two-parts"):
-        read(presses, tmp_path / "out")
-    found = read(presses, tmp_path / "out", skip_bad=True)
-    assert kinds(found.skipped) == {"two-parts": 1}
-    assert found.manifest.ids == whole.manifest.ids
-    assert found.splits["Orig"].parts == {
+        read(ssvtp_tree, tmp_path / "out")
+    result = read(ssvtp_tree, tmp_path / "out", skip_bad=True)
+    assert kinds(result.skipped) == {"two-parts": 1}
+    assert result.manifest.ids == whole.manifest.ids
+    assert result.splits["Orig"].parts == {
         i: part for i, part in whole.splits["Orig"].parts.items() if i != both
     }
 
 
-def test_ssvtp_tells_unlisted_photos_absent_words_and_the_background(presses, tmp_path):
-    write_csv(presses / "train.csv", ("url", "caption"), [["images_rgb/image_3_rgb.jpg", ""]])
-    (presses / "text" / "labels_3.txt").write_text("\n")
-    put(presses / "tac_background.png", gel(0, pressed=False))
-    found = read(presses, tmp_path / "out")
-    assert set(found.manifest.column("background")) == {"tac_background.png"}
-    assert {(p.kind, p.text.split()[0]) for p in found.suspicious} == {
+def test_ssvtp_reports_unlisted_photos_absent_words_and_the_background(ssvtp_tree, tmp_path):
+    write_csv(ssvtp_tree / "train.csv", ("url", "caption"), [["images_rgb/image_3_rgb.jpg", ""]])
+    (ssvtp_tree / "text" / "labels_3.txt").write_text("\n")
+    put(ssvtp_tree / "tac_background.png", gel(0, pressed=False))
+    result = read(ssvtp_tree, tmp_path / "out")
+    assert set(result.manifest.column("background")) == {"tac_background.png"}
+    assert {(p.kind, p.text.split()[0]) for p in result.suspicious} == {
         ("unlisted", "photos"),
         ("no-text", "1"),
     }
-    assert found.manifest.column("text")[0] is None
+    assert result.manifest.column("text")[0] is None
 
 
 @pytest.mark.parametrize(
-    ("given", "wanted"),
+    ("given", "expected"),
     [
         (" Soft ,  FUZZY.", "soft, fuzzy"),
         ("textured, stiff, rigid,", "textured, stiff, rigid"),
@@ -415,5 +418,5 @@ def test_ssvtp_tells_unlisted_photos_absent_words_and_the_background(presses, tm
         ("two  words\n, x", "two words, x"),
     ],
 )
-def test_captions_are_cleaned(given, wanted):
-    assert tvl.clean_caption(given) == wanted
+def test_captions_are_cleaned(given, expected):
+    assert tvl.clean_caption(given) == expected

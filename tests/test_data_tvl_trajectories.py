@@ -1,4 +1,4 @@
-"""HCT's trajectories: contact and captions, touches and sessions, backgrounds, exchanged folders, and bad input."""
+"""Trajectories of HCT: contacts and sessions, backgrounds, swapped folders, and bad input."""
 
 import json
 import shutil
@@ -8,23 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from format_trees import PHOTO, gel, make_hct, name_of, photo, put, write_csv
+from format_trees import TACTILE as TOUCH
+from format_trees import TVL_COLUMNS as COLUMNS
+from format_trees import make_trajectory as trajectory
 from palpate.core import PalpateError, ProblemsError, Split, quiet
-from palpate.data.formats.base import Scan
 from palpate.data.formats import hct, swapped, tvl
+from palpate.data.formats.base import Scan
 from palpate.data.formats.hct import TRAJECTORY
 from palpate.data.importing import import_dataset, validate_dataset, write_lists
-from format_trees import (
-    TVL_COLUMNS as COLUMNS,
-    PHOTO,
-    TACTILE as TOUCH,
-    make_hct,
-    gel,
-    name_of,
-    photo,
-    put,
-    make_trajectory as trajectory,
-    write_csv,
-)
 
 
 @pytest.fixture
@@ -44,7 +36,7 @@ def read(source, out, **options):
     return import_dataset(source, out, **options)
 
 
-# ---------------------------------------------------------------- contact.json, captions, touches, sessions
+# --- Contact.json, captions, contacts, sessions
 
 
 def test_without_lists_contact_json_gives_the_samples_if_requested(tree, tmp_path):
@@ -53,11 +45,11 @@ def test_without_lists_contact_json_gives_the_samples_if_requested(tree, tmp_pat
         path.unlink()
     with pytest.raises(PalpateError, match="at least one usable sample"):
         read(tree, tmp_path / "none")
-    found = read(tree, tmp_path / "found", contact=True)
-    assert found.manifest.ids == listed.ids
-    assert found.manifest.column("contact") == listed.column("contact")
-    assert set(found.manifest.column("text")) == {None}
-    assert (found.facts["text_source"], found.splits) == ("none", {})
+    result = read(tree, tmp_path / "result", contact=True)
+    assert result.manifest.ids == listed.ids
+    assert result.manifest.column("contact") == listed.column("contact")
+    assert set(result.manifest.column("text")) == {None}
+    assert (result.facts["text_source"], result.splits) == ("none", {})
 
 
 def test_frames_that_only_contact_json_names_are_counted_or_taken(tree, tmp_path):
@@ -88,9 +80,9 @@ def test_frames_of_not_contact_json_are_no_samples(tree, tmp_path):
     for side in data:
         data[side].append(contact[side][0])
     (tree / "data1" / "not_contact.json").write_text(json.dumps(data))
-    found = read(tree, tmp_path / "a")
-    assert kinds(found.suspicious) == {"contact-and-not": 1}
-    assert f"data1/{both}" in found.manifest.column("vision")
+    result = read(tree, tmp_path / "a")
+    assert kinds(result.suspicious) == {"contact-and-not": 1}
+    assert f"data1/{both}" in result.manifest.column("vision")
     for path in tree.glob("data1/*.csv"):
         path.unlink()
     assert f"data1/{both}" not in read(tree, tmp_path / "b").manifest.column("vision")
@@ -108,7 +100,7 @@ def test_frames_of_not_contact_json_are_no_samples(tree, tmp_path):
         ('{"vision": [], "tactile": [], "background": ["x"]}', "unequal-lists"),
     ],
 )
-def test_broken_json_is_told_once_and_its_rows_stay_out(tree, tmp_path, text, kind):
+def test_broken_json_is_reported_once_and_its_rows_stay_out(tree, tmp_path, text, kind):
     (tree / "data1" / "contact.json").write_text(text)
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")
@@ -118,7 +110,7 @@ def test_broken_json_is_told_once_and_its_rows_stay_out(tree, tmp_path, text, ki
     assert len(read(tree, tmp_path / "out", skip_bad=True).manifest) == 24
 
 
-def test_a_touch_runs_on_through_frames_that_only_contact_json_names(tmp_path):
+def test_a_contact_runs_on_through_frames_that_only_contact_json_names(tmp_path):
     rig = tmp_path / "hct" / "data1"
     rows = trajectory(rig, "4-100.5", [5, 6, 7, 10])
     write_csv(rig / "train.csv", COLUMNS, [[*rows[k], "soft"] for k in (0, 2, 3)])
@@ -136,25 +128,25 @@ def test_a_touch_runs_on_through_frames_that_only_contact_json_names(tmp_path):
     }
 
 
-def test_a_row_in_both_lists_is_told_and_is_in_no_part(tree, tmp_path):
+def test_a_row_in_both_lists_is_reported_and_is_in_no_part(tree, tmp_path):
     rows = (tree / "data1" / "train.csv").read_text().split("\n", 1)[1]
     with (tree / "data1" / "test.csv").open("a") as file:
         file.write(rows)
-    found = read(tree, tmp_path / "out", skip_bad=True)
-    assert kinds(found.skipped) == {"two-parts": 9}
-    assert found.splits["Orig"].counts() == {"train": 9, "test": 6}
-    assert len(found.manifest) == 24
+    result = read(tree, tmp_path / "out", skip_bad=True)
+    assert kinds(result.skipped) == {"two-parts": 9}
+    assert result.splits["Orig"].counts() == {"train": 9, "test": 6}
+    assert len(result.manifest) == 24
 
 
-def test_touches_are_runs_and_sessions_chains(tree, tmp_path):
+def test_contacts_are_runs_and_sessions_chains(tree, tmp_path):
     table = read(tree, tmp_path / "a").manifest.table
     first = table.filter(table["video"] == table["video"][0])
     assert first["frame"].to_list() == [10, 11, 30, 31]
     assert [t.split("#")[1] for t in first["contact"]] == ["0001", "0001", "0002", "0002"]
     starts = [1702596200.5, 1702596265.5, 1702596380.5]  # gaps of 65 and 115 seconds
     for gap, sessions in ((64.9, 3), (65.0, 2), (115.0, 1)):
-        found = hct.sessions_of([f"data1/{k}-{t}" for k, t in enumerate(starts)], gap)
-        assert len(set(found.values())) == sessions
+        result = hct.sessions_of([f"data1/{k}-{t}" for k, t in enumerate(starts)], gap)
+        assert len(set(result.values())) == sessions
     videos = [*(f"data1/9-{100 + 50 * k}" for k in range(4)), "data2/9-120", "data2/odd name"]
     chained = hct.sessions_of(videos, 60.0)
     assert set(chained.values()) == {"data1/9-100", "data2/9-120", "data2/odd name"}
@@ -164,7 +156,7 @@ def test_touches_are_runs_and_sessions_chains(tree, tmp_path):
         read(tree, tmp_path / "c", session_gap=-1.0)
 
 
-# ---------------------------------------------------------------- backgrounds
+# --- Backgrounds
 
 
 def test_each_source_of_a_background_is_tried_in_turn_and_counted(tree, tmp_path):
@@ -177,21 +169,21 @@ def test_each_source_of_a_background_is_tried_in_turn_and_counted(tree, tmp_path
     rest = videos[2]  # of data1: its untouched frames are gone too
     for frame in (8, 9):
         (rest / "tactile" / name_of(frame)).unlink()
-    found = read(tree, tmp_path / "out")
+    result = read(tree, tmp_path / "out")
     assert (
-        found.facts["backgrounds"]
+        result.facts["backgrounds"]
         == "as listed 4, digit_background.png 12, none 4, untouched frame 4"
     )
     own = {
-        v: set(found.manifest.table.filter(found.manifest.table["video"] == v)["background"])
-        for v in set(found.manifest.column("video"))
+        v: set(result.manifest.table.filter(result.manifest.table["video"] == v)["background"])
+        for v in set(result.manifest.column("video"))
     }
     names = [v.relative_to(tree).as_posix() for v in videos]
     assert own[names[0]] == {f"{names[0]}/background.png"}
     assert own[names[1]] == {f"{names[1]}/tactile/{name_of(8)}"}
     assert own[names[2]] == {None}
     assert own[names[3]] == own[names[5]] == {"data2/digit_background.png"}
-    assert [(p.kind, p.text[:6]) for p in found.suspicious] == [("no-background", "4 rows")]
+    assert [(p.kind, p.text[:6]) for p in result.suspicious] == [("no-background", "4 rows")]
     (tree / "data2" / "digit_background.png").rename(tree / "digit_background.png")
     above = read(tree, tmp_path / "above")
     assert above.facts["backgrounds"] == "as listed 4, digit_background.png 20"
@@ -212,8 +204,8 @@ def test_the_untouched_frame_nearest_to_the_median_is_taken(tmp_path):
     (rig / "not_contact.json").write_text(
         json.dumps({"vision": [r[0] for r in rest], "tactile": [r[1] for r in rest]})
     )
-    found = read(tmp_path, tmp_path / "out")
-    assert set(found.manifest.column("background")) == {f"data1/4-100.5/tactile/{name_of(2)}"}
+    result = read(tmp_path, tmp_path / "out")
+    assert set(result.manifest.column("background")) == {f"data1/4-100.5/tactile/{name_of(2)}"}
     (rig / "4-100.5" / "tactile" / name_of(3)).write_bytes(b"")  # a broken one does not count
     assert set(read(tmp_path, tmp_path / "again").manifest.column("background")) == {
         f"data1/4-100.5/tactile/{name_of(0)}"
@@ -222,11 +214,11 @@ def test_the_untouched_frame_nearest_to_the_median_is_taken(tmp_path):
     assert read(tmp_path, tmp_path / "out").facts["backgrounds"] == "none 6"
 
 
-# ---------------------------------------------------------------- exchanged folders
+# --- Swapped folders
 
 
 def rig_of(tmp_path, *, swapped, sizes, count=12, **sides):
-    """One rig of ``count`` trajectories of which some are exchanged, and the rows of its list."""
+    """One rig of ``count`` trajectories of which some are swapped, and the rows of its list."""
     rig = tmp_path / "hct" / "data1"
     rows = []
     for k in range(count):
@@ -257,34 +249,34 @@ def named(problems):
     ids=["foreign sizes", "equal sizes", "true sizes"],
 )
 @pytest.mark.parametrize("swapped", [set(), {0}, {2, 5, 11}])
-def test_exchanged_folders_are_told_and_mended(tmp_path, sizes, swapped):
+def test_swapped_folders_are_reported_and_fixed(tmp_path, sizes, swapped):
     rig_of(tmp_path, swapped=swapped, sizes=sizes)
-    found = read(tmp_path, tmp_path / "a")
-    assert named(found.suspicious) == swapped
-    assert all("vision/" in p for p in found.manifest.column("vision"))
+    result = read(tmp_path, tmp_path / "a")
+    assert named(result.suspicious) == swapped
+    assert all("vision/" in p for p in result.manifest.column("vision"))
     (tmp_path / "hct" / "digit_background.png").write_bytes(
         put(tmp_path / "b.png", gel(0, pressed=False)).read_bytes()
     )
-    mended = read(tmp_path, tmp_path / "b", swap="fix").manifest
-    for video, vision, tactile, background in mended.table.select(
+    fixed = read(tmp_path, tmp_path / "b", swap="fix").manifest
+    for video, vision, tactile, background in fixed.table.select(
         "video", "vision", "tactile", "background"
     ).iter_rows():
         right = int(float(video.split("-")[1])) // 100 - 10 not in swapped
         assert ("/vision/" in vision, "/tactile/" in tactile) == (right, right)
         assert background == (f"{video}/background.png" if right else "digit_background.png")
-    again = write_lists(mended, Split(dict.fromkeys(mended.ids, "train")), tmp_path / "lists")
+    again = write_lists(fixed, Split(dict.fromkeys(fixed.ids, "train")), tmp_path / "lists")
     assert named(read(tmp_path, tmp_path / "c", lists=tmp_path / "lists").suspicious) == set()
     assert len(again) == 1
     with pytest.raises(PalpateError, match="must be report or fix"):
         read(tmp_path, tmp_path / "out", swap="yes")
 
 
-def test_a_rig_that_is_exchanged_as_a_whole_is_found_too(tmp_path):
+def test_a_rig_that_is_swapped_as_a_whole_is_recognized(tmp_path):
     rig_of(tmp_path, swapped=set(range(12)) - {3}, sizes=(TOUCH, TOUCH))
     assert named(read(tmp_path, tmp_path / "a").suspicious) == set(range(12)) - {3}
 
 
-def test_sides_that_look_alike_are_not_called_exchanged(tmp_path):
+def test_sides_that_look_similar_are_not_called_swapped(tmp_path):
     rig_of(tmp_path, swapped={1}, sizes=(TOUCH, TOUCH), tactile=lambda n: photo(n + 7, TOUCH))
     assert read(tmp_path, tmp_path / "a").suspicious == []
     shutil.rmtree(tmp_path / "hct")
@@ -294,8 +286,8 @@ def test_sides_that_look_alike_are_not_called_exchanged(tmp_path):
     assert read(tmp_path, tmp_path / "b").suspicious == []
 
 
-def test_exchange_by_color_over_many_rigs():
-    """Precision and recall on 60 rigs whose gel drifts and whose photos share a tint; a look is made of thumbnails directly."""
+def test_swaps_by_color_over_many_rigs():
+    """Precision and recall on 60 rigs whose gel drifts and whose photos share a tint."""
     hits = wrong = planted = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -310,17 +302,17 @@ def test_exchange_by_color_over_many_rigs():
                 (240, 320), (0.5 * tint + 0.5 * rng.uniform(0, 1, (8, 8, 3))).clip(0, 1)
             )
             sides[str(k)] = (touch, view) if str(k) in truth else (view, touch)
-        found = set(swapped.swapped(sides, (240, 320)))
+        result = set(swapped.swapped(sides, (240, 320)))
         hits, wrong, planted = (
-            hits + len(found & truth),
-            wrong + len(found - truth),
+            hits + len(result & truth),
+            wrong + len(result - truth),
             planted + len(truth),
         )
     assert planted > 100
     assert (hits, wrong) == (planted, 0)
 
 
-def test_a_recording_with_touch_on_both_sides_is_not_called_exchanged(tmp_path):
+def test_a_recording_with_touch_on_both_sides_is_not_called_swapped(tmp_path):
     rig = rig_of(tmp_path, swapped=set(), sizes=(TOUCH, TOUCH))
     for path in (rig / "3-1300.5" / "tactile").iterdir():
         shutil.copy(path, rig / "3-1300.5" / "vision" / path.name)
@@ -347,7 +339,7 @@ def test_colors_that_prove_nothing_are_not_used():
         assert swapped.swapped({str(k): p for k, p in enumerate(pairs)}, (240, 320)) == {}
 
 
-def test_looks_pass_over_what_cannot_be_read(tmp_path):
+def test_looks_skip_what_cannot_be_read(tmp_path):
     (tmp_path / "cut.jpg").write_bytes(b"")
     put(tmp_path / "a.jpg", gel(1))
     assert swapped.look([tmp_path / "cut.jpg", tmp_path / "none.jpg"]) is None
@@ -361,10 +353,10 @@ def test_looks_pass_over_what_cannot_be_read(tmp_path):
     assert swapped.looks({"x": ([tmp_path / "cut.jpg"], [tmp_path / "a.jpg"])}, quiet) == {}
 
 
-# ---------------------------------------------------------------- bad input
+# --- Bad input
 
 
-def test_every_bad_row_of_hct_is_told_at_once(tree, tmp_path):
+def test_every_bad_row_of_hct_is_reported(tree, tmp_path):
     video = sorted({p.parent.name for p in tree.glob("data1/*/vision")})[0]
     gone = sorted({p.parent.name for p in tree.glob("data2/*/vision")})[1]
     shutil.rmtree(tree / "data2" / gone)
@@ -384,7 +376,7 @@ def test_every_bad_row_of_hct_is_told_at_once(tree, tmp_path):
         "data7/1-2.5/vision/1-0.1.jpg,data7/1-2.5/tactile/1-0.1.jpg,,a\n"  # 11: no such rig
         f"{good},{good},,\xff".encode("latin-1")  # 12: not UTF-8
     )
-    wanted = [
+    expected = [
         (2, "outside-root"),
         (3, "outside-root"),
         (4, "bad-row"),
@@ -400,24 +392,24 @@ def test_every_bad_row_of_hct_is_told_at_once(tree, tmp_path):
     ]
     with pytest.raises(ProblemsError) as caught:
         read(tree, tmp_path / "out")
-    told = caught.value.problems
+    reported = caught.value.problems
     assert [
         (int(p.where.rpartition(":")[2]), p.kind)
-        for p in told
+        for p in reported
         if p.where.startswith(str(tree / "data1" / "val.csv"))
-    ] == wanted
-    assert [p.text for p in told if p.where.endswith("val.csv:11")] == [
+    ] == expected
+    assert [p.text for p in reported if p.where.endswith("val.csv:11")] == [
         f"1 row: no folder 'data7' in {tree}"
     ]
-    others = [p for p in told if not p.where.startswith(str(tree / "data1" / "val.csv"))]
+    others = [p for p in reported if not p.where.startswith(str(tree / "data1" / "val.csv"))]
     assert [p.kind for p in others] == ["bad-image", "missing-folder"]
     assert others[1].text == f"4 rows: no folder 'data2/{gone}' in {tree}"
     assert not (tmp_path / "out").exists()
-    found = read(tree, tmp_path / "out", skip_bad=True)
-    assert len(found.manifest) == 24 - 4 - 1
-    looked = validate_dataset(tree)
-    assert (looked.samples, kinds(looked.missing) + kinds(looked.invalid)) == (19, kinds(told))
-    assert kinds(looked.missing) == {"missing-file": 2, "missing-folder": 2}
+    result = read(tree, tmp_path / "out", skip_bad=True)
+    assert len(result.manifest) == 24 - 4 - 1
+    report = validate_dataset(tree)
+    assert (report.samples, kinds(report.missing) + kinds(report.invalid)) == (19, kinds(reported))
+    assert kinds(report.missing) == {"missing-file": 2, "missing-folder": 2}
 
 
 def test_a_rig_that_is_missing_is_one_problem(tree, tmp_path):
@@ -441,10 +433,10 @@ def test_names_with_spaces_commas_and_other_scripts(tmp_path):
             put(rig / sides["tactile"], gel(frame))
             rows.append([*sides.values(), "", "Weich, groß."])
     write_csv(rig / "train.csv", COLUMNS, rows)
-    found = read(tmp_path, tmp_path / "out")
-    assert len(found.manifest) == 6
-    assert set(found.manifest.column("text")) == {"weich, groß"}
-    assert {"data1/机 1", "data1/tisch, groß {n}"} < set(found.manifest.column("video"))
+    result = read(tmp_path, tmp_path / "out")
+    assert len(result.manifest) == 6
+    assert set(result.manifest.column("text")) == {"weich, groß"}
+    assert {"data1/机 1", "data1/tisch, groß {n}"} < set(result.manifest.column("video"))
     shutil.rmtree(rig / "tisch, groß {n}")
     with pytest.raises(ProblemsError) as caught:
         read(tmp_path, tmp_path / "out2")

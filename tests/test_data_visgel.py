@@ -1,4 +1,4 @@
-"""VisGel: both kinds of lists, recordings without lists, the contact of a frame; everything bad reported."""
+"""VisGel: both kinds of lists, recordings without lists, the contact of a frame, all problems."""
 
 import numpy as np
 import pytest
