@@ -257,7 +257,7 @@ def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_
 def test_report_refuses_foreign_json(capsys, tmp_path):
     (tmp_path / "x.json").write_text('{"format": "other"}')
     assert (
-        "must hold results of palpate"
+        "must have the format palpate-results/2"
         in call(capsys, "report", tmp_path / "x.json", "-o", tmp_path / "p.html")[2]
     )
     (tmp_path / "x.json").write_text('{"format": "palpate-audit/2", "name": "x"}')

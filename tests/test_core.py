@@ -1,4 +1,4 @@
-"""Core: errors, digests, files, splits, scores, results, stages."""
+"""Core: errors, digests, files, splits, scores, features, stages."""
 
 import itertools
 import json
@@ -15,7 +15,6 @@ from palpate.core import (
     Problem,
     ProblemsError,
     Run,
-    SampleRef,
     Score,
     Split,
     atomic_folder,
@@ -27,7 +26,6 @@ from palpate.core import (
     rng_for,
     seed_for,
 )
-from palpate.report.results import Audit, GalleryItem, LeakPair, Results
 
 
 def test_an_error_is_one_line_of_must_got_fix():
@@ -234,26 +232,6 @@ def test_features_name_the_bad_row_and_round_trip(tmp_path):
     column = pytest.importorskip("pandas").Series(["a", "b"], index=[5, 6])
     with pytest.raises(PalpateError, match=r"1 row \(1: 'b'\)"):
         FeatureSet(column, np.array([[1.0], [np.nan]]))
-
-
-def test_results_round_trip(tmp_path):
-    ref = SampleRef("v/1", "v", 1, "Wood", "a.png", "b.png")
-    audit = Audit(
-        "Orig", "video", 1, 1, 1, 1, 1, 1, 1.0, 0, 2, 2, 2, [0, 3], [1], [LeakPair(ref, ref, 2)]
-    )
-    results = Results(
-        "t",
-        ["f"],
-        [audit],
-        [Score("TMMD", "g", float("inf"), interval=(0.0, 1.0))],
-        [GalleryItem(ref, "g.png")],
-    )
-    results.save(tmp_path / "r.json")
-    again = Results.load(tmp_path / "r.json")
-    assert again.audits[0].worst[0].test == ref
-    assert again.scores[0].value is None  # JSON has no infinity
-    assert again.scores[0].interval == (0.0, 1.0)
-    assert again.gallery[0].sample == ref
 
 
 def test_a_stage_is_built_once_and_again_for_other_inputs(tmp_path):

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from audit_samples import clean_audit, full_audit, pictures, pretraining_audit
-from palpate.core import SampleRef, Score
+from palpate.core import Note, SampleRef, Score
 from palpate.report import write_report
 from palpate.report.results import Audit, GalleryItem, LeakPair, Results
+from report_fixtures import clean_audit, full_audit, images, pretraining_audit
 
 LONG = "a_recording_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b"
 
@@ -93,7 +93,7 @@ def forged(folder):
             [0, 2400, 12080, 13002, 2115],
             pairs,
             rows,
-            ["One remark."],
+            [Note("text", {"text": "One remark."})],
             "9f" * 32,
         ),
         Audit(
@@ -164,7 +164,7 @@ def forged(folder):
         scores,
         gallery,
         settings,
-        ["Synthetic data."],
+        [Note("text", {"text": "Synthetic data."})],
         [f"palpate audit {LONG} --out {LONG}"],
     )
 
@@ -216,7 +216,7 @@ def test_page_in_chromium(chromium, page_file, width, scheme):
 @pytest.fixture(scope="module")
 def audit_page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("audits")
-    names = pictures(folder, 16)
+    names = images(folder, 16)
     long = full_audit(
         names,
         name=LONG,
@@ -333,7 +333,9 @@ def test_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_file):
     tags = [tag for tag, _ in reached]
     assert tags[:6] == ["A"] * 6
     assert "SUMMARY" in tags
-    assert any(tag == "DIV" and label.startswith("Table: Touch features") for tag, label in reached)
+    assert any(
+        tag == "DIV" and label.startswith("Table: Tactile features") for tag, label in reached
+    )
 
 
 def test_printed_page_opens_what_is_folded(chromium, page_file):

@@ -66,7 +66,7 @@ def test_the_demo_ends_in_a_page_with_everything_on_it(whole):
     assert results.audits[0].leaked_fraction > 0
     assert results.audits[1].leaked_fraction == 0
     assert len(results.facts) == 3
-    assert any("synthetic" in note for note in results.notes)
+    assert any("synthetic" in str(note) for note in results.notes)
     assert results.title == "From photo to touch on palpate's procedural world"
     assert {s.metric for s in results.scores} >= {
         "TMMD",
@@ -279,8 +279,8 @@ def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
         "import world -o tag",
         "split tag -o s.json --train 0.5",
         "audit tag --split s.json -o audit.json --fail-over 0",
-        "encoder tag --split s.json -o encoders --preset tiny",
-        "train tag --split s.json --encoder encoders -o model --preset tiny --background",
+        "train encoder tag --split s.json -o encoders --preset tiny",
+        "train generator tag --split s.json --encoder encoders -o model --preset tiny --background",
         "generate --model model --manifest tag --split s.json -o made",
         "score tag --generated made --split s.json --encoder encoders -o scores.json --json",
         "report audit.json scores.json -o page.html",

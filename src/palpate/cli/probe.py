@@ -40,7 +40,6 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require_extra("palpate probe")
     if options.output:
         guard_output(options.output, [options.manifest, options.split])
-    from palpate.cli.scoring_tables import show
     from palpate.evaluation import probe
 
     names = ("encoder", "modality", "group", "balanced", "cache", "seed")
@@ -48,7 +47,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     with terminal.progress() as progress:
         results = probe(options.manifest, options.split, progress=progress, **arguments)
     results = replace(results, commands=[terminal.command])
-    show(results, terminal)
+    terminal.show(results)
     if options.output:
         results.save(options.output)
     return results.to_json()

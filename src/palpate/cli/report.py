@@ -2,108 +2,84 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
-from palpate.core import Note, PalpateError, read_json
+from palpate.core import Note, PalpateError, read_record, short
 from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results
+
+TITLE = "palpate report"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Write one self-contained page, with JSON and Markdown of the same results beside it."""
+    """Write one self-contained page, with JSON and Markdown of the same results next to it."""
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Any of: the JSON of `palpate audit -o`, of `palpate score -o`, or of an earlier page."""
     output: OutPath
     """The page to write (.html)."""
-    title: str = "palpate report"
+    title: str = TITLE
     """Heading of the page."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
-    """Merges the results and writes the page."""
+    """Merge the results and write the page."""
     if not options.results:
-        raise PalpateError(
-            "A report needs results",
-            "no file",
-            "E.g. palpate audit train.txt test.txt -o audit.json",
-        )
+        example = {"results": "audit.json"}
+        raise PalpateError("A report needs results", "no file", "Name some", example=example)
     from palpate.report import write_report
 
     if options.output.suffix == ".html":
-        guard_output(options.output, options.results, (b"palpate",))
+        marks = (options.title.encode(), b"palpate")
+        guard_output(options.output, options.results, marks)
         guard_output(options.output.with_suffix(".json"), options.results)
-        guard_output(
-            options.output.with_suffix(".md"), options.results, (options.title.encode(), b"palpate")
-        )
-    merged = Results(title=options.title)
-    for path in options.results:
-        merged = _join(merged, _read(path))
-    mismatch = [Note("text", {"text": text}) for text in _mismatch(merged)]
-    merged = replace(merged, notes=[*merged.notes, *mismatch])
+        guard_output(options.output.with_suffix(".md"), options.results, marks)
+    merged = reduce(join, map(read, options.results), Results(title=options.title))
+    merged = replace(merged, notes=[*merged.notes, *_mismatch(merged)])
     with terminal.progress() as progress:
-        files = write_report(merged, options.output, progress=progress)
+        files = write_report(merged, options.output, base=Path(), progress=progress)
     paths = {"page": str(files.page), "json": str(files.json), "markdown": str(files.markdown)}
     terminal.facts("Report", paths)
     return paths
 
 
-def _read(path: Path) -> Results:
-    """One file of results, checked, with absolute picture paths.
+def read(path: Path) -> Results:
+    """Read one file of results or an audit, with image paths from the working directory.
 
     Raises:
-        PalpateError: if it is missing, not ours, or incomplete.
+        PalpateError: if it is missing, of another format, or incomplete.
     """
-    from palpate.report import with_paths
-
-    data = read_json(path, "results file")
-    kind = data.get("format") if isinstance(data, dict) else None
+    data = read_record(path, "results file", form=(*RESULTS_FORMATS, *AUDIT_FORMATS))
     try:
-        match kind:
-            case _ if kind in AUDIT_FORMATS:
-                results = replace(Audit.from_json(data).to_results(), title="")
-            case _ if kind in RESULTS_FORMATS:
-                results = Results.from_json(data)
-            case _:
-                raise PalpateError(
-                    f"{path} must hold results of palpate",
-                    f"format {kind!r}",
-                    "Pass the JSON of audit -o, score -o, or of a page",
-                )
+        if data["format"] in AUDIT_FORMATS:
+            results = replace(Audit.from_json(data).to_results(), title="")
+        else:
+            results = Results.from_json(data)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise PalpateError(
-            f"{path} must hold complete results",
-            f"a missing or unknown field ({error})",
-            "Write it again with palpate",
-        ) from None
-    return with_paths(results, lambda name: str((path.parent / name).resolve()))
+        got = f"a missing or unknown field ({error})"
+        fix = "Write it again with palpate"
+        raise PalpateError(f"{path} must hold complete results", got, fix) from None
+    return results.with_paths(lambda name: os.path.normpath(path.parent / name))
 
 
-def _mismatch(results: Results) -> list[str]:
-    """Says so if no audit on the page is of the split that the scores are on."""
+def join(first: Results, second: Results) -> Results:
+    """Return both, one after the other; the first title of its own stays."""
+    names = ("facts", "audits", "scores", "gallery", "notes", "commands")
+    lists: dict[str, Any] = {n: [*getattr(first, n), *getattr(second, n)] for n in names}
+    title = second.title if first.title == TITLE and second.title else first.title
+    return Results(title=title, settings={**first.settings, **second.settings}, **lists)
+
+
+def _mismatch(results: Results) -> list[Note]:
+    """Return a note if no audit on the page is of the split that the scores are on."""
     audited, scored = ({x.split for x in of if x.split} for of in (results.audits, results.scores))
-    if results.audits and scored - audited:
-        named = ", ".join(s[:8] for s in sorted(scored - audited))
-        return [
-            f"No audit on this page is of the split that these scores are on ({named}): what the audits say of leaks does not speak of them."
-        ]
-    return []
-
-
-def _join(a: Results, b: Results) -> Results:
-    """The two, one after the other; the first non-empty title stays."""
-    return Results(
-        title=a.title if a.title != "palpate report" or not b.title else b.title,
-        facts=[*a.facts, *b.facts],
-        audits=[*a.audits, *b.audits],
-        scores=[*a.scores, *b.scores],
-        gallery=[*a.gallery, *b.gallery],
-        settings={**a.settings, **b.settings},
-        notes=[*a.notes, *b.notes],
-        commands=[*a.commands, *b.commands],
-    )
+    if not results.audits or not scored - audited:
+        return []
+    return [Note("other-split", {"splits": ", ".join(map(short, sorted(scored - audited)))})]

@@ -75,7 +75,6 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write JSON and LaTeX."""
     _check_outputs(options)
-    from palpate.cli.scoring_tables import show
     from palpate.evaluation import score
 
     names = ("encoder", "split", "labels", "groups", "group", "estimator", "backend", "controls")
@@ -96,7 +95,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         )
     results = replace(results, commands=[terminal.command])
     try:
-        show(results, terminal)  # before saving: a full disk loses nothing
+        terminal.show(results)  # before saving: a full disk loses nothing
     finally:
         if options.output:
             results.save(options.output)

@@ -132,7 +132,9 @@ class Score:
         fields = dict(data)
         for name in ("interval", "null"):
             fields[name] = tuple(data[name]) if data.get(name) is not None else None
-        fields["notes"] = tuple(Note.from_json(note) for note in data.get("notes", ()))
+        sentence = fields.pop("note", "")  # format 1 had one string
+        notes = [*data.get("notes", ()), *([sentence] if sentence else [])]
+        fields["notes"] = tuple(map(Note.from_json, notes))
         if not isinstance(fields.get("value"), int | float | None):
             raise TypeError(f"the value of a score must be a number, got {fields['value']!r}")
         return cls(**fields)

@@ -1,50 +1,21 @@
 """The report room: results as tables in the terminal, in Markdown and in LaTeX, and as a page.
 
-Importing this package or :mod:`palpate.report.results` loads no template engine and no image library.
+Importing this package or :mod:`palpate.report.results` loads no template engine and no image
+library.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple
 
 from palpate.core import PalpateError, Progress, quiet, write_json, write_text
 from palpate.report.results import Audit, Results
 
-if TYPE_CHECKING:
-    from palpate.report.markdown import render_markdown
-    from palpate.report.page import render_page
-    from palpate.report.paths import with_paths
-    from palpate.report.sentences import summary_lines
-
-_LAZY = {
-    "render_markdown": "markdown",
-    "render_page": "page",
-    "summary_lines": "sentences",
-    "with_paths": "paths",
-}
-__all__ = [
-    "Audit",
-    "ReportFiles",
-    "Results",
-    "render_markdown",
-    "render_page",
-    "summary_lines",
-    "with_paths",
-    "write_report",
-]
+__all__ = ["Audit", "ReportFiles", "Results", "summary_lines", "write_report"]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"palpate.report.{_LAZY[name]}"), name)
-
-
-@dataclass(frozen=True)
-class ReportFiles:
+class ReportFiles(NamedTuple):
     """What :func:`write_report` wrote."""
 
     page: Path
@@ -52,14 +23,11 @@ class ReportFiles:
     markdown: Path
 
 
-def _moved(results: Results, base: Path, folder: Path) -> Results:
-    """The results with image paths relative to ``folder``: they stay right when the run folder moves."""
-    import os
+def summary_lines(results: Results) -> list[str]:
+    """Return at most three headline facts."""
+    from palpate.report import sentences
 
-    from palpate.report.paths import with_paths
-
-    start, end = base.resolve(), folder.resolve()
-    return with_paths(results, lambda name: Path(os.path.relpath(start / name, end)).as_posix())
+    return sentences.summary_lines(results)
 
 
 def write_report(
@@ -70,39 +38,34 @@ def write_report(
     max_bytes: int = 10_000_000,
     progress: Progress = quiet,
 ) -> ReportFiles:
-    """Write ``page`` (HTML) and, next to it, the same results as ``.json`` and ``.md``, each atomically.
+    """Write ``page`` (HTML) and, next to it, the same results as ``.json`` and ``.md``.
 
     Args:
         results: everything to show.
         page: the HTML file; its name must end in ``.html``.
-        base: folder that relative image paths of ``results`` start from; by default the folder of ``page``. The JSON
-            counts them from its own folder.
-        max_bytes: largest size of the HTML file. Images shrink, then rows are skipped, and the page says so.
+        base: folder that relative image paths of ``results`` start from; by default that of
+            ``page``. The JSON counts them from its own folder.
+        max_bytes: largest size of the HTML file. Images shrink, then rows are skipped, and the page
+            says so.
         progress: called while images are made.
 
-    Returns:
-        The three paths.
-
     Raises:
-        PalpateError: if ``page`` does not end in ``.html``, if scores of different settings would share a column (nothing
-            is written then), or if ``max_bytes`` cannot even hold the text.
+        PalpateError: if ``page`` does not end in ``.html``, if scores of different settings would
+            share a column (nothing is written then), or if ``max_bytes`` cannot hold the text.
     """
-    from palpate.report.markdown import render_markdown
     from palpate.report.page import render_page
-    from palpate.report.text import plain
 
     page = Path(page)
     if page.suffix != ".html":
-        raise PalpateError(
-            "The page's file name must end in .html", f"{page.name!r}", "Name it e.g. report.html"
-        )
+        fix = "Name it e.g. report.html"
+        raise PalpateError("The page's file name must end in .html", f"{page.name!r}", fix)
     folder = page.parent
-    results = _moved(results, base if base is not None else folder, folder)
+    results = results.relative_to(folder, base=base or folder)
     files = ReportFiles(page, page.with_suffix(".json"), page.with_suffix(".md"))
-    text = render_markdown(results)
-    write_json(files.json, plain(results.to_json()))
-    write_text(files.markdown, text)
     names = (files.json.name, files.markdown.name)
+    markdown = results.to_markdown()
     html = render_page(results, folder, max_bytes=max_bytes, names=names, progress=progress)
+    write_json(files.json, results.to_json())
+    write_text(files.markdown, markdown)
     write_text(page, html)
     return files

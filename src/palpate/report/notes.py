@@ -1,8 +1,8 @@
-"""The sentence of every note code: one table a room, in the wording of Python or of the command line.
+"""The sentence of every note code: one table a room, in Python's or the command line's wording.
 
 A template is filled with the note's parameters. ``{arg:backend=blocked}`` in it becomes
-``backend='blocked'`` for Python users and ``--backend blocked`` on the command line. Where one
-template cannot do (plurals, optional parts), the entry is a function of the parameters and the style.
+``backend='blocked'`` in Python and ``--backend blocked`` on the command line. Where one
+template cannot do (plurals, optional parts), the entry is a function of parameters and style.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from palpate.core import Note
+from palpate.report.text import few
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,19 @@ def _unstable(p: Mapping[str, Any], _: Style) -> str:
     return f"Denominators {why}, so the ratio is unreliable: {names}{tail}"
 
 
+def _excluded_classes(p: Mapping[str, Any], _: Style) -> str:
+    names: dict[str, list[str]] = {}
+    for name, why in p["excluded"].items():
+        names.setdefault(EXCLUDED.get(why, str(why)), []).append(name)
+    return "Excluded: " + "; ".join(f"{few(n)} ({why})" for why, n in names.items())
+
+
 METRICS: dict[str, Sentence] = {
     "undefined": _undefined,
     "no-interval": lambda p, _: f"No interval: {_NO_INTERVAL[p['reason']]}",
-    "no-floor": lambda p, _: f"No floor: real images of {_NO_FLOOR[p['reason']]} have another value",
+    "no-floor": lambda p, _: (
+        f"No floor: real images of {_NO_FLOOR[p['reason']]} have another value"
+    ),
     "within-bound": (
         "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments"
     ),
@@ -340,19 +350,35 @@ EVALUATION: dict[str, Sentence] = {
     "widened": "The features in {source}: {type} was widened to float32; its rounding stays",
     "within-bound": "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments",
 }
-OTHER: dict[str, Sentence] = {"text": "{text}"}
+OTHER: dict[str, Sentence] = {
+    "text": "{text}",
+    "excluded-classes": _excluded_classes,
+    "nearer-to-floor": (
+        "Which is nearer to the floor: confidence and p are of |a - floor| - |b - floor|"
+    ),
+    "no-contact-baseline": (
+        "No contact: what the no-contact image scores in place of a contact score; squared errors "
+        "(PSNR) prefer it to a wrong tactile image"
+    ),
+    "no-floor-of-tmmd": (
+        "No floor: that of TMMD is made of further real images, the train part of a split"
+    ),
+    "floor-unknown": "No floor: no such value of real images is known",
+    "other-split": (
+        "No audit on this page is of the split that these scores are on ({splits}): what the "
+        "audits say of leaks does not apply to them"
+    ),
+}
 SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | OTHER
 
 
 def sentence(note: Note | str, style: Style = PYTHON) -> str:
-    """A note in words, without a full stop at the end.
-
-    Raises:
-        KeyError: for a code without a sentence, or a parameter that its template lacks.
-    """
+    """Return a note in words, without a full stop at the end."""
     if isinstance(note, str):  # until every room makes notes
         return note
-    template = SENTENCES[note.code]
+    template = SENTENCES.get(note.code)
+    if template is None:  # a note of another version of palpate
+        return ", ".join([note.code, *(f"{k} {v}" for k, v in note.params.items())])
     if callable(template):
         return template(note.params, style)
     return template.format(arg=style, **note.params)

@@ -1,26 +1,28 @@
-"""Inline SVG: interval bars on one axis a column, the histogram of gaps, and the two histograms of a calibrated signal.
+"""Inline SVG: interval bars on one axis a column, and histograms of gaps and of scores.
 
-Every drawing takes its colors from the page's CSS (classes, no inline color), so light, dark and print agree.
-The interval bar maps x to ``pad + (x - low) / (high - low) * (width - 2 pad)`` pixels. The histograms have no
+Colors come from the page's CSS (classes), so light, dark and print agree. Histograms have no
 ``viewBox``: their lengths are percentages, so text keeps its size on a phone and on a desk.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.core import Score
-from palpate.report.results import Audit, Signal
+from palpate.report.results import Audit, Impact, Signal
 from palpate.report.text import count, number, score_text
 
-WIDTH, HEIGHT, PAD = 148, 22, 7
-_LEFT, _RIGHT = 13.0, 99.0  # per cent of the histogram's width
+WIDTH, HEIGHT, PAD = 148, 22, 7  # pixels of an interval bar
+LEFT, RIGHT = 13.0, 99.0  # percent of a histogram's width
+PANEL, TOP, BETWEEN = 70.0, 44.0, 30.0  # pixels of a histogram's panels
+#: Most bars in a histogram of scores; finer bins are joined.
+MAX_BARS = 48
 
 
 @dataclass(frozen=True)
@@ -33,367 +35,260 @@ class Axis:
     digits: int
 
     def x(self, value: float) -> float:
-        """Pixels from the left edge of the drawing; values outside are put on the edge."""
+        """Return pixels from the left edge; values outside are put on the edge."""
         share = (value - self.low) / (self.high - self.low)
         return round(PAD + min(1.0, max(0.0, share)) * (WIDTH - 2 * PAD), 2)
 
 
 def nice_step(span: float, parts: int) -> float:
-    """The smallest of 1, 2, 5 times a power of ten that cuts ``span`` > 0 into at most ``parts`` steps."""
-    raw = span / parts
-    power = 10.0 ** math.floor(math.log10(raw))
-    return next((m * power for m in (1, 2, 5) if m * power >= raw * (1 - 1e-9)), 10 * power)
+    """Return the least 1, 2, 5 times a power of ten that cuts ``span`` into at most ``parts``."""
+    power = 10.0 ** math.floor(math.log10(span / parts))
+    return next(m * power for m in (1, 2, 5, 10) if m * power >= span / parts * (1 - 1e-9))
 
 
-def axis_of(scores: Sequence[Score]) -> Axis | None:
-    """The axis that holds values, intervals, nulls and floors of one column; None if nothing is defined."""
-    seen: list[float] = []
-    for s in scores:
-        seen += [
-            v for v in (s.value, s.floor, *(s.interval or ()), *(s.null or ())) if v is not None
-        ]
-    return axis_over(seen)
+def ticks_of(low: float, high: float, parts: int) -> tuple[list[float], int]:
+    """Return round numbers in [low, high] and their decimals."""
+    step = nice_step(high - low, parts)
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    return [round(k * step, 12) for k in range(first, last + 1)], digits
 
 
-def axis_over(values: Sequence[float]) -> Axis | None:
-    """The axis that holds all finite ``values``; None if there are none. Zero is put on it whenever they come near it."""
-    seen = [v for v in values if math.isfinite(v)]
-    if not seen:
+def axis_over(values: Iterable[float | None]) -> Axis | None:
+    """Return the axis that holds all finite ``values``, with zero if they come near it."""
+    finite = [v for v in values if v is not None and math.isfinite(v)]
+    if not finite:
         return None
-    low, high = min(seen), max(seen)
+    low, high = min(finite), max(finite)
     if 0 < low < 0.4 * high:
         low = 0.0
-    if low > 0.4 * high and high < 0:
+    elif 0.4 * low < high < 0:
         high = 0.0
     if high - low <= 1e-12 * max(abs(high), abs(low), 1e-300):
         margin = abs(high) * 0.1 or 1.0
         low, high = low - margin, high + margin
-    step = nice_step(high - low, 3)
-    ticks = [
-        round(k * step, 12)
-        for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
-    ]
     margin = 0.02 * (high - low)
-    return Axis(low - margin, high + margin, ticks, max(0, -math.floor(math.log10(step) + 1e-9)))
+    return Axis(low - margin, high + margin, *ticks_of(low, high, 3))
 
 
-def interval_bar(score: Score, axis: Axis) -> Markup:
-    """The score as a dot, its interval as a line, its null as a band and its floor as a dashed tick."""
-    return bar(axis, score.value, score.interval, null=score.null, floor=score.floor)
+def axis_of(scores: Iterable[Score]) -> Axis | None:
+    """Return the axis that holds values, intervals, nulls and floors of one column."""
+    return axis_over(
+        v for s in scores for v in (s.value, s.floor, *(s.interval or ()), *(s.null or ()))
+    )
+
+
+def impact_axes(impact: Impact) -> list[Axis | None]:
+    """Return the axes of accuracy under both splits and of the cost, in percent."""
+    accuracies: list[float] = [0.0]
+    costs: list[float] = [0.0]
+    for row in impact.rows:
+        accuracies += [row.given, row.clean, row.chance]
+        accuracies += [*(row.given_interval or ()), *(row.clean_interval or ())]
+        costs += [row.cost, *(row.cost_interval or ())]
+    accuracy, cost = (axis_over([100 * v for v in values]) for values in (accuracies, costs))
+    return [accuracy, accuracy, cost]
 
 
 def bar(
-    axis: Axis,
+    axis: Axis | None,
     value: float | None,
     interval: tuple[float, float] | None,
-    *,
     null: tuple[float, float] | None = None,
     floor: float | None = None,
 ) -> Markup:
-    """A value with what belongs to it on ``axis``; what is None or not finite is left out.
+    """Draw a value with its interval, null band and floor on ``axis``.
 
-    The same numbers stand beside it as text, so it is hidden from screen readers.
+    The same numbers are next to it as text, so it is hidden from screen readers.
     """
+    if axis is None:
+        return Markup("")
     mid = HEIGHT / 2
     parts = [f'<line class="rail" x1="{PAD}" x2="{WIDTH - PAD}" y1="{mid}" y2="{mid}"/>']
-    if null and all(math.isfinite(v) for v in null):
-        a, b = (axis.x(v) for v in null)
+    if null:
+        a, b = sorted(map(axis.x, null))
         parts.append(
-            f'<rect class="null" x="{min(a, b) - 0.75:.2f}" y="3" width="{abs(b - a) + 1.5:.2f}" height="{HEIGHT - 6}" rx="1.5"/>'
+            f'<rect class="null" x="{a - 0.75:.2f}" y="3" width="{b - a + 1.5:.2f}" '
+            f'height="{HEIGHT - 6}" rx="1.5"/>'
         )
-    if floor is not None and math.isfinite(floor):
+    if floor is not None:
         x = axis.x(floor)
         parts.append(f'<line class="floor" x1="{x}" x2="{x}" y1="1" y2="{HEIGHT - 1}"/>')
-    if interval and all(math.isfinite(v) for v in interval):
-        a, b = (axis.x(v) for v in interval)
+    if interval:
+        a, b = map(axis.x, interval)
         parts.append(f'<path class="interval" d="M{a} {mid}H{b}M{a} {mid - 4}v8M{b} {mid - 4}v8"/>')
-    if value is not None and math.isfinite(value):
+    if value is not None:
         parts.append(f'<circle class="value" cx="{axis.x(value)}" cy="{mid}" r="4"/>')
-    return Markup(
-        f'<svg class="bar" width="{WIDTH}" height="{HEIGHT}" aria-hidden="true" focusable="false">{"".join(parts)}</svg>'
-    )
+    return _svg("bar", WIDTH, HEIGHT, parts)
 
 
-def axis_row(axis: Axis) -> Markup:
-    """The labeled axis below a column of interval bars."""
+def axis_row(axis: Axis | None) -> Markup:
+    """Draw the labeled axis below a column of bars."""
+    if axis is None:
+        return Markup("")
     parts = [f'<line class="rail" x1="{PAD}" x2="{WIDTH - PAD}" y1="1" y2="1"/>']
     for tick in axis.ticks:
-        x = axis.x(tick)
-        text = number(tick, axis.digits)
-        half = 3.6 * len(text)  # of the label at 12 px; kept inside the drawing
-        at = min(max(x, half), WIDTH - half)
+        x, text = axis.x(tick), number(tick, axis.digits)
+        half = 3.6 * len(text)  # of the label at 12 px
+        label = min(max(x, half), WIDTH - half)
         parts.append(f'<line class="tick" x1="{x}" x2="{x}" y1="1" y2="5"/>')
-        parts.append(f'<text x="{at:.2f}" y="17" text-anchor="middle">{text}</text>')
-    return Markup(
-        f'<svg class="bar axis" width="{WIDTH}" height="20" aria-hidden="true" focusable="false">{"".join(parts)}</svg>'
-    )
+        parts.append(f'<text x="{label:.2f}" y="17" text-anchor="middle">{text}</text>')
+    return _svg("bar axis", WIDTH, 20, parts)
 
 
-def _edge_position(edges: Sequence[int], value: float) -> float | None:
-    """Per cent of the width at which ``value`` lies, linear inside each bin; None if it lies outside the edges."""
-    bins = len(edges) - 1
-    for k, (a, b) in enumerate(pairwise(edges)):
-        if a <= value <= b:
-            return _LEFT + (k + ((value - a) / (b - a) if b > a else 0.0)) / bins * (_RIGHT - _LEFT)
-    return None
-
-
-def _marks(edges: Sequence[int]) -> list[int]:
-    """Which edges to label: at most six, the first and the last among them."""
-    bins = len(edges) - 1
-    every = max(1, math.ceil(bins / 5))
-    marks = [k for k in range(0, bins, every) if bins - k >= every or k == 0]
-    return [*marks, bins]
-
-
-def _tick(value: int, step: int) -> str:
-    return f"{value // 1000:,}k" if value and step % 1000 == 0 else count(value)
-
-
-def uneven(edges: Sequence[int]) -> bool:
-    """Whether bins differ in width; the last may be cut short."""
-    return len({b - a for a, b in pairwise(edges[:-1])}) > 1
-
-
-def _reach(edges: Sequence[int], least: float | None, middle: float, most: float | None) -> str:
-    """A line from the least to the greatest value with a dot at the middle, above the bars; '' if one is unknown."""
-    places = [_edge_position(edges, v) for v in (least, middle, most) if v is not None]
-    if len(places) < 3 or None in places:
-        return ""
-    a, m, b = places
-    ends = "".join(
-        f'<line class="reach" x1="{x:.3f}%" x2="{x:.3f}%" y1="20" y2="28"/>' for x in (a, b)
-    )
-    return f'<line class="reach" x1="{a:.3f}%" x2="{b:.3f}%" y1="24" y2="24"/>{ends}<circle class="value" cx="{m:.3f}%" cy="24" r="3.5"/>'
-
-
-def gap_histogram(audit: Audit) -> Markup:
-    """Bars of the gaps between test frames and their nearest train frame; '' if the audit has none.
-
-    One bar a bin, all equally wide, with the edges labeled below; the median is a dashed line, and a line above the bars
-    reaches from the least gap to the most.
-
-    Args:
-        audit: ``gap_edges`` (frames) one longer than ``gap_counts`` (test samples).
-    """
-    edges, counts = list(audit.gap_edges), list(audit.gap_counts)
-    if not counts or len(edges) != len(counts) + 1 or max(counts) <= 0:
-        return Markup("")
-    top, bottom = 38.0, 172.0
-    step = max(1.0, nice_step(max(counts), 3))
-    ceiling = step * math.ceil(max(counts) / step)
-    wide = (_RIGHT - _LEFT) / len(counts)
-    y = lambda v: bottom - (bottom - top) * v / ceiling  # noqa: E731
-    parts: list[str] = []
-    for k in range(int(ceiling / step) + 1):
-        parts.append(
-            f'<line class="grid" x1="{_LEFT}%" x2="{_RIGHT}%" y1="{y(k * step):.1f}" y2="{y(k * step):.1f}"/>'
-        )
-        parts.append(
-            f'<text class="ylabel" x="{_LEFT - 1.5}%" y="{y(k * step) + 4:.1f}" text-anchor="end">{_tick(int(k * step), int(step))}</text>'
-        )
-    for k, n in enumerate(counts):
-        last = k == len(counts) - 1
-        said = f"{count(edges[k])} to {count(edges[k + 1])} frames{'' if last else ' (exclusive)'}: {count(n)}"
-        parts.append(
-            f'<rect class="column" x="{_LEFT + (k + 0.06) * wide:.3f}%" width="{0.88 * wide:.3f}%" '
-            f'y="{y(n):.1f}" height="{bottom - y(n):.1f}"><title>{said}</title></rect>'
-        )
-    for k in _marks(edges):
-        x = _LEFT + k * wide
-        anchor = "end" if k == len(counts) else "middle"
-        parts.append(
-            f'<line class="tick" x1="{x:.3f}%" x2="{x:.3f}%" y1="{bottom}" y2="{bottom + 4}"/>'
-        )
-        parts.append(
-            f'<text x="{x:.3f}%" y="{bottom + 18}" text-anchor="{anchor}">{count(edges[k])}</text>'
-        )
-    middle = audit.gap_median
-    if middle is not None and (x := _edge_position(edges, middle)) is not None:
-        anchor, shift = ("end", -1) if x > 60 else ("start", 1)
-        parts.append(f'<line class="median" x1="{x:.3f}%" x2="{x:.3f}%" y1="8" y2="{bottom}"/>')
-        parts.append(
-            f'<text class="median-label" x="{x + shift:.3f}%" y="14" text-anchor="{anchor}">median {number(middle, 0)}</text>'
-        )
-        parts.append(_reach(edges, audit.gap_min, middle, audit.gap_max))
-    parts.append(
-        f'<text class="xlabel" x="{_RIGHT}%" y="{bottom + 36}" text-anchor="end">frames to the nearest train frame</text>'
-    )
-    label = escape(
-        f"Histogram of gaps for {audit.name}: {count(sum(counts))} test samples, {count(edges[0])} to {count(edges[-1])} frames"
-        + (f", median {number(middle, 0)}" if middle is not None else "")
-    )
-    return Markup(
-        f'<svg class="histogram" width="100%" height="214" role="img" aria-label="{label}">{"".join(parts)}</svg>'
-    )
-
-
-#: Most bars in a histogram of scores; finer bins are joined.
-BARS = 48
-_PANEL, _TOP, _BETWEEN = (
-    70.0,
-    44.0,
-    30.0,
-)  # pixels: height of a panel, above the first, between the two
+def _svg(
+    name: str, width: float | str, height: float, parts: Iterable[str], label: str = ""
+) -> Markup:
+    role = f'role="img" aria-label="{escape(label)}"' if label else 'aria-hidden="true"'
+    size = f'width="{width}" height="{height:.0f}" {role} focusable="false"'
+    return Markup(f'<svg class="{name}" {size}>{"".join(parts)}</svg>')
 
 
 @dataclass(frozen=True)
-class Bins:
-    """The two histograms of a calibrated signal over the same bins, cut to where anything lies.
+class Panel:
+    """One histogram: a name, heights of its bars with what each is, and the top of its scale."""
 
-    Attributes:
-        edges: ascending scores, one more than there are bins.
-        unrelated, matches: counts of unrelated matches and of test samples; ``unrelated`` may be empty.
+    name: str
+    heights: Sequence[float]
+    titles: Sequence[str]
+    kinds: Sequence[str]
+    top: str
+
+
+def _histogram(
+    panels: Sequence[Panel],
+    positions: Sequence[float],
+    *,
+    ticks: Sequence[tuple[float, str]],
+    marker: tuple[float, str] | None,
+    xlabel: str,
+    label: str,
+) -> Markup:
+    """Draw panels above one another; ``positions`` of edges, ticks and marker lie in [0, 1]."""
+
+    def at(share: float) -> float:
+        return LEFT + share * (RIGHT - LEFT)
+
+    parts: list[str] = []
+    bottom = TOP
+    for k, panel in enumerate(panels):
+        bottom = TOP + PANEL + k * (PANEL + BETWEEN)
+        for y, text in ((bottom - PANEL, panel.top), (bottom, "0")):
+            parts.append(f'<line class="grid" x1="{LEFT}%" x2="{RIGHT}%" y1="{y}" y2="{y}"/>')
+            parts.append(_text("ylabel", LEFT - 1.5, y + 4, text, "end"))
+        scale = PANEL / (max(panel.heights) or 1.0)
+        for height, title, kind, (a, b) in zip(
+            panel.heights, panel.titles, panel.kinds, pairwise(positions), strict=True
+        ):
+            if height:
+                tall, edge = max(1.0, scale * height), 0.06 * (b - a)
+                size = f'width="{at(b - edge) - at(a + edge):.3f}%" height="{tall:.1f}"'
+                place = f'x="{at(a + edge):.3f}%" y="{bottom - tall:.1f}"'
+                rect = f'<rect class="{kind}" {place} {size}><title>{escape(title)}</title></rect>'
+                parts.append(rect)
+        parts.append(_text("panel", LEFT, bottom - PANEL - 7, panel.name, "start"))
+    for share, text in ticks:
+        x, anchor = at(share), "end" if share > 0.95 else "middle"
+        line = f'<line class="tick" x1="{x:.3f}%" x2="{x:.3f}%" y1="{bottom}" y2="{bottom + 4}"/>'
+        parts += [line, _text("", x, bottom + 18, text, anchor)]
+    parts.append(_text("xlabel", RIGHT, bottom + 36, xlabel, "end"))
+    if marker:
+        x, (anchor, shift) = at(marker[0]), ("end", -1) if marker[0] > 0.55 else ("start", 1)
+        line = f'<line class="median" x1="{x:.3f}%" x2="{x:.3f}%" y1="4" y2="{bottom}"/>'
+        parts += [line, _text("median-label", x + shift, 14, marker[1], anchor)]
+    return _svg("histogram", "100%", bottom + 42, parts, label)
+
+
+def _text(name: str, x: float, y: float, text: str, anchor: str) -> str:
+    place = f'x="{x:.3f}%" y="{y:.1f}" text-anchor="{anchor}"'
+    return f'<text class="{name}" {place}>{escape(text)}</text>'
+
+
+def gap_histogram(audit: Audit) -> Markup:
+    """Draw the gaps between test frames and their nearest train frame; '' if there are none.
+
+    All bars are equally wide, with the edges (frames) labeled below; the median is a dashed line.
     """
-
-    edges: Sequence[float]
-    unrelated: Sequence[int]
-    matches: Sequence[int]
-
-    @property
-    def even(self) -> bool:
-        """Whether all bins are equally wide, so that heights are shares."""
-        widths = [b - a for a, b in pairwise(self.edges)]
-        return max(widths) - min(widths) <= 1e-6 * max(widths)
-
-
-def bins_of(signal: Signal) -> Bins | None:
-    """The signal's histograms as they are drawn: at most :data:`BARS` bins, none empty at the ends; None if there are none.
-
-    Neighboring bins are joined where there are too many; the bin of the threshold is always kept.
-    """
-    edges, unrelated, found = list(signal.edges), list(signal.unrelated), list(signal.matches)
-    fits = (
-        len(edges) == len(found) + 1
-        and len(unrelated) in (0, len(found))
-        and all(a < b for a, b in pairwise(edges))
-    )
-    if (
-        not fits
-        or not found
-        or not all(map(math.isfinite, (*edges, signal.threshold)))
-        or sum(found) + sum(unrelated) <= 0
-    ):
-        return None
-    size = len(found)
-    full = [k for k in range(size) if found[k] or (unrelated and unrelated[k])]
-    full += [min(max(bisect_right(edges, signal.threshold) - 1, 0), size - 1)]
-    first, last = min(full), max(full) + 1
-    step = math.ceil((last - first) / BARS)
-    first = max(0, first - (first - last) % step)  # whole steps, so that even bins stay even
-    last = min(size, last + (first - last) % step)
-    starts = list(range(first, last, step))
-    join = lambda counts: [sum(counts[k : min(k + step, last)]) for k in starts] if counts else []  # noqa: E731
-    return Bins([*(edges[k] for k in starts), edges[last]], join(unrelated), join(found))
-
-
-def _heights(counts: Sequence[int], bins: Bins) -> list[float]:
-    """The share of all counts in each bin; in bins of unequal width, per width."""
-    total = sum(counts) or 1
-    return [
-        n / total / (1.0 if bins.even else b - a)
-        for n, (a, b) in zip(counts, pairwise(bins.edges), strict=True)
+    edges, counts = list(audit.gap_edges), list(audit.gap_counts)
+    if not sum(counts):
+        return Markup("")
+    positions = np.linspace(0, 1, len(edges)).tolist()
+    every = max(1, math.ceil(len(counts) / 5))
+    labeled = [k for k in range(len(edges)) if k % every == 0 and len(counts) - k >= every]
+    labeled.append(len(counts))
+    marker = None
+    if audit.gap_median is not None:
+        place = float(np.interp(audit.gap_median, edges, positions))
+        marker = (place, f"median {number(audit.gap_median, 0)}")
+    label = f"Histogram of gaps for {audit.name}: {count(sum(counts))} test samples, "
+    label += f"{count(edges[0])} to {count(edges[-1])} frames"
+    titles = [
+        f"{count(a)} to {count(b)} frames: {count(n)}"
+        for (a, b), n in zip(pairwise(edges), counts, strict=True)
     ]
+    panel = Panel("test samples", counts, titles, ["column"] * len(counts), count(max(counts)))
+    return _histogram(
+        [panel],
+        positions,
+        ticks=[(positions[k], count(edges[k])) for k in labeled],
+        marker=marker,
+        xlabel="frames to the nearest train frame",
+        label=label + (f", {marker[1]}" if marker else ""),
+    )
 
 
-def score_histogram(signal: Signal, said: str, other: str = "train") -> Markup:
-    """Scores of unrelated matches above, of the test samples' best matches below, on one axis with the threshold; '' if there are none.
+def bins_of(signal: Signal) -> tuple[list[float], list[int], list[int]] | None:
+    """Return edges and both histograms of a calibrated signal as they are drawn, or None.
 
-    Each panel has its own scale, in shares of its own samples. Bars of test samples are strong from the threshold on; the bin
-    that the threshold cuts is drawn in both strengths.
+    Empty bins at the ends are cut, and neighbors joined to at most :data:`MAX_BARS`.
+    """
+    edges, matches = np.asarray(signal.edges), np.asarray(signal.matches)
+    unrelated = np.asarray(signal.unrelated if len(signal.unrelated) else np.zeros_like(matches))
+    if not (matches.sum() + unrelated.sum()):
+        return None
+    inside = int(np.searchsorted(edges, signal.threshold, "right")) - 1
+    full = [*np.flatnonzero(matches + unrelated), min(max(inside, 0), len(matches) - 1)]
+    first, last = min(full), max(full) + 1
+    step = math.ceil((last - first) / MAX_BARS)
+    starts = np.arange(first, last, step)
+    join: Callable[[np.ndarray], list[int]] = lambda n: np.add.reduceat(n[:last], starts).tolist()  # noqa: E731
+    return [*edges[starts].tolist(), float(edges[last])], join(unrelated), join(matches)
+
+
+def score_histogram(signal: Signal, label: str, data: str = "train") -> Markup:
+    """Draw scores of unrelated pairs above those of test samples, with the threshold.
+
+    Each panel has its own scale, in shares of its own samples; '' if nothing was calibrated.
 
     Args:
         signal: ``edges`` (scores), ``unrelated`` and ``matches`` (counts), ``threshold``.
-        said: the drawing in words, for those who do not see it.
-        other: what the test samples were compared with.
+        label: the drawing in words, for those who do not see it.
+        data: what the test samples were compared with.
     """
     bins = bins_of(signal)
     if bins is None:
         return Markup("")
-    low, high = bins.edges[0], bins.edges[-1]
-    at = lambda v: _LEFT + (min(max(v, low), high) - low) / (high - low) * (_RIGHT - _LEFT)  # noqa: E731
-    panels = [("unrelated samples", "apart", bins.unrelated)] if bins.unrelated else []
-    panels.append((f"test against {other}", "found", bins.matches))
-    parts: list[str] = []
-    bottom = _TOP
-    for k, (name, kind, counts) in enumerate(panels):
-        bottom = _TOP + _PANEL + k * (_PANEL + _BETWEEN)
-        parts += _panel(
-            f"{name} ({count(sum(counts))})", kind, counts, bins, bottom, at, signal.threshold
-        )
-    digits = _digits(step := nice_step(high - low, 6))
-    for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1):
-        x = at(k * step)
-        anchor = "end" if x > 95 else "middle"
-        parts.append(
-            f'<line class="tick" x1="{x:.3f}%" x2="{x:.3f}%" y1="{bottom}" y2="{bottom + 4}"/>'
-        )
-        parts.append(
-            f'<text x="{x:.3f}%" y="{bottom + 18}" text-anchor="{anchor}">{number(k * step, digits)}</text>'
-        )
-    parts.append(
-        f'<text class="xlabel" x="{_RIGHT}%" y="{bottom + 36}" text-anchor="end">score of the best match; 1 = the same</text>'
-    )
-    x = at(signal.threshold)
-    anchor, shift = ("end", -1) if x > 60 else ("start", 1)
-    label = f"flagged from {score_text(signal.threshold)}"
-    parts.append(f'<line class="median" x1="{x:.3f}%" x2="{x:.3f}%" y1="4" y2="{bottom}"/>')
-    parts.append(
-        f'<text class="median-label" x="{x + shift:.3f}%" y="14" text-anchor="{anchor}">{label}</text>'
-    )
-    height = bottom + 42
-    return Markup(
-        f'<svg class="histogram" width="100%" height="{height:.0f}" role="img" aria-label="{escape(said)}">{"".join(parts)}</svg>'
-    )
+    edges, unrelated, matches = bins
+    low, high = edges[0], edges[-1]
 
+    def share(value: float) -> float:
+        return (min(max(value, low), high) - low) / (high - low)
 
-def _digits(step: float) -> int:
-    return max(0, -math.floor(math.log10(step) + 1e-9))
-
-
-def _panel(
-    name: str,
-    kind: str,
-    counts: Sequence[int],
-    bins: Bins,
-    bottom: float,
-    at: Callable[[float], float],
-    threshold: float,
-) -> list[str]:
-    """One histogram of scores: its name, its scale and its bars; a bin that is not empty is at least a pixel high."""
-    heights = _heights(counts, bins)
-    step = nice_step(max(heights) or 1.0, 4)
-    ceiling = step * math.ceil(max(heights) / step - 1e-9) or 1.0
-    top = bottom - _PANEL
-    parts = [
-        f'<line class="grid" x1="{_LEFT}%" x2="{_RIGHT}%" y1="{y}" y2="{y}"/>'
-        for y in (top, bottom)
-    ]
-    if bins.even:
-        parts.append(
-            f'<text class="ylabel" x="{_LEFT - 1.5}%" y="{top + 4}" text-anchor="end">{number(100 * ceiling, _digits(100 * step))}\u00a0%</text>'
-        )
-        parts.append(
-            f'<text class="ylabel" x="{_LEFT - 1.5}%" y="{bottom + 4}" text-anchor="end">0</text>'
-        )
-    for n, share, (a, b) in zip(counts, heights, pairwise(bins.edges), strict=True):
-        if not n:
-            continue
-        tall = max(1.0, _PANEL * share / ceiling)
-        pieces = [(a, b, kind)]
-        if kind == "found":
-            cut = min(max(threshold, a), b)
-            pieces = [(a, cut, "below"), (cut, b, "column")]
-        for start, end, name_of in pieces:
-            if end > start:
-                edge = 0.06 * (at(b) - at(a))
-                x, wide = (
-                    at(start) + edge * (start == a),
-                    at(end) - at(start) - edge * ((start == a) + (end == b)),
-                )
-                parts.append(
-                    f'<rect class="{name_of}" x="{x:.3f}%" width="{max(wide, 0.05):.3f}%" y="{bottom - tall:.1f}" height="{tall:.1f}">'
-                    f"<title>{score_text(a)} to {score_text(b)}: {count(n)}</title></rect>"
-                )
-    parts.append(f'<text class="panel" x="{_LEFT}%" y="{top - 7}">{escape(name)}</text>')
-    return parts
+    strong = ["column" if a >= signal.threshold else "below" for a in edges[:-1]]
+    panels: list[Panel] = []
+    rows = [(f"test against {data}", matches, strong)]
+    if sum(unrelated):
+        rows.insert(0, ("unrelated samples", unrelated, ["apart"] * len(unrelated)))
+    for name, counts, kinds in rows:
+        titles = [
+            f"{score_text(a)} to {score_text(b)}: {count(n)}"
+            for (a, b), n in zip(pairwise(edges), counts, strict=True)
+        ]
+        top = f"{number(100 * max(counts) / (sum(counts) or 1))}\u00a0%"
+        panels.append(Panel(f"{name} ({count(sum(counts))})", counts, titles, kinds, top))
+    ticks, digits = ticks_of(low, high, 6)
+    marker = (share(signal.threshold), f"flagged from {score_text(signal.threshold)}")
+    xlabel = "score of the best match; 1 = the same"
+    marks = [(share(t), number(t, digits)) for t in ticks]
+    positions = [share(edge) for edge in edges]
+    return _histogram(panels, positions, ticks=marks, marker=marker, xlabel=xlabel, label=label)

@@ -1,13 +1,15 @@
 """What the verbs return: plain data that pages, tables and JSON files are written from.
 
-:class:`Results` holds scores and audits, :class:`Audit` the leaks of one split. Both show themselves:
-``print(results)``, ``results.to_html("page.html")``, ``results.to_latex()``, ``results.to_frame()``.
+:class:`Results` holds scores and audits, :class:`Audit` the leaks of one split. Both can show
+themselves: ``print(results)``, ``results.to_html("page.html")``, ``results.to_latex()``,
+``results.to_frame()``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -59,19 +61,22 @@ class Signal:
     """One kind of leak, over all test samples.
 
     Attributes:
-        kind: ``identical sample``, ``identical bytes``, ``shared video`` (or ``object``, ``session`` ...), ``time gap``,
-            ``near-duplicate vision`` or ``near-duplicate tactile``.
+        kind: ``identical sample``, ``identical bytes``, ``shared video`` (or ``object`` ...),
+            ``time gap``, ``near-duplicate vision`` or ``near-duplicate tactile``.
         checked: test samples that could be checked (a null or unreadable one cannot).
         flagged: test samples that leak by this signal.
         threshold: the score from which a sample is flagged.
-        false_positives: the rate at which unrelated samples would be flagged, which the threshold was calibrated to; None where
-            the signal is exact.
-        edges, unrelated, matches: histograms of scores over the same bins, of unrelated pairs and of test samples against train
-            (counts; ``len(edges) == len(matches) + 1``); empty where nothing was calibrated.
-        causes: test samples at or over the threshold by cause (``CAUSES``); empty where the signal has one cause.
+        false_positives: the rate at which unrelated samples are flagged, which the threshold was
+            calibrated to; None where the signal is exact.
+        edges, unrelated, matches: histograms of scores over the same bins, of unrelated pairs and
+            of test samples against train (counts; ``len(edges) == len(matches) + 1``); empty where
+            nothing was calibrated.
+        causes: test samples at or over the threshold by cause (``CAUSES``); empty where the signal
+            has one cause.
         worst: the strongest pairs.
         notes: what a reader must know.
-        counts: whether flagged samples count as leaking; a shared group other than the audit's is reported but not counted.
+        counts: whether flagged samples count as leaking; a shared group other than the audit's is
+            reported but not counted.
     """
 
     kind: str
@@ -110,7 +115,8 @@ class ImpactRow:
         classifier: ``1-NN`` or ``linear probe``.
         given, clean: accuracy on the test part of the given split and of the leak-free one.
         cost: ``given - clean``.
-        given_interval, clean_interval, cost_interval: 95 %, leaving out whole groups; None with fewer than two.
+        given_interval, clean_interval, cost_interval: 95 %, leaving out whole groups; None with
+            fewer than two.
         chance: 1 / materials.
     """
 
@@ -132,7 +138,7 @@ class ImpactRow:
 
 @dataclass(frozen=True)
 class Impact:
-    """What a split's leak does to scores: the same classifiers under the given split and under leak-free ones.
+    """What a leak does to scores: the same classifiers under the given and leak-free splits.
 
     Attributes:
         rows: one for each kind of features and classifier.
@@ -166,17 +172,19 @@ class Audit:
         name: ``"Orig"``, ``"NoLeak"`` or a file name.
         group: the column that must not be shared (``video``, ``contact``, ``object`` ...).
         leaked_fraction: test samples in shared groups / test samples.
-        gap_min, gap_median, gap_max: distance to the nearest train frame of the same video, over test samples that have one; else None.
+        gap_min, gap_median, gap_max: distance to the nearest train frame of the same video, over
+            test samples that have one; else None.
         gap_edges, gap_counts: histogram of those distances; ``len(edges) == len(counts) + 1``.
         identical_samples: test samples whose id, or whose video and frame, are in train as well.
         worst: pairs with the smallest gaps, at most one a group first.
         materials: rows ``{"material", "train", "test", "groups_train", "groups_test"}``.
         notes: what a reader must know (fallbacks, exclusions).
-        against: what the test part was compared with: ``train``, or ``pretraining`` where a third list was given.
+        against: what the test part was compared with: ``train``, or ``pretraining`` where a third
+            list was given.
         signals: every kind of leak that was checked, strongest evidence first.
         leaking_samples: test samples that any signal flags.
-        matrix: rows ``{"group", "train", "val", "test", "leaking"}`` (counts of samples), shared groups with most test samples first; at
-            most ``MATRIX_ROWS`` of ``groups_in_all``.
+        matrix: rows ``{"group", "train", "val", "test", "leaking"}`` (counts of samples), shared
+            groups with most test samples first; at most ``MATRIX_ROWS`` of ``groups_in_all``.
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).
@@ -214,16 +222,16 @@ class Audit:
 
     @property
     def fraction(self) -> float:
-        """Leaking share of the test samples: by any signal, or by shared groups where none was checked."""
+        """Leaking share of the test samples: by any signal, or by groups where none was checked."""
         if not self.signals:
             return self.leaked_fraction
         return self.leaking_samples / self.test_samples if self.test_samples else 0.0
 
     def __str__(self) -> str:
         """The finding, the signals, and the notes: a few lines."""
-        from palpate.report.terminal import audit_text
+        from palpate.report.terminal import as_text
 
-        return audit_text(self)
+        return as_text(self)
 
     def _repr_html_(self) -> str:
         """For notebooks: the same as :meth:`__str__`."""
@@ -257,7 +265,7 @@ class Audit:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Audit:
-        """The inverse of :meth:`to_json`; keys that a command adds (``skipped``, ``failed``) are ignored."""
+        """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
         fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")}
         fields["worst"] = [LeakPair.from_json(pair) for pair in data.get("worst", ())]
         fields["signals"] = [Signal.from_json(signal) for signal in data.get("signals", ())]
@@ -293,14 +301,15 @@ class GalleryItem:
 class Results:
     """Scores, audits and images of a run: a table of scores that can also be drawn as a page.
 
-    Iterates over its scores; ``results["TMMD"]`` lists those of a metric, ``results["TMMD", "a"]`` is that of
-    generator ``a`` (of several presets the first; ``results["TMMD", "a", "paper"]`` names one).
+    Iterates over its scores; ``results["TMMD"]`` lists those of a metric, ``results["TMMD", "a"]``
+    is that of generator ``a`` (of several presets the first; ``results["TMMD", "a", "paper"]``
+    names one).
 
     Attributes:
         title: heading of the page.
         facts: the headline facts, one sentence each.
         audits, scores, gallery: what the page shows.
-        settings: nested JSON of settings, digests, seeds, versions and times; the page prints it whole.
+        settings: nested JSON of settings, digests, seeds, versions and times.
         notes: what a reader must see first (synthetic data, fallbacks, skipped inputs).
         commands: command lines that reproduce the run or say what to do next.
     """
@@ -343,23 +352,24 @@ class Results:
 
     def __str__(self) -> str:
         """The tables of scores, as in the terminal."""
-        from palpate.report.terminal import results_text
+        from palpate.report.terminal import as_text
 
-        return results_text(self)
+        return as_text(self)
 
     def _repr_html_(self) -> str:
         """For notebooks: the tables of scores."""
         return _preformatted(str(self))
 
     def to_html(self, path: str | Path) -> None:
-        """Write a self-contained page; relative image paths start from the folder of ``path``.
+        """Write a self-contained page and, next to it, the same as ``.json`` and ``.md``.
 
         Raises:
-            PalpateError: if ``path`` does not end in ``.html`` or scores of different settings would share a column.
+            PalpateError: if ``path`` does not end in ``.html``, or scores of different settings
+                would share a column.
         """
         from palpate.report import write_report
 
-        write_report(self, Path(path))
+        write_report(self, Path(path), base=Path())
 
     def to_markdown(self) -> str:
         """Everything as Markdown, with paths in place of images."""
@@ -405,13 +415,49 @@ class Results:
             rows.append(row | {"preset": preset, "notes": [sentence(note) for note in score.notes]})
         return pl.DataFrame(rows, infer_schema_length=None)
 
+    def relative_to(self, folder: Path, base: Path) -> Results:
+        """The results with image paths relative to ``folder`` instead of ``base``.
+
+        So they stay right when a run folder is moved as a whole.
+        """
+        start, end = base.resolve(), folder.resolve()
+        return self.with_paths(lambda name: Path(os.path.relpath(start / name, end)).as_posix())
+
+    def with_paths(self, change: Callable[[str], str]) -> Results:
+        """The results with ``change`` applied to the path of every image."""
+
+        def path(name: str | None) -> str | None:
+            return None if name is None else change(name)
+
+        def sample(ref: SampleRef) -> SampleRef:
+            return replace(ref, vision=path(ref.vision), tactile=path(ref.tactile))
+
+        def pairs(rows: Sequence[LeakPair]) -> list[LeakPair]:
+            return [replace(p, test=sample(p.test), train=sample(p.train)) for p in rows]
+
+        def audit(a: Audit) -> Audit:
+            signals = [replace(s, worst=pairs(s.worst)) for s in a.signals]
+            others = [audit(other) for other in a.others]
+            return replace(a, worst=pairs(a.worst), signals=signals, others=others)
+
+        gallery = [
+            replace(
+                row,
+                sample=sample(row.sample),
+                generated=change(row.generated),
+                background=path(row.background),
+            )
+            for row in self.gallery
+        ]
+        return replace(self, audits=[audit(a) for a in self.audits], gallery=gallery)
+
     def to_json(self) -> dict[str, Any]:
         """A JSON object with ``format: palpate-results/2``."""
         return {"format": RESULTS_FORMAT, **plain(self)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Results:
-        """The inverse of :meth:`to_json`; notes of format 1, which were sentences, become notes of code ``text``."""
+        """The inverse of :meth:`to_json`; sentences of format 1 become notes of code ``text``."""
         fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")}
         fields["audits"] = [Audit.from_json(audit) for audit in data.get("audits", ())]
         fields["scores"] = [Score.from_json(score) for score in data.get("scores", ())]
@@ -423,8 +469,9 @@ class Results:
         return cls(**fields)
 
     def save(self, path: str | Path) -> None:
-        """Write the results as JSON, atomically."""
-        write_json(Path(path), self.to_json())
+        """Write the results as JSON, atomically; image paths become relative to its folder."""
+        folder = Path(path).parent
+        write_json(Path(path), self.relative_to(folder, base=Path()).to_json())
 
     @classmethod
     def load(cls, path: str | Path) -> Results:
@@ -433,7 +480,9 @@ class Results:
         Raises:
             PalpateError: if it is missing, or holds no results.
         """
-        return cls.from_json(read_record(Path(path), "results file", form=RESULTS_FORMATS))
+        path = Path(path)
+        results = cls.from_json(read_record(path, "results file", form=RESULTS_FORMATS))
+        return results.with_paths(lambda name: os.path.normpath(path.parent / name))
 
 
 def _key(score: Score) -> tuple[str, str, str]:

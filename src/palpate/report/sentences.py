@@ -1,103 +1,84 @@
-"""What was found, in sentences for people: the headline facts, what each kind of leak means, and how its line was set."""
+"""Findings in sentences: what each kind of leak means, and the headline facts of a page."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from palpate.core import SampleRef, Score, columns
-from palpate.core.score import BETTER
+from palpate.core import Score
 from palpate.report.results import Audit, Results, Signal
-from palpate.report.sides import sides
-from palpate.report.text import (
-    count,
-    decimals,
-    defined,
-    interval_text,
-    number,
-    percent,
-    plural,
-    score_text,
-    setting_of,
-)
+from palpate.report.tables import Table, score_tables
+from palpate.report.text import count, number, percent, plural, score_text
 
-#: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {there} the other part), and how a share of the test
-#: samples is told. The first match wins.
+#: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
+#: is compared with), and what is said of a share of the test samples. The first match wins.
 KINDS: tuple[tuple[str, str, str], ...] = (
     (
         "identical sample",
-        "The very same sample, by its id or by its video and frame, is in {there}.",
-        "are samples of {there} themselves",
+        "The very same sample, by its id or by its video and frame, is in {data}.",
+        "are samples of {data} themselves",
     ),
     (
         "identical bytes",
-        "A picture file of the sample is, byte for byte, a picture file of {there}.",
-        "have a picture that {there} holds byte for byte",
+        "An image file of the sample is, byte for byte, an image file of {data}.",
+        "have an image that {data} has byte for byte",
     ),
     (
         "shared ",
-        "Its {thing} is also in {there}: what is learned of that {thing} helps on the sample.",
-        "share {a} {thing} with {there}",
+        "Its {thing} is also in {data}: what is learned of that {thing} helps on the sample.",
+        "share {a} {thing} with {data}",
     ),
     (
         "time gap",
-        "A frame of the same video, a moment before or after, is in {there}.",
-        "lie a moment from a frame of {there}",
+        "A frame of the same video, a moment before or after, is in {data}.",
+        "lie a moment from a frame of {data}",
     ),
     (
         "near-duplicate vision",
-        "Its photo can hardly be told from a photo of {there}.",
-        "have a near-duplicate photo in {there}",
+        "Its photo can hardly be distinguished from a photo of {data}.",
+        "have a near-duplicate photo in {data}",
     ),
     (
         "near-duplicate t",  # tactile; format 1 called it touch
-        "Its touch, without the sensor's own look, can hardly be told from one of {there}.",
-        "have a near-duplicate touch in {there}",
+        "Its tactile image, without the sensor's background, can hardly be distinguished from one "
+        "of {data}.",
+        "have a near-duplicate tactile image in {data}",
     ),
 )
-#: Causes of pictures that look alike without being a leak, and what to make of them.
+#: Causes of similar images that are no leak.
 HARMLESS = {
-    "nothing touched": "the gel was untouched in both, and untouched gel looks alike everywhere",
-    "sensor drift": "the gel's slow change over time makes both alike, not what was touched",
+    "nothing touched": "the gel was untouched in both, and untouched gel looks similar everywhere",
+    "sensor drift": "the gel's slow change over time makes both similar, not the contact",
 }
 
 
-def where(sample: SampleRef) -> str:
-    """``"video, frame 12"``, or the id where the sample has no video."""
-    if sample.video is None:
-        return sample.id
-    return sample.video if sample.frame is None else f"{sample.video}, frame {sample.frame}"
-
-
-def there(audit: Audit) -> str:
-    """What the test part was compared with, as it stands in a sentence."""
+def data_of(audit: Audit) -> str:
+    """Return what the test part was compared with, as it reads in a sentence."""
     return "train" if audit.against == "train" else f"the {audit.against} data"
 
 
-def _kind(kind: str) -> tuple[str, str, str]:
-    """Meaning and share of a kind of leak, and the thing that is shared, if any."""
-    for start, meaning, said in KINDS:
+def _kind(kind: str, audit: Audit) -> tuple[str, str]:
+    """Return the meaning of a kind of leak, and what is said of a share of the test samples."""
+    thing = kind.removeprefix("shared ")
+    words = {"thing": thing, "data": data_of(audit), "a": "an" if thing[:1] in "aeiou" else "a"}
+    for start, meaning, share in KINDS:
         if kind.startswith(start):
-            return meaning, said, kind.removeprefix("shared ")
-    return "", f"are flagged by {kind}", ""
+            return meaning.format(**words), share.format(**words)
+    return "", f"are flagged by {kind}"
 
 
 def meaning_of(signal: Signal, audit: Audit) -> str:
-    """What a kind of leak means, in one sentence; '' for a kind without one."""
-    meaning, _, thing = _kind(signal.kind)
-    return meaning.format(thing=thing, there=there(audit))
+    """Return what a kind of leak means, in one sentence; '' for an unknown kind."""
+    return _kind(signal.kind, audit)[0]
 
 
 def threshold_text(signal: Signal) -> str:
-    """The score from which samples are flagged; ``exact`` where nothing but a score of 1 is."""
-    return (
-        "exact"
-        if signal.threshold >= 1 and signal.false_positives is None
-        else f"score {score_text(signal.threshold)}"
-    )
+    """Return the score from which samples are flagged; ``exact`` where only a score of 1 is."""
+    exact = signal.threshold >= 1 and signal.false_positives is None
+    return "exact" if exact else f"score {score_text(signal.threshold)}"
 
 
 def cause_texts(signal: Signal) -> list[str]:
-    """How many test samples look alike for which cause, and which causes are no leak."""
+    """Return how many test samples are similar for which cause."""
     return [
         f"{cause} {count(n)}{' (no leak)' if cause in HARMLESS else ''}"
         for cause, n in signal.causes.items()
@@ -105,119 +86,114 @@ def cause_texts(signal: Signal) -> list[str]:
 
 
 def cause_notes(signal: Signal) -> list[str]:
-    """A sentence for each cause that is no leak."""
+    """Return a sentence for each cause that is no leak."""
     return [
-        f"{plural(signal.causes[cause], 'test sample')} at or beyond the line "
-        f"{'looks' if signal.causes[cause] == 1 else 'look'} alike for another reason ({cause}): {why}. Not counted as leaking."
+        f"{plural(signal.causes[cause], 'test sample')} at or above the threshold: {why} "
+        f"({cause}). Not counted as leaking."
         for cause, why in HARMLESS.items()
         if signal.causes.get(cause)
     ]
 
 
-def line_text(signal: Signal) -> str:
-    """How the line between unrelated and alike was set, and what lies at or beyond it."""
-    line = f"The line stands at a score of {score_text(signal.threshold)}"
+def threshold_line(signal: Signal) -> str:
+    """Return how the threshold was set, and how many samples are at or above it."""
+    line = f"The threshold is a score of {score_text(signal.threshold)}"
     if signal.false_positives is not None:
-        line += f", where {percent(signal.false_positives)} of the samples known to be unrelated find a match as good by chance"
-    beyond = max(sum(signal.causes.values()), signal.flagged)
-    share = beyond / signal.checked if signal.checked else 0.0
-    return f"{line}. {count(beyond)} of {plural(signal.checked, 'test sample')} ({percent(share)}) {'lies' if beyond == 1 else 'lie'} at or beyond it."
+        rate = percent(signal.false_positives)
+        line += f", where {rate} of the samples known to be unrelated find a match by chance"
+    above = max(sum(signal.causes.values()), signal.flagged)
+    share = percent(above / signal.checked if signal.checked else 0.0)
+    verb = "is" if above == 1 else "are"
+    samples = plural(signal.checked, "test sample")
+    return f"{line}. {count(above)} of {samples} ({share}) {verb} at or above it."
 
 
 def leak_line(audit: Audit) -> str:
-    """How many test samples any signal flags."""
-    n, total = audit.leaking_samples, audit.test_samples
+    """Return how many test samples any signal flags."""
+    n, total = audit.leaking_samples, plural(audit.test_samples, "test sample")
     if not n:
-        looked = "the signal" if len(audit.signals) == 1 else f"the {len(audit.signals)} signals"
-        return f"None of {plural(total, 'test sample')} leaks by {looked} that {'was' if len(audit.signals) == 1 else 'were'} looked for."
-    return f"{count(n)} of {plural(total, 'test sample')} {'leaks' if n == 1 else 'leak'} ({percent(n / total if total else 0.0)})."
-
-
-def purpose(results: Results) -> str:
-    """One sentence that says what the page is."""
-    parts: list[str] = []
-    if results.gallery or results.scores:
-        parts.append("how close touch generated from photos comes to real touch")
-    if results.audits:
-        parts.append("whether the split behind the numbers leaks from train into test")
-    return (
-        f"What this page shows: {', and '.join(parts)}."
-        if parts
-        else "Results of palpate; nothing has been measured yet."
-    )
-
-
-def _said(signal: Signal, audit: Audit, first: bool) -> str:
-    """``"95.0 % share a video with train"``; the first of several says of whom."""
-    of = " of the test samples" if first else ""
-    if signal.checked < audit.test_samples:
-        of = f" of the {count(signal.checked)} looked at"
-    _, said, thing = _kind(signal.kind)
-    return f"{percent(signal.fraction)}{of} {said.format(thing=thing, there=there(audit), a='an' if thing[:1] in 'aeiou' else 'a')}"
+        several = len(audit.signals) != 1
+        signals = f"any of the {len(audit.signals)} signals" if several else "the one signal"
+        return f"None of {total} leaks by {signals} checked."
+    return f"{count(n)} of {total} {'leaks' if n == 1 else 'leak'} ({percent(audit.fraction)})."
 
 
 def audit_line(audit: Audit) -> str:
-    """The finding of one audit in one sentence."""
-    name = audit.name if audit.against == "train" else f"{audit.name} against {there(audit)}"
+    """Return the finding of one audit in one sentence."""
+    name = audit.name if audit.against == "train" else f"{audit.name} against {data_of(audit)}"
     if not audit.test_samples:
         return f"{name}: the test part is empty, so nothing can leak."
-    if audit.signals:
-        found = sorted(
-            (s for s in audit.signals if s.flagged and s.counts), key=lambda s: -s.fraction
-        )[:3]
-        if not found:
-            line = leak_line(audit)
-            return f"{name}: {line[0].lower()}{line[1:]}"
-        told = "; ".join(_said(s, audit, k == 0) for k, s in enumerate(found))
-        return f"{name}: {told}. {leak_line(audit)}"
-    if not audit.test_samples_in_shared_groups:
-        return f"{name}: no {audit.group} is shared; none of the {plural(audit.test_samples, 'test sample')} leaks."
-    one = audit.test_samples_in_shared_groups == 1
-    return (
-        f"{name}: {percent(audit.leaked_fraction)} of the test samples leak; {count(audit.test_samples_in_shared_groups)} of "
-        f"{count(audit.test_samples)} {'comes' if one else 'come'} from a {audit.group} that {there(audit)} holds as well."
+    if not audit.signals:
+        if not audit.test_samples_in_shared_groups:
+            total = plural(audit.test_samples, "test sample")
+            return f"{name}: no {audit.group} is shared; none of the {total} leaks."
+        shared = count(audit.test_samples_in_shared_groups)
+        verb = "comes" if audit.test_samples_in_shared_groups == 1 else "come"
+        return (
+            f"{name}: {percent(audit.leaked_fraction)} of the test samples leak; {shared} of "
+            f"{count(audit.test_samples)} {verb} from a {audit.group} that {data_of(audit)} has as "
+            "well."
+        )
+    flagged = [s for s in audit.signals if s.flagged and s.counts]
+    strongest = sorted(flagged, key=lambda s: -s.fraction)[:3]
+    shares: list[str] = []
+    for k, signal in enumerate(strongest):
+        of = "" if k else " of the test samples"
+        if signal.checked < audit.test_samples:
+            of = f" of the {count(signal.checked)} checked"
+        shares.append(f"{percent(signal.fraction)}{of} {_kind(signal.kind, audit)[1]}")
+    return f"{name}: " + " ".join(
+        [*(["; ".join(shares) + "."] if shares else []), leak_line(audit)]
     )
 
 
+def purpose(results: Results) -> str:
+    """Return one sentence that says what the page is."""
+    parts: list[str] = []
+    if results.gallery or results.scores:
+        parts.append("how close tactile images generated from photos come to real ones")
+    if results.audits:
+        parts.append("whether the split behind the numbers leaks from train into test")
+    if not parts:
+        return "Results of palpate; nothing has been measured yet."
+    return f"What this page shows: {', and '.join(parts)}."
+
+
 def score_line(scores: Sequence[Score]) -> str:
-    """The first column with a value, in one sentence; '' if there is none."""
-    places = [(*setting_of(s), side) for s, side in zip(scores, sides(scores).of, strict=True)]
-    first = next((place for s, place in zip(scores, places, strict=True) if defined(s)), None)
-    for metric, column in columns(
-        s for s, place in zip(scores, places, strict=True) if place == first
-    ).items():
-        shown = [s for s in column if defined(s)]
-        if shown:
-            digits = decimals([s.value for s in shown if s.value is not None])
-            said = ", ".join(
-                f"{s.subject} {number(s.value, digits)}{interval_text(s, digits, before=' ')}"
-                for s in shown[:3]
-            )
-            floors = [s.floor for s in shown if s.floor is not None]
-            floor = f"; floor {number(floors[0], digits)}" if floors else ""
-            return f"{metric} ({BETTER[shown[0].higher_is_better]}): {said}{floor}."
+    """Return the first column with a value, in one sentence; '' if there is none."""
+    tables: list[Table] = score_tables(scores)
+    for column in (column for table in tables for column in table.columns):
+        cells = [cell for cell in column.cells if cell.defined]
+        if not cells:
+            continue
+        values: list[str] = []
+        for score in (cell.score for cell in cells[:3]):
+            low_high = [number(v, column.digits) for v in score.interval or ()]
+            interval = f" [{', '.join(low_high)}]" if low_high else ""
+            values.append(f"{score.subject} {number(score.value, column.digits)}{interval}")
+        floors = [cell.score.floor for cell in cells if cell.score.floor is not None]
+        floor = f"; floor {number(floors[0], column.digits)}" if floors else ""
+        return f"{column.metric} ({column.better}): {', '.join(values)}{floor}."
     return ""
 
 
 def summary_lines(results: Results) -> list[str]:
-    """At most three headline facts for the terminal and the head of the page.
+    """Return at most three headline facts.
 
-    The facts of the results come first; where there are fewer than three, the first and the last audit, what the first
-    measured leak costs, and the first metric fill up.
+    The facts of the results come first, then the first and the last audit, what the first measured
+    leak costs, the first metric and the size of the gallery.
 
     Raises:
-        PalpateError: if the scores may not stand in one table.
+        PalpateError: if scores of different settings would share a column.
     """
-    lines = list(results.facts[:3])
-    ends = (
-        [results.audits[0], results.audits[-1]] if len(results.audits) > 1 else list(results.audits)
-    )
+    audits = [*results.audits[:1], *results.audits[1:][-1:]]
     cost = next((a.impact.headline for a in results.audits if a.impact), "")
-    candidates = [*(audit_line(a) for a in ends), cost, score_line(results.scores)]
-    if len(results.gallery):
-        candidates.append(
-            f"{plural(len(results.gallery), 'generated touch', 'generated touches')} in the gallery."
-        )
-    return (
-        (lines + [c for c in candidates if c and c not in lines])[:3] if len(lines) < 3 else lines
-    )
+    images = plural(len(results.gallery), "generated image") if results.gallery else ""
+    lines = [
+        *results.facts,
+        *map(audit_line, audits),
+        cost,
+        score_line(results.scores),
+        f"{images} in the gallery." if images else "",
+    ]
+    return list(dict.fromkeys(filter(None, lines)))[:3]

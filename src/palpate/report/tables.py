@@ -1,91 +1,127 @@
-"""Tables of scores: one a metric family, rows = subjects, columns = metrics.
+"""The table model of scores: what rows, columns, footnotes and best marks there are.
 
-A column is what :func:`palpate.core.columns` makes, so scores of different settings raise instead of standing side by side.
+The terminal, Markdown, LaTeX and HTML write these tables; none decides anything on its own. A
+column is what :func:`palpate.core.columns` makes, so scores of different settings raise instead of
+sharing one. Scores of another family of metrics, another preset, another split, other features or
+another reference are in tables of their own.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from palpate.core import Score, columns
+from palpate.core import Note, Score, columns, plain, short
 from palpate.core.score import ARROWS, BETTER
-from palpate.report.plots import Axis, axis_of
-from palpate.report.remarks import Footnotes, by_gap, reason, remarks
 from palpate.report.results import Results
-from palpate.report.sides import TAIL, Sides, sides
-from palpate.report.text import decimals, defined, interval_text, number, plain, setting_of
+from palpate.report.text import decimals, number
 
-#: Family title, what it asks, and the pieces of a metric's name (lower case) that put it there; the first match wins.
-FAMILIES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    (
-        "Touch features",
-        "Are generated and real touches alike to a touch encoder? I-, CI- and D-TMMD need no reference images.",
+#: What the name of a metric ends in where the score is the difference of two generators.
+DIFFERENCE = " difference"
+
+
+@dataclass(frozen=True)
+class Family:
+    """Metrics that answer one question, and the parts of their names (lower case)."""
+
+    title: str
+    question: str = ""
+    parts: tuple[str, ...] = ()
+
+
+#: The first family whose parts match takes a metric.
+FAMILIES = (
+    Family(
+        "Tactile features",
+        "Are generated and real images similar to a tactile encoder? I-, CI- and D-TMMD need no "
+        "reference images.",
         ("tmmd",),
     ),
-    (
+    Family(
         "Image distributions",
-        "Are the sets of images alike to a general image encoder?",
+        "Are the sets of images similar to a general image encoder?",
         ("cmmd", "fid", "kid", "mmd", "precision", "recall (", "density", "coverage"),
     ),
-    (
+    Family(
         "Image by image",
-        "Does each generated touch match its own real touch, pixel by pixel or patch by patch?",
+        "Does each generated image match its real image, pixel by pixel or patch by patch?",
         ("contact ", "ssim", "psnr", "lpips", "l1", "mse"),
     ),
-    (
+    Family(
         "Recognition",
-        "What can be read from the touch: its material, or the text and photo that belong to it?",
+        "What can be read from the image: its material, or the text and photo that belong to it?",
         ("acc", "top", "retriev", "probe", "@"),
     ),
+    Family("Other metrics"),
 )
-OTHER = ("Other metrics", "")
-#: Stands with the question where a table has contact scores.
-GEL = "Gel: what the empty gel, without any touch, has in the place of a contact score; squared errors such as PSNR prefer it to a wrong touch."
-#: The family of differences of two generators.
-DIFFERENCES = (
-    "Paired differences",
-    "Which of two generators is better on the same samples? Values are a - b; where the interval leaves out 0 the difference is more than chance.",
+BEST = (
+    "better than every other generator (metrics without reference: closer to the floor) by a "
+    "paired difference whose interval excludes 0"
 )
-#: Stands with that question where metrics without a direction have differences.
-NEARER = "For metrics with → that tells a from b, not which is better: the nearer to the floor is, and confidence and p are of |a - floor| - |b - floor|."
+#: What a preset of the TMMD family means, for the head of its table.
+PRESETS = {
+    "paper": "the paper's formula to the letter, random halves",
+    "paper-tables": "the reading that fits the paper's printed tables",
+    "cmmd": "as CMMD's published code",
+    "grouped": "whole groups kept together",
+}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One score as text.
+    """A score in a table.
 
     Attributes:
-        score: the score itself.
-        value, interval, floor, null: numbers as text, '' where there is none.
-        gel: what the empty gel scores, for contact scores.
-        size: ``"n = 240"`` or ``"n = 240, m = 1,200"``; '' where the whole column shares it.
-        footnotes: numbers of the notes below the table.
-        why: why an undefined score is.
+        score: the score.
+        footnotes: numbers, from 1, of its notes below the table.
+        size: ``"n = 240"``; '' where the whole column shares it.
+        best: better than every other generator by a paired difference that is decided.
     """
 
     score: Score
-    value: str
-    interval: str
-    floor: str
-    null: str
-    gel: str
-    size: str
     footnotes: Sequence[int]
-    why: str
+    size: str = ""
+    best: bool = False
+
+    @property
+    def defined(self) -> bool:
+        """Whether the score has a finite value."""
+        return defined(self.score)
+
+    @property
+    def p_value(self) -> float | None:
+        """p-value of the permutation test."""
+        return self.score.details.get("p_value")
+
+    @property
+    def baseline(self) -> float | None:
+        """What the no-contact image scores in place of a contact score."""
+        value = self.score.details.get("empty")
+        return value if isinstance(value, int | float) and math.isfinite(value) else None
 
 
 @dataclass(frozen=True)
 class Column:
-    """One metric: its direction, its axis, the sample sizes if all of its scores share them, and how the scores were made."""
+    """One metric.
+
+    Attributes:
+        metric: its name; ``label`` lacks the features, which are in the table's title.
+        higher_is_better: the direction.
+        digits: decimals of all its numbers.
+        size: sample sizes if all of its scores share them.
+        made: (what, how) its scores were made, where that differs from the other columns.
+        cells: its scores.
+    """
 
     metric: str
+    label: str
     higher_is_better: bool | None
-    axis: Axis | None
+    digits: int
     size: str
     made: Sequence[tuple[str, str]]
+    cells: Sequence[Cell]
 
     @property
     def arrow(self) -> str:
@@ -99,84 +135,256 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Table:
-    """One family. ``cells[subject][metric]`` lists the scores that stand there (several where seeds differ).
+class Difference:
+    """A paired difference of two generators, a - b: one row below the scores.
 
-    ``shared`` is how all columns were made alike; a column's ``made`` is what is its own. ``sides`` are the real touches of these scores, as in
-    :mod:`palpate.report.sides`.
+    Attributes:
+        metric: of the two scores.
+        arrow: its better direction.
+        a, b: the generators.
+        confidence: that a is better, in [0, 1], or None.
+        p: two-sided p-value, adjusted by Holm over the pairs, or None.
+        digits: decimals of value and interval.
+    """
+
+    cell: Cell
+    metric: str
+    arrow: str
+    a: str
+    b: str
+    confidence: float | None
+    p: float | None
+    digits: int
+
+
+@dataclass(frozen=True)
+class Table:
+    """Scores of one family: rows are subjects, columns metrics.
+
+    Attributes:
+        title: family, preset, features, split and reference, as far as they are needed.
+        question: what the family asks; '' in its further tables.
+        columns: the metrics.
+        subjects: the rows.
+        differences: paired differences of these scores.
+        notes: the footnotes.
+        made: (what, how) all columns were made.
     """
 
     title: str
     question: str
     columns: Sequence[Column]
     subjects: Sequence[str]
-    cells: Mapping[str, Mapping[str, Sequence[Cell]]]
-    shared: Sequence[tuple[str, str]]
-    notes: Sequence[str]
-    sides: frozenset[int]
+    differences: Sequence[Difference]
+    notes: Sequence[Note]
+    made: Sequence[tuple[str, str]]
 
-
-@dataclass(frozen=True)
-class Part:
-    """Scores that stand in one table: its title, what of it names split and reference ('' where all share them), its question, and the sides."""
-
-    title: str
-    tail: str
-    question: str
-    scores: Sequence[Score]
-    sides: frozenset[int]
-
-    @property
-    def differences(self) -> bool:
-        """Whether these are paired differences."""
-        return self.scores[0].metric.endswith(TAIL)
+    def cells(self, subject: str, column: Column) -> list[Cell]:
+        """The scores of a subject in a column; several where seeds differ."""
+        return [cell for cell in column.cells if cell.score.subject == subject]
 
 
 @dataclass(frozen=True)
 class Heat:
-    """A square matrix of divergences, e.g. D-TMMD's between classes. ``shares`` are the colors' strengths in [0, 1]."""
+    """A square matrix of divergences, e.g. D-TMMD's between classes; ``shares`` lie in [0, 1]."""
 
     title: str
     labels: Sequence[str]
     values: Sequence[Sequence[str]]
-    shares: Sequence[Sequence[float]] = field(default_factory=list)
+    shares: Sequence[Sequence[float]]
 
 
-def family_of(metric: str) -> tuple[str, str]:
-    """Title and question of the family that a metric belongs to."""
-    name = metric.lower()
-    if name.endswith(TAIL):
-        return DIFFERENCES
-    return next(
-        (
-            (title, question)
-            for title, question, pieces in FAMILIES
-            if any(p in f"{name} (" for p in pieces)
-        ),
-        OTHER,
+def defined(score: Score) -> bool:
+    """Return whether a score has a finite value."""
+    return score.value is not None and math.isfinite(score.value)
+
+
+def family_of(metric: str) -> Family:
+    """Return the family of a metric."""
+    name = f"{metric.lower()} ("
+    return next((f for f in FAMILIES[:-1] if any(p in name for p in f.parts)), FAMILIES[-1])
+
+
+def notes_of(score: Score) -> list[Note]:
+    """Return what a reader must know of a score: its notes, and what follows from its fields."""
+    notes = [note for note in score.notes if note.code != "ahead"]  # the table has columns for it
+    if score.note:
+        notes.append(Note("text", {"text": score.note}))
+    if excluded := score.details.get("excluded"):
+        notes.append(Note("excluded-classes", {"excluded": excluded}))
+    if score.higher_is_better is None and score.details.get("gap") is not None:
+        notes.append(Note("nearer-to-floor"))
+    if Cell(score, ()).baseline is not None:
+        notes.append(Note("no-contact-baseline"))
+    family = score.metric.split(" ")[0]
+    lacks_floor = score.floor is None and not score.metric.endswith(DIFFERENCE)
+    if lacks_floor and defined(score) and family in ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD"):
+        code = "no-floor-of-tmmd" if family == "TMMD" else "floor-unknown"
+        notes += [] if any(note.code.startswith("no-floor") for note in notes) else [Note(code)]
+    return notes
+
+
+class Footnotes:
+    """Notes in order of first use; equal notes have one number."""
+
+    def __init__(self) -> None:
+        self.notes: list[Note] = []
+
+    def numbers(self, notes: Iterable[Note]) -> list[int]:
+        """Return the numbers, from 1, of some notes, in rising order."""
+        notes = list(notes)
+        self.notes += [n for k, n in enumerate(notes) if n not in self.notes and n not in notes[:k]]
+        return sorted({self.notes.index(note) + 1 for note in notes})
+
+
+def score_tables(scores: Sequence[Score]) -> list[Table]:
+    """Return the tables of all scores: families in fixed order, metrics as they first appear.
+
+    Raises:
+        PalpateError: if two scores that share a column were not made with the same settings.
+    """
+    references = _references(scores)
+    groups: dict[tuple[int, str, str, str, int], list[Score]] = {}
+    for score, reference in zip(scores, references, strict=True):
+        metric = score.metric.removesuffix(DIFFERENCE)
+        place = FAMILIES.index(family_of(metric))
+        preset = str(score.settings.get("preset", ""))
+        key = (place, preset, score.split or "", _features(metric), reference)
+        groups.setdefault(key, []).append(score)
+    several = [len({key[k] for key in groups}) > 1 for k in (2, 4)]
+    tables: list[Table] = []
+    for key, members in sorted(groups.items(), key=lambda item: item[0][0]):
+        place, preset, split, features, _ = key
+        title = [FAMILIES[place].title + (f" of {features}" if features else "")]
+        title += [f"{preset}: {PRESETS[preset]}" if preset in PRESETS else preset] if preset else []
+        title += [f"split {short(split)}"] if split and several[0] else []
+        known = dict.fromkeys(short(s.reference) for s in members if s.reference)
+        title += [f"reference {' and '.join(known) or 'not recorded'}"] if several[1] else []
+        question = FAMILIES[place].question
+        if any(question == table.question for table in tables):
+            question = ""
+        tables.append(_table(", ".join(title), question, members))
+    return tables
+
+
+def _features(metric: str) -> str:
+    """``"tactile"`` of ``"FID (tactile)"``; '' for a name without brackets."""
+    return metric[metric.rindex(" (") + 2 : -1] if metric.endswith(")") and " (" in metric else ""
+
+
+def _references(scores: Sequence[Score]) -> list[int]:
+    """Return which reference each score was compared with: 0 for the first of its metric, 1 ...
+
+    Different encoders make different features of the same images, so references are counted by
+    metric. A score without one (I-, CI-, D-TMMD) goes with the last of its subject that has one,
+    else with the first after it.
+    """
+    known: dict[tuple[str, str | None], list[str]] = {}
+    index: list[int | None] = []
+    for score in scores:
+        if score.reference is None:
+            index.append(None)
+            continue
+        metric = known.setdefault((score.metric.removesuffix(DIFFERENCE), score.encoder), [])
+        metric += [] if score.reference in metric else [score.reference]
+        index.append(metric.index(score.reference))
+    last: dict[str, int] = {}
+    for score, k in reversed(list(zip(scores, index, strict=True))):
+        if k is not None:
+            last[score.subject] = k
+    result: list[int] = []
+    for score, k in zip(scores, index, strict=True):
+        if k is not None:
+            last[score.subject] = k
+        result.append(last.get(score.subject, 0))
+    return result
+
+
+def _table(title: str, question: str, scores: Sequence[Score]) -> Table:
+    footnotes = Footnotes()
+    differences = [s for s in scores if s.metric.endswith(DIFFERENCE)]
+    members = [s for s in scores if not s.metric.endswith(DIFFERENCE)]
+    heads: list[Column] = []
+    for metric, column in columns(members).items():
+        sizes = [_size(score) for score in column]
+        shared = sizes[0] if len(set(sizes)) == 1 else ""
+        best = best_of(column, differences)
+        cells = [
+            Cell(
+                score,
+                footnotes.numbers(notes_of(score)),
+                "" if shared else size,
+                score.subject == best,
+            )
+            for score, size in zip(column, sizes, strict=True)
+        ]
+        features = _features(metric)
+        label = metric.removesuffix(f" ({features})") if features else metric
+        direction, digits = column[0].higher_is_better, _digits(column)
+        heads.append(Column(metric, label, direction, digits, shared, _made(column), cells))
+    columns(differences)
+    rows = [_difference(score, footnotes) for score in differences if defined(score)]
+    shared = [fact for fact in heads[0].made if all(fact in h.made for h in heads)] if heads else []
+    heads = [replace(h, made=[fact for fact in h.made if fact not in shared]) for h in heads]
+    subjects = list(dict.fromkeys(score.subject for score in members))
+    return Table(title, question, heads, subjects, rows, footnotes.notes, shared)
+
+
+def _difference(score: Score, footnotes: Footnotes) -> Difference:
+    details = score.details
+    return Difference(
+        Cell(score, footnotes.numbers(notes_of(score))),
+        score.metric.removesuffix(DIFFERENCE),
+        ARROWS[score.higher_is_better],
+        str(details["a"]),
+        str(details["b"]),
+        details.get("p_better"),
+        details.get("p_adjusted"),
+        _digits([score]),
     )
 
 
+def _digits(scores: Sequence[Score]) -> int:
+    values = (v for s in scores for v in (s.value, s.floor, *(s.interval or ())))
+    return decimals([v for v in values if v is not None])
+
+
+def _size(score: Score) -> str:
+    sizes = {"n": score.n or None, "m": score.m}
+    return ", ".join(f"{name} = {value:,}" for name, value in sizes.items() if value is not None)
+
+
+def best_of(column: Sequence[Score], differences: Sequence[Score]) -> str | None:
+    """Return the subject that is better than every other by a decided paired difference, or None.
+
+    Args:
+        column: scores of one metric.
+        differences: paired differences; subjects without one (controls) take no part.
+    """
+    wins: dict[str, bool] = {}
+    for d in differences:
+        if column and d.metric == column[0].metric + DIFFERENCE:
+            for name in (d.details["a"], d.details["b"]):
+                won = bool(d.details.get("decided")) and d.details.get("better") == name
+                wins[name] = wins.get(name, True) and won
+    return next((name for name, won in wins.items() if won), None)
+
+
 def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
-    """How the scores of one column were made, as (what, how): what all of them share, and the interval's method."""
+    """Return how the scores of one column were made, as (what, how)."""
     first = column[0]
-    rows = [("estimator", first.estimator)]
-    if first.bandwidth is not None:
-        rows.append(("bandwidth σ", f"{first.bandwidth:g}"))
-    if first.scale != 1:
-        rows.append(("scale", f"× {first.scale:g}"))
-    levels = [
-        (f"{100 * s.level:g}\u00a0%", s.interval_method) for s in column if s.interval is not None
-    ]
-    methods = dict.fromkeys(f"{level}, {method}" if method else level for level, method in levels)
-    rows.append(("interval", "; ".join(methods)))
-    seeds = dict.fromkeys(str(s.seed) for s in column if s.seed is not None)
-    rows.append(("seed", ", ".join(seeds)))
-    rows += [
-        (str(k).replace("_", " "), v if isinstance(v, str) else str(plain(v)))
-        for k, v in first.settings.items()
-    ]
-    rows += [
+    intervals = (
+        ", ".join(filter(None, [f"{100 * s.level:g} %", s.interval_method]))
+        for s in column
+        if s.interval is not None
+    )
+    rows = [
+        ("estimator", first.estimator),
+        ("bandwidth σ", f"{first.bandwidth:g}" if first.bandwidth is not None else ""),
+        ("scale", f"× {first.scale:g}" if first.scale != 1 else ""),
+        ("interval", "; ".join(dict.fromkeys(intervals))),
+        ("seed", ", ".join(dict.fromkeys(str(s.seed) for s in column if s.seed is not None))),
+        *((str(k).replace("_", " "), str(plain(v))) for k, v in first.settings.items()),
         ("encoder", first.encoder or ""),
         ("reference", first.reference or ""),
         ("split", first.split or ""),
@@ -184,205 +392,52 @@ def _made(column: Sequence[Score]) -> list[tuple[str, str]]:
     return [(what, how) for what, how in rows if how]
 
 
-def _size(score: Score) -> str:
-    return ", ".join(
-        f"{k} = {v:,}" for k, v in (("n", score.n or None), ("m", score.m)) if v is not None
-    )
-
-
-def gel_of(score: Score) -> float | None:
-    """What the empty gel, without any touch, scores in the place of a contact score; None for other scores."""
-    empty = score.details.get("empty")
-    return (
-        empty
-        if isinstance(empty, int | float) and not isinstance(empty, bool) and math.isfinite(empty)
-        else None
-    )
-
-
-def _cell(score: Score, digits: int, notes: Footnotes, size: str) -> Cell:
-    gel = gel_of(score)
-    return Cell(
-        score,
-        value=number(score.value, digits),
-        interval=interval_text(score, digits),
-        floor=number(score.floor, digits) if score.floor is not None else "",
-        null=f"{number(score.null[0], digits)} to {number(score.null[1], digits)}"
-        if score.null
-        else "",
-        gel=number(gel, digits) if gel is not None else "",
-        size=size,
-        footnotes=notes.numbers(remarks(score)),
-        why="" if defined(score) else reason(score).removeprefix("Undefined: "),
-    )
-
-
-#: What a named reading of the TMMD family means, in a few words, for the head of its table.
-READINGS = {
-    "paper": "the paper's formula to the letter, random halves",
-    "paper-tables": "the reading that fits the paper's printed tables",
-    "cmmd": "as CMMD's published code",
-    "grouped": "whole groups kept together",
-}
-
-
-def parts(scores: Sequence[Score]) -> list[Part]:
-    """The scores of each table, families in fixed order.
-
-    Scores of another preset or of another split, or compared with other real touches, stand in tables of their own. A score that was compared
-    with none (I-, CI-, D-TMMD) stands with the others of its subject.
-    """
-    order = [title for title, _, _ in FAMILIES] + [OTHER[0], DIFFERENCES[0]]
-    found: dict[tuple[int, str, str], list[int]] = {}
-    for k, score in enumerate(scores):
-        found.setdefault((order.index(family_of(score.metric)[0]), *setting_of(score)), []).append(
-            k
-        )
-    several, at, out = len({split for _, _, split in found}) > 1, sides(scores), list[Part]()
-    for (place, preset, split), members in sorted(found.items(), key=lambda item: item[0][0]):
-        title, question = family_of(scores[members[0]].metric)
-        if preset:
-            title += f", {preset}: {READINGS[preset]}" if preset in READINGS else f", {preset}"
-        cut = f", split {split[:8]}" if several and split else ""
-        for side, some in _by_side(members, scores, at):
-            first = not any(p.question == question for p in out)
-            asked = question if first or place == len(FAMILIES) else ""
-            out.append(
-                Part(
-                    title + cut + side,
-                    cut + side,
-                    asked,
-                    [scores[k] for k in some],
-                    frozenset(at.of[k] for k in some),
-                )
-            )
-    return out
-
-
-def _by_side(
-    members: Sequence[int], scores: Sequence[Score], at: Sides
-) -> list[tuple[str, list[int]]]:
-    """The members by side, with what their title ends in, where those with a reference are of more than one; else all of them."""
-    if len({at.of[k] for k in members if at.bound[k]}) < 2:
-        return [("", list(members))]
-    apart: dict[int, list[int]] = {}
-    for k in members:
-        apart.setdefault(at.of[k], []).append(k)
-    digests = {
-        side: dict.fromkeys(scores[k].reference or "" for k in some if at.bound[k])
-        for side, some in apart.items()
-    }
-    said = {
-        side: " and ".join(d[:8] or "not recorded" for d in digests[side] or at.references[side])
-        for side in apart
-    }
-    return [(f", reference {said[side]}", some) for side, some in apart.items()]
-
-
-def score_tables(scores: Sequence[Score]) -> list[Table]:
-    """The tables of all scores, as :func:`parts`; metrics and subjects in the order of first appearance.
-
-    Raises:
-        PalpateError: if two scores that share a column were not made alike.
-    """
-    return [_table(part) for part in parts(scores)]
-
-
-def _table(part: Part) -> Table:
-    notes = Footnotes()
-    cells: dict[str, dict[str, list[Cell]]] = {}
-    heads: list[Column] = []
-    for metric, column in columns(part.scores).items():
-        near = [
-            v
-            for s in column
-            for v in (s.value, s.floor, *(s.interval or ()))
-            if v is not None and math.isfinite(v)
-        ]
-        common = _size(column[0]) if len({_size(s) for s in column}) == 1 else ""
-        for score in column:
-            cell = _cell(score, decimals(near), notes, "" if common else _size(score))
-            cells.setdefault(score.subject, {}).setdefault(metric, []).append(cell)
-        heads.append(
-            Column(metric, column[0].higher_is_better, axis_of(column), common, _made(column))
-        )
-    subjects = list(dict.fromkeys(score.subject for score in part.scores))
-    shared = [row for row in heads[0].made if len(heads) > 1 and all(row in h.made for h in heads)]
-    heads = [replace(h, made=[row for row in h.made if row not in shared]) for h in heads]
-    said = [
-        NEARER if any(map(by_gap, part.scores)) else "",
-        GEL if any(gel_of(s) is not None for s in part.scores) else "",
-    ]
-    question = " ".join(filter(None, [part.question, *said]))
-    return Table(part.title, question, heads, subjects, cells, shared, notes.texts, part.sides)
-
-
 def settings_of(results: Results) -> dict[str, Any]:
-    """The settings of results, with the digests of the real touches that their scores were compared with."""
-    by_subject: dict[str, list[str]] = {}
+    """Return the settings of results, with the digest of each subject's reference images."""
+    references: dict[str, list[str]] = {}
     for score in results.scores:
-        if score.reference and not score.metric.endswith(TAIL):
-            by_subject.setdefault(score.subject, []).append(score.reference)
-    joined: dict[tuple[str, ...], list[str]] = {}
-    for subject, digests in by_subject.items():
-        joined.setdefault(tuple(dict.fromkeys(digests)), []).append(subject)
-    shown = plain(results.settings)
-    if joined:
-        shown["real touches compared with"] = {
-            ", ".join(subjects): digests[0] if len(digests) == 1 else list(digests)
-            for digests, subjects in joined.items()
-        }
-    return shown
-
-
-def _square(matrix: Any) -> list[list[float | None]] | None:
-    """``matrix`` as rows of numbers (None = undefined), or None if it is not a square of them."""
-    rows = plain(matrix)
-    if (
-        not isinstance(rows, list)
-        or not rows
-        or any(not isinstance(r, list) or len(r) != len(rows) for r in rows)
-    ):
-        return None
-    if any(
-        v is not None and (isinstance(v, bool) or not isinstance(v, int | float))
-        for r in rows
-        for v in r
-    ):
-        return None
-    return rows
+        if score.reference and not score.metric.endswith(DIFFERENCE):
+            known = references.setdefault(score.subject, [])
+            known += [] if score.reference in known else [score.reference]
+    subjects: dict[str, list[str]] = {}
+    for subject, digests in references.items():
+        subjects.setdefault(", ".join(digests), []).append(subject)
+    settings: dict[str, Any] = plain(results.settings)
+    if subjects:
+        by_subject = {", ".join(names): digests for digests, names in subjects.items()}
+        settings["reference images"] = by_subject
+    return settings
 
 
 def heat_tables(scores: Sequence[Score]) -> list[Heat]:
-    """One heat table for each score whose details hold a square ``matrix`` (``classes`` or ``labels`` name its rows, else they are numbered).
+    """Return one heat table for each score whose details hold a square ``matrix`` of numbers.
 
-    Where the table that a score stands in is named by its reference or split, so is its matrix.
+    ``details["classes"]`` names its rows, else they are numbered.
     """
     tables: list[Heat] = []
-    tails = {id(score): part.tail for part in parts(scores) for score in part.scores}
     for score in scores:
-        matrix = _square(score.details.get("matrix"))
-        if matrix is None:
+        matrix: Any = plain(score.details.get("matrix"))
+        if not isinstance(matrix, list) or not all(
+            isinstance(row, list) and len(row) == len(matrix) for row in matrix
+        ):
             continue
-        names = plain(score.details.get("classes", score.details.get("labels")))
-        labels = (
-            [str(n) for n in names]
-            if isinstance(names, list) and len(names) == len(matrix)
-            else [f"{k + 1}" for k in range(len(matrix))]
-        )
-        seen = [abs(v) for row in matrix for v in row if v is not None]
-        digits, top = min(3, decimals(seen)), max(seen, default=0.0) or 1.0
+        names: Sequence[Any] = score.details.get("classes") or range(1, len(matrix) + 1)
+        values = [abs(v) for row in matrix for v in row if v is not None]
+        digits, top = min(3, decimals(values)), max(values, default=0.0) or 1.0
+        parts = [score.metric, score.subject, str(score.settings.get("preset", ""))]
+        parts += [f"reference {short(score.reference)}"] if score.reference else []
         tables.append(
             Heat(
-                ", ".join(
-                    filter(
-                        None, [score.metric, score.subject, str(score.settings.get("preset", ""))]
-                    )
-                )
-                + tails[id(score)],
-                labels,
+                ", ".join(filter(None, parts)),
+                [str(name) for name in names],
                 [[number(v, digits) for v in row] for row in matrix],
                 [[round(max(0.0, v or 0.0) / top, 3) for v in row] for row in matrix],
             )
         )
     return tables
+
+
+def table_facts(table: Table) -> list[tuple[str, Mapping[str, str]]]:
+    """Return how the scores were made: of all columns together, then what differs by column."""
+    rows = [("All of these", table.made), *((c.metric, c.made) for c in table.columns)]
+    return [(title, dict(made)) for title, made in rows if made]

@@ -1,22 +1,130 @@
-"""Results and audits as text for a terminal."""
+"""Results and audits as text for a terminal: one row a score, so that names and notes have room."""
 
 from __future__ import annotations
 
-from rich.console import Console
+import io
+from collections.abc import Sequence
 
-from palpate.report.notes import sentence
+from rich.console import Console
+from rich.table import Table as Grid
+from rich.text import Text
+
+from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import audit_line, cause_texts, threshold_text
-from palpate.report.text import percent
+from palpate.report.tables import BEST, Cell, Table, score_tables
+from palpate.report.text import count, percent
+
+#: Columns that are text; all others are numbers, flush right.
+NAMES = ("metric", "subject", "a", "b", "notes")
 
 
-def results_text(results: Results) -> str:
-    """The scores, then the audits."""
-    return "\n".join([*map(str, results.scores), *map(str, results.audits)])
+def print_result(result: Results | Audit, console: Console, style: Style = COMMAND_LINE) -> None:
+    """Print a result as wide as the console."""
+    if isinstance(result, Audit):
+        console.print(audit_text(result, style), markup=False, soft_wrap=True)
+        return
+    for table in score_tables(result.scores):
+        console.print(Text(table.title, "bold"))
+        _print_rows(_score_rows(table), console)
+        if table.differences:
+            console.print(Text("Differences on the same samples, a - b", "bold"))
+            _print_rows(_difference_rows(table), console)
+        lines = [f"({k}) {sentence(note, style)}" for k, note in enumerate(table.notes, 1)]
+        if any(cell.best for column in table.columns for cell in column.cells):
+            lines.insert(0, f"* {BEST}")
+        for line in lines:
+            console.print(Text(line), soft_wrap=True)
+        console.print()
+    for audit in result.audits:
+        print_result(audit, console, style)
+    for note in result.notes:
+        console.print(Text(sentence(note, style)), soft_wrap=True)
 
 
-def audit_text(audit: Audit) -> str:
-    """The finding, a line for each signal, and the notes."""
+def as_text(result: Results | Audit, width: int = 140) -> str:
+    """Return a result as text, in the wording of Python."""
+    file = io.StringIO()
+    print_result(result, Console(file=file, width=width, color_system=None), PYTHON)
+    return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
+
+
+def _score_rows(table: Table) -> list[dict[str, str]]:
+    return [
+        {
+            "metric": f"{column.metric} {column.arrow}",
+            "subject": cell.score.subject,
+            "value": _number(cell.score.value, column.digits) + (" *" if cell.best else ""),
+            "95 % interval": _pair(cell.score.interval, column.digits),
+            "null": _pair(cell.score.null, column.digits),
+            "p": _p(cell.p_value),
+            "floor": _number(cell.score.floor, column.digits, ""),
+            "no contact": _number(cell.baseline, column.digits, ""),
+            "n": count(cell.score.n) if cell.score.n else "",
+            "notes": _marks(cell),
+        }
+        for column in table.columns
+        for cell in column.cells
+    ]
+
+
+def _difference_rows(table: Table) -> list[dict[str, str]]:
+    return [
+        {
+            "metric": f"{d.metric} {d.arrow}",
+            "a": d.a,
+            "b": d.b,
+            "a - b": _number(d.cell.score.value, d.digits),
+            "95 % interval": _pair(d.cell.score.interval, d.digits),
+            "a better": "" if d.confidence is None else confidence(d.confidence),
+            "Holm p": _p(d.p),
+            "notes": _marks(d.cell),
+        }
+        for d in table.differences
+    ]
+
+
+def _print_rows(rows: Sequence[dict[str, str]], console: Console) -> None:
+    """Print rows as a table without empty columns, or as lists where that is too wide."""
+    if not rows:
+        return
+    names = [name for name in rows[0] if any(row[name] for row in rows)]
+    grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in names:
+        grid.add_column(name, justify="left" if name in NAMES else "right", no_wrap=True)
+    for row in rows:
+        grid.add_row(*(Text(row[name]) for name in names))
+    wide = console.measure(grid, options=console.options.update(width=10_000)).maximum
+    if wide <= console.width:
+        console.print(grid)
+        return
+    for row in rows:
+        head = [row[name] for name in names[:3] if name in NAMES]
+        console.print(Text(", ".join(head), "bold"), soft_wrap=True)
+        for name in names[len(head) :]:
+            if row[name]:
+                console.print(Text(f"  {name}: {row[name]}"), soft_wrap=True)
+
+
+def _marks(cell: Cell) -> str:
+    return " ".join(f"({k})" for k in cell.footnotes)
+
+
+def _number(value: float | None, digits: int, none: str = "undefined") -> str:
+    # An ASCII minus: not every terminal has the true one.
+    return none if value is None else f"{value:z.{digits}f}"
+
+
+def _pair(pair: tuple[float, float] | None, digits: int) -> str:
+    return "" if pair is None else f"[{_number(pair[0], digits)}, {_number(pair[1], digits)}]"
+
+
+def _p(p: float | None) -> str:
+    return "" if p is None else "< 1e-15" if p < 1e-15 else f"{p:.3g}"
+
+
+def audit_text(audit: Audit, style: Style = PYTHON) -> str:
+    """Return the finding, a line for each signal, the notes and what leaking costs."""
     lines = [audit_line(audit)]
     if audit.groups_in_all:
         lines.append(f"  {audit.groups_shared} of {audit.groups_in_all} {audit.group} groups are shared")
@@ -25,16 +133,15 @@ def audit_text(audit: Audit) -> str:
         lines.append(f"  gap to the nearest train frame of the video: {gaps}")
     width = max((len(signal.kind) for signal in audit.signals), default=0)
     for signal in audit.signals:
-        share = f"{signal.flagged} of {signal.checked} ({percent(signal.fraction)})"
+        share = f"{count(signal.flagged)} of {count(signal.checked)} ({percent(signal.fraction)})"
         facts = [share, threshold_text(signal), *cause_texts(signal)]
         lines.append(f"  {signal.kind:<{width}}  {', '.join(facts)}")
-    lines += [f"  {signal.kind}: {sentence(n)}" for signal in audit.signals for n in signal.notes]
-    lines += [sentence(note) for note in audit.notes]
+    for signal in audit.signals:
+        lines += [f"  {signal.kind}: {sentence(note, style)}" for note in signal.notes]
+    lines += [sentence(note, style) for note in audit.notes]
     if audit.impact is not None:
         lines.append(audit.impact.headline)
-    return "\n".join([*lines, *map(str, audit.others)])
+    return "\n".join([*lines, *(audit_text(other, style) for other in audit.others)])
 
 
-def print_result(result: Results | Audit, console: Console) -> None:
-    """Print a result as wide as the console."""
-    console.print(str(result), markup=False, soft_wrap=True)
+__all__ = ["as_text", "audit_text", "print_result"]

@@ -1,13 +1,14 @@
-"""Made-up audits with everything an audit can hold, sized like Touch and Go's own lists, for tests of the report."""
+"""Results and audits with everything that they can hold, for tests of the report."""
 
 import dataclasses
 import os
+from html.parser import HTMLParser
 
 import numpy as np
 from PIL import Image
 
-from palpate.core import Note, SampleRef
-from palpate.report.results import Audit, Impact, ImpactRow, LeakPair, Signal
+from palpate.core import Note, SampleRef, Score
+from palpate.report.results import Audit, GalleryItem, Impact, ImpactRow, LeakPair, Results, Signal
 
 #: Gaps of Touch and Go's own split, as `palpate audit` finds them.
 GAPS = {
@@ -36,8 +37,8 @@ def relief(rng, side):
     )
 
 
-def pictures(folder, n, side=128):
-    """Names of ``n`` pictures written to ``folder``."""
+def images(folder, n, side=128):
+    """Write ``n`` images to ``folder``; return their names."""
     rng = np.random.default_rng(7)
     for k in range(n):
         Image.fromarray(relief(rng, side)).save(folder / f"p{k}.png")
@@ -45,7 +46,7 @@ def pictures(folder, n, side=128):
 
 
 def pairs(names, n, *, start=0, gap=True, score=0.97, causes=("",), prefix="2022_06_"):
-    """``n`` pairs over the pictures ``names`` from ``start`` on, gaps growing and scores falling."""
+    """``n`` pairs over the images ``names`` from ``start`` on, gaps growing, scores falling."""
     out = []
     for k in range(n):
         pick = lambda j, k=k: names[(start + 4 * k + j) % len(names)] if names else None  # noqa: E731
@@ -68,7 +69,7 @@ def pairs(names, n, *, start=0, gap=True, score=0.97, causes=("",), prefix="2022
 
 
 def histograms(rng, low, high, n=29879, bins=80):
-    """Edges, counts of unrelated matches and of test samples: two humps, the second with a tail over the first."""
+    """Edges, counts of unrelated pairs and of test samples: two humps."""
     edges = np.linspace(0, 1, bins + 1)
     unrelated = np.histogram(rng.beta(low * 40, (1 - low) * 40, 12000), edges)[0]
     found = np.histogram(
@@ -96,7 +97,7 @@ def signals(names=(), worst=8):
             40,
             1.0,
             worst=pairs(names, min(worst, 4), start=400, gap=False, score=1.0),
-            notes=[text_note("4 pictures could not be read.")],
+            notes=[text_note("4 images could not be read.")],
         ),
         Signal("shared video", n, 29597, 1.0),
         Signal(
@@ -118,7 +119,7 @@ def signals(names=(), worst=8):
             pairs(names, worst, start=200, gap=False, causes=("content",)),
         ),
         Signal(
-            "near-duplicate touch",
+            "near-duplicate tactile",
             n,
             3601,
             0.872,
@@ -141,7 +142,7 @@ def impact():
     """Two kinds of features, two classifiers; the last row has no intervals."""
     rows = [
         ImpactRow(
-            "touch pixels",
+            "tactile pixels",
             "1-NN",
             0.714,
             0.382,
@@ -152,7 +153,7 @@ def impact():
             0.0526,
         ),
         ImpactRow(
-            "touch pixels",
+            "tactile pixels",
             "linear probe",
             0.522,
             0.347,
@@ -162,9 +163,9 @@ def impact():
             (0.102, 0.25),
             0.0526,
         ),
-        ImpactRow("touch minus background", "1-NN", 0.61, 0.401, 0.209, None, None, None, 0.0526),
+        ImpactRow("tactile minus background", "1-NN", 0.61, 0.401, 0.209, None, None, None, 0.0526),
     ]
-    headline = "A 1-NN on touch pixels reaches 71.4 % under this split and 38.2 % without the leak: it costs 33.2 points [26.2, 40.1]."
+    headline = "A 1-NN on tactile pixels reaches 71.4 % under this split and 38.2 % without the leak: it costs 33.2 points [26.2, 40.1]."
     return Impact(
         rows,
         headline,
@@ -287,3 +288,117 @@ def many_names(folder, sources, n):
         os.link(folder / source, folder / name)
         names.append(name)
     return names
+
+
+def gallery(folder, n, side=64, materials=("wood", "rock", "grass")):
+    rng = np.random.default_rng(0)
+    items = []
+    for k in range(n):
+        names = [f"{kind}{k}.png" for kind in ("photo", "real", "generated")]
+        for name in names:
+            Image.fromarray(rng.integers(0, 256, (side, side, 3), dtype=np.uint8)).save(
+                folder / name
+            )
+        material = materials[k % len(materials)]
+        sample = SampleRef(f"vid{k % 4}/{k}", f"vid{k % 4}", k, material, names[0], names[1])
+        items.append(GalleryItem(sample, names[2]))
+    return items
+
+
+def score(metric="TMMD", subject="a", value=1.374, **changes):
+    """A score with interval, null and floor."""
+    fields = {
+        "interval": (1.01, 1.75),
+        "interval_method": "jackknife, t, 9 df",
+        "null": (-0.05, 0.06),
+        "floor": 0.042,
+        "estimator": "unbiased",
+        "bandwidth": 10.0,
+        "scale": 1000.0,
+        "n": 240,
+    }
+    return Score(metric, subject, value, **(fields | changes))
+
+
+def difference(a, b, metric="TMMD", value=-1.0, better=None, **changes):
+    """A paired difference a - b; decided if ``better`` is given."""
+    details = {"a": a, "b": b, "better": better, "decided": better is not None}
+    details |= {"p_better": 0.975, "p_adjusted": 0.05}
+    fields = {"interval": (-1.5, -0.5), "n": 240, "details": details}
+    return Score(f"{metric} difference", f"{a} - {b}", value, **(fields | changes))
+
+
+def full_results(folder, n=6, side=64):
+    """Results with every section of a page."""
+    items = gallery(folder, n, side)
+    matrix = {"matrix": [[0.1, 3.0], [3.0, 0.25]], "classes": ["wood", "rock"]}
+    scores = [
+        score(subject="generated", notes=(text_note("Small sample."),)),
+        score(subject="background", value=None, notes=(text_note("one image for all"),)),
+        score("D-TMMD", "generated", 0.44, interval=None, floor=0.1, details=matrix),
+        score("SSIM", "generated", 0.49, interval=(0.47, 0.51), higher_is_better=True),
+    ]
+    settings = {
+        "split": {"digest": "cd" * 32, "seed": 0},
+        "many": list(range(1000)),
+        "nothing": None,
+        "classes": {"oak": {"n": 3, "E": 0.5}, "elm": {"n": 4, "E": 0.25}},
+    }
+    pair = LeakPair(items[0].sample, items[1].sample, 7)
+    return Results(
+        "A title",
+        ["80.0 % leak."],
+        [small_audit([pair])],
+        scores,
+        items,
+        settings,
+        [text_note("Synthetic data.")],
+        ["palpate audit x"],
+    )
+
+
+def small_audit(worst=(), **changes):
+    """An audit of groups and gaps alone, without signals."""
+    materials = [{"material": "wood", "train": 5, "test": 6, "groups_train": 6, "groups_test": 3}]
+    audit = Audit("Orig", "video", 900, 100, 10, 5, 4, 80, 0.8, 3, 1, 24.0, 60)
+    fields = {"gap_edges": [0, 10, 30, 60], "gap_counts": [10, 40, 30], "worst": worst}
+    fields |= {"materials": materials, "notes": [text_note("A remark.")], "split": "ab" * 32}
+    return dataclasses.replace(audit, **(fields | changes))
+
+
+VOID = {"meta", "link", "img", "line", "rect", "path", "circle", "br", "hr"}
+
+
+class Tree(HTMLParser):
+    """Checks nesting; collects tags with their attributes, and the text."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.tags, self.words = [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]

@@ -1,0 +1,137 @@
+"""Thumbnails as ``data:`` URIs that fit a budget of bytes.
+
+Images of at most 96 pixels stay lossless PNG (the page magnifies them without smoothing), larger
+ones become JPEG. Where the whole does not fit, first the images shrink, then the last rows are
+skipped. An image that is missing or broken keeps its place and its name.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from palpate.core import Progress, quiet, track
+
+TINY = 96
+#: (longest side in pixels, JPEG quality), best first.
+SIZES = ((256, 88), (192, 86), (160, 84), (128, 82), (96, 78), (64, 72), (48, 64), (32, 60))
+#: Below this side, rows that are folded anyway are skipped before images shrink further.
+KEEP_ALL = 128
+#: Bytes of markup around the images of one row, roughly.
+ROW_MARKUP = 1_500
+
+
+class Wanted(NamedTuple):
+    """An image to show: its path (None = there is none), what it is in words, its column's name."""
+
+    path: str | None
+    alt: str
+    label: str
+
+
+class Thumbnail(NamedTuple):
+    """An image as the page shows it; without ``uri`` a placeholder, and ``problem`` says why.
+
+    ``tiny`` images are magnified without smoothing.
+    """
+
+    uri: str = ""
+    width: int = 0
+    height: int = 0
+    tiny: bool = False
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Album:
+    """The rows of images that fit: key -> (wanted, thumbnail) of each; ``side`` in pixels."""
+
+    rows: Mapping[Hashable, Sequence[tuple[Wanted, Thumbnail]]]
+    side: int
+
+    @property
+    def broken(self) -> int:
+        """The number of files that could not be read."""
+        images = (image for row in self.rows.values() for image in row)
+        return len({w.path for w, thumbnail in images if w.path and thumbnail.problem})
+
+
+def fit(
+    rows: Mapping[Hashable, Sequence[Wanted]],
+    base: Path,
+    budget: int,
+    essential: int,
+    progress: Progress = quiet,
+) -> Album:
+    """Make the largest thumbnails with which the rows fit.
+
+    Args:
+        rows: what to show, the most important first.
+        base: folder that relative paths start from.
+        budget: bytes for all rows together, markup included.
+        essential: rows to keep even if images must become smaller than 128 pixels.
+        progress: called after each row.
+    """
+    fitting: dict[Hashable, Sequence[tuple[Wanted, Thumbnail]]] = {}
+    side = 0
+    for side, quality in SIZES:
+        fitting, used = {}, 0
+        for key, wanted in track(list(rows.items()), f"images of {side} px", progress):
+            images = [(w, thumbnail(base, w.path, side, quality)) for w in wanted]
+            used += ROW_MARKUP + sum(len(image.uri) for _, image in images)
+            if used > budget:
+                break
+            fitting[key] = images
+        if len(fitting) >= (len(rows) if side > KEEP_ALL else min(essential, len(rows))):
+            break
+    return Album(fitting, side)
+
+
+@lru_cache(maxsize=4096)
+def thumbnail(base: Path, name: str | None, side: int, quality: int) -> Thumbnail:
+    """Return one image with at most ``side`` pixels a side."""
+    if name is None:
+        return Thumbnail(problem="not recorded")
+    try:
+        with Image.open(base / name) as file:
+            tiny = max(file.size) <= TINY
+            file.draft("RGB", (2 * side, 2 * side))
+            image = to_rgb(file)
+        image.thumbnail((side, side), Image.Resampling.LANCZOS)
+        data = io.BytesIO()
+        if kind := "png" if tiny and side >= KEEP_ALL else "":
+            image.save(data, kind, optimize=True)
+        else:
+            kind = "jpeg"
+            image.save(data, kind, quality=quality, subsampling=0 if quality >= 86 else 2)
+    except FileNotFoundError:
+        return Thumbnail(problem="file missing")
+    except Exception:  # a damaged file makes PIL raise almost anything
+        return Thumbnail(problem="file unreadable")
+    uri = f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}"
+    return Thumbnail(uri, image.width, image.height, tiny)
+
+
+def to_rgb(image: Image.Image) -> Image.Image:
+    """Return an upright 8-bit RGB copy.
+
+    16-bit and float grays are stretched from their own range, transparency becomes white.
+    """
+    image = ImageOps.exif_transpose(image)
+    if image.mode.startswith("I") or image.mode == "F":
+        values = np.asarray(image, dtype=np.float64)
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        unit = np.nan_to_num((values - low) / (high - low)) if high > low else np.zeros_like(values)
+        image = Image.fromarray((255 * unit).round().astype(np.uint8))
+    if "A" in image.getbands() or "transparency" in image.info:
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+    return image.convert("RGB")

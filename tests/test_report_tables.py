@@ -1,0 +1,181 @@
+"""The table model of scores: tables, columns, best marks, footnotes, differences and matrices."""
+
+import pytest
+
+from palpate.core import Note, PalpateError
+from palpate.report.tables import family_of, heat_tables, score_tables, settings_of
+from palpate.report.text import decimals, number, percent, plural, score_text
+from report_fixtures import difference, score, text_note
+
+
+@pytest.mark.parametrize(
+    ("function", "args", "text"),
+    [
+        (number, (None,), "–"),
+        (number, (float("nan"),), "–"),
+        (number, (-0.0001, 2), "0.00"),
+        (number, (-1234.5, 1), "−1,234.5"),
+        (number, (0.000123,), "0.000123"),
+        (percent, (0.0,), "0 %"),
+        (percent, (1e-6,), "< 0.01 %"),
+        (percent, (0.005,), "0.50 %"),
+        (percent, (0.99056,), "99.06 %"),
+        (percent, (0.99999,), "> 99.99 %"),
+        (percent, (1.0,), "100 %"),
+        (score_text, (1.0,), "1.000"),
+        (score_text, (0.99996,), "0.99996"),
+        (plural, (1, "video"), "1 video"),
+        (plural, (1200, "match", "matches"), "1,200 matches"),
+    ],
+)
+def test_numbers_are_written_for_people(function, args, text):
+    assert function(*args) == text
+
+
+@pytest.mark.parametrize(
+    ("values", "digits"), [([], 1), ([1234.0], 0), ([12.0], 2), ([0.5], 3), ([0.0123], 4)]
+)
+def test_decimals_follow_the_largest_value(values, digits):
+    assert decimals(values) == digits
+
+
+@pytest.mark.parametrize(
+    ("metric", "title"),
+    [
+        ("CI-TMMD", "Tactile features"),
+        ("CMMD", "Image distributions"),
+        ("recall (tactile)", "Image distributions"),
+        ("contact PSNR", "Image by image"),
+        ("recall@5", "Recognition"),
+        ("novel", "Other metrics"),
+    ],
+)
+def test_families(metric, title):
+    assert family_of(metric).title == title
+
+
+def test_scores_of_a_family_are_one_table_with_what_they_share():
+    scores = [
+        score("TMMD", "a", seed=1),
+        score("TMMD", "b", seed=2),
+        score("I-TMMD", "a", n=100),
+        score("I-TMMD", "b", n=200),
+    ]
+    (table,) = score_tables(scores)
+    assert table.subjects == ["a", "b"]
+    assert [(c.metric, c.size) for c in table.columns] == [("TMMD", "n = 240"), ("I-TMMD", "")]
+    assert table.cells("b", table.columns[1])[0].size == "n = 200"
+    assert ("bandwidth σ", "10") in table.made
+    assert table.columns[0].made == [("seed", "1, 2")]
+
+
+def test_several_seeds_of_a_subject_share_a_cell():
+    (table,) = score_tables([score(seed=1), score(seed=2)])
+    assert len(table.cells("a", table.columns[0])) == 2
+
+
+def test_scores_of_different_settings_raise():
+    for change in ({"bandwidth": 5.0}, {"encoder": "e"}, {"scale": 1.0}):
+        with pytest.raises(PalpateError, match="must agree in"):
+            score_tables([score(), score(subject="b", **change)])
+
+
+@pytest.mark.parametrize(
+    ("changes", "titles"),
+    [
+        (
+            [{"settings": {"preset": "paper"}}, {"settings": {"preset": "grouped"}}],
+            ["paper: the paper's formula", "grouped: whole groups"],
+        ),
+        ([{"split": "a" * 64}, {"split": "b" * 64}], ["split aaaa", "split bbbb"]),
+        ([{"reference": "a" * 64}, {"reference": "b" * 64}], ["reference aaaa", "reference bbbb"]),
+        ([{"metric": "FID (tactile)"}, {"metric": "FID (inception)"}], ["tactile", "inception"]),
+    ],
+)
+def test_other_presets_splits_references_and_features_have_their_own_tables(changes, titles):
+    tables = score_tables([score(**change) for change in changes])
+    assert len(tables) == len(titles)
+    assert all(title in table.title for title, table in zip(titles, tables, strict=True))
+    assert [bool(t.question) for t in tables] == [True, False]
+
+
+def test_scores_without_reference_go_with_their_subject():
+    scores = [
+        score("TMMD", "a", reference="r1"),
+        score("I-TMMD", "a"),
+        score("TMMD", "b", reference="r2"),
+        score("I-TMMD", "b"),
+    ]
+    first, second = score_tables(scores)
+    assert (first.subjects, second.subjects) == (["a"], ["b"])
+    assert [c.metric for c in second.columns] == ["TMMD", "I-TMMD"]
+
+
+def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
+    scores = [score("KID", "a", reference="r1", encoder="e"), score("CMMD", "a", reference="r2")]
+    assert len(score_tables(scores)) == 1
+
+
+@pytest.mark.parametrize(
+    ("differences", "best"),
+    [
+        ([difference("a", "b", better="a"), difference("a", "c", better="a")], "a"),
+        ([difference("a", "b", better="a"), difference("a", "c")], None),
+        ([difference("a", "b", metric="I-TMMD", better="a")], None),
+        ([], None),
+    ],
+)
+def test_best_needs_a_decided_difference_against_every_other(differences, best):
+    table = score_tables([*(score(subject=s) for s in "abc"), *differences])[0]
+    assert [c.score.subject for c in table.columns[0].cells if c.best] == ([best] if best else [])
+
+
+def test_equal_notes_have_one_number():
+    copied = Note("copied-rows", {"count": 1, "n": 5})
+    other = Note("copied-rows", {"count": 2, "n": 5})
+    scores = [
+        score(subject="a", notes=(copied, text_note("Seen."))),
+        score(subject="b", notes=(other, Note("copied-rows", {"count": 1, "n": 5}))),
+    ]
+    (table,) = score_tables(scores)
+    assert [c.footnotes for c in table.columns[0].cells] == [[1, 2], [1, 3]]
+    assert table.notes == [copied, text_note("Seen."), other]
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"floor": None}, "no-floor-of-tmmd"),
+        ({"metric": "I-TMMD", "floor": None}, "floor-unknown"),
+        ({"details": {"excluded": {"a": "few"}}}, "excluded-classes"),
+        ({"metric": "contact PSNR", "details": {"empty": 28.6}}, "no-contact-baseline"),
+    ],
+)
+def test_what_follows_from_the_fields_of_a_score_is_a_note(changes, code):
+    assert [note.code for note in score_tables([score(**changes)])[0].notes] == [code]
+    assert score_tables([score("FID", floor=None)])[0].notes == []
+
+
+def test_differences_are_rows_below_their_scores():
+    table = score_tables([score(subject="a"), score(subject="b"), difference("a", "b")])[0]
+    (row,) = table.differences
+    assert (row.metric, row.a, row.b, row.confidence, row.p) == ("TMMD", "a", "b", 0.975, 0.05)
+
+
+def test_only_square_matrices_of_numbers_are_drawn():
+    matrices = [[[0.1, 2.0], [2.0, None]], [[1.0, 2.0]], "text"]
+    scores = [score("D-TMMD", details={"matrix": m, "classes": ["x", "y"]}) for m in matrices]
+    (heat,) = heat_tables(scores)
+    assert heat.labels == ["x", "y"]
+    assert heat.values == [["0.100", "2.000"], ["2.000", "–"]]
+    assert heat.shares == [[0.05, 1.0], [1.0, 0.0]]
+
+
+def test_settings_name_the_reference_of_each_subject():
+    from palpate.report.results import Results
+
+    scores = [score(subject=s, reference="r" * 64) for s in "ab"]
+    assert settings_of(Results("t", scores=scores, settings={"x": 1})) == {
+        "x": 1,
+        "reference images": {"a, b": "r" * 64},
+    }

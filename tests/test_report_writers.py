@@ -1,0 +1,147 @@
+"""The writers of the table model: terminal, Markdown and LaTeX hold the same numbers."""
+
+import re
+import shutil
+import subprocess
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from palpate.core import Note
+from palpate.report.latex import LONG, escape
+from palpate.report.results import Results
+from palpate.report.terminal import as_text
+from report_fixtures import difference, full_audit, full_results, score, text_note
+
+NASTY = r"100% & {x} $_#^~ <b> \input{a} | `c` [d]"
+
+
+@pytest.fixture
+def results():
+    return Results(
+        "T",
+        scores=[
+            score(subject="a", details={"p_value": 0.0312}, notes=(text_note("Seen"),)),
+            score(subject="b", value=2.5, interval=(2.0, 3.0)),
+            score("I-TMMD", "a", None, interval=None, null=None, floor=None),
+            score("contact PSNR", "a", 18.2, interval=None, details={"empty": 28.6}, floor=None),
+            difference("a", "b", better="a"),
+        ],
+        commands=["palpate score a/ --reference b/"],
+    )
+
+
+def test_every_front_end_has_every_number_and_note(results):
+    ascii_minus = str(results)
+    for text in (ascii_minus, results.to_markdown(), results.to_latex()):
+        for part in ("1.374", "1.010, 1.750", "2.500", "18.2", "28.6", "0.042", "97.5"):
+            assert part in text, part
+        assert text.count("Seen") == 1
+    assert "undefined" in ascii_minus
+    assert "0.0312" in ascii_minus
+
+
+def test_the_terminal_has_a_row_a_score(results):
+    lines = str(results).splitlines()
+    row = next(line for line in lines if line.startswith("TMMD ↓") and " a " in line)
+    assert row.split() == [
+        *("TMMD", "↓", "a", "1.374", "*", "[1.010,", "1.750]", "[-0.050,", "0.060]"),
+        *("0.0312", "0.042", "240", "(1)"),
+    ]
+    assert "(1) Seen" in lines
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_a_narrow_terminal_cuts_no_number(results, width):
+    text = as_text(results, width)
+    assert "[-0.050, 0.060]" in text
+    assert "…" not in text
+    table = text.split("(1)")[0]
+    assert max(map(len, table.splitlines())) <= width
+
+
+def test_arguments_are_options_on_the_command_line_and_keywords_in_python(capsys):
+    from rich.console import Console
+
+    from palpate.report import notes
+    from palpate.report.terminal import print_result
+
+    shown = Results("T", scores=[score(notes=(Note("planted", {}),))])
+    notes.SENTENCES["planted"] = "Pass {arg:backend=blocked}"
+    try:
+        assert "Pass backend='blocked'" in str(shown)
+        print_result(shown, Console(width=100))
+    finally:
+        del notes.SENTENCES["planted"]
+    assert "Pass --backend blocked" in capsys.readouterr().out
+
+
+def test_an_audit_is_a_readable_summary():
+    text = str(full_audit())
+    assert text.startswith("Orig: 99.06 % of the test samples share a video with train; ")
+    assert "29,611 of 29,879 test samples leak (99.10 %)." in text
+    assert "  near-duplicate vision   5,210 of 29,879 (17.4 %), score 0.812" in text
+    assert "2 test samples have no video." in text
+
+
+def test_markdown_tables_are_rectangular_and_hold_every_section(tmp_path):
+    text = full_results(tmp_path).to_markdown()
+    for section in ("Gallery", "Scores", "Leakage audit", "Settings and digests", "Commands"):
+        assert f"## {section}\n" in text
+    for part in ("**1.374** [1.010, 1.750] floor 0.042", "Synthetic data", "palpate audit x"):
+        assert part in text
+    tables = re.findall(
+        r"(?:^\|.*\n)+", text + Results("T", audits=[full_audit()]).to_markdown(), re.M
+    )
+    assert len(tables) >= 8
+    for table in tables:
+        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1
+    empty = Results("T").to_markdown()
+    assert empty.count("See `palpate") == 5
+
+
+def test_names_mean_nothing_to_markdown():
+    text = Results(NASTY, scores=[score(subject=NASTY)]).to_markdown()
+    assert "<b>" not in re.sub(r"`[^`]*`", "", text).replace("\\<b\\>", "")
+
+
+@given(st.text())
+def test_no_text_is_a_latex_command(text):
+    escaped = escape(text)
+    commands = set(re.findall(r"\\[a-zA-Z]+|\\.", escaped))
+    allowed = r"\textbackslash \textasciitilde \textasciicircum \textless \textgreater \textbar"
+    allowed += r" \char \times \sigma \rightarrow \{ \} \$ \& \# \% \_ \`"
+    assert commands <= set(allowed.split())
+    assert not re.search(r"(?<!\\)[%#&]", escaped)
+
+
+def test_latex_tables_have_bold_best_marks_and_floors(results):
+    text = results.to_latex()
+    assert r"a & $\mathbf{1.374}$\textsuperscript{a} & --" in text
+    assert r"{\scriptsize $[1.010, 1.750]$}" in text
+    assert r"{\scriptsize $p = 0.0312$}" in text
+    assert "floor (real images) & $0.042$ & -- " in text
+    assert "no-contact image & $28.60$" in text
+    assert r"\textsuperscript{a}~Seen" in text
+    assert "-{}-reference b/" in text
+    assert r"TMMD $\downarrow$ & a & b & $-1.000$ & $[-1.500, -0.500]$ & 97.5 \%" in text
+    for begin, end in (("table", "table"), ("tabular", "tabular")):
+        assert text.count(rf"\begin{{{begin}}}") == text.count(rf"\end{{{end}}}") == 3
+    for table in re.findall(r"\\begin\{tabular\}\{(.*?)\}(.*?)\\end\{tabular\}", text, re.S):
+        rows = [line for line in table[1].splitlines() if line.endswith(r"\\")]
+        assert {row.count("&") for row in rows} == {len(table[0]) - 1}
+
+
+def test_many_differences_break_over_pages():
+    text = Results("T", scores=[difference("a", str(k)) for k in range(LONG)]).to_latex()
+    assert r"\usepackage{booktabs,longtable}" in text
+    assert text.count(r"\begin{longtable}") == text.count(r"\end{longtable}") == 1
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
+def test_latex_compiles(results, tmp_path):
+    preamble = r"\documentclass{article}\usepackage{booktabs,longtable}\begin{document}"
+    (tmp_path / "t.tex").write_text(f"{preamble}\n{results.to_latex()}\n\\end{{document}}\n")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
