@@ -1,23 +1,26 @@
-"""Trains the models that ship with palpate (``palpate/mini``), scores them on worlds that they have not seen, and writes their cards.
+"""Train the models that ship with palpate (``palpate/mini``), score them on unseen worlds, and
+write their cards.
 
     python recipes/mini.py --work runs/mini                     # everything: worlds, encoders, autoencoder, generator, scores
     python recipes/mini.py --work runs/mini --only autoencoder  # one part and what it needs; parts may run side by side after "worlds"
     python recipes/mini.py --work runs/mini --ship              # and put the result into src/palpate/mini
     python recipes/mini.py --work runs/mini --verify            # score what is shipped again and compare with its cards
 
-Stopped half-way, the same command goes on. Only worlds of the seeds ``palpate.sim.presets.MINI_SEEDS`` are read, which nothing else may use:
+Stopped half-way, the same command goes on. Only worlds of the seeds
+``palpate.sim.presets.MINI_SEEDS`` are read, which nothing else may use:
 
 =============  ========  ====================================================================================
 world          seed      read by
 =============  ========  ====================================================================================
-touches        900000    every part
+gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
-one unit       900002    the generator alone: one gel unit, because a photo cannot tell which of several will touch
-new touches    900050    scores: new objects, videos and gel units
+one unit       900002    the generator alone: one gel unit, because a photo does not show which of several is used
+new gelsight   900050    scores: new objects, videos and gel units
 new digit      900051    scores of the autoencoder
 =============  ========  ====================================================================================
 
-Weights are rounded to 16 bits before anything is scored, so the scores are those of the shipped files; what rounding costs is in the cards.
+Weights are rounded to 16 bits before anything is scored, so the scores are those of the shipped
+files; what rounding costs is in the cards.
 """
 
 from __future__ import annotations
@@ -36,16 +39,16 @@ from mini_cards import ship, write_page
 from mini_scores import score_all
 
 from palpate.core import PalpateError, Run, Split, digest_json, read_json, write_json
-from palpate.core.shipped import SHIPPED, shipped_root
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.autoencoder_training import train_autoencoder
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import MINI as DIFFUSION
-from palpate.diffusion.recipe import train_pipeline
-from palpate.encoders.contrastive import train_clip, train_touch
+from palpate.diffusion.training import train_pipeline
+from palpate.encoders.contrastive import train_clip, train_tactile
 from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.encoders.models import SHIPPED, shipped_root
 from palpate.encoders.presets import preset
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
 from palpate.studies.inputs import fresh
@@ -56,15 +59,15 @@ PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "mini.md"
 SEED = 0
 _BASE = replace(PRESETS["pretrain"], contacts_per_video=3, frames_per_contact=2)
 WORLDS: dict[str, WorldOptions] = {
-    "touches": replace(_BASE, seed=900_000, objects_per_material=150, sensors=8),
+    "gelsight": replace(_BASE, seed=900_000, objects_per_material=150, sensors=8),
     "digit": replace(_BASE, seed=900_001, objects_per_material=30, sensors=4, look="digit"),
     "one unit": replace(_BASE, seed=900_002, objects_per_material=100, sensors=1),
-    "new touches": replace(_BASE, seed=900_050, objects_per_material=10),
+    "new gelsight": replace(_BASE, seed=900_050, objects_per_material=10),
     "new digit": replace(_BASE, seed=900_051, objects_per_material=4, look="digit"),
 }
 ENCODER = preset("mini")
-#: Passes over the touches. One core sees about 400 photos or touches a second in training.
-CLIP_EPOCHS, TOUCH_EPOCHS = 14.0, 8.0
+#: Passes over the data. One core sees about 400 images a second in training.
+CLIP_EPOCHS, TACTILE_EPOCHS = 14.0, 8.0
 AUTOENCODER = (
     replace(DIFFUSION.autoencoder, steps_free=12_000, steps_quantized=1_200)
     if DIFFUSION.autoencoder
@@ -73,13 +76,15 @@ AUTOENCODER = (
 GENERATOR_STEPS = 8_000
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
 LIMITS = (
-    "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. Real photos and real touches are out of its range.",
+    "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. Real photos and real tactile images are out of its range.",
     "Made to show mechanisms and to test code offline; never compare its numbers with those of real data sets.",
 )
 
 
 def main() -> int:
-    """Runs the asked parts; the exit status is 1 if ``--verify`` finds other scores than the cards say."""
+    """Runs the asked parts; the exit status is 1 if ``--verify`` finds other scores than the cards
+    say.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -184,7 +189,7 @@ class Recipe:
 
     def clip(self) -> Path:
         """Vision and text, by contrast of photos and captions."""
-        train = self.world("touches")
+        train = self.world("gelsight")
         epochs = CLIP_EPOCHS * self.share
 
         def build(folder: Path) -> Mapping[str, Any]:
@@ -210,11 +215,11 @@ class Recipe:
 
     def encoders(self) -> EncoderSet:
         """The pair and a tactile encoder that learns from it, rounded to 16 bits."""
-        clip, train = self.clip(), self.world("touches")
-        epochs = TOUCH_EPOCHS * self.share
+        clip, train = self.clip(), self.world("gelsight")
+        epochs = TACTILE_EPOCHS * self.share
 
         def build(folder: Path) -> Mapping[str, Any]:
-            encoders = train_touch(
+            encoders = train_tactile(
                 train,
                 self._everything(train),
                 load_clip(clip),
@@ -241,8 +246,8 @@ class Recipe:
         return EncoderSet.load(stage.folder / "encoders")
 
     def autoencoder(self) -> Autoencoder:
-        """The VQ autoencoder, of touches of both looks."""
-        parts = [self.world(name) for name in ("touches", "digit")]
+        """The VQ autoencoder, of tactile images of both looks."""
+        parts = [self.world(name) for name in ("gelsight", "digit")]
         if AUTOENCODER is None:
             raise PalpateError(
                 "The preset mini must train an autoencoder", "none", "Give it AutoencoderOptions"
@@ -276,7 +281,7 @@ class Recipe:
         return Autoencoder.load(self.run.stage("autoencoder", inputs, build).folder / "autoencoder")
 
     def generator(self) -> TactilePipeline:
-        """From a photo to a touch, in the space of the rounded encoders and autoencoder."""
+        """From a photo to a tactile image, in the space of the rounded encoders and autoencoder."""
         encoders, autoencoder, train = self.encoders(), self.autoencoder(), self.world("one unit")
         encoders.halve()
         autoencoder.halve()
@@ -307,7 +312,9 @@ class Recipe:
             "autoencoder": autoencoder.digest,
             "train": train.digest,
         }
-        return TactilePipeline.load(self.run.stage("generator", inputs, build).folder / "model")
+        return TactilePipeline.from_pretrained(
+            self.run.stage("generator", inputs, build).folder / "model"
+        )
 
     def scores(self) -> dict[str, Any]:
         """Scores of the full and of the rounded models on the new worlds, as rows for the cards."""
@@ -342,14 +349,16 @@ class Recipe:
     def _halve(
         encoders: EncoderSet, autoencoder: Autoencoder, pipeline: TactilePipeline
     ) -> dict[str, float]:
-        """Rounds all weights to 16 bits, in place; the largest relative change of a tensor of each model."""
+        """Rounds all weights to 16 bits, in place; the largest relative change of a tensor of each
+        model.
+        """
         changes = {
             "encoders": encoders.halve(),
             "autoencoder": autoencoder.halve(),
             "generator": pipeline.denoiser.halve(),
         }
         vars(pipeline).pop("digest", None)  # cached before the weights changed
-        return {name: change.relative for name, change in changes.items()}
+        return changes
 
     def ship(self) -> None:
         """Writes ``src/palpate/mini``: weights in 16 bits, and cards."""
@@ -388,11 +397,13 @@ class Recipe:
         ]
 
     def verify(self) -> int:
-        """Scores the shipped models again; every score must come out as its card says, within 0.002 of its scale."""
+        """Scores the shipped models again; every score must come out as its card says, within 0.002
+        of its scale.
+        """
         encoders, autoencoder, pipeline = (
             EncoderSet.load(NAME),
             Autoencoder.load(NAME),
-            TactilePipeline.load(NAME),
+            TactilePipeline.from_pretrained(NAME),
         )
         rows = score_all(
             encoders, autoencoder, pipeline, self._samples(), self.cache, None, self.progress

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import read_json, write_text
-from palpate.core.cards import write_model_cards
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.sim import VERSION
+from palpate.training.cards import write_model_cards
 
 NAME = "palpate/mini"
 RECIPE = "python recipes/mini.py --work runs/mini --ship"
@@ -22,28 +22,35 @@ TAGS = ("synthetic",)
 SUMMARIES = {
     "encoders": (
         "Vision, text and tactile encoders of palpate's world",
-        "Three small encoders with one space of 128 dimensions: a CLIP (vision and text, own tokenizer) trained on photos and captions of the procedural "
-        "world, and a tactile encoder trained against it with the three-way InfoNCE. They take the part of the frozen CLIP of the paper where no hub is in reach.",
+        "Three small encoders with one space of 128 dimensions: a CLIP (vision and text, with"
+        " its tokenizer) trained on photos and captions of the procedural world, and a "
+        "tactile encoder trained against it with the three-way InfoNCE. They replace the "
+        "frozen CLIP of the paper where no hub is in reach.",
     ),
     "autoencoder": (
-        "VQ f4 autoencoder of touches of palpate's world",
-        "A diffusers VQModel that turns a touch of 64 x 64 pixels into 16 x 16 codes and back. It takes the part of latent diffusion's vq-f4. Trained on "
-        "touches of both looks of the sensor (with markers and without).",
+        "VQ f4 autoencoder of tactile images of palpate's world",
+        "A diffusers VQModel that turns a tactile image of 64 x 64 pixels into 16 x 16 codes "
+        "and back, in the place of latent diffusion's vq-f4. Trained on tactile images of "
+        "both looks of the sensor (with markers and without).",
     ),
     "generator": (
-        "From a photo to a touch of palpate's world",
-        "A latent diffusion model, conditioned on captions and photos in turn and driven by photos, in the space of the encoders and the autoencoder beside it. "
-        "It knows the world's twenty materials and nothing else, tells rough from smooth better than one rough material from another, and always answers for the one gel unit it has learned.",
+        "From a photo to a tactile image of palpate's world",
+        "A latent diffusion model, conditioned on captions and photos in turn and driven by "
+        "photos, in the space of the encoders and the autoencoder next to it. It knows the "
+        "world's twenty materials and nothing else, separates rough from smooth better than "
+        "one rough material from another, and always answers for the one gel unit it has "
+        "learned.",
     ),
 }
 PAIR = (
     "Vision and text encoders of palpate's world",
-    "A small CLIP with its own tokenizer, trained on photos and captions of the procedural world; its space has 128 dimensions. The tactile encoder beside it was trained against it.",
+    "A small CLIP with its tokenizer, trained on photos and captions of the procedural world;"
+    " its space has 128 dimensions. The tactile encoder next to it was trained against it.",
 )
 READ = {
-    "encoders": ("touches", "new touches"),
-    "autoencoder": ("touches", "digit", "new touches", "new digit"),
-    "generator": ("one unit", "touches", "new touches"),
+    "encoders": ("gelsight", "new gelsight"),
+    "autoencoder": ("gelsight", "digit", "new gelsight", "new digit"),
+    "generator": ("one unit", "gelsight", "new gelsight"),
 }
 
 
@@ -56,12 +63,13 @@ def ship(
     worlds: Sequence[Mapping[str, Any]],
     limits: Sequence[str],
 ) -> None:
-    """Replaces what is shipped; the models must be rounded to 16 bits already, since the scores are theirs.
+    """Replaces what is shipped; the models must be rounded to 16 bits already, since the scores are
+    theirs.
 
     Args:
         target: the folder of the package.
-        encoders: vision, text and touch.
-        autoencoder: of touches.
+        encoders: vision, text and tactile.
+        autoencoder: of tactile images.
         pipeline: the generator, in the space of the other two.
         scores: rows by model under ``rounded`` and ``exact``, and the change by ``rounding``.
         worlds: rows that describe the worlds.
@@ -97,7 +105,7 @@ def ship(
     encoders.card = {**encoders.card, **card("encoders")}
     pair = card("encoders")
     pair["title"], pair["summary"] = PAIR
-    pair["scores"] = [row for row in pair["scores"] if "touch" not in row["score"]]
+    pair["scores"] = [row for row in pair["scores"] if "tactile" not in row["score"]]
     encoders.clip.card = {**encoders.clip.card, **pair}
     autoencoder.card = {**autoencoder.card, **card("autoencoder")}
     pipeline = replace(pipeline, training={**pipeline.training, **card("generator")})
@@ -131,7 +139,7 @@ def _use(part: str, world: str) -> str:
         return "scores"
     return (
         "training of the encoders and the autoencoder"
-        if part == "generator" and world == "touches"
+        if part == "generator" and world == "gelsight"
         else "training"
     )
 

@@ -1,7 +1,9 @@
-"""What the shipped models can do, measured on worlds that they have not seen; the rows of their cards.
+"""What the shipped models can do, measured on worlds that they have not seen; the rows of their
+cards.
 
-Intervals are leave-one-video-out jackknives. Zero-shot prompts are the world's own sentences with a class name and no adjective; a class whose
-pieces have names of their own ("a leaf", "moss") is asked for by each of them. The probe's train side is every fourth sample of the world that the
+Intervals are leave-one-video-out jackknives. Zero-shot prompts are the world's own sentences with a
+class name and no adjective; a class whose pieces have names of their own ("a leaf", "moss") is
+asked for by each of them. The probe's train side is every fourth sample of the world that the
 encoders were trained on, its test side the new world.
 """
 
@@ -18,13 +20,13 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.autoencoder_training import measure_reconstruction
-from palpate.diffusion.generate import generate
+from palpate.diffusion.generation import generate
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.metrics.probe import material_accuracy, retrieval, text_positives
 from palpate.encoders.zero_shot import zero_shot_accuracy
-from palpate.evaluation import score
+from palpate.evaluation.scoring import score
+from palpate.metrics.probe import material_accuracy, retrieval, text_positives
 from palpate.sim import MATERIALS, WorldOptions
 from palpate.sim.objects import make_object
 from palpate.sim.plan import ObjectRef
@@ -54,24 +56,24 @@ def score_all(
     """Rows of scores by model: ``encoders``, ``autoencoder``, ``generator``.
 
     Args:
-        encoders: vision, text and touch.
-        autoencoder: of touches.
+        encoders: vision, text and tactile.
+        autoencoder: of tactile images.
         pipeline: the generator.
-        worlds: ``touches``, ``new touches``, ``digit`` and ``new digit``.
+        worlds: ``gelsight``, ``new gelsight``, ``digit`` and ``new digit``.
         cache: folder for decoded pixels and embeddings.
-        folder: for the generated touches; None puts them into ``cache``.
+        folder: for the generated images; None puts them into ``cache``.
         progress: told what is being done.
     """
     return {
         "encoders": score_encoders(
-            encoders, worlds["touches"], worlds["new touches"], cache, progress
+            encoders, worlds["gelsight"], worlds["new gelsight"], cache, progress
         ),
         "autoencoder": score_autoencoder(autoencoder, worlds, cache, progress),
         "generator": score_generator(
             pipeline,
             encoders,
-            worlds["touches"],
-            worlds["new touches"],
+            worlds["gelsight"],
+            worlds["new gelsight"],
             folder or cache,
             cache,
             progress,
@@ -101,21 +103,21 @@ def score_encoders(
         t: [embed(part, encoders, t, cache=cache, progress=progress) for part in (train, new)]
         for t in ("vision", "tactile")
     }
-    vision, touch = sides["vision"][1], sides["tactile"][1]
+    vision, tactile = sides["vision"][1], sides["tactile"][1]
     text = embed(new, encoders, "text", cache=cache, progress=progress)
     same = text_positives(
         embed_texts(texts_of(new)[0], encoders), 0.999
     )  # equal captions count as right
     scores = [
         ("zero-shot material, vision", zero_shot_accuracy(vision, names, encoders)),
-        ("zero-shot material, touch", zero_shot_accuracy(touch, names, encoders)),
+        ("zero-shot material, tactile", zero_shot_accuracy(tactile, names, encoders)),
         ("linear probe of material, vision", material_accuracy(*sides["vision"])),
-        ("linear probe of material, touch", material_accuracy(*sides["tactile"])),
+        ("linear probe of material, tactile", material_accuracy(*sides["tactile"])),
     ]
     pairs = (
         ("photo to text", vision, text, same),
         ("text to photo", text, vision, same),
-        ("photo to touch", vision, touch, None),
+        ("photo to tactile", vision, tactile, None),
     )
     for name, queries, keys, positives in pairs:
         scores += [
@@ -130,9 +132,9 @@ def score_encoders(
 def score_autoencoder(
     autoencoder: Autoencoder, worlds: Mapping[str, Manifest], cache: Path, progress: Progress
 ) -> Rows:
-    """Reconstruction of touches of new videos, and use of the codebook."""
+    """Reconstruction of tactile images of new videos, and use of the codebook."""
     rows: Rows = []
-    for look, name in (("gelsight", "new touches"), ("digit", "new digit")):
+    for look, name in (("gelsight", "new gelsight"), ("digit", "new digit")):
         images = cached_images(worlds[name], "tactile", 64, cache, progress)
         found = measure_reconstruction(autoencoder, np.asarray(images))
         values = {
@@ -159,7 +161,9 @@ def score_generator(
     cache: Path,
     progress: Progress,
 ) -> Rows:
-    """TMMD, material accuracy and the pairwise metrics of touches for photos of the new world, beside the controls."""
+    """TMMD, material accuracy and the pairwise metrics of images for photos of the new world, with
+    controls.
+    """
     step = max(1, len(new) // GENERATED)
     test, train = new.take(new.ids[::step]), old.take(old.ids[::EVERY])
     joined = Manifest.join(train.prefixed("train/"), test)
@@ -169,15 +173,15 @@ def score_generator(
         rule={"name": "old and new world"},
         manifest=joined.digest,
     )
-    made = generate(
-        pipeline,
-        manifest=joined.part(split, "test"),
-        out=folder / f"touches-{pipeline.digest[:12]}",
+    generated = generate(
+        joined.part(split, "test"),
+        model=pipeline,
+        output=folder / f"generated-{pipeline.digest[:12]}",
         seed=0,
         progress=progress,
     )
     scores = score(
-        made.folder,
+        generated.folder,
         joined,
         encoder=encoders,
         split=split,

@@ -8,10 +8,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from palpate.core import PalpateError
-from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, UNetOptions, build_unet
-from palpate.diffusion.latents import LatentStats
+from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Schedule, UNetOptions, build_unet
 from palpate.diffusion.presets import MINI, PAPER, PRESETS, preset_named
-from palpate.diffusion.training import DiffusionLoss, Schedule, train_denoiser
+from palpate.diffusion.training import DiffusionLoss, train_denoiser
 from palpate.training.loop import LoopOptions
 
 UNET = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
@@ -131,12 +131,10 @@ def test_condition_and_background_reach_the_output():
     with torch.no_grad():
         assert not torch.allclose(model(x, t, a, ground), model(x, t, b, ground))
         assert not torch.allclose(model(x, t, a, ground), model(x, t, a, torch.zeros_like(ground)))
-    with pytest.raises(PalpateError, match="background image"):
-        model(x, t, a)
 
 
 class Recorder(Denoiser):
-    """Answers zero and keeps what it was asked."""
+    """Return zeros and keep the arguments."""
 
     def forward(self, x, t, tokens, background=None):
         self.seen = (x.clone(), t.clone(), tokens.clone(), background)
@@ -197,7 +195,7 @@ def test_min_snr_weight():
         loss = DiffusionLoss(
             torch.zeros(1, 3, 2, 2), {}, None, PLAIN, Schedule(prediction=prediction, min_snr=5.0)
         )
-        assert loss._weight(t).tolist() == pytest.approx(
+        assert loss.weight(t).tolist() == pytest.approx(
             (snr.clamp(max=5) / (snr + extra)).tolist(), rel=1e-5
         )
 
@@ -298,7 +296,7 @@ def test_saved_denoiser_is_the_same(tmp_path):
     assert torch.isfinite(again.means).all()
 
 
-def test_mistakes_are_told(tmp_path):
+def test_mistakes_are_explained(tmp_path):
     z, conditions = data()
     with pytest.raises(PalpateError, match="needs embeddings of text, vision"):
         train_denoiser(
@@ -307,17 +305,6 @@ def test_mistakes_are_told(tmp_path):
             stats=PLAIN,
             unet=UNET,
             policy=replace(POLICY, source="mixed"),
-            schedule=Schedule(),
-            loop=LOOP,
-            folder=tmp_path,
-        )
-    with pytest.raises(PalpateError, match="one row a sample"):
-        train_denoiser(
-            z[:-1],
-            conditions,
-            stats=PLAIN,
-            unet=UNET,
-            policy=POLICY,
             schedule=Schedule(),
             loop=LOOP,
             folder=tmp_path,
@@ -365,7 +352,7 @@ def test_the_token_reaches_the_output_through_the_time_embedding_alone():
 
 @pytest.mark.filterwarnings("ignore:It is deprecated:FutureWarning")
 @pytest.mark.parametrize("harm", ["cut", "no means", "no null", "shape", "config", "weights"])
-def test_a_broken_folder_is_told(tmp_path, harm):
+def test_a_broken_folder_is_rejected(tmp_path, harm):
     policy, folder = replace(POLICY, null="learned"), tmp_path / "unet"
     denoiser(policy).save(folder)
     extra = folder / "condition.safetensors"
@@ -382,6 +369,6 @@ def test_a_broken_folder_is_told(tmp_path, harm):
     else:
         del tensors[harm.removeprefix("no ")]
         save_file(tensors, extra)
-    with pytest.raises(PalpateError, match="must be a folder written by palpate") as told:
+    with pytest.raises(PalpateError, match="must be as palpate writes it") as caught:
         Denoiser.load(folder, policy)
-    assert str(folder) in told.value.got
+    assert str(folder) in caught.value.must

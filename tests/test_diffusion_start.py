@@ -6,15 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from diffusion_forge import make_pipeline
-from mini_forge import make_encoders
+from diffusion_fixtures import make_pipeline
+from mini_fixtures import make_encoders
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
-from palpate.diffusion.denoiser import ConditionPolicy, UNetOptions
-from palpate.diffusion.latents import LatentStats
+from palpate.diffusion.autoencoder import LatentStats
+from palpate.diffusion.denoiser import ConditionPolicy, Schedule, UNetOptions
 from palpate.diffusion.presets import TINY
-from palpate.diffusion.recipe import train_pipeline
-from palpate.diffusion.training import Schedule, train_denoiser
+from palpate.diffusion.training import train_denoiser, train_pipeline
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.training.loop import LoopOptions
 

@@ -12,16 +12,15 @@ from palpate.core import PalpateError, Split, rng_for
 from palpate.data.manifest import Manifest
 from palpate.encoders import contrastive
 from palpate.encoders.contrastive import (
-    TouchModel,
+    TactileModel,
     info_nce,
     new_clip,
     soft_targets,
     three_way,
-    touch_loss,
     train_clip,
-    train_touch,
+    train_tactile,
 )
-from palpate.encoders.encoder_set import EncoderSet, new_touch
+from palpate.encoders.encoder_set import EncoderSet, encode_tactile, new_tactile
 from palpate.encoders.presets import preset
 
 TINY = preset("tiny")
@@ -108,16 +107,16 @@ def test_loss_equals_the_slow_loop():
     )
     # arguments in the order touch, text, vision
     parts = {
-        "touch_text": slow_nce(a, b, 7.0, soft),
+        "tactile_text": slow_nce(a, b, 7.0, soft),
         "vision_text": slow_nce(c, b, 7.0, soft),
-        "touch_vision": slow_nce(a, c, 7.0, np.eye(6)),
+        "tactile_vision": slow_nce(a, c, 7.0, np.eye(6)),
     }
     total, logs = three_way(a, b, c, 7.0, text_targets=soft_targets(words))
     assert logs == pytest.approx(parts, abs=1e-5)
     assert float(total) == pytest.approx(sum(parts.values()) / 3, abs=1e-5)
     weighted, _ = three_way(a, b, c, 7.0, weights=(1, 0, 3), text_targets=soft_targets(words))
     assert float(weighted) == pytest.approx(
-        (parts["touch_text"] + 3 * parts["touch_vision"]) / 4, abs=1e-5
+        (parts["tactile_text"] + 3 * parts["tactile_vision"]) / 4, abs=1e-5
     )
 
 
@@ -137,17 +136,17 @@ def test_bad_weights(weights):
 
 def test_gradient_goes_to_the_touch_encoder_and_the_temperature_only(world):
     clip = new_clip(TINY, world.column("text"), seed=0)
-    model = TouchModel(new_touch(TINY.touch_config(clip.dim), seed=1))
+    model = TactileModel(new_tactile(TINY.tactile_config(clip.dim), seed=1))
     text = clip.encode_text(world.column("text")[:6])
     vision = clip.encode_vision(
         torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
     )
     assert not text.requires_grad
     assert not vision.requires_grad
-    total, logs = touch_loss(
-        model, torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(1)), text, vision
-    )
-    total.backward()
+    pixels = torch.randn(6, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    scale = contrastive.clamped_scale(model.log_scale)
+    embedded = encode_tactile(model.tactile, pixels)
+    three_way(embedded, text, vision, scale)[0].backward()
     moved = {
         name
         for name, p in model.named_parameters()
@@ -155,23 +154,23 @@ def test_gradient_goes_to_the_touch_encoder_and_the_temperature_only(world):
     }
     silent = {name for name, _ in model.named_parameters()} - moved
     assert "log_scale" in moved
-    assert "touch.visual_projection.weight" in moved
+    assert "tactile.visual_projection.weight" in moved
     assert all(
         "post_layernorm" in name or "k_proj.bias" in name for name in silent
     )  # a key bias cancels in the softmax
     assert all(p.grad is None for p in clip.model.parameters())
-    assert logs["scale"] == pytest.approx(1 / 0.07, rel=1e-5)
+    assert float(scale.detach()) == pytest.approx(1 / 0.07, rel=1e-5)
 
 
 def test_vision_text_term_moves_only_the_temperature(world):
     clip = new_clip(TINY, world.column("text"), seed=0)
-    model = TouchModel(new_touch(TINY.touch_config(clip.dim), seed=1))
-    total, _ = touch_loss(
-        model, torch.zeros(6, 3, 16, 16), unit(6, 8, seed=1), unit(6, 8, seed=2), weights=(0, 1, 0)
-    )
-    total.backward()
+    model = TactileModel(new_tactile(TINY.tactile_config(clip.dim), seed=1))
+    scale = contrastive.clamped_scale(model.log_scale)
+    embedded = encode_tactile(model.tactile, torch.zeros(6, 3, 16, 16))
+    pairs = unit(6, 8, seed=1), unit(6, 8, seed=2)
+    three_way(embedded, *pairs, scale, weights=(0, 1, 0))[0].backward()
     assert model.log_scale.grad.abs() > 0
-    assert all(p.grad is None or p.grad.abs().max() == 0 for p in model.touch.parameters())
+    assert all(p.grad is None or p.grad.abs().max() == 0 for p in model.tactile.parameters())
 
 
 def test_temperature_is_clamped_and_can_come_back():
@@ -185,7 +184,7 @@ def test_temperature_is_clamped_and_can_come_back():
 
 def quick(**change):
     return replace(
-        TINY, **{"touch_course": replace(TINY.touch_course, epochs=4.0, batch=6), **change}
+        TINY, **{"tactile_course": replace(TINY.tactile_course, epochs=4.0, batch=6), **change}
     )
 
 
@@ -197,14 +196,16 @@ def clip(world, tmp_path_factory):
 def test_training_moves_touch_alone_and_says_what_it_used(world, clip, tmp_path):
     split = by_video(world)
     before = clip.digest("vision"), clip.digest("text")
-    encoders = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu")
+    encoders = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu")
     assert (
         (clip.digest("vision"), clip.digest("text"))
         == before
         == (encoders.digest("vision"), encoders.digest("text"))
     )
-    start = new_touch(TINY.touch_config(clip.dim), seed=0)
-    assert not torch.equal(start.visual_projection.weight, encoders.touch.visual_projection.weight)
+    start = new_tactile(TINY.tactile_config(clip.dim), seed=0)
+    assert not torch.equal(
+        start.visual_projection.weight, encoders.tactile.visual_projection.weight
+    )
     card = encoders.card
     assert card["split"] == split.digest
     assert card["train_manifest"] == world.part(split, "train").digest
@@ -212,9 +213,9 @@ def test_training_moves_touch_alone_and_says_what_it_used(world, clip, tmp_path)
     assert set(card["loss"][0]) == {
         "step",
         "loss",
-        "touch_text",
+        "tactile_text",
         "vision_text",
-        "touch_vision",
+        "tactile_vision",
         "scale",
     }
     assert card["targets"] == "identical-text"
@@ -227,7 +228,7 @@ def test_training_moves_touch_alone_and_says_what_it_used(world, clip, tmp_path)
 
 def test_training_depends_on_the_seed_alone_and_resumes(world, clip, tmp_path):
     split = by_video(world)
-    digest = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
+    digest = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
         "tactile"
     )
     torch.manual_seed(99)
@@ -237,7 +238,7 @@ def test_training_depends_on_the_seed_alone_and_resumes(world, clip, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_touch(
+        train_tactile(
             world,
             split,
             clip,
@@ -248,19 +249,19 @@ def test_training_depends_on_the_seed_alone_and_resumes(world, clip, tmp_path):
             cache=tmp_path / "cache",
         )
     assert (
-        train_touch(
+        train_tactile(
             world, split, clip, quick(), tmp_path / "b", device="cpu", cache=tmp_path / "cache"
         ).digest("tactile")
         == digest
     )
     assert (
-        train_touch(world, split, clip, quick(), tmp_path / "b", device="cpu", seed=1).digest(
+        train_tactile(world, split, clip, quick(), tmp_path / "b", device="cpu", seed=1).digest(
             "tactile"
         )
         != digest
     )
     assert (
-        train_touch(
+        train_tactile(
             world, split, clip, quick(), tmp_path / "c", device="cpu", targets="diagonal"
         ).digest("tactile")
         != digest
@@ -269,28 +270,30 @@ def test_training_depends_on_the_seed_alone_and_resumes(world, clip, tmp_path):
 
 def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
     split = by_video(world)
-    first = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu", seed=3)
+    first = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu", seed=3)
     digest = first.digest("tactile")
-    frozen = quick(touch_course=replace(TINY.touch_course, lr=1e-30, weight_decay=0.0))
-    again = train_touch(world, split, clip, frozen, tmp_path / "b", device="cpu", start=first)
-    fresh = train_touch(world, split, clip, frozen, tmp_path / "c", device="cpu")
+    frozen = quick(tactile_course=replace(TINY.tactile_course, lr=1e-30, weight_decay=0.0))
+    again = train_tactile(world, split, clip, frozen, tmp_path / "b", device="cpu", start=first)
+    fresh = train_tactile(world, split, clip, frozen, tmp_path / "c", device="cpu")
     assert again.digest("tactile") == first.digest("tactile") == digest != fresh.digest("tactile")
-    assert again.touch is not first.touch
+    assert again.tactile is not first.tactile
     assert again.card["start"] == digest
     assert again.card["start_card"]["seed"] == 3
     assert fresh.card["start"] is None
     with pytest.raises(PalpateError, match="size of the preset"):
-        train_touch(
+        train_tactile(
             world, split, clip, replace(TINY, patch=4), tmp_path / "d", device="cpu", start=first
         )
     with pytest.raises(PalpateError, match="tactile encoder"):
-        train_touch(world, split, clip, TINY, tmp_path / "e", device="cpu", start=EncoderSet(clip))
+        train_tactile(
+            world, split, clip, TINY, tmp_path / "e", device="cpu", start=EncoderSet(clip)
+        )
 
 
 def test_test_side_is_never_read(world, clip, tmp_path):
     """The same train side with other test samples, whose files are even missing, trains the same encoder."""
     split = by_video(world)
-    digest = train_touch(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
+    digest = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
         "tactile"
     )
     rows = world.table.to_dicts()
@@ -299,7 +302,7 @@ def test_test_side_is_never_read(world, clip, tmp_path):
             row.update(tactile="absent.png", vision="absent.png", text="other words")
     other = Manifest.from_rows(rows, world.root)
     assert (
-        train_touch(other, split, clip, quick(), tmp_path / "b", device="cpu").digest("tactile")
+        train_tactile(other, split, clip, quick(), tmp_path / "b", device="cpu").digest("tactile")
         == digest
     )
 
@@ -308,7 +311,7 @@ def test_global_random_state_is_left_alone(world, tmp_path):
     torch.manual_seed(7)
     state = torch.get_rng_state()
     clip = train_clip(world, by_video(world), TINY, tmp_path / "clip", device="cpu")
-    train_touch(world, by_video(world), clip, quick(), tmp_path / "tactile", device="cpu")
+    train_tactile(world, by_video(world), clip, quick(), tmp_path / "tactile", device="cpu")
     assert torch.equal(torch.get_rng_state(), state)
 
 
@@ -325,13 +328,13 @@ def test_fresh_clip_learns(world, tmp_path):
 def test_refusals(world, clip, tmp_path):
     empty = Split.from_ids(test=world.ids)
     with pytest.raises(PalpateError, match="train part"):
-        train_touch(world, empty, clip, TINY, tmp_path, device="cpu")
+        train_tactile(world, empty, clip, TINY, tmp_path, device="cpu")
     with pytest.raises(PalpateError, match="train part"):
         train_clip(world, empty, TINY, tmp_path, device="cpu")
     rows = world.table.to_dicts()
     rows[2]["tactile"] = None
     with pytest.raises(PalpateError, match=r"tactile image.*v0/2"):
-        train_touch(
+        train_tactile(
             Manifest.from_rows(rows, world.root),
             by_video(world),
             clip,
@@ -341,7 +344,7 @@ def test_refusals(world, clip, tmp_path):
         )
     rows[2].update(tactile="gone.png")
     with pytest.raises(PalpateError, match="1 bad-image"):
-        train_touch(
+        train_tactile(
             Manifest.from_rows(rows, world.root),
             by_video(world),
             clip,
@@ -351,7 +354,7 @@ def test_refusals(world, clip, tmp_path):
         )
     rows[2].update(tactile=rows[1]["tactile"], text=None, material=None)
     with pytest.raises(PalpateError, match=r"text or a material.*v0/2"):
-        train_touch(
+        train_tactile(
             Manifest.from_rows(rows, world.root),
             by_video(world),
             clip,
@@ -360,21 +363,21 @@ def test_refusals(world, clip, tmp_path):
             device="cpu",
         )
     with pytest.raises(PalpateError, match=r"1 that are not, first .nobody"):
-        train_touch(world, Split.from_ids(train=["nobody"]), clip, TINY, tmp_path, device="cpu")
+        train_tactile(world, Split.from_ids(train=["nobody"]), clip, TINY, tmp_path, device="cpu")
     with pytest.raises(PalpateError, match="fresh CLIP"):
         train_clip(world, by_video(world), preset("paper"), tmp_path, device="cpu")
     with pytest.raises(PalpateError, match="device"):
-        train_touch(world, by_video(world), clip, TINY, tmp_path, device="abacus")
+        train_tactile(world, by_video(world), clip, TINY, tmp_path, device="abacus")
 
 
 def test_paper_preset_is_the_paper():
     paper = preset("paper")
-    assert (paper.touch_course.epochs, paper.touch_course.batch, paper.targets) == (
+    assert (paper.tactile_course.epochs, paper.tactile_course.batch, paper.targets) == (
         200,
         256,
         "diagonal",
     )
-    options = paper.touch_course.options(13_900, seed=0)
+    options = paper.tactile_course.options(13_900, seed=0)
     assert (options.steps, options.warmup, options.betas, options.lr) == (
         10860,
         543,
@@ -382,7 +385,7 @@ def test_paper_preset_is_the_paper():
         1.5e-4,
     )
     with torch.device("meta"):
-        touch = contrastive.CLIPVisionModelWithProjection(paper.touch_config(768))
+        touch = contrastive.CLIPVisionModelWithProjection(paper.tactile_config(768))
     assert (
         sum(p.numel() for p in touch.parameters()) == 303_966_208
     )  # ViT-L/14 at 224 px with a 768-wide projection

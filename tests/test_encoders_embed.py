@@ -12,8 +12,7 @@ from palpate.data.manifest import Manifest
 from palpate.encoders import embed as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed, embed_images, embed_texts, texts_of
-from palpate.encoders.encoder_set import EncoderSet, new_touch
-from palpate.encoders.preprocess import Preprocess
+from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
 from palpate.encoders.presets import preset
 from test_encoders_contrastive import make_world
 
@@ -30,8 +29,8 @@ def world(tmp_path):
 def encoders(world):
     return EncoderSet(
         new_clip(TINY, world.column("text"), 0),
-        new_touch(TINY.touch_config(8), 1).eval(),
-        Preprocess.of_size(16),
+        new_tactile(TINY.tactile_config(8), 1).eval(),
+        Preprocess(16, 16),
     )
 
 
@@ -66,7 +65,7 @@ def test_embedding_equals_the_encoder_picture_by_picture(
                     torch.tensor(picture).permute(2, 0, 1)[None] / 255
                     - torch.tensor(pre.mean).view(3, 1, 1)
                 ) / torch.tensor(pre.std).view(3, 1, 1)
-                model = encoders.clip.model if encoder == "vision" else encoders.touch
+                model = encoders.clip.model if encoder == "vision" else encoders.tactile
                 states = model.vision_model(pixel_values=pixels).pooler_output
                 expect = torch.nn.functional.normalize(model.visual_projection(states), dim=-1)[0]
             assert np.allclose(found.features[k], expect, atol=1e-5)
@@ -115,7 +114,7 @@ def test_changed_image_weight_row_or_text_is_computed_again(world, encoders, tmp
     assert sum(count) == 12
     assert [k for k in range(12) if not np.allclose(first.features[k], second.features[k])] == [4]
     with torch.no_grad():
-        encoders.touch.visual_projection.weight[0, 0] += 1
+        encoders.tactile.visual_projection.weight[0, 0] += 1
     count.clear()
     assert not np.allclose(embed(world, encoders, "tactile", cache=cache).features, second.features)
     assert sum(count) == 12
@@ -182,11 +181,11 @@ def test_other_columns(world, encoders):
 @pytest.mark.parametrize("cached", [True, False])
 def test_refusals(world, encoders, tmp_path, cached):
     cache = tmp_path / "cache" if cached else None
-    with pytest.raises(PalpateError, match="vision, text, touch"):
+    with pytest.raises(PalpateError, match="vision, text, tactile"):
         embed(world, encoders, "smell", cache=cache)
     with pytest.raises(PalpateError, match="must be samples"):
         embed(world.take([]), encoders, "tactile", cache=cache)
-    with pytest.raises(PalpateError, match="--batch"):
+    with pytest.raises(PalpateError, match="`batch` must be at least 1"):
         embed(world, encoders, "tactile", batch=0, cache=cache)
     with pytest.raises(PalpateError, match="tactile encoder"):
         embed(world, EncoderSet(encoders.clip), "tactile", cache=cache)

@@ -104,7 +104,7 @@ def test_a_mask_weighs_the_places_of_every_stage(states, network, size):
         expect += (weight * places).sum() / weight.sum()
     assert found[0] == pytest.approx(expect, rel=1e-5)
     for bad in (mask[:2], mask[:, :-1], mask.astype(float)):
-        with pytest.raises(PalpateError, match="mask must be of shape"):
+        with pytest.raises(PalpateError, match="`mask` must be boolean of shape"):
             lpips_per_image(first, second, network, mask=bad)
 
 
@@ -208,7 +208,7 @@ def test_files_are_refused_by_name_and_never_unpickled(files, states, tmp_path):
             lambda x: np.where(np.arange(3)[:, None, None, None] == 2, np.nan, x / 255),
             r"\[nan, nan\] in image 2",
         ),
-        (lambda x: x[:2], "one to one"),
+        (lambda x: x[:2], "must have the shape of the generated"),
     ],
 )
 def test_bad_images_are_refused(network, change, match):
@@ -221,8 +221,6 @@ def test_small_images_and_bad_batches_are_refused(network):
     first, second = pairs(2, 32, 31)
     with pytest.raises(PalpateError, match=r"at least 32 x 32 for LPIPS\. Got 32 x 31"):
         lpips_per_image(first, second, network)
-    with pytest.raises(PalpateError, match="batch must be a whole number"):
-        lpips_per_image(*pairs(2, 32, 32), network, batch=0)
 
 
 def test_the_layout_is_torchvisions():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mini_forge import make_encoders
+from mini_fixtures import make_encoders
 from palpate.core import FeatureSet, PalpateError
 from palpate.encoders.zero_shot import zero_shot_accuracy
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from palpate.core import PalpateError, digest_folder, read_json
-from palpate.core import shipped as shipped_module
+from palpate.encoders import models as shipped_module
 from palpate.sim.presets import MINI_SEEDS
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -37,7 +37,7 @@ def small(mini, monkeypatch, tmp_path):
         mini, "WORLDS", {name: replace(options, **few) for name, options in mini.WORLDS.items()}
     )
     monkeypatch.setattr(mini, "CLIP_EPOCHS", 1.0)
-    monkeypatch.setattr(mini, "TOUCH_EPOCHS", 1.0)
+    monkeypatch.setattr(mini, "TACTILE_EPOCHS", 1.0)
     monkeypatch.setattr(
         mini, "AUTOENCODER", replace(mini.AUTOENCODER, steps_free=3, steps_quantized=2, codes=32)
     )
@@ -91,7 +91,7 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     )
     assert "900050" in (target / "encoders" / "README.md").read_text()
     assert not any(
-        "touch" in row["score"]
+        "tactile" in row["score"]
         for row in read_json(target / "encoders" / "clip" / "palpate.json", "card")["card"][
             "scores"
         ]

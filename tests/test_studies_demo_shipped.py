@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from mini_forge import WORLD, write_shipped
+from mini_fixtures import WORLD, write_shipped
 from palpate.core import PalpateError, read_json, shipped, write_json
-from palpate.core.shipped import shipped_folder
+from palpate.encoders.models import shipped_folder
 from palpate.data.importing import import_dataset
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.encoder_set import EncoderSet
@@ -50,18 +50,18 @@ def test_shipped_models_take_the_place_of_three_stages(mini, tmp_path):
     assert done.models == {"clip": "palpate/mini", "autoencoder": "palpate/mini"}
     encoders, model = (
         EncoderSet.load(tmp_path / "run" / "encoders" / "encoders"),
-        TactilePipeline.load(tmp_path / "run" / "generator" / "model"),
+        TactilePipeline.from_pretrained(tmp_path / "run" / "generator" / "model"),
     )
     ready = EncoderSet.load("palpate/mini")
     assert encoders.digest("vision") == ready.digest("vision")
-    assert encoders.digest("touch") != ready.digest("touch")
+    assert encoders.digest("tactile") != ready.digest("tactile")
     assert encoders.card["start_card"]["data"] == WORLD
     assert encoders.card["clip"] == "palpate/mini"
     assert model.training["start"] == mini.digest
     assert model.training["start_record"]["data"] == WORLD
     assert model.stats == mini.stats
     assert "Brick" in model.notice
-    assert {s.encoder for s in done.scores if s.metric == "TMMD"} == {encoders.digest("touch")}
+    assert {s.encoder for s in done.scores if s.metric == "TMMD"} == {encoders.digest("tactile")}
     bound = done.stages["generator"].facts["autoencoder on test touches"]
     assert (bound["n"], bound["codes"]) == (len(done.split.ids("test")), 64)
     results = summarize(done, "palpate demo")
@@ -88,14 +88,14 @@ def test_shipped_models_take_the_place_of_three_stages(mini, tmp_path):
 def test_from_scratch_and_the_variant_with_backgrounds_start_from_nothing(mini, tmp_path):
     done = run_pipeline(replace(OPTIONS, from_scratch=True), tmp_path / "a")
     assert {"pretraining", "clip", "autoencoder"} <= set(done.stages)
-    assert TactilePipeline.load(tmp_path / "a" / "generator" / "model").training["start"] is None
+    assert TactilePipeline.from_pretrained(tmp_path / "a" / "generator" / "model").training["start"] is None
     assert (
         EncoderSet.load(tmp_path / "a" / "encoders" / "encoders").card["start_card"].get("data")
         is None
     )
     assert any("trained in this run" in n for n in summarize(done, "x").notes)
     run_pipeline(replace(OPTIONS, background=True), tmp_path / "b")
-    assert TactilePipeline.load(tmp_path / "b" / "generator" / "model").training["start"] is None
+    assert TactilePipeline.from_pretrained(tmp_path / "b" / "generator" / "model").training["start"] is None
 
 
 def test_a_world_that_the_shipped_models_saw_is_refused(mini, tmp_path):

@@ -14,7 +14,7 @@ from safetensors import safe_open
 from torch import nn
 
 from palpate.core import PalpateError
-from palpate.encoders import loop
+from palpate.training import loop
 from palpate.training.loop import LoopOptions, fit, learning_rate, rows_at
 
 N = 23
@@ -287,7 +287,7 @@ def test_no_rows_no_parameters_bad_options(tmp_path):
         {"clip": 0.0},
         {"warmup": -1},
     ):
-        with pytest.raises(PalpateError, match=next(iter(change))):
+        with pytest.raises(PalpateError, match=f"`{next(iter(change))}` must"):
             options(**change)
 
 
@@ -331,7 +331,7 @@ def test_log_file_is_the_log(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from test_encoders_loop import N, Net, loss, options
+from test_training_loop import N, Net, loss, options
 from palpate.training.loop import fit
 
 def until(module, rows, generator, step):

@@ -18,13 +18,12 @@ import json
 import os
 import re
 import shlex
-import shutil
 import sys
 import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -67,8 +66,8 @@ RENAMED: dict[tuple[str, str], str] = {
     ("import", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("validate", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",
-    ("score", "MANIFEST"): "--reference",
-    ("score", "--controls"): "--no-controls",
+    ("generate", "--manifest"): "a positional argument: palpate generate tag/ --split noleak.json",
+    ("score", "--generated"): "positional arguments: palpate score generated/ --reference real/",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' stands for every verb.
@@ -233,10 +232,9 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         raise PalpateError(must, got, f"See: palpate {name} --help") from None
 
 
-def _answer_renamed(name: str, args: Sequence[str]) -> None:
-    """Raise for an option or a first argument of an earlier version, with its new name."""
-    first = ["MANIFEST"] if args and not args[0].startswith("-") else []
-    for option in (*first, *(arg.partition("=")[0] for arg in args if arg.startswith("--"))):
+def _answer_renamed(name: str, args: Iterable[str]) -> None:
+    """Raise for an option of an earlier version, with its new name."""
+    for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
         if new := RENAMED.get((name, option)) or RENAMED.get(("", option)):
             must = f"{option} of palpate {name} is now written {new}"
             raise PalpateError(must, option, f"See: palpate {name} --help")
@@ -255,8 +253,6 @@ def error_line(verb: str, error: PalpateError) -> str:
         name = option_name(verb, argument)
         if isinstance(value, bool):
             return name if value else name.replace("--", "--no-", 1)
-        if isinstance(value, Mapping):  # e.g. columns={"vision": "rgb"}
-            value = [f"{key}={cell}" for key, cell in value.items()]
         values = value if isinstance(value, list | tuple) else [value]
         words = shlex.join(map(str, values))
         return f"{name} {words}" if name.startswith("-") else words
@@ -273,31 +269,6 @@ def require_extra(purpose: str) -> None:
     for package in ("torch", "diffusers", "transformers", "safetensors", "av"):
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(package, "all", purpose)
-
-
-@contextlib.contextmanager
-def working_folder(output: Path, terminal: Terminal) -> Generator[Path]:
-    """Yield ``.<name>.work`` next to an output folder, for checkpoints and caches.
-
-    The same command finds it again; it is removed on success.
-
-    Raises:
-        PalpateError: if the output exists already, before any work is done.
-    """
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        must, fix = "must be absent or an empty folder", "Choose another folder, or remove it"
-        raise PalpateError(must, f"{output}, which exists", fix, argument="output")
-    work = output.absolute().parent / f".{output.name}.work"
-    if work.exists():
-        terminal.say(f"Resuming from {work}")
-    work.mkdir(parents=True, exist_ok=True)
-    try:
-        yield work
-    except PalpateError:
-        if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
-            shutil.rmtree(work)
-        raise
-    shutil.rmtree(work, ignore_errors=True)
 
 
 def guard_output(
@@ -438,5 +409,4 @@ __all__ = [
     "list_problems",
     "require_extra",
     "run_verb",
-    "working_folder",
 ]

@@ -1,31 +1,36 @@
 """Training of a small VQ autoencoder, in stages that leave no code unused.
 
-1. *Free*: encoder and decoder without quantization, with Gaussian noise on the latents (relative to their
+1. *Free*: encoder and decoder without quantization, with Gaussian noise on the latents (relative to
+their
    spread), so that the decoder is smooth around each latent.
-2. *Codebook*: k-means of encoder outputs (Lloyd's iterations; an empty cell moves to the point farthest from
+2. *Codebook*: k-means of encoder outputs (Lloyd's iterations; an empty cell moves to the point
+farthest from
    its center) becomes the codebook, so that every code starts in use.
 3. *Quantized*: everything together with straight-through gradients (van den Oord et al. 2017).
 
-Loss: ``l1 * L1 + l2 * L2 + edge * L2 of the first differences`` (+ the codebook loss of VQModel in stage 3). Squares
-where the texture is: where a pattern is not yet known, an absolute error is least for none at all. Stage 1 sees
-random crops: the network is convolutional, and crops give it more steps a second. Stage 3 sees whole images, because
-group normalization takes its statistics over the image: trained on crops alone, whole images come out too dark.
+Loss: ``l1 * L1 + l2 * L2 + edge * L2 of the first differences`` (+ the codebook loss of VQModel in
+stage 3). Squares where the texture is: where a pattern is not yet known, an absolute error is least
+for none at all. Stage 1 sees random crops: the network is convolutional, and crops give it more
+steps a second. Stage 3 sees whole images, because group normalization takes its statistics over the
+image: trained on crops alone, whole images come out too dark.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from diffusers.models.autoencoders.vq_model import VQModel
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for, seed_for
-from palpate.diffusion.autoencoder import Autoencoder
-from palpate.diffusion.pixels import to_bytes, to_unit
+from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
+from palpate.diffusion.autoencoder import Autoencoder, to_bytes
+from palpate.encoders.encoder_set import seeded, to_unit
 from palpate.training.loop import LoopOptions, fit
 
 
@@ -86,11 +91,11 @@ def build_autoencoder(options: AutoencoderOptions) -> Autoencoder:
 
 
 def train_autoencoder(
-    images: np.ndarray,
+    images: NDArray[np.uint8],
     options: AutoencoderOptions,
     folder: Path,
     *,
-    held_out: np.ndarray | None = None,
+    held_out: NDArray[np.uint8] | None = None,
     seed: int = 0,
     key: str = "",
     device: str | torch.device = "cpu",
@@ -102,7 +107,8 @@ def train_autoencoder(
         images: bytes (n, h, w, 3), an array or a memory map: the train part alone.
         options: see :class:`AutoencoderOptions`.
         folder: for checkpoints.
-        held_out: bytes (m, h, w, 3) of other videos; the card then says how well they are reconstructed.
+        held_out: bytes (m, h, w, 3) of other videos; the card then says how well they are
+            reconstructed.
         seed: of weights, order, crops and noise.
         key: digest of the images.
         device: where to train.
@@ -114,50 +120,31 @@ def train_autoencoder(
     side = options.crop or images.shape[1]
     factor = options.patch * 2 ** (len(options.widths) - 1)
     if side % factor or side > min(images.shape[1:3]):
-        raise PalpateError(
-            f"Crops must be multiples of {factor} and fit into the images",
-            f"{side} for {images.shape[1:3]}",
-            "Choose another crop",
-        )
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed_for(seed, "autoencoder"))
+        must, got = f"must be a multiple of {factor} that fits into the images", f"{side}"
+        raise PalpateError(must, got, "Choose another", argument="crop")
+    with seeded(seed, "autoencoder"):
         model = build_autoencoder(options).to(device)
     key = digest_json([key, asdict(options), seed])
-    free = LoopOptions(
-        steps=options.steps_free, batch=options.batch, lr=options.lr, weight_decay=1e-4, seed=seed
-    )
-    fit(
-        model,
-        _Loss(images, options, quantize=False),
-        len(images),
-        free,
-        folder / "free",
-        what="autoencoder",
-        key=key,
-        progress=progress,
-    )
-    _set_codebook(model, images, options, seed)
+    free = LoopOptions(options.steps_free, options.batch, options.lr, weight_decay=1e-4, seed=seed)
     last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
-    fit(
-        model,
-        _Loss(images, options, quantize=True),
-        len(images),
-        last,
-        folder / "quantized",
-        what="codebook",
-        key=key,
-        progress=progress,
-    )
+    common: dict[str, Any] = {"key": key, "progress": progress}
+    loss = _Loss(images, options, quantize=False)
+    fit(model, loss, len(images), free, folder / "free", what="autoencoder", **common)
+    _set_codebook(model, images, options, seed)
+    loss = _Loss(images, options, quantize=True)
+    fit(model, loss, len(images), last, folder / "quantized", what="codebook", **common)
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "key": key}
     if held_out is not None and len(held_out):
         model.card["held_out"] = asdict(measure_reconstruction(model, held_out))
-    return model.eval().requires_grad_(requires_grad=False)
+    return model.eval().requires_grad_(False)
 
 
 class _Loss:
-    """The loss of one step; see the head of this file."""
+    """The loss of one step; see the module's docstring."""
 
-    def __init__(self, images: np.ndarray, options: AutoencoderOptions, *, quantize: bool) -> None:
+    def __init__(
+        self, images: NDArray[np.uint8], options: AutoencoderOptions, *, quantize: bool
+    ) -> None:
         self.images, self.options, self.quantize = images, options, quantize
 
     def __call__(
@@ -165,14 +152,12 @@ class _Loss:
     ) -> tuple[Tensor, dict[str, float]]:
         assert isinstance(module, Autoencoder)
         options, device = self.options, next(module.parameters()).device
-        x = _crops(
-            to_unit(self.images[rows.numpy()]), 0 if self.quantize else options.crop, generator
-        ).to(device)
+        x = to_unit(self.images[rows.numpy()], signed=True)
+        x = (x if self.quantize else _crops(x, options.crop, generator)).to(device)
         z = module.latents(x)
         if not self.quantize and options.noise:
-            z = z + options.noise * z.detach().std() * torch.randn(z.shape, generator=generator).to(
-                device
-            )
+            noise = torch.randn(z.shape, generator=generator).to(device)
+            z = z + options.noise * z.detach().std() * noise
         y, codebook = module.image(z, quantize=self.quantize)
         error = y - x
         edges = torch.diff(error, dim=3).square().mean() + torch.diff(error, dim=2).square().mean()
@@ -190,36 +175,26 @@ def _crops(x: Tensor, side: int, generator: torch.Generator) -> Tensor:
     n, _, height, width = x.shape
     top = torch.randint(0, height - side + 1, (n,), generator=generator).tolist()
     left = torch.randint(0, width - side + 1, (n,), generator=generator).tolist()
-    return torch.stack(
-        [
-            x[k, :, t : t + side, c : c + side]
-            for k, (t, c) in enumerate(zip(top, left, strict=True))
-        ]
-    )
+    corners = zip(x, top, left, strict=True)
+    return torch.stack([image[:, t : t + side, c : c + side] for image, t, c in corners])
 
 
 def _set_codebook(
-    model: Autoencoder, images: np.ndarray, options: AutoencoderOptions, seed: int
+    model: Autoencoder, images: NDArray[np.uint8], options: AutoencoderOptions, seed: int
 ) -> None:
-    """Makes the centers of encoder outputs the codebook."""
+    """Make the centers of encoder outputs the codebook."""
     rng = rng_for(seed, "codebook")
     side = images.shape[1] // model.factor
     count = max(8, -(-options.codes * 32 // side**2))
     chosen = np.sort(rng.choice(len(images), size=min(len(images), count), replace=False))
-    points = (
-        model.encode(images[chosen])
-        .permute(0, 2, 3, 1)
-        .reshape(-1, model.channels)
-        .double()
-        .numpy()
-    )
-    centers = torch.from_numpy(k_means(points, options.codes, rng))
-    model.vq.quantize.embedding.weight.data.copy_(centers)
+    latents = model.encode(images[chosen]).permute(0, 2, 3, 1).reshape(-1, model.channels)
+    centers = k_means(latents.double().numpy(), options.codes, rng)
+    model.vq.quantize.embedding.weight.data.copy_(torch.from_numpy(centers))
 
 
 def k_means(
-    points: np.ndarray, k: int, rng: np.random.Generator, iterations: int = 12
-) -> np.ndarray:
+    points: NDArray[np.float64], k: int, rng: np.random.Generator, iterations: int = 12
+) -> NDArray[np.float64]:
     """Lloyd's k-means in few dimensions.
 
     Args:
@@ -236,15 +211,9 @@ def k_means(
     for _ in range(iterations):
         distance, nearest = KDTree(centers).query(points)
         counts = np.bincount(nearest, minlength=k)
-        sums = np.stack(
-            [
-                np.bincount(nearest, weights=points[:, j], minlength=k)
-                for j in range(points.shape[1])
-            ],
-            axis=1,
-        )
+        sums = [np.bincount(nearest, weights=column, minlength=k) for column in points.T]
         used = counts > 0
-        centers[used] = sums[used] / counts[used, None]
+        centers[used] = np.stack(sums, axis=1)[used] / counts[used, None]
         empty = np.flatnonzero(~used)
         farthest = np.argsort(-np.asarray(distance))[: len(empty)]
         centers[empty[: len(farthest)]] = points[farthest]
@@ -259,7 +228,8 @@ class Reconstruction:
         n: images.
         psnr: mean over images of 10 log10(1 / MSE), values in [0, 1].
         psnr_free: the same without quantization.
-        ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range 1).
+        ssim: mean structural similarity (Wang et al. 2004: Gaussian window of 11, sigma 1.5, range
+            1).
         perplexity: exp of the entropy of the codes used; at most the number of codes.
         dead: codes never used on these images.
         codes: entries of the codebook.
@@ -276,54 +246,43 @@ class Reconstruction:
 
 @torch.no_grad()
 def measure_reconstruction(
-    autoencoder: Autoencoder, images: np.ndarray, batch: int = 64
+    autoencoder: Autoencoder, images: NDArray[np.uint8], batch: int = 64
 ) -> Reconstruction:
     """Scores reconstructions of bytes (n, h, w, 3), a batch at a time."""
     device = next(autoencoder.parameters()).device
     codes = int(autoencoder.vq.config["num_vq_embeddings"])
     counts = np.zeros(codes, dtype=np.int64)
     rows: dict[str, list[Tensor]] = {"psnr": [], "psnr_free": [], "ssim": []}
-    for k in range(0, len(images), batch):
-        x = to_unit(images[k : k + batch]).to(device)
+    for start in range(0, len(images), batch):
+        x = to_unit(images[start : start + batch], device, signed=True)
         z = autoencoder.latents(x)
-        # Rounded to bytes first: what is scored is the picture that anybody gets.
-        y, free = (
-            to_unit(to_bytes(autoencoder.image(z, quantize=q)[0])).to(device) for q in (True, False)
-        )
-        rows["psnr"].append(10 * torch.log10(4 / (y - x).square().mean((1, 2, 3)).clamp_min(1e-12)))
-        rows["psnr_free"].append(
-            10 * torch.log10(4 / (free - x).square().mean((1, 2, 3)).clamp_min(1e-12))
-        )
+        # Rounded to bytes first: what is scored is the image that a user gets.
+        bytes_of = (to_bytes(autoencoder.image(z, quantize=q)[0]) for q in (True, False))
+        y, free = (to_unit(pixels, device, signed=True) for pixels in bytes_of)
+        for name, image in (("psnr", y), ("psnr_free", free)):
+            error = (image - x).square().mean((1, 2, 3)).clamp_min(1e-12)
+            rows[name].append(10 * torch.log10(4 / error))
         rows["ssim"].append(_ssim((x + 1) / 2, (y + 1) / 2))
         counts += np.bincount(autoencoder.codes(z).flatten().cpu().numpy(), minlength=codes)
     share = counts[counts > 0] / counts.sum()
     mean = {name: float(torch.cat(values).double().mean()) for name, values in rows.items()}
-    return Reconstruction(
-        len(images),
-        **mean,
-        perplexity=float(np.exp(-(share * np.log(share)).sum())),
-        dead=int((counts == 0).sum()),
-        codes=codes,
-    )
+    perplexity, dead = float(np.exp(-(share * np.log(share)).sum())), int((counts == 0).sum())
+    return Reconstruction(len(images), **mean, perplexity=perplexity, dead=dead, codes=codes)
 
 
 def _ssim(x: Tensor, y: Tensor) -> Tensor:
-    """SSIM of each image of (n, 3, h, w) in [0, 1], mean over channels and the positions where the window fits."""
+    """Return the SSIM of each image (n, 3, h, w) in [0, 1], where the window fits."""
     offset = torch.arange(11, dtype=x.dtype, device=x.device) - 5
     window = torch.exp(-offset.square() / (2 * 1.5**2))
     window = window / window.sum()
 
     def blur(z: Tensor) -> Tensor:
-        z = nn.functional.conv2d(z.flatten(0, 1).unsqueeze(1), window.reshape(1, 1, 1, -1))
-        return (
-            nn.functional.conv2d(z, window.reshape(1, 1, -1, 1))
-            .unflatten(0, (x.shape[0], x.shape[1]))
-            .squeeze(2)
-        )
+        rows = nn.functional.conv2d(z.flatten(0, 1).unsqueeze(1), window.reshape(1, 1, 1, -1))
+        both = nn.functional.conv2d(rows, window.reshape(1, 1, -1, 1))
+        return both.unflatten(0, x.shape[:2]).squeeze(2)
 
     mx, my = blur(x), blur(y)
     vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
     c1, c2 = 0.01**2, 0.03**2
-    return ((2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean(
-        (1, 2, 3)
-    )
+    ratio = (2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    return ratio.mean((1, 2, 3))

@@ -1,26 +1,27 @@
-"""Presets: complete configurations of autoencoder, denoiser, training and sampling, one column each.
+"""Presets: complete configurations of autoencoder, denoiser, training and sampling.
 
-=================  =====================  ================================  ===============================================
-setting            ``tiny``               ``mini``                          ``paper``
-=================  =====================  ================================  ===============================================
-for                tests, seconds         two CPU cores, minutes            GPUs; paper sections 2 and 9
-image, latents     32 px, 3 x 8 x 8       64 px, 4 x 16 x 16                256 px, 3 x 64 x 64
-autoencoder        patch 4, width 16      patch 2, 32-64, 8,192 codes       latent diffusion ``vq-f4``, frozen, given
-latent scale       std                    std                               one (recorded, not applied)
-U-Net              16-32                  64-96, modulated, 2.6 M           192 x (1, 2, 3, 5), 406.3 M (``text2img256``)
-schedule           T = 1000, beta linear in its square root, 0.0015 -> 0.0195, in all three
-prediction         eps                    v                                 eps (Eq. 1)
-condition          one token, dropout 0.1, null zeros, in all three
-source             text                   text or photo, half each          text
-gap, noise         none, 0                mean-shift, 0.3                   none, 0
-optimizer          AdamW 1e-3, EMA 0.99   AdamW 1e-3, cosine, EMA 0.99      AdamW 6.4e-5 (2e-6 x batch 32), EMA 0.9999
-length             20 steps of 8          800 steps of 8                    30 epochs of batch 32
-sampler            DPM-Solver++ 4         DPM-Solver++ 8                    DDIM 200, eta 0
-guidance           2                      4                                 7.5
-=================  =====================  ================================  ===============================================
+==============  ====================  ============================  ================================
+setting         ``tiny``              ``mini``                      ``paper``
+==============  ====================  ============================  ================================
+for             tests, seconds        two CPU cores, minutes        GPUs; paper sections 2 and 9
+image, latents  32 px, 3 x 8 x 8      64 px, 4 x 16 x 16            256 px, 3 x 64 x 64
+autoencoder     patch 4, width 16     patch 2, 32-64, 8,192 codes   latent diffusion ``vq-f4``
+latent scale    std                   std                           one (recorded, not applied)
+U-Net           16-32                 64-96, modulated, 2.6 M       192 x (1, 2, 3, 5), 406.3 M
+schedule        T = 1000, beta linear in its square root, 0.0015 -> 0.0195, in all three
+prediction      eps                   v                             eps (Eq. 1)
+condition       one token, dropout 0.1, null zeros, in all three
+source          text                  text or photo, half each      text
+gap, noise      none, 0               mean-shift, 0.3               none, 0
+optimizer       AdamW 1e-3, EMA 0.99  AdamW 1e-3, cosine, EMA 0.99  AdamW 6.4e-5, EMA 0.9999
+length          20 steps of 8         800 steps of 8                30 epochs of batch 32
+sampler         DPM-Solver++ 4        DPM-Solver++ 8                DDIM 200, eta 0
+guidance        2                     4                             7.5
+==============  ====================  ============================  ================================
 
-``mini`` is the geometry of the models that ship (docs/concepts/mini.md, with their scores and with what did not work): what is trained with it can go on from
-them. ``--source text`` is the paper's training.
+``mini`` is the geometry of the models that ship (docs/concepts/mini.md, with their scores and with
+what did not work): what is trained with it can go on from them. ``source="text"`` is the paper's
+training.
 """
 
 from __future__ import annotations
@@ -30,21 +31,21 @@ from typing import Literal
 
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder_training import AutoencoderOptions
-from palpate.diffusion.denoiser import ConditionPolicy, UNetOptions
-from palpate.diffusion.sampling import SamplerOptions
-from palpate.diffusion.training import Schedule
+from palpate.diffusion.denoiser import ConditionPolicy, Schedule, UNetOptions
+from palpate.diffusion.pipeline import SamplerOptions
 from palpate.training.loop import LoopOptions
 
 
 @dataclass(frozen=True)
 class DiffusionPreset:
-    """Everything that defines a generator beside its data and encoders.
+    """Everything that defines a generator except its data and encoders.
 
     Attributes:
         name: recorded in the pipeline.
-        size: side of the touches in pixels.
-        autoencoder: how to train one, or None if a trained one is given (``paper``: a ``vq-f4`` folder).
-        latent_scale: see :class:`~palpate.diffusion.latents.LatentStats`.
+        size: side of the tactile images in pixels.
+        autoencoder: how to train one, or None if a trained one is given (``paper``: a ``vq-f4``
+            folder).
+        latent_scale: see :class:`~palpate.diffusion.autoencoder.LatentStats`.
         unet, schedule, sampler: see there.
         condition: the policy; its width is replaced by that of the encoders at hand.
         loop: training; ``steps`` is ignored if ``epochs`` is given.
@@ -64,11 +65,9 @@ class DiffusionPreset:
 
     def loop_for(self, n: int, *, seed: int | None = None) -> LoopOptions:
         """The loop for ``n`` training samples: epochs become steps."""
-        steps = (
-            self.loop.steps
-            if self.epochs is None
-            else max(1, -(-self.epochs * n // self.loop.batch))
-        )
+        steps = self.loop.steps
+        if self.epochs is not None:
+            steps = max(1, -(-self.epochs * n // self.loop.batch))
         return replace(self.loop, steps=steps, seed=self.loop.seed if seed is None else seed)
 
     def condition_for(self, width: int) -> ConditionPolicy:
@@ -99,7 +98,8 @@ TINY = DiffusionPreset(
 MINI = DiffusionPreset(
     name="mini",
     size=64,
-    # f4 as in latent diffusion: pixel pairs become channels, then one halving. Straight four-pixel patches lose texture.
+    # f4 as in latent diffusion: pixel pairs become channels, then one halving. Plain 4 px patches
+    # lose texture.
     autoencoder=AutoencoderOptions(
         patch=2, widths=(32, 64), channels=4, codes=8192, steps_free=2000, steps_quantized=300
     ),
@@ -114,7 +114,8 @@ MINI = DiffusionPreset(
     sampler=SamplerOptions("dpm", steps=8, guidance=4.0),
 )
 
-#: The paper's model as far as it is known; reference/paper.md section 9 gives the reason for each open choice.
+#: The paper's model as far as it is known; reference/paper.md section 9 gives the reason for each
+#: open choice.
 PAPER = DiffusionPreset(
     name="paper",
     size=256,
@@ -152,7 +153,6 @@ def preset_named(name: str) -> DiffusionPreset:
         PalpateError: if there is none.
     """
     if name not in PRESETS:
-        raise PalpateError(
-            f"The preset must be one of {', '.join(PRESETS)}", repr(name), "Choose one of them"
-        )
+        must = f"must be one of {', '.join(PRESETS)}"
+        raise PalpateError(must, repr(name), "Choose one of these", argument="preset")
     return PRESETS[name]

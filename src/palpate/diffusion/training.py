@@ -1,71 +1,329 @@
-"""Training the denoiser (paper Eq. 1):
+"""Training a generator (paper section 2): encode once, then train the denoiser on Eq. 1,
 
     L(theta) = E_{z, c, eps, t} || eps - eps_theta(z^t, t, c) ||^2,   t uniform on 1..T,
-    z^t = sqrt(a_t) z + sqrt(1 - a_t) eps,   a_t = prod_{s<=t} (1 - beta_s),
+    z^t = sqrt(a_t) z + sqrt(1 - a_t) eps.
 
-with beta linear in its square root (latent diffusion's schedule). The condition c is dropped with probability p, which
-trains the unconditional model that guidance needs (Ho & Salimans 2022). Latents and embeddings are read from caches.
+Only the train part of the split is read. Tactile images go through the frozen autoencoder and texts
+and photos through the frozen encoders once, into caches; the training loop reads those. The
+condition c is dropped with probability p, which trains the unconditional model that guidance needs
+(Ho & Salimans 2022).
 
-Options beyond the paper: v-prediction (Salimans & Ho 2022), whose target is ``sqrt(a) eps - sqrt(1 - a) z``, and the
-min-SNR weight (Hang et al. 2023): ``min(snr, g) / snr`` for eps and ``min(snr, g) / (snr + 1)`` for v.
+Options beyond the paper: v-prediction (Salimans & Ho 2022), whose target is ``sqrt(a) eps - sqrt(1
+- a) z``, and the min-SNR weight (Hang et al. 2023): ``min(snr, g) / snr`` for eps and ``min(snr, g)
+/ (snr + 1)`` for v.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, digest_json, quiet, seed_for
+from palpate import __version__
+from palpate.core import (
+    PalpateError,
+    Progress,
+    Split,
+    atomic_path,
+    digest_json,
+    quiet,
+    read_json,
+    write_json,
+)
+from palpate.data.images import cached_images, image_stamp
+from palpate.data.manifest import Manifest
+from palpate.diffusion.autoencoder import Autoencoder, LatentStats
+from palpate.diffusion.autoencoder_training import train_autoencoder
 from palpate.diffusion.denoiser import (
     SOURCES,
     ConditionPolicy,
     Denoiser,
+    Schedule,
     Source,
     UNetOptions,
     build_unet,
 )
-from palpate.diffusion.latents import LatentStats
-from palpate.diffusion.pixels import digest_tensors
-from palpate.training.loop import LoopOptions, fit
+from palpate.diffusion.pipeline import TactilePipeline
+from palpate.diffusion.presets import DiffusionPreset, preset_named
+from palpate.encoders.contrastive import load_manifest, split_of, train_part
+from palpate.encoders.embed import embed, texts_of
+from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
+from palpate.encoders.models import digest_tensors, pick_device
+from palpate.training.loop import LoopOptions, fit, work_folder
+
+CACHE_FORMAT = "palpate-latents/1"
+Sources = Literal["text", "vision", "mixed"]
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """The forward process and what the network predicts.
+def train_generator(  # noqa: PLR0913 - a public verb
+    data: Manifest | str | Path,
+    split: Split | str | Path,
+    clip: EncoderSet | str | Path,
+    *,
+    preset: str | DiffusionPreset = "mini",
+    autoencoder: Autoencoder | str | Path | None = None,
+    output: Path | str | None = None,
+    source: Sources | None = None,
+    background: bool = False,
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Progress = quiet,
+) -> TactilePipeline:
+    """Train a generator on the train part of a split; run again with one ``output`` to resume.
 
-    Attributes:
-        beta_start, beta_end: of the schedule linear in sqrt(beta).
-        steps: T.
-        prediction: ``epsilon`` (the paper) or ``v_prediction``.
-        min_snr: g of the min-SNR weight, or None for Eq. 1's uniform weight.
+    Args:
+        data: a manifest, or anything that :func:`palpate.data.load` reads.
+        split: a split or its file; its digest goes into the pipeline.
+        clip: vision and text encoders that condition the generator: a set of encoders, its folder,
+            the folder or hub id of a CLIP, or ``palpate/mini``.
+        preset: geometry, schedule and length: ``mini``, ``tiny`` or ``paper``, or a preset.
+        autoencoder: a VQ model, its folder or hub id, or ``palpate/mini``. Default: a small one,
+            trained first on the train part; the preset ``paper`` needs one.
+        output: folder for the pipeline, new or empty; None keeps it in memory.
+        source: what training conditions on; default: the preset's. ``vision`` is the baseline
+            without text (GVST).
+        background: the variant w/ BG, which also sees the no-contact image.
+        steps: optimizer steps; default: the preset's.
+        seed: of weights, order, noise and condition dropout.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        progress: called while the work goes on.
+
+    Raises:
+        PalpateError: if the train part is empty, a sample of it lacks an image or words, or models
+            are missing.
     """
-
-    beta_start: float = 0.0015
-    beta_end: float = 0.0195
-    steps: int = 1000
-    prediction: Literal["epsilon", "v_prediction"] = "epsilon"
-    min_snr: float | None = None
-
-    def alphas(self) -> Tensor:
-        """a_t for t = 1..T as float64 (T,)."""
-        betas = (
-            torch.linspace(
-                self.beta_start**0.5, self.beta_end**0.5, self.steps, dtype=torch.float64
+    if steps is not None and steps < 1:
+        fix = "Leave it out for the preset's length"
+        raise PalpateError("must be at least 1", str(steps), fix, argument="steps")
+    chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
+    if autoencoder is None and chosen.autoencoder is None:
+        must, fix = f"must be given for the preset {chosen.name}", "Pass a hub id or a folder"
+        raise PalpateError(must, "none", fix, argument="autoencoder")
+    manifest, split = load_manifest(data), split_of(split)
+    encoders = clip if isinstance(clip, EncoderSet) else EncoderSet(load_clip(clip))
+    output = None if output is None else Path(output)
+    with work_folder(output) as work:
+        cache = work / "cache"
+        if autoencoder is None:
+            train, others = train_part(manifest, split), manifest.part(split, "val", "test")
+            images, held_out = (
+                cached_images(part, "tactile", chosen.size, cache, progress) if len(part) else None
+                for part in (train, others)
             )
-            ** 2
+            assert images is not None
+            assert chosen.autoencoder is not None
+            autoencoder = train_autoencoder(
+                images,
+                chosen.autoencoder,
+                work / "autoencoder",
+                held_out=held_out,
+                seed=seed,
+                key=image_stamp(train, "tactile"),
+                device=pick_device(device),
+                progress=progress,
+            )
+        elif not isinstance(autoencoder, Autoencoder):
+            autoencoder = Autoencoder.load(autoencoder)
+        pipeline = train_pipeline(
+            manifest,
+            split,
+            encoders,
+            autoencoder,
+            chosen,
+            work,
+            seed=seed,
+            steps=steps,
+            source=source,
+            background=background,
+            cache=cache,
+            device=device,
+            progress=progress,
         )
-        return torch.cumprod(1 - betas, dim=0)
+        if output is not None:
+            pipeline.save(output)
+    return pipeline
 
 
-def train_denoiser(
-    latents: Tensor | np.ndarray,
-    conditions: Mapping[Source, Tensor | np.ndarray],
+def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the training
+    manifest: Manifest,
+    split: Split,
+    encoders: EncoderSet,
+    autoencoder: Autoencoder,
+    preset: DiffusionPreset,
+    folder: Path,
+    *,
+    seed: int = 0,
+    steps: int | None = None,
+    source: Sources | None = None,
+    background: bool = False,
+    start: TactilePipeline | None = None,
+    cache: Path | None = None,
+    device: str = "auto",
+    progress: Progress = quiet,
+) -> TactilePipeline:
+    """Train the denoiser of a pipeline on the train part of a split; run again to resume.
+
+    Args:
+        manifest: samples with tactile image and photo, and a text or a material.
+        split: its digest goes into the pipeline.
+        encoders: their text embeddings condition the training, their vision embeddings the
+            sampling.
+        autoencoder: frozen.
+        preset: geometry, schedule, length, sampler.
+        folder: for checkpoints and latents; nothing in it belongs to the pipeline.
+        seed: of weights, order, noise and condition dropout.
+        steps: default: the preset's length.
+        source: default: the preset's.
+        background: the variant w/ BG.
+        start: go on from this pipeline's denoiser instead of random weights. It must use the same
+            autoencoder, vision encoder and schedule, gives its latent statistics, and its record
+            goes into the new one, so that the data it was trained on stays declared.
+        cache: folder for decoded pixels and embeddings.
+        device: see :func:`palpate.encoders.models.pick_device`.
+        progress: called while the work goes on.
+
+    Raises:
+        PalpateError: if the train part is empty, a sample lacks what is needed, or ``start`` does
+            not fit.
+    """
+    train = train_part(manifest, split)
+    if start is not None:
+        _require_same(start, encoders, autoencoder, preset)
+    place = pick_device(device)
+    encoders.to(place)
+    autoencoder.to(place)
+    _, text_source = texts_of(train)
+    conditions: dict[Source, NDArray[Any]] = {
+        s: embed(train, encoders, s, cache=cache, progress=progress).features for s in SOURCES
+    }
+
+    def latents_of(column: str) -> NDArray[np.float32]:
+        images = cached_images(train, column, preset.size, cache, progress)
+        key = digest_json([train.digest, image_stamp(train, column), preset.size])
+        place = folder / f"latents-{column}"
+        return encode_latents(autoencoder, images, train.ids, place, key=key, progress=progress)
+
+    latents = latents_of("tactile")
+    stats = LatentStats.of(latents, preset.latent_scale) if start is None else start.stats
+    policy = preset.condition_for(encoders.dim)
+    policy = policy if source is None else replace(policy, source=source)
+    loop = preset.loop_for(len(train), seed=seed)
+    loop = loop if steps is None else replace(loop, steps=steps)
+    denoiser = train_denoiser(
+        latents,
+        conditions,
+        stats=stats,
+        unet=preset.unet,
+        policy=policy,
+        schedule=preset.schedule,
+        loop=loop,
+        folder=folder / "denoiser",
+        background=latents_of("background") if background else None,
+        start=start.denoiser if start else None,
+        device=place,
+        progress=progress,
+    )
+    record = {
+        "manifest": manifest.digest,
+        "split": split.digest,
+        "split_rule": dict(split.rule),
+        "train_samples": len(train),
+        "text_source": text_source,
+        "autoencoder": autoencoder.digest,
+        "vision": encoders.digest("vision"),
+        "text": encoders.digest("text"),
+        "source": policy.source,
+        "background": background,
+        "loop": asdict(loop),
+        "unet": asdict(preset.unet),
+        "seed": seed,
+        "palpate": __version__,
+        "parameters": sum(p.numel() for p in denoiser.unet.parameters()),
+        "synthetic": bool(manifest.facts.get("synthetic")),
+        "materials": sorted({str(m) for m in train.column("material") if m}),
+        "start": start.digest if start else None,
+        "start_record": dict(start.training) if start else None,
+    }
+    return TactilePipeline(
+        autoencoder,
+        denoiser,
+        stats,
+        preset.schedule,
+        preset.sampler,
+        preset.size,
+        EncoderSet(encoders.clip),  # the tactile encoder scores, it does not generate
+        preset.name,
+        record,
+    )
+
+
+def _require_same(
+    start: TactilePipeline, encoders: EncoderSet, autoencoder: Autoencoder, preset: DiffusionPreset
+) -> None:
+    """A denoiser goes on only in the space that it knows."""
+    vision = start.encoders.digest("vision") if start.encoders else None
+    pairs = {
+        "autoencoder": (start.autoencoder.digest, autoencoder.digest),
+        "vision encoder": (vision, encoders.digest("vision")),
+        "schedule": (start.schedule, preset.schedule),
+    }
+    if different := [name for name, (a, b) in pairs.items() if a != b]:
+        must, got = f"must share {', '.join(pairs)}", f"another {', another '.join(different)}"
+        raise PalpateError(must, got, "Leave it out", argument="start")
+
+
+def encode_latents(
+    autoencoder: Autoencoder,
+    images: NDArray[np.uint8],
+    ids: Sequence[str],
+    folder: Path,
+    *,
+    key: str = "",
+    batch: int = 32,
+    progress: Progress = quiet,
+) -> NDArray[np.float32]:
+    """Latents of all images, before quantization, as a read-only memory map; encoded once.
+
+    Args:
+        autoencoder: frozen; its digest is part of the cache's key.
+        images: (n, h, w, 3) bytes, in the order of ``ids``; an array or a memory map.
+        ids: sample ids.
+        folder: holds ``latents.npy`` and ``latents.json``, the ids in order and a key.
+        key: digest of what the images are (manifest, column, size).
+        batch: images at once.
+        progress: called after each batch.
+
+    Returns:
+        float32 (n, c, h / f, w / f).
+    """
+    data, note = folder / "latents.npy", folder / "latents.json"
+    key = digest_json([key, autoencoder.digest])
+    about = {"format": CACHE_FORMAT, "key": key, "ids": list(ids)}
+    if not (data.is_file() and note.is_file() and read_json(note, "latent cache") == about):
+        note.unlink(missing_ok=True)
+        height, width = (side // autoencoder.factor for side in images.shape[1:3])
+        shape = (len(ids), autoencoder.channels, height, width)
+        with atomic_path(data) as part:
+            store = np.lib.format.open_memmap(part, mode="w+", dtype=np.float32, shape=shape)
+            for start in range(0, len(ids), batch):
+                rows = slice(start, min(start + batch, len(ids)))
+                store[rows] = autoencoder.encode(images[rows], batch).numpy()
+                progress("encoding tactile images", rows.stop, len(ids))
+            store.flush()
+        write_json(note, about)
+    return np.load(data, mmap_mode="r", allow_pickle=False)
+
+
+def train_denoiser(  # noqa: PLR0913 - one row per part of the model
+    latents: Tensor | NDArray[Any],
+    conditions: Mapping[Source, Tensor | NDArray[Any]],
     *,
     stats: LatentStats,
     unet: UNetOptions,
@@ -73,27 +331,26 @@ def train_denoiser(
     schedule: Schedule,
     loop: LoopOptions,
     folder: Path,
-    background: Tensor | np.ndarray | None = None,
+    background: Tensor | NDArray[Any] | None = None,
     start: Denoiser | None = None,
-    key: str = "",
     device: str | torch.device = "cpu",
     progress: Progress = quiet,
 ) -> Denoiser:
-    """Trains a denoiser; resumes if ``folder`` holds a checkpoint of the same run.
+    """Train a denoiser; resume if ``folder`` holds a checkpoint of the same run.
 
     Args:
         latents: (n, c, h, w) of the autoencoder, not normalized; a memory map will do.
-        conditions: embeddings (n, d) by source; ``policy.sources`` are needed, others only give their mean.
-        stats: normalize the latents, of touch and background alike.
+        conditions: embeddings (n, d) by source; ``policy.sources`` are needed, others only give
+            their mean.
+        stats: normalize the latents, of tactile and background images alike.
         unet: geometry of the network.
         policy: how embeddings become tokens, and which train.
         schedule: the forward process and the target.
         loop: length, rate, averaging; its seed also seeds the weights.
         folder: for checkpoints and the log.
         background: latents (n, c, h, w) of the no-contact images, for the variant w/ BG.
-        start: go on from these weights instead of random ones; the geometry must be the same. The modality means are those of
-            ``conditions`` all the same.
-        key: anything else that a checkpoint must match (latents and conditions are compared by digest anyway).
+        start: go on from these weights instead of random ones, in the same geometry. The modality
+            means are those of ``conditions`` all the same.
         device: where to train.
         progress: called after each step.
 
@@ -101,40 +358,19 @@ def train_denoiser(
         The denoiser with averaged weights, frozen.
 
     Raises:
-        PalpateError: if a source is missing, lengths differ, or ``start`` has another geometry.
+        PalpateError: if a source is missing, or ``start`` has another geometry.
     """
-    n, channels, size = latents.shape[0], latents.shape[1], latents.shape[2]
-    tables = {
-        source: torch.as_tensor(np.asarray(table), dtype=torch.float32)
-        for source, table in conditions.items()
-    }
+    tables = {s: torch.as_tensor(np.asarray(t), dtype=torch.float32) for s, t in conditions.items()}
     if missing := [s for s in policy.sources if s not in tables]:
-        raise PalpateError(
-            f"source={policy.source!r} needs embeddings of {', '.join(policy.sources)}",
-            f"none of {missing[0]}",
-            "Embed them first",
-        )
-    lengths = {"latents": n, **{s: len(t) for s, t in tables.items()}} | (
-        {} if background is None else {"background": len(background)}
-    )
-    if len(set(lengths.values())) > 1:
-        raise PalpateError(
-            "Latents, conditions and backgrounds must have one row a sample",
-            str(lengths),
-            "Cache them for the same ids",
-        )
+        must, fix = f"source={policy.source!r} needs embeddings of {', '.join(policy.sources)}", ""
+        raise PalpateError(must, f"none of {missing[0]}", fix)
+    channels, size = latents.shape[1], latents.shape[2]
     means: dict[Source, Tensor] = {
         s: tables[s].double().mean(0).float() for s in SOURCES if s in tables
     }
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed_for(loop.seed, "denoiser"))
-        net = build_unet(
-            unet,
-            channels=channels,
-            size=size,
-            width=policy.width,
-            background=background is not None,
-        )
+    with seeded(loop.seed, "denoiser"):
+        shape: dict[str, Any] = {"channels": channels, "size": size, "width": policy.width}
+        net = build_unet(unet, **shape, background=background is not None)
         model = Denoiser(net, policy, means).to(device)
     if start is not None:
         _copy_weights(start, model)
@@ -142,39 +378,24 @@ def train_denoiser(
         tokens: dict[Source, Tensor] = {
             s: model.tokens(tables[s], s).to("cpu") for s in policy.sources
         }
-    data = {f"tokens.{s}": value for s, value in tokens.items()} | {
-        "latents": torch.tensor(np.asarray(latents))
-    }
+    data = {f"tokens.{s}": value for s, value in tokens.items()}
+    data["latents"] = torch.tensor(np.asarray(latents))
     if background is not None:
         data["background"] = torch.tensor(np.asarray(background))
+    facts = [asdict(settings) for settings in (stats, unet, policy, schedule)]
     begin = [] if start is None else [digest_tensors(start.unet.state_dict())]
-    key = digest_json(
-        [
-            key,
-            asdict(stats),
-            asdict(unet),
-            asdict(policy),
-            asdict(schedule),
-            digest_tensors(data),
-            *begin,
-        ]
-    )
+    key = digest_json(["", *facts, digest_tensors(data), *begin])
     loss = DiffusionLoss(latents, tokens, background, stats, schedule)
-    fit(model, loss, n, loop, folder, what="generator", key=key, progress=progress)
-    return model.eval().requires_grad_(requires_grad=False)
+    fit(model, loss, len(latents), loop, folder, what="generator", key=key, progress=progress)
+    return model.eval().requires_grad_(False)
 
 
 def _copy_weights(source: Denoiser, target: Denoiser) -> None:
-    """The U-Net, and the unconditional token if both have learned one; other shapes are refused."""
-    shapes = [
-        {name: tuple(v.shape) for name, v in d.unet.state_dict().items()} for d in (source, target)
-    ]
+    """Copy the U-Net, and the unconditional token if both have learned one."""
+    shapes = [{k: v.shape for k, v in d.unet.state_dict().items()} for d in (source, target)]
     if shapes[0] != shapes[1]:
-        raise PalpateError(
-            "The denoiser to start from must have the geometry of the preset",
-            "another geometry",
-            "Leave it out",
-        )
+        must, got = "must have the geometry of the preset", "another geometry"
+        raise PalpateError(must, got, "Leave it out", argument="start")
     target.unet.load_state_dict(source.unet.state_dict())
     if source.null is not None and target.null is not None:
         target.null.data.copy_(source.null.data)
@@ -185,83 +406,61 @@ class DiffusionLoss:
 
     def __init__(
         self,
-        latents: Tensor | np.ndarray,
+        latents: Tensor | NDArray[Any],
         tokens: Mapping[Source, Tensor],
-        background: Tensor | np.ndarray | None,
+        background: Tensor | NDArray[Any] | None,
         stats: LatentStats,
         schedule: Schedule,
     ) -> None:
-        self.latents, self.tokens, self.background, self.stats, self.schedule = (
-            latents,
-            dict(tokens),
-            background,
-            stats,
-            schedule,
-        )
-        self.alphas = schedule.alphas()
+        """Take latents and backgrounds (n, c, h, w), not normalized, and tokens (n, k, d)."""
+        self.latents, self.tokens, self.background = latents, dict(tokens), background
+        self.stats, self.schedule, self.alphas = stats, schedule, schedule.alphas()
 
     def __call__(
         self, module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
     ) -> tuple[Tensor, dict[str, float]]:
-        """The mean weighted squared error of a batch, and the unweighted one to log; see ``LossFunction``."""
+        """Return the weighted error of a batch, and the unweighted to log; see ``LossFunction``."""
         assert isinstance(module, Denoiser)
-        policy, n = module.policy, len(rows)
+        policy, n, device = module.policy, len(rows), module.device
         z = self.stats.normalize(_take(self.latents, rows))
         t = torch.randint(0, self.schedule.steps, (n,), generator=generator)
         noise = torch.randn(z.shape, generator=generator)
-        tokens = self._tokens(rows, policy, generator)
+        tokens = self._tokens(rows, policy, generator).to(device)
         dropped = torch.rand(n, generator=generator) < policy.dropout
         a = self.alphas[t].float().reshape(-1, 1, 1, 1)
         noisy = a.sqrt() * z + (1 - a).sqrt() * noise
-        target = (
-            noise
-            if self.schedule.prediction == "epsilon"
-            else a.sqrt() * noise - (1 - a).sqrt() * z
-        )
-        device = module.device
-        tokens = torch.where(
-            dropped.reshape(-1, 1, 1).to(device), module.null_tokens(n), tokens.to(device)
-        )
-        ground = (
-            None
-            if self.background is None
-            else self.stats.normalize(_take(self.background, rows)).to(device)
-        )
-        error = (
-            (module(noisy.to(device), t.to(device), tokens, ground) - target.to(device))
-            .square()
-            .mean((1, 2, 3))
-        )
-        weight = self._weight(t).to(device)
-        return (weight * error).mean(), {"mse": float(error.detach().mean())}
+        epsilon = self.schedule.prediction == "epsilon"
+        target = noise if epsilon else a.sqrt() * noise - (1 - a).sqrt() * z
+        tokens = torch.where(dropped.reshape(-1, 1, 1).to(device), module.null_tokens(n), tokens)
+        ground = None
+        if self.background is not None:
+            ground = self.stats.normalize(_take(self.background, rows)).to(device)
+        prediction = module(noisy.to(device), t.to(device), tokens, ground)
+        error = (prediction - target.to(device)).square().mean((1, 2, 3))
+        loss = (self.weight(t).to(device) * error).mean()
+        return loss, {"mse": float(error.detach().mean())}
 
     def _tokens(self, rows: Tensor, policy: ConditionPolicy, generator: torch.Generator) -> Tensor:
         parts = [self.tokens[s][rows] for s in policy.sources]
         tokens = parts[0]
         if len(parts) == 2:
-            tokens = torch.where(
-                torch.rand(len(rows), 1, 1, generator=generator) < 0.5, parts[0], parts[1]
-            )
+            coin = torch.rand(len(rows), 1, 1, generator=generator)
+            tokens = torch.where(coin < 0.5, parts[0], parts[1])
         if policy.noise:
-            # One draw a sample: the k tokens stay copies of each other.
-            tokens = tokens + policy.noise * torch.randn(
-                len(rows), 1, policy.width, generator=generator
-            )
-            tokens = nn.functional.normalize(tokens, dim=2) * policy.width**0.5
+            # One draw per sample: the k tokens stay copies of each other.
+            noise = torch.randn(len(rows), 1, policy.width, generator=generator)
+            tokens = nn.functional.normalize(tokens + policy.noise * noise, dim=2)
+            tokens = tokens * policy.width**0.5
         return tokens
 
-    def _weight(self, t: Tensor) -> Tensor:
+    def weight(self, t: Tensor) -> Tensor:
+        """The min-SNR weight of each step."""
         if self.schedule.min_snr is None:
             return torch.ones(len(t))
         snr = (self.alphas[t] / (1 - self.alphas[t])).float()
-        return snr.clamp(max=self.schedule.min_snr) / (
-            snr if self.schedule.prediction == "epsilon" else snr + 1
-        )
+        epsilon = self.schedule.prediction == "epsilon"
+        return snr.clamp(max=self.schedule.min_snr) / (snr if epsilon else snr + 1)
 
 
-def _take(table: Tensor | np.ndarray, rows: Tensor) -> Tensor:
-    return (
-        table[rows]
-        if isinstance(table, Tensor)
-        else torch.from_numpy(np.ascontiguousarray(table[rows.numpy()]))
-    )
+def _take(table: Tensor | NDArray[Any], rows: Tensor) -> Tensor:
+    return torch.as_tensor(table[rows.numpy()])

@@ -1,17 +1,19 @@
-"""Contrastive training of the encoders (paper section 3). Rows of a, b are L2-normalized and belong together row by row:
+"""Contrastive training (paper section 3). Rows of a, b are L2-normalized and belong together:
 
     L_ab = -1/(2N) sum_i [ log softmax_j(a_i.b_j / tau)_i + log softmax_j(b_i.a_j / tau)_i ],
-    L    = (w_tt L_touch,text + w_vt L_vision,text + w_tv L_touch,vision) / (w_tt + w_vt + w_tv),      w = 1: the mean of the three pairs.
+    L    = (w_1 L_tactile,text + w_2 L_vision,text + w_3 L_tactile,vision) / (w_1 + w_2 + w_3)
 
-1 / tau is learned, from 1 / 0.07, and kept at or below 100. Vision and text are frozen, so L_vision,text moves only the temperature; it
-stays in the loss and in the log because the paper has it there.
+1 / tau is learned, from 1 / 0.07, and kept at or below 100. Vision and text are frozen, so
+L_vision,text moves only the temperature; it stays in the loss and in the log because the paper has
+it there.
 
-Captions repeat: every frame of a video, and often every object of a kind, has the same one, so the plain diagonal calls equal texts
-negatives. ``targets="identical-text"`` spreads the target mass of the two text pairs equally over rows with equal text. It is the
-default of the mini preset (where captions come from templates); ``diagonal`` is the paper's and that of its preset.
+Captions repeat: every frame of a video, and often every object of a kind, has the same one, so the
+plain diagonal calls equal texts negatives. ``targets="identical-text"`` spreads the target mass of
+the two text pairs equally over rows with equal text: the default of the preset mini; ``diagonal``
+is the paper's.
 
-The tactile encoder trains on the train part of a split only, against embeddings of the frozen encoders that are computed once. With one
-process all negatives are in the loss; nothing here splits a batch over processes.
+The tactile encoder trains on the train part of a split only, against embeddings of the frozen
+encoders that are computed once. With one process all negatives are in the loss.
 """
 
 from __future__ import annotations
@@ -26,9 +28,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 import transformers
+from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import cross_entropy
 from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate import __version__
@@ -39,31 +42,111 @@ from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     ClipEncoders,
     EncoderSet,
-    encode_touch,
-    move,
-    new_touch,
-    pick_device,
-    seeded,
-)
-from palpate.encoders.preprocess import (
-    CLIP_MEAN,
-    CLIP_STD,
-    Augment,
     Preprocess,
-    statistics,
+    encode_tactile,
+    load_clip,
+    new_tactile,
+    seeded,
     to_unit,
 )
-from palpate.encoders.presets import EncoderPreset, Targets
+from palpate.encoders.models import move, pick_device
+from palpate.encoders.presets import Augment, EncoderPreset, Targets, preset
 from palpate.encoders.tokenizer import train_tokenizer
-from palpate.training.loop import LoopOptions, fit
+from palpate.metrics.probe import material_accuracy
+from palpate.training.loop import LoopOptions, fit, work_folder
 
 #: The learned parameter is the logarithm of 1 / tau.
-LOG_SCALE_START = math.log(1 / 0.07)
-LOG_SCALE_MAX = math.log(100.0)
+LOG_SCALE_START, LOG_SCALE_MAX = math.log(1 / 0.07), math.log(100.0)
+
+
+def train_encoder(
+    data: Manifest | str | Path,
+    split: Split | str | Path,
+    *,
+    preset: str | EncoderPreset = "mini",
+    clip: str | Path | ClipEncoders | None = None,
+    output: Path | str | None = None,
+    epochs: float | None = None,
+    targets: Targets | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Progress = quiet,
+) -> EncoderSet:
+    """Train a tactile encoder on the train part of a split, against frozen vision and text.
+
+    A linear probe then scores how well it tells the materials of the test part apart; the score
+    goes into the card (``card["scores"]``). Run again with the same ``output`` to resume.
+
+    Args:
+        data: a manifest, or anything that :func:`palpate.data.load` reads.
+        split: a split or its file; its digest goes into the card.
+        preset: ``mini``, ``tiny`` or ``paper``, or a preset.
+        clip: hub id or folder of a frozen CLIP, or ``palpate/mini``. Default: the preset's, or a
+            small one that is trained first on the same train part.
+        output: folder for the encoders, new or empty; None keeps them in memory.
+        epochs: of the tactile encoder; default: the preset's.
+        targets: ``diagonal`` or ``identical-text``; default: the preset's.
+        seed: of weights, order and augmentation.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        progress: called while the work goes on.
+
+    Returns:
+        All three encoders, with a card.
+
+    Raises:
+        PalpateError: if the train part is empty, or a sample of it lacks an image or words.
+    """
+    if epochs is not None and not 0 < epochs < math.inf:
+        fix = "Leave it out for the preset's length"
+        raise PalpateError("must be a positive number", str(epochs), fix, argument="epochs")
+    chosen = preset_of(preset)
+    manifest, split = load_manifest(data), split_of(split)
+    output = None if output is None else Path(output)
+    with work_folder(output) as work:
+        common: dict[str, Any] = {"seed": seed, "targets": targets, "cache": work / "cache"}
+        common |= {"device": device, "progress": progress}
+        source = clip or chosen.pretrained
+        if source is None:
+            source = train_clip(manifest, split, chosen, work / "clip", **common)
+        elif not isinstance(source, ClipEncoders):
+            source = load_clip(source, device=device)
+        encoders = train_tactile(
+            manifest, split, source, chosen, work / "tactile", epochs=epochs, **common
+        )
+        parts = [manifest.part(split, part) for part in ("train", "test")]
+        if len(parts[1]) and len(set(parts[0].column("material")) - {None}) > 1:
+            cache = work / "cache"
+            features = [embed(p, encoders, cache=cache, progress=progress) for p in parts]
+            score = material_accuracy(features[0], features[1], split=split.digest)
+            row = {"score": "linear probe of material, tactile", "value": score.value}
+            row |= {"interval": score.interval, "chance": score.details.get("chance"), "n": score.n}
+            encoders.card["scores"] = json.loads(json.dumps([row]))
+        if output is not None:
+            encoders.save(output)
+    return encoders
+
+
+def load_manifest(data: Manifest | str | Path) -> Manifest:
+    """A manifest as it is, or read from where it lies."""
+    if isinstance(data, Manifest):
+        return data
+    from palpate.data import load
+
+    return load(data)
+
+
+def split_of(split: Split | str | Path) -> Split:
+    """A split as it is, or read from its file."""
+    return split if isinstance(split, Split) else Split.load(Path(split))
+
+
+def preset_of(name: str | EncoderPreset) -> EncoderPreset:
+    """A preset as it is, or by name."""
+    return name if isinstance(name, EncoderPreset) else preset(name)
 
 
 def soft_targets(texts: Tensor) -> Tensor:
-    """Targets (n, n) that spread each row's mass equally over the rows with the same text number (n,)."""
+    """Spread each row's target mass equally over the rows with its text number: (n,) to (n, n)."""
     same = (texts[:, None] == texts[None, :]).float()
     return same / same.sum(dim=1, keepdim=True)
 
@@ -75,18 +158,19 @@ def info_nce(a: Tensor, b: Tensor, scale: Tensor | float, targets: Tensor | None
         a: (n, d), L2-normalized.
         b: (n, d), L2-normalized; row i belongs to row i of ``a``.
         scale: 1 / tau.
-        targets: symmetric (n, n) with rows that sum to 1, or None for the diagonal (paper section 3).
+        targets: symmetric (n, n) with rows that sum to 1, or None for the diagonal (paper section
+            3).
 
     Returns:
         The scalar loss in nats.
     """
     logits = scale * a @ b.T
     target = torch.arange(len(a), device=a.device) if targets is None else targets
-    return (F.cross_entropy(logits, target) + F.cross_entropy(logits.T, target)) / 2
+    return (cross_entropy(logits, target) + cross_entropy(logits.T, target)) / 2
 
 
 def three_way(
-    touch: Tensor,
+    tactile: Tensor,
     text: Tensor,
     vision: Tensor,
     scale: Tensor | float,
@@ -97,11 +181,11 @@ def three_way(
     """The paper's loss over three pairs.
 
     Args:
-        touch: (n, d), L2-normalized.
-        text: (n, d), the same.
-        vision: (n, d), the same.
+        tactile: (n, d), L2-normalized.
+        text: the same.
+        vision: the same.
         scale: 1 / tau.
-        weights: of touch-text, vision-text, touch-vision; the total is their weighted mean.
+        weights: of tactile-text, vision-text, tactile-vision; the total is their weighted mean.
         text_targets: for the two text pairs, see :func:`info_nce`.
 
     Returns:
@@ -111,61 +195,35 @@ def three_way(
         PalpateError: on weights that are not three numbers of at least 0 with a positive sum.
     """
     if len(weights) != 3 or min(weights) < 0 or not sum(weights) > 0:
-        raise PalpateError(
-            "weights must be three numbers >= 0 with a positive sum",
-            f"{tuple(weights)}",
-            "Pass e.g. (1, 1, 1)",
-        )
+        must, got = "must be three numbers >= 0 with a positive sum", f"{tuple(weights)}"
+        raise PalpateError(must, got, "", argument="weights", example={"weights": (1, 1, 1)})
     pairs = {
-        "touch_text": info_nce(touch, text, scale, text_targets),
+        "tactile_text": info_nce(tactile, text, scale, text_targets),
         "vision_text": info_nce(vision, text, scale, text_targets),
-        "touch_vision": info_nce(touch, vision, scale),
+        "tactile_vision": info_nce(tactile, vision, scale),
     }
-    total = torch.stack(
-        [w * loss for w, loss in zip(weights, pairs.values(), strict=True)]
-    ).sum() / sum(weights)
+    weighted = [w * loss for w, loss in zip(weights, pairs.values(), strict=True)]
+    total = torch.stack(weighted).sum() / sum(weights)
     return total, {name: float(loss.detach()) for name, loss in pairs.items()}
 
 
-class TouchModel(nn.Module):
+class TactileModel(nn.Module):
     """What trains: the tactile encoder and the temperature."""
 
-    def __init__(self, touch: CLIPVisionModelWithProjection) -> None:
+    def __init__(self, tactile: CLIPVisionModelWithProjection) -> None:
         super().__init__()
-        self.touch = touch
+        self.tactile = tactile
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_START))
 
 
-def touch_loss(
-    model: TouchModel,
-    pixels: Tensor,
-    text: Tensor,
-    vision: Tensor,
-    *,
-    weights: Sequence[float] = (1.0, 1.0, 1.0),
-    text_targets: Tensor | None = None,
-) -> tuple[Tensor, dict[str, float]]:
-    """One batch through the tactile encoder, against frozen text and vision embeddings; the temperature is clamped first."""
-    scale = clamped_scale(model.log_scale)
-    total, logs = three_way(
-        encode_touch(model.touch, pixels),
-        text,
-        vision,
-        scale,
-        weights=weights,
-        text_targets=text_targets,
-    )
-    return total, {**logs, "scale": float(scale.detach())}
-
-
 def clamped_scale(log_scale: Tensor) -> Tensor:
-    """1 / tau, after pulling the parameter itself back to log 100: a clamp of the value alone would end its gradient there."""
+    """Return 1 / tau; the parameter is clamped, as clamping the value alone ends its gradient."""
     with torch.no_grad():
         log_scale.clamp_(max=LOG_SCALE_MAX)
     return log_scale.exp()
 
 
-def train_touch(
+def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     manifest: Manifest,
     split: Split,
     clip: ClipEncoders,
@@ -181,7 +239,7 @@ def train_touch(
     device: str = "auto",
     progress: Progress = quiet,
 ) -> EncoderSet:
-    """Trains a tactile encoder beside a frozen CLIP on the train part of a split. Run again to resume.
+    """Train a tactile encoder against a frozen CLIP; run again to resume.
 
     Args:
         manifest: samples with tactile and vision images, and a text or a material.
@@ -189,113 +247,105 @@ def train_touch(
         clip: the frozen encoders; moved to ``device``.
         preset: size and course.
         folder: of the checkpoint and the log.
-        epochs: instead of the preset's.
+        epochs: default: the preset's.
         seed: of the initial weights, the order and the augmentation.
-        targets: instead of the preset's.
-        weights: of the pairs touch-text, vision-text, touch-vision.
-        start: go on from this set's tactile encoder instead of random weights (which are the paper's); it must have the preset's
-            size, keeps its own preprocessing, and its card goes into the new card, so that what it saw stays declared.
+        targets: default: the preset's.
+        weights: of the pairs tactile-text, vision-text, tactile-vision.
+        start: go on from this set's tactile encoder instead of random weights (the paper's); it
+            must have the preset's size. Its card goes into the new card, so that the data it was
+            trained on stays declared.
         cache: folder for decoded pixels and frozen embeddings.
-        device: see :func:`palpate.encoders.encoder_set.pick_device`.
-        progress: told each step.
+        device: see :func:`palpate.encoders.models.pick_device`.
+        progress: called after each step.
 
     Returns:
         All three encoders with a card.
 
     Raises:
-        PalpateError: if the train part is empty or has samples without a touch image, photo, or text and material.
+        PalpateError: if the train part is empty, or a sample lacks an image, or both text and
+            material.
     """
     place = pick_device(device)
-    train = _train_part(manifest, split)
+    train = train_part(manifest, split)
     move(clip.model, place)
-    encoders = EncoderSet(clip)
+    frozen = EncoderSet(clip)
     texts, text_source = texts_of(train)
     images = cached_images(train, "tactile", preset.image, cache, progress)
-    frozen = {
-        t: torch.from_numpy(embed(train, encoders, t, cache=cache, progress=progress).features).to(
-            place
-        )
-        for t in ("text", "vision")
-    }
-    touch, preprocess = _start(preset, clip.dim, images, seed, start)
-    options = preset.touch_course.options(len(train), seed, epochs)
-    mode = targets or preset.targets
-    numbers = _numbers(texts).to(place)
+    text, vision = (
+        torch.from_numpy(embed(train, frozen, m, cache=cache, progress=progress).features).to(place)
+        for m in ("text", "vision")
+    )
+    tactile, preprocess = _first_weights(preset, clip.dim, images, seed, start)
+    course = preset.tactile_course
+    options = course.options(len(train), seed, epochs)
+    mode, numbers = targets or preset.targets, _numbers(texts).to(place)
 
     def loss(
         module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
     ) -> tuple[Tensor, dict[str, float]]:
-        assert isinstance(module, TouchModel)
-        pixels = _augmented(images, rows, preset.touch_course.augment, preprocess, generator, place)
+        assert isinstance(module, TactileModel)
+        pixels = _augmented(images, rows, course.augment, preprocess, generator, place)
         rows = rows.to(place)
         soft = soft_targets(numbers[rows]) if mode == "identical-text" else None
-        return touch_loss(
-            module,
-            pixels,
-            frozen["text"][rows],
-            frozen["vision"][rows],
-            weights=weights,
-            text_targets=soft,
+        scale = clamped_scale(module.log_scale)
+        embedded = encode_tactile(module.tactile, pixels)
+        total, logs = three_way(
+            embedded, text[rows], vision[rows], scale, weights=weights, text_targets=soft
         )
+        return total, {**logs, "scale": float(scale.detach())}
 
-    model = TouchModel(touch).to(place)
-    facts = _facts(preset, train, split, texts, text_source, options, seed) | {
+    model = TactileModel(tactile).to(place)
+    facts = _facts(preset, train, split, texts, text_source, options) | {
         "targets": mode,
         "weights": list(weights),
         "vision": clip.digest("vision"),
         "text": clip.digest("text"),
         "start": start.digest("tactile") if start else None,
     }
-    log = fit(
-        model,
-        loss,
-        len(train),
-        options,
-        folder,
-        what="training the tactile encoder",
-        key=digest_json([facts, _stamps(train)]),
-        progress=progress,
-    )
-    touch = model.touch.eval().requires_grad_(False)
-    card = _card(facts, options, log, place) | {
-        "clip": clip.name,
-        "clip_card": clip.card,
-        "start_card": start.card if start else None,
-    }
-    return EncoderSet(clip, touch, preprocess, card)
+    key, what = digest_json([facts, _stamps(train)]), "training the tactile encoder"
+    log = fit(model, loss, len(train), options, folder, what=what, key=key, progress=progress)
+    card = _card(facts, options, log, place) | {"clip": clip.name, "clip_card": clip.card}
+    card["start_card"] = start.card if start else None
+    return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card)
 
 
-def _start(
-    preset: EncoderPreset, dim: int, images: np.ndarray, seed: int, start: EncoderSet | None
+def _first_weights(
+    preset: EncoderPreset, dim: int, images: NDArray[np.uint8], seed: int, start: EncoderSet | None
 ) -> tuple[CLIPVisionModelWithProjection, Preprocess]:
-    """The tactile encoder to train, and its preprocessing: random weights, or a copy of another set's encoder."""
-    touch = new_touch(preset.touch_config(dim), seed)
+    """Return the encoder to train and its preprocessing: random, or a copy of ``start``'s."""
+    tactile = new_tactile(preset.tactile_config(dim), seed)
     if start is None:
-        mean, std = statistics(images) if preset.own_statistics else (CLIP_MEAN, CLIP_STD)
-        return touch, Preprocess.of_size(preset.image, mean, std)
+        return tactile, _preprocess(preset, images)
     before = start.preprocess("tactile")
-    state = start.touch.state_dict() if start.touch is not None else {}
-    shapes = [{name: tuple(v.shape) for name, v in s.items()} for s in (state, touch.state_dict())]
+    state = start.tactile.state_dict() if start.tactile is not None else {}
+    shapes = [{k: v.shape for k, v in s.items()} for s in (state, tactile.state_dict())]
     if shapes[0] != shapes[1] or before.size != preset.image or before.resize != preset.image:
-        raise PalpateError(
-            f"The tactile encoder to start from must have the size of the preset {preset.name}",
-            "another size",
-            "Leave it out",
-        )
-    touch.load_state_dict(state)
-    return touch, before
+        must, fix = f"must have the size of the preset {preset.name}", "Leave it out"
+        raise PalpateError(must, "another size", fix, argument="start")
+    tactile.load_state_dict(state)
+    return tactile, before
+
+
+def _preprocess(preset: EncoderPreset, images: NDArray[np.uint8]) -> Preprocess:
+    """CLIP's constants, or mean and deviation per channel of at most 2,000 evenly spaced images."""
+    if not preset.data_statistics:
+        return Preprocess(preset.image, preset.image)
+    some = np.asarray(images[:: max(1, len(images) // 2000)], dtype=np.float64).reshape(-1, 3) / 255
+    mean, std = some.mean(axis=0), np.maximum(some.std(axis=0), 1 / 255)
+    statistics = (tuple(float(v) for v in values.round(6)) for values in (mean, std))
+    return Preprocess(preset.image, preset.image, *statistics)
 
 
 def new_clip(
     preset: EncoderPreset, texts: Sequence[str], seed: int, preprocess: Preprocess | None = None
 ) -> ClipEncoders:
-    """A CLIP with random weights and a tokenizer learned from ``texts``; still to be trained.
+    """A CLIP with random weights and a tokenizer learned from ``texts``, to be trained.
 
     Args:
         preset: one that describes a fresh CLIP.
         texts: what the tokenizer is learned from.
         seed: of the weights.
-        preprocess: the vision encoder's transform; default: CLIP's constants at the preset's size.
+        preprocess: for the vision encoder; default: CLIP's constants at the preset's size.
     """
     tokenizer = train_tokenizer(texts, vocabulary=preset.vocabulary, context=preset.context)
     config = preset.clip_config(len(tokenizer))
@@ -304,9 +354,8 @@ def new_clip(
     with torch.no_grad():
         model.logit_scale.fill_(LOG_SCALE_START)
     model.eval().requires_grad_(False)
-    return ClipEncoders(
-        model, tokenizer, preprocess or Preprocess.of_size(preset.image), preset.name
-    )
+    preprocess = preprocess or Preprocess(preset.image, preset.image)
+    return ClipEncoders(model, tokenizer, preprocess, preset.name)
 
 
 def train_clip(
@@ -322,9 +371,10 @@ def train_clip(
     device: str = "auto",
     progress: Progress = quiet,
 ) -> ClipEncoders:
-    """Trains a fresh vision and text encoder on the train part of a split, by InfoNCE of that pair. Run again to resume.
+    """Train a fresh vision and text encoder on the train part of a split, by InfoNCE of that pair.
 
-    Arguments as :func:`train_touch`; ``manifest`` needs photos and a text or a material.
+    Arguments as :func:`train_tactile`; ``manifest`` needs photos and a text or a material. Run
+    again to resume.
 
     Returns:
         The CLIP, frozen, with a card.
@@ -333,84 +383,59 @@ def train_clip(
         PalpateError: if the train part is empty, or the preset takes a pretrained CLIP.
     """
     place = pick_device(device)
-    train = _train_part(manifest, split)
+    train = train_part(manifest, split)
     texts, text_source = texts_of(train)
-    course = preset.clip_course
-    if course is None:
-        raise PalpateError(
-            f"The preset {preset.name} must describe a fresh CLIP",
-            f"it takes {preset.pretrained}",
-            "Use the preset mini",
-        )
+    preset.clip_config(0)  # rejects a preset that takes a pretrained CLIP
+    course = preset.clip_course or preset.tactile_course
     images = cached_images(train, "vision", preset.image, cache, progress)
-    mean, std = statistics(images) if preset.own_statistics else (CLIP_MEAN, CLIP_STD)
-    clip = new_clip(preset, texts, seed, Preprocess.of_size(preset.image, mean, std))
+    clip = new_clip(preset, texts, seed, _preprocess(preset, images))
     move(clip.model, place)
     clip.model.requires_grad_(True)
     options = course.options(len(train), seed, epochs)
-    mode = targets or preset.targets
-    numbers = _numbers(texts)
-    distinct = sorted(set(texts))
+    mode, numbers, distinct = targets or preset.targets, _numbers(texts), sorted(set(texts))
 
     def loss(
         module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
     ) -> tuple[Tensor, dict[str, float]]:
-        assert module is clip.model
-        vision = clip.encode_vision(
-            _augmented(images, rows, course.augment, clip.preprocess, generator, place)
-        )
-        here, back = torch.unique(
-            numbers[rows], return_inverse=True
-        )  # each distinct text goes through the encoder once
-        text = clip.encode_text([distinct[int(k)] for k in here])[back.to(place)]
+        pixels = _augmented(images, rows, course.augment, clip.preprocess, generator, place)
+        vision = clip.encode_vision(pixels)
+        # Each distinct text goes through the encoder once.
+        some, inverse = torch.unique(numbers[rows], return_inverse=True)
+        text = clip.encode_text([distinct[int(k)] for k in some])[inverse.to(place)]
         scale = clamped_scale(clip.model.logit_scale)
-        soft = soft_targets(back.to(place)) if mode == "identical-text" else None
+        soft = soft_targets(inverse.to(place)) if mode == "identical-text" else None
         return info_nce(vision, text, scale, soft), {"scale": float(scale.detach())}
 
-    facts = _facts(preset, train, split, texts, text_source, options, seed) | {"targets": mode}
-    log = fit(
-        clip.model,
-        loss,
-        len(train),
-        options,
-        folder,
-        what="training vision and text",
-        key=digest_json([facts, _stamps(train)]),
-        progress=progress,
-    )
+    facts = _facts(preset, train, split, texts, text_source, options) | {"targets": mode}
+    key, what = digest_json([facts, _stamps(train)]), "training vision and text"
+    log = fit(clip.model, loss, len(train), options, folder, what=what, key=key, progress=progress)
     clip.model.eval().requires_grad_(False)
     clip.card = _card(facts, options, log, place)
     return clip
 
 
-def _train_part(manifest: Manifest, split: Split) -> Manifest:
+def train_part(manifest: Manifest, split: Split) -> Manifest:
+    """The train part of a split, which must not be empty."""
     train = manifest.part(split, "train")
     if not len(train):
-        raise PalpateError(
-            "The train part of the split must hold samples of this manifest",
-            "none",
-            "Make a split with: palpate split",
-        )
+        must = "The train part of the split must hold samples of this manifest"
+        raise PalpateError(must, "none", "Make a split with: palpate split")
     return train
 
 
 def _stamps(train: Manifest) -> list[str]:
     """What must not have changed on disk for a checkpoint to be continued."""
-    return [
-        image_stamp(train, column)
-        for column in ("vision", "tactile")
-        if not train.table[column].null_count()
-    ]
+    columns = [c for c in ("vision", "tactile") if not train.table[c].null_count()]
+    return [image_stamp(train, column) for column in columns]
 
 
 def _numbers(texts: Sequence[str]) -> Tensor:
-    """Each text's place among the sorted distinct texts, (n,) int64."""
-    place = {text: k for k, text in enumerate(sorted(set(texts)))}
-    return torch.tensor([place[text] for text in texts], dtype=torch.int64)
+    """Each text's index among the sorted distinct texts, (n,) int64."""
+    return torch.from_numpy(np.unique(np.array(texts, dtype=object), return_inverse=True)[1])
 
 
-def _augmented(
-    images: np.ndarray,
+def _augmented(  # noqa: PLR0917
+    images: NDArray[np.uint8],
     rows: Tensor,
     augment: Augment,
     preprocess: Preprocess,
@@ -421,23 +446,20 @@ def _augmented(
     return preprocess.normalize(augment(to_unit(images[rows.numpy()], device), generator))
 
 
-def _facts(
+def _facts(  # noqa: PLR0917
     preset: EncoderPreset,
     train: Manifest,
     split: Split,
     texts: Sequence[str],
     source: str,
     options: LoopOptions,
-    seed: int,
 ) -> dict[str, Any]:
-    """What decides the result of a training run; also the run's key, so that another run's checkpoint is not continued."""
-    settings = {k: v for k, v in asdict(preset).items() if k != "cost"}
-    course = {k: v for k, v in asdict(options).items() if k != "checkpoint_seconds"}
+    """What decides the result of a training run; also the run's key."""
     return {
         "preset": preset.name,
-        "settings": settings,
-        "options": course,
-        "seed": seed,
+        "settings": {k: v for k, v in asdict(preset).items() if k != "cost"},
+        "options": options.facts,
+        "seed": options.seed,
         "train_manifest": train.digest,
         "train_samples": len(train),
         "split": split.digest,
@@ -455,22 +477,14 @@ def _card(
     device: torch.device,
 ) -> dict[str, Any]:
     """The facts, the versions, and at most 50 points of the loss curve."""
-    keep = (
-        sorted({round(k) for k in np.linspace(0, len(log) - 1, min(50, len(log)))}) if log else []
-    )
-    curve = [
-        {k: round(v, 6) for k, v in log[at].items() if k not in ("seconds", "lr")} for at in keep
-    ]
+    rows = sorted({round(k) for k in np.linspace(0, len(log) - 1, min(50, len(log)))})
+    hidden = ("seconds", "lr")
+    curve = [{k: round(v, 6) for k, v in log[row].items() if k not in hidden} for row in rows]
     versions = {
         "palpate": __version__,
         "torch": torch.__version__,
         "transformers": transformers.__version__,
         "python": platform.python_version(),
     }
-    card = facts | {
-        "steps": options.steps,
-        "device": device.type,
-        "versions": versions,
-        "loss": curve,
-    }
-    return json.loads(json.dumps(card))  # as it will be read back: lists for tuples
+    card = {**facts, "steps": options.steps, "device": device.type, "versions": versions}
+    return json.loads(json.dumps(card | {"loss": curve}))  # as it will be read back

@@ -1,65 +1,65 @@
-"""The three encoders: frozen CLIP vision and text, and a tactile encoder of the same kind with random initial weights (paper section 3).
+"""The three encoders: frozen CLIP vision and text, and a tactile encoder (paper section 3).
 
-Every encoder maps into one space: features are *projected* (``visual_projection``, ``text_projection``) and L2-normalized. States
-before the projection live in no common space, so nothing here returns them.
+Every encoder maps into one space: features are *projected* (``visual_projection``,
+``text_projection``) and L2-normalized. States before the projection share no space, so nothing here
+returns them.
+
+Images are prepared by :class:`Preprocess`: center square, antialiased bicubic to ``resize``, center
+crop to ``size``, then ``(x / 255 - mean) / std`` per channel, as in CLIP's
+``preprocessor_config.json``.
 
 A saved set is a folder::
 
-    palpate.json        the card: preset, training and split digests, seeds, steps, versions, loss curve, digests of the encoders
-    clip/               transformers' CLIPModel: config.json, model.safetensors, tokenizer files, preprocessor_config.json
-    touch/              transformers' CLIPVisionModelWithProjection: config.json, model.safetensors, preprocessor_config.json
-    README.md           the card for people; clip/ has both files of its own
+    palpate.json   {"format": "palpate-encoders/2", "digests": {modality: sha256}, "card": {...}}
+    clip/          CLIPModel, its tokenizer and preprocessor_config.json
+    tactile/       CLIPVisionModelWithProjection and preprocessor_config.json
+    README.md      the card for people
 
-The digest of a encoder is SHA-256 over the architecture, the preprocessing (for text: the tokenizer) and every weight. Weights may be
-saved in 16 bits (:mod:`palpate.encoders.half`); they are rounded before the digest is taken, and are 32 bits again when loaded.
+The digest of an encoder is SHA-256 over its architecture, preprocessing (text: tokenizer) and
+weights.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
-import torch.nn.functional as F
+from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 from transformers import AutoTokenizer, CLIPModel, CLIPVisionConfig, CLIPVisionModelWithProjection
-from transformers.utils.hub import cached_file
 
-from palpate.core import (
-    PalpateError,
-    atomic_folder,
-    read_record,
-    reading_entry,
-    seed_for,
-    write_json,
-)
-from palpate.core.shipped import SHIPPED, is_hub_id, shipped_folder
-from palpate.encoders.half import Rounding, round_to_half
-from palpate.encoders.hub import fetch, find_model
-from palpate.encoders.preprocess import Preprocess
-from palpate.encoders.tokenizer import save_tokenizer
-from palpate.encoders.weights import (
+from palpate.core import PalpateError, atomic_folder, digest_json, read_record, seed_for, write_json
+from palpate.data.images import square
+from palpate.encoders.models import (
     UNREADABLE,
     architecture,
     digest_modules,
-    load_weights,
-    save_weights,
+    find_model,
+    find_single,
+    first_line,
+    is_shipped,
+    load_model,
+    pick_device,
+    round_to_half,
+    save_model,
     silent,
-    tokenizer_digest,
 )
+from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
-from palpate.training.device import require_device_name
 
 Modality = Literal["vision", "text", "tactile"]
 MODALITIES: tuple[Modality, ...] = get_args(Modality)
-FORMAT = "palpate-encoders/2"
+FORMAT, CLIP_FORMAT = "palpate-encoders/2", "palpate-clip/1"
 #: Format 1 called the tactile encoder ``touch`` and a set of encoders ``towers``; it is still read.
 FORMAT_1 = "palpate-towers/1"
-CLIP_FORMAT = "palpate-clip/1"
 #: What a local CLIP folder must hold, as alternatives.
 CLIP_FILES = {
     "config.json": ("config.json",),
@@ -72,6 +72,98 @@ CLIP_FILES = {
     "tokenizer.json (or vocab.json and merges.txt)": ("tokenizer.json", "vocab.json"),
     "preprocessor_config.json": ("preprocessor_config.json",),
 }
+CLIP_FIX = f"Pass a folder that holds {', '.join(CLIP_FILES)}"
+SAVE_AGAIN = "Save the encoders again"
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """What happens to the images of one encoder, in training and evaluation alike.
+
+    Attributes:
+        size: side of what the encoder sees, in pixels.
+        resize: side of the square before the center crop, in pixels (``size`` for CLIP).
+        mean, std: per channel, of values in [0, 1].
+    """
+
+    size: int
+    resize: int
+    mean: tuple[float, ...] = CLIP_MEAN
+    std: tuple[float, ...] = CLIP_STD
+
+    @classmethod
+    def from_config(cls, path: Path, size: int) -> Preprocess:
+        """Read a ``preprocessor_config.json`` of transformers, in old or new spelling.
+
+        Args:
+            path: the file; CLIP's constants are the defaults of its entries.
+            size: the encoder's image side, which the crop must agree with.
+
+        Raises:
+            PalpateError: if the crop has another size than the encoder, or an entry is malformed.
+        """
+        config = read_record(path, "image processor")
+        try:
+            crop = _side(config.get("crop_size"), size)
+            resize = _side(config.get("size"), crop)
+            mean, std = config.get("image_mean") or CLIP_MEAN, config.get("image_std") or CLIP_STD
+            (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
+        except (AttributeError, TypeError, ValueError) as error:
+            must = f"Size, crop and statistics in {path} must be those of an image processor"
+            raise PalpateError(must, str(error), SAVE_AGAIN) from None
+        if not config.get("do_center_crop", True):
+            crop = resize
+        if crop != size or resize < size:
+            must, got = f"{path} must give the encoder's {size} px", f"{crop} px from {resize} px"
+            raise PalpateError(must, got, "Set size and crop_size to the encoder's")
+        if not config.get("do_normalize", True):
+            return cls(size, resize, (0.0,) * 3, (1.0,) * 3)
+        return cls(size, resize, (r, g, b), (sr, sg, sb))
+
+    def to_config(self) -> dict[str, Any]:
+        """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
+        return {
+            "image_processor_type": "CLIPImageProcessor",
+            "do_convert_rgb": True,
+            "do_resize": True,
+            "size": {"shortest_edge": self.resize},
+            "resample": 3,
+            "do_center_crop": True,
+            "crop_size": {"height": self.size, "width": self.size},
+            "do_rescale": True,
+            "rescale_factor": 1 / 255,
+            "do_normalize": True,
+            "image_mean": list(self.mean),
+            "image_std": list(self.std),
+        }
+
+    def fit(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Images (n, h, w, 3) as squares (n, resize, resize, 3)."""
+        if images.shape[1:3] == (self.resize, self.resize):
+            return images
+        squares = [square(Image.fromarray(image), self.resize) for image in images]
+        return np.stack(squares) if squares else images.reshape(0, self.resize, self.resize, 3)
+
+    def normalize(self, unit: Tensor) -> Tensor:
+        """``(x - mean) / std`` for x in [0, 1], (b, 3, h, w)."""
+        mean, std = (unit.new_tensor(v).view(1, 3, 1, 1) for v in (self.mean, self.std))
+        return (unit - mean) / std
+
+    def __call__(self, unit: Tensor) -> Tensor:
+        """Center crop and normalization of squares in [0, 1], (b, 3, resize, resize)."""
+        edge = (self.resize - self.size) // 2
+        return self.normalize(unit[..., edge : edge + self.size, edge : edge + self.size])
+
+
+def to_unit(
+    images: NDArray[np.uint8], device: torch.device | str = "cpu", *, signed: bool = False
+) -> Tensor:
+    """8-bit images (b, h, w, 3) as float32 (b, 3, h, w) in [0, 1], or in [-1, 1] if ``signed``."""
+    # np.array copies: a mapped cache is read-only, which torch warns about.
+    pixels = torch.from_numpy(np.array(images)).to(device).permute(0, 3, 1, 2).float()
+    return pixels / 127.5 - 1 if signed else pixels / 255
 
 
 @dataclass
@@ -81,9 +173,9 @@ class ClipEncoders:
     Attributes:
         model: in evaluation mode; its parameters do not require gradients.
         tokenizer: a transformers tokenizer that ends every text with the end token.
-        preprocess: the evaluation transform of the vision encoder.
+        preprocess: for the vision encoder.
         name: hub id or folder it came from, or the preset that made it.
-        card: how it was trained, if it was trained here.
+        card: how it was trained, if palpate trained it.
     """
 
     model: CLIPModel
@@ -94,7 +186,7 @@ class ClipEncoders:
 
     @property
     def dim(self) -> int:
-        """Width of the common space."""
+        """Width of the shared space."""
         return int(_config(self.model).projection_dim)
 
     def tokens(self, texts: Sequence[str]) -> dict[str, Tensor]:
@@ -103,172 +195,111 @@ class ClipEncoders:
         encoded = self.tokenizer(
             list(texts), padding=True, truncation=True, max_length=context, return_tensors="pt"
         )
-        return {
-            name: encoded[name].to(self.model.device) for name in ("input_ids", "attention_mask")
-        }
+        return {k: encoded[k].to(self.model.device) for k in ("input_ids", "attention_mask")}
 
     def encode_text(self, texts: Sequence[str]) -> Tensor:
         """Texts to (n, dim), L2-normalized; differentiable."""
         tokens: dict[str, Any] = {**self.tokens(texts)}
-        return F.normalize(_projected(self.model.get_text_features(**tokens)), dim=-1)
+        return normalize(_projected(self.model.get_text_features(**tokens)), dim=-1)
 
     def encode_vision(self, pixels: Tensor) -> Tensor:
         """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalized; differentiable."""
-        return F.normalize(_projected(self.model.get_image_features(pixel_values=pixels)), dim=-1)
+        return normalize(_projected(self.model.get_image_features(pixel_values=pixels)), dim=-1)
 
-    def digest(self, encoder: str) -> str:
+    def digest(self, modality: str) -> str:
         """SHA-256 of the vision or the text encoder."""
-        if encoder == "vision":
-            parts = {"tower": self.model.vision_model, "projection": self.model.visual_projection}
-            facts = {
-                "preprocess": asdict(self.preprocess),
-                **architecture(_config(self.model).vision_config),
-            }
-        else:
-            parts = {"tower": self.model.text_model, "projection": self.model.text_projection}
-            facts = {
-                "tokenizer": tokenizer_digest(self.tokenizer),
-                **architecture(_config(self.model).text_config),
-            }
+        if modality == "vision":
+            return vision_digest(self.model, _config(self.model).vision_config, self.preprocess)
+        facts = {"tokenizer": _tokenizer_digest(self.tokenizer)}
+        facts |= architecture(_config(self.model).text_config)
+        parts = {"tower": self.model.text_model, "projection": self.model.text_projection}
         return digest_modules(parts, facts)
 
-    def halve(self) -> Rounding:
-        """Rounds the weights to 16 bits, here and now; see :func:`palpate.encoders.half.round_to_half`."""
-        return round_to_half({"clip": self.model})
-
     def save(self, folder: Path, *, half: bool = False) -> None:
-        """Writes the standard CLIP folder, which ``CLIPModel.from_pretrained`` reads; whole or not at all.
+        """Write a folder for ``CLIPModel.from_pretrained``, whole or not at all.
 
         Args:
             folder: must be new or empty.
-            half: :meth:`halve` first (this object too), and write 16-bit weights.
+            half: round the weights to 16 bits first (here too) and write 16-bit weights.
 
         Raises:
-            PalpateError: if the folder exists and is not empty, or a weight is too large for 16 bits.
+            PalpateError: if the folder is not empty, or a weight is too large for 16 bits.
         """
         with atomic_folder(Path(folder)) as part:
-            self._write(part, half=half)
+            if half:
+                round_to_half({"clip": self.model})
+            self.write(part, half=half)
             write_model_cards(part)
 
-    def _write(self, folder: Path, *, half: bool) -> None:
-        if half:
-            self.halve()
-        save_weights(self.model, folder, half=half)
+    def write(self, folder: Path, *, half: bool) -> None:
+        """Write the files into ``folder``; see :meth:`save`, which does so atomically."""
+        save_model(self.model, folder, half=half)
         with silent():
             save_tokenizer(self.tokenizer, folder)
         write_json(folder / "preprocessor_config.json", self.preprocess.to_config())
-        digests = {encoder: self.digest(encoder) for encoder in ("vision", "text")}
-        write_json(
-            folder / "palpate.json",
-            {"format": CLIP_FORMAT, "name": self.name, "digests": digests, "card": self.card},
-        )
+        digests = {modality: self.digest(modality) for modality in ("vision", "text")}
+        about = {"format": CLIP_FORMAT, "name": self.name, "digests": digests, "card": self.card}
+        write_json(folder / "palpate.json", about)
 
 
-def load_clip(name_or_folder: str | Path, *, device: str = "cpu") -> ClipEncoders:
-    """A frozen CLIP that ships with the package, from a local folder or from the hub; only the last needs a network.
+def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
+    """Load a frozen CLIP; only one from the hub needs a network, once.
 
     Args:
-        name_or_folder: a shipped name (``palpate/mini``), a folder as :meth:`ClipEncoders.save` or transformers writes it, or a hub id
-            (``openai/clip-vit-large-patch14``); which comes first: :mod:`palpate.core.shipped`. safetensors is preferred; a
-            ``.bin`` is read as weights only.
-        device: see :func:`pick_device`.
+        source: a shipped name (``palpate/mini``), a folder as :meth:`ClipEncoders.save` or
+            transformers writes it, a set of encoders, or a hub id
+            (``openai/clip-vit-large-patch14``). safetensors is preferred; a ``.bin`` is read as
+            weights only.
+        device: see :func:`palpate.encoders.models.pick_device`.
 
     Raises:
-        PalpateError: if files are missing, unreadable, of another model or changed since, or the hub cannot be reached.
+        PalpateError: if files are missing, unreadable, of another model or changed since, or the
+            hub is out of reach.
     """
-    shipped = shipped_folder(name_or_folder, "clip")
-    folder = shipped or Path(name_or_folder)
-    name = str(folder) if shipped else str(name_or_folder)
-    local = not is_hub_id(name_or_folder)
+    name, folder = find_single(source, "clip", "CLIP", CLIP_FIX)
+    local, must = name == str(folder), f"{source} must be a CLIP model"
     note = folder / "palpate.json"
-    if local and (not str(name_or_folder) or not folder.is_dir()):
-        must = f"The CLIP must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
-        raise PalpateError(
-            must,
-            f"no folder {name_or_folder or repr('')}",
-            f"Pass a folder that holds {', '.join(CLIP_FILES)}",
-        )
+    if note.is_file() and read_record(note, "card of the CLIP").get("format") in (FORMAT, FORMAT_1):
+        return EncoderSet.load(source, device=device).clip
     if local:
-        missing = [
-            what
-            for what, choices in CLIP_FILES.items()
-            if not any((folder / c).is_file() for c in choices)
-        ]
-        if missing:
-            raise PalpateError(
-                f"The CLIP folder {folder} must hold {', '.join(CLIP_FILES)}",
-                f"no {', no '.join(missing)}",
-                "Add the files",
-            )
-    else:  # a small file first: out of reach, the hub is asked once instead of many times
-        note = (
-            fetch(
-                name,
-                ("config.json", "palpate.json"),
-                "CLIP",
-                f"Pass a folder that holds {', '.join(CLIP_FILES)}",
-            )
-            / "palpate.json"
-        )
+        require_files(folder, CLIP_FILES, CLIP_FIX)
+    model = load_model(CLIPModel, name, must, CLIP_FIX, local_files_only=local)
     try:
         with silent():
-            model = load_weights(CLIPModel, name, local_files_only=local)
             tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
-            processor = cached_file(name, "preprocessor_config.json", local_files_only=local)
     except UNREADABLE as error:
-        must = (
-            f"{name} must be a CLIP model"
-            if local
-            else f"The CLIP {name} must be a local folder, or a hub id within reach"
-        )
-        fix = f"Pass a folder that holds {', '.join(CLIP_FILES)}"
-        raise PalpateError(
-            must, (str(error).splitlines() or [type(error).__name__])[0], fix
-        ) from None
-    preprocess = _preprocess(Path(str(processor)), int(_config(model).vision_config.image_size))
-    digests, card, called = {}, {}, name
+        raise PalpateError(must, first_line(error), CLIP_FIX) from None
+    size = int(model.config.vision_config.image_size)
+    preprocess = Preprocess.from_config(folder / "preprocessor_config.json", size)
+    clip = ClipEncoders(model, tokenizer, preprocess, str(source))
     if note.is_file():
-        about = read_record(
-            note, "card of the CLIP", form=CLIP_FORMAT, keys=("name", "digests", "card")
-        )
-        (digests, card), called = _card(note, about), str(about["name"])
-    clip = ClipEncoders(
-        model.float().eval().requires_grad_(False),
-        tokenizer,
-        preprocess,
-        str(name_or_folder) if shipped else called,
-        card,
-    )
-    _require_digests(clip.digest, digests, name)
-    move(clip.model, pick_device(device))
+        about = _read_card(folder, CLIP_FORMAT)
+        clip.card = about["card"]
+        clip.name = clip.name if is_shipped(source) else str(about["name"])
+        _require_digests(clip, about["digests"], folder)
+    model.to(pick_device(device))
     return clip
-
-
-def new_touch(config: CLIPVisionConfig, seed: int) -> CLIPVisionModelWithProjection:
-    """A tactile encoder with random weights that depend on ``seed`` alone; global random state is left as it was."""
-    with seeded(seed, "tactile encoder"):
-        return CLIPVisionModelWithProjection(config)
 
 
 @dataclass
 class EncoderSet:
-    """Vision, text and, once trained, touch.
+    """Vision, text and, once trained, tactile encoder.
 
     Attributes:
         clip: the frozen vision and text encoders.
-        touch: the tactile encoder, or None.
-        touch_preprocess: its evaluation transform, or None.
-        card: see the head of this file; ``{}`` for encoders that were not trained here.
+        tactile: the tactile encoder, or None.
+        tactile_preprocess: for the tactile encoder, or None.
+        card: how the tactile encoder was trained; ``{}`` if palpate did not train it.
     """
 
     clip: ClipEncoders
-    touch: CLIPVisionModelWithProjection | None = None
-    touch_preprocess: Preprocess | None = None
+    tactile: CLIPVisionModelWithProjection | None = None
+    tactile_preprocess: Preprocess | None = None
     card: dict[str, Any] = field(default_factory=dict)
 
     @property
     def dim(self) -> int:
-        """Width of the common space."""
+        """Width of the shared space."""
         return self.clip.dim
 
     @property
@@ -276,181 +307,151 @@ class EncoderSet:
         """Where the encoders are."""
         return self.clip.model.device
 
-    def to(self, device: str) -> EncoderSet:
-        """Moves all encoders; returns self."""
-        for model in (self.clip.model, self.touch):
-            if model is not None:
-                move(model, pick_device(device))
+    @property
+    def modalities(self) -> list[Modality]:
+        """The modalities of this set."""
+        return [m for m in MODALITIES if m != "tactile" or self.tactile is not None]
+
+    def to(self, device: str | torch.device) -> EncoderSet:
+        """Move all encoders; returns self."""
+        for module in self._modules().values():
+            module.to(pick_device(device))
         return self
 
-    def preprocess(self, encoder: str) -> Preprocess:
-        """The evaluation transform of ``vision`` or ``touch``.
+    def preprocess(self, modality: str) -> Preprocess:
+        """The preprocessing of ``vision`` or ``tactile``.
 
         Raises:
-            PalpateError: for another name, or if there is no tactile encoder.
+            PalpateError: for another modality, or if there is no tactile encoder.
         """
-        if encoder == "vision":
-            return self.clip.preprocess
-        return self._touch(encoder)[1]
+        return self.clip.preprocess if modality == "vision" else self._tactile(modality)[1]
 
-    def encode(self, encoder: str, batch: Tensor | Sequence[str]) -> Tensor:
-        """One batch to (n, dim), projected and L2-normalized.
+    def encode(self, modality: str, batch: Tensor | Sequence[str]) -> Tensor:
+        """One batch to (n, dim), projected and L2-normalized; differentiable.
 
         Args:
-            encoder: ``vision``, ``text`` or ``touch``.
+            modality: ``vision``, ``text`` or ``tactile``.
             batch: preprocessed pixels (n, 3, size, size) on the encoders' device, or texts.
         """
-        if encoder == "text":
+        if modality == "text":
             return self.clip.encode_text([str(text) for text in batch])
         pixels = torch.as_tensor(batch)
-        return (
-            self.clip.encode_vision(pixels)
-            if encoder == "vision"
-            else encode_touch(self._touch(encoder)[0], pixels)
-        )
+        if modality == "vision":
+            return self.clip.encode_vision(pixels)
+        return encode_tactile(self._tactile(modality)[0], pixels)
 
-    def digest(self, encoder: str) -> str:
+    def digest(self, modality: str) -> str:
         """SHA-256 of one encoder: weights, architecture, preprocessing."""
-        if encoder == "vision" or encoder == "text":
-            return self.clip.digest(encoder)
-        touch, preprocess = self._touch(encoder)
-        return digest_modules(
-            {"touch": touch}, {"preprocess": asdict(preprocess), **architecture(touch.config)}
-        )
+        if modality in ("vision", "text"):
+            return self.clip.digest(modality)
+        tactile, preprocess = self._tactile(modality)
+        facts = {"preprocess": asdict(preprocess), **architecture(tactile.config)}
+        return digest_modules({"touch": tactile}, facts)
 
-    def halve(self) -> Rounding:
-        """Rounds the weights of all encoders to 16 bits, here and now; see :func:`palpate.encoders.half.round_to_half`."""
-        return round_to_half(
-            {"clip": self.clip.model} | ({} if self.touch is None else {"touch": self.touch})
-        )
+    def halve(self) -> float:
+        """Round all weights to 16 bits in place; see ``models.round_to_half``."""
+        return round_to_half(self._modules())
 
     def save(self, folder: Path, *, half: bool = False) -> None:
-        """Writes the folder described at the head of this file; whole or not at all.
+        """Write the folder described in the module's docstring; whole or not at all.
 
         Args:
             folder: must be new or empty.
             half: :meth:`halve` first (this object too), and write 16-bit weights.
 
         Raises:
-            PalpateError: if the folder exists and is not empty, or a weight is too large for 16 bits.
+            PalpateError: if the folder is not empty, or a weight is too large for 16 bits.
         """
         with atomic_folder(Path(folder)) as part:
             (part / "clip").mkdir()
             if half:
                 self.halve()
-            self.clip._write(part / "clip", half=half)  # pyright: ignore[reportPrivateUsage]
-            if self.touch is not None and self.touch_preprocess is not None:
-                save_weights(self.touch, part / "tactile", half=half)
-                write_json(
-                    part / "tactile" / "preprocessor_config.json", self.touch_preprocess.to_config()
-                )
-            names = [t for t in MODALITIES if t != "tactile" or self.touch is not None]
-            write_json(
-                part / "palpate.json",
-                {
-                    "format": FORMAT,
-                    "digests": {t: self.digest(t) for t in names},
-                    "card": self.card,
-                },
-            )
+            self.clip.write(part / "clip", half=half)
+            if self.tactile is not None and self.tactile_preprocess is not None:
+                save_model(self.tactile, part / "tactile", half=half)
+                config = self.tactile_preprocess.to_config()
+                write_json(part / "tactile" / "preprocessor_config.json", config)
+            digests = {m: self.digest(m) for m in self.modalities}
+            about = {"format": FORMAT, "digests": digests, "card": self.card}
+            write_json(part / "palpate.json", about)
             write_model_cards(part)
 
     @classmethod
     def load(cls, source: str | Path, *, device: str = "cpu") -> EncoderSet:
-        """Reads what :meth:`save` wrote and checks every encoder against its digest.
+        """Read what :meth:`save` wrote and compare every encoder with its digest.
 
         Args:
-            source: a shipped name (``palpate/mini``), a folder or a hub id; see :mod:`palpate.core.shipped`.
-            device: see :func:`pick_device`.
+            source: a shipped name (``palpate/mini``), a folder or a hub id.
+            device: see :func:`palpate.encoders.models.pick_device`.
 
         Raises:
-            PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub cannot be reached.
+            PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub
+                is out of reach.
         """
-        folder = find_model(
-            source, "encoders", "set of encoders", "Train one with: palpate encoder"
-        )
-        note = folder / "palpate.json"
-        digests, card = _card(
-            note,
-            read_record(
-                note, "card of the encoders", form=(FORMAT, FORMAT_1), keys=("digests", "card")
-            ),
-        )
-        # A shipped CLIP keeps its name, so that cards of what is trained beside it say it.
-        clip = (
-            load_clip(source)
-            if str(source) in SHIPPED and isinstance(source, str)
-            else load_clip(folder / "clip")
-        )
-        encoders = cls(clip, card=card)
-        if "tactile" in digests:
-            place = folder / "tactile"
-            place = place if place.is_dir() else folder / "touch"  # format 1
-            encoders.touch = _load_touch(place)
-            place = place / "preprocessor_config.json"
-            encoders.touch_preprocess = _preprocess(place, int(_config(encoders.touch).image_size))
-        _require_digests(encoders.digest, digests, str(folder))
+        fix = "Train one with: palpate train encoder"
+        folder = find_model(source, "encoders", "set of encoders", fix)
+        about = _read_card(folder, (FORMAT, FORMAT_1))
+        # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
+        clip = load_clip(source if is_shipped(source) else folder / "clip")
+        encoders = cls(clip, card=about["card"])
+        if "tactile" in about["digests"]:
+            place = folder / ("tactile" if about["format"] == FORMAT else "touch")
+            must = f"The tactile encoder {place} must hold config.json and model.safetensors"
+            options = {"local_files_only": True, "use_safetensors": True}
+            kind = CLIPVisionModelWithProjection
+            encoders.tactile = tactile = load_model(kind, str(place), must, SAVE_AGAIN, **options)
+            path, size = place / "preprocessor_config.json", _config(tactile).image_size
+            encoders.tactile_preprocess = Preprocess.from_config(path, size)
+        _require_digests(encoders, about["digests"], folder)
         return encoders.to(device)
 
-    def _touch(self, encoder: str) -> tuple[CLIPVisionModelWithProjection, Preprocess]:
-        if encoder == "text":
-            raise PalpateError(
-                "A encoder of images must be vision or touch",
-                repr(encoder),
-                "Pass texts to the text encoder",
-            )
-        if encoder != "tactile":
-            raise PalpateError(
-                f"A encoder must be one of {', '.join(MODALITIES)}",
-                repr(encoder),
-                "Choose one of these",
-            )
-        if self.touch is None or self.touch_preprocess is None:
-            raise PalpateError(
-                "These encoders must include a tactile encoder",
-                "vision and text only",
-                "Train one with: palpate encoder",
-            )
-        return self.touch, self.touch_preprocess
+    def _modules(self) -> dict[str, nn.Module]:
+        tactile = {} if self.tactile is None else {"tactile": self.tactile}
+        return {"clip": self.clip.model, **tactile}
+
+    def _tactile(self, modality: str) -> tuple[CLIPVisionModelWithProjection, Preprocess]:
+        if modality != "tactile":
+            must, fix = "must be vision or tactile for images", "Pass texts to the text encoder"
+            raise PalpateError(must, repr(modality), fix, argument="modality")
+        if self.tactile is None or self.tactile_preprocess is None:
+            must, fix = "These encoders must include a tactile encoder", "Train one: train_encoder"
+            raise PalpateError(must, "vision and text only", fix)
+        return self.tactile, self.tactile_preprocess
 
 
-def encode_touch(touch: nn.Module, pixels: Tensor) -> Tensor:
+def new_tactile(config: CLIPVisionConfig, seed: int) -> CLIPVisionModelWithProjection:
+    """A tactile encoder with random weights that depend on ``seed`` alone."""
+    with seeded(seed, "tactile encoder"):
+        return CLIPVisionModelWithProjection(config)
+
+
+def encode_tactile(tactile: nn.Module, pixels: Tensor) -> Tensor:
     """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalized; differentiable."""
-    return F.normalize(touch(pixel_values=pixels).image_embeds, dim=-1)
+    return normalize(tactile(pixel_values=pixels).image_embeds, dim=-1)
 
 
-def pick_device(device: str) -> torch.device:
-    """``auto`` is CUDA, else Apple's MPS, else the CPU; any other name is torch's.
+def vision_digest(model: Any, config: Any, preprocess: Preprocess) -> str:
+    """SHA-256 of a CLIP vision encoder with its projection."""
+    parts = {"tower": model.vision_model, "projection": model.visual_projection}
+    return digest_modules(parts, {"preprocess": asdict(preprocess), **architecture(config)})
 
-    Raises:
-        PalpateError: for a name that torch does not know or a device that is not there.
-    """
-    require_device_name(device)
-    if device == "auto":
-        mps = torch.backends.mps.is_available()
-        device = "cuda" if torch.cuda.is_available() else "mps" if mps else "cpu"
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise PalpateError(
-            "--device must be auto, cpu, or a device that is there",
-            repr(device),
-            str(error).splitlines()[0],
-        ) from None
-    return torch.device(device)
+
+def require_files(folder: Path, files: Mapping[str, Sequence[str]], fix: str) -> None:
+    """Raise if a CLIP folder lacks one of ``files``, each with its alternatives."""
+    missing = [
+        name for name, any_of in files.items() if not any((folder / f).is_file() for f in any_of)
+    ]
+    if missing:
+        must = f"The CLIP folder {folder} must hold {', '.join(files)}"
+        raise PalpateError(must, f"no {', no '.join(missing)}", fix)
 
 
 @contextmanager
 def seeded(seed: int, purpose: str) -> Generator[None]:
-    """CPU randomness of torch seeded by (seed, purpose) inside, and as it was before outside: for random initial weights."""
+    """Seed torch's CPU generator by (seed, purpose) inside and restore it afterwards."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_for(seed, purpose))
         yield
-
-
-def move(module: nn.Module, device: torch.device) -> None:
-    """Moves a module in place."""
-    module.to(device)
 
 
 def _config(model: nn.Module) -> Any:
@@ -458,60 +459,40 @@ def _config(model: nn.Module) -> Any:
     return model.config
 
 
-def _card(note: Path, about: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
-    """The digests by encoder and the card that a ``palpate.json`` holds.
-
-    Raises:
-        PalpateError: if one of them is no object, or there is no digest of vision or text.
-    """
-    digests, card = about["digests"], about["card"]
-    if about["format"] == FORMAT_1 and isinstance(digests, dict):
-        digests = {
-            "tactile" if name == "touch" else name: digest for name, digest in digests.items()
-        }
-    if (
-        not isinstance(digests, dict)
-        or not isinstance(card, dict)
-        or not {"vision", "text"} <= set(digests) <= set(MODALITIES)
-    ):
-        must = f"In {note}, digests must be an object with vision and text, and card an object"
-        got = f"digests {json.dumps(digests)[:80]} and a card of type {type(card).__name__}"
-        raise PalpateError(must, got, "Save the encoders again")
-    return digests, card
+def _side(value: Any, default: int) -> int:
+    """A side in pixels from a number, ``{"shortest_edge": s}`` or ``{"height": s, "width": s}``."""
+    if isinstance(value, Mapping):
+        value = value.get("shortest_edge", value.get("height"))
+    return default if value is None else int(value)
 
 
-def _preprocess(path: Path, size: int) -> Preprocess:
-    config = read_record(path, "image processor")
-    with reading_entry(path, "An entry"):
-        return Preprocess.from_config(config, size)
+def _read_card(folder: Path, form: str | tuple[str, ...]) -> dict[str, Any]:
+    about = read_record(
+        folder / "palpate.json", "card of the encoders", form=form, keys=("digests", "card")
+    )
+    if about["format"] == FORMAT_1:
+        names = {"touch": "tactile"}
+        about["digests"] = {names.get(k, k): v for k, v in about["digests"].items()}
+    return about
 
 
-def _require_digests(digest: Callable[[str], str], wanted: Mapping[str, str], place: str) -> None:
-    for name, value in wanted.items():
-        if digest(name) != value:
-            must = f"The {name} encoder in {place} must match its digest"
-            raise PalpateError(
-                must, "weights or settings that were changed", "Save the encoders again"
-            )
+def _require_digests(
+    encoders: ClipEncoders | EncoderSet, digests: Mapping[str, str], folder: Path
+) -> None:
+    for modality, digest in digests.items():
+        if encoders.digest(modality) != digest:
+            must = f"The {modality} encoder in {folder} must match its digest"
+            raise PalpateError(must, "weights or settings that were changed", SAVE_AGAIN)
 
 
-def _load_touch(folder: Path) -> CLIPVisionModelWithProjection:
-    try:
-        with silent():
-            model = load_weights(
-                CLIPVisionModelWithProjection,
-                str(folder),
-                local_files_only=True,
-                use_safetensors=True,
-            )
-    except UNREADABLE as error:
-        got = (str(error).splitlines() or ["unreadable files"])[0]
-        raise PalpateError(
-            f"The tactile encoder {folder} must hold config.json and model.safetensors",
-            got,
-            "Save the encoders again",
-        ) from None
-    return model.float().eval().requires_grad_(False)
+def _tokenizer_digest(tokenizer: Any) -> str:
+    """SHA-256 of all that a tokenizer does to a text."""
+    backend = getattr(tokenizer, "backend_tokenizer", None)
+    if backend is None:  # a slow tokenizer of transformers 4
+        return digest_json(tokenizer.get_vocab())
+    # Truncation and padding are state of the last call, not of the tokenizer.
+    table = json.loads(backend.to_str())
+    return digest_json({k: v for k, v in table.items() if k not in ("truncation", "padding")})
 
 
 def _projected(output: Any) -> Tensor:

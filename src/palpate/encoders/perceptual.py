@@ -1,41 +1,41 @@
-"""LPIPS, the learned perceptual distance of two images (Zhang et al., arXiv 1801.03924), version 0.1 with AlexNet; 0 is identical.
+"""LPIPS, the learned perceptual distance (Zhang et al., arXiv 1801.03924), v0.1 with AlexNet.
 
-``d(x, y) = sum_l mean_hw sum_c w_lc (f_lc(x) - f_lc(y))^2``: f_l is the l-th of AlexNet's five convolutions after its ReLU, divided at every
-place by its norm over channels (plus 1e-10), w_l the weights of a 1 x 1 convolution that was fitted to human judgments.
-Pixels in [-1, 1] are shifted and scaled per channel first.
+``d(x, y) = sum_l mean_hw sum_c w_lc (f_lc(x) - f_lc(y))^2``: f_l is the l-th of AlexNet's five
+convolutions after its ReLU, divided at every position by its norm over channels (plus 1e-10), w_l
+the weights of a 1 x 1 convolution that was fitted to human judgments. Pixels in [-1, 1] are shifted
+and scaled per channel first.
 
-Two files of one's own, read as weights only:
+Two local files, read as weights only:
 
-* the backbone, torchvision's ``alexnet-owt-7be5be79.pth``: ``features.0``, ``.3``, ``.6``, ``.8``, ``.10`` with ``.weight`` and ``.bias``;
-* the heads, ``alex.pth`` of LPIPS v0.1: ``lin0.model.1.weight`` (1, 64, 1, 1) to ``lin4.model.1.weight`` (1, 256, 1, 1).
+* the backbone, torchvision's ``alexnet-owt-7be5be79.pth``: ``features.0``, ``.3``, ``.6``, ``.8``,
+  ``.10`` with ``.weight`` and ``.bias``;
+* the heads, ``alex.pth`` of LPIPS v0.1: ``lin0.model.1.weight`` (1, 64, 1, 1) to
+  ``lin4.model.1.weight`` (1, 256, 1, 1).
 """
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, relu
 
 from palpate.core import PalpateError, Progress, quiet
-from palpate.encoders.embed import _exact  # pyright: ignore[reportPrivateUsage]
-from palpate.encoders.encoder_set import pick_device
-from palpate.encoders.weights import digest_modules
+from palpate.encoders.embed import exact
+from palpate.encoders.models import UNREADABLE, digest_modules, first_line, pick_device
 
 #: Below this the last stage has no pixel left that saw the whole image.
 SMALLEST = 32
 #: Per channel, of pixels in [-1, 1]; constants of LPIPS v0.1.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 EPSILON = 1e-10
-#: Place in torchvision's ``features``, channels in and out, kernel, stride, padding; a 3 x 3 maximum of stride 2 comes before the second and third.
+#: Index in torchvision's ``features``, channels in and out, kernel, stride, padding.
 LAYERS = (
     (0, 3, 64, 11, 4, 2),
     (3, 64, 192, 5, 1, 2),
@@ -43,10 +43,15 @@ LAYERS = (
     (8, 384, 256, 3, 1, 1),
     (10, 256, 256, 3, 1, 1),
 )
+#: Stages after a 3 x 3 maximum of stride 2.
 POOLED = (1, 2)
+BACKBONE_URL = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
+HEADS_URL = (
+    "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/alex.pth"
+)
 FIX = (
-    "Pass two files: the backbone alexnet-owt-7be5be79.pth (https://download.pytorch.org/models/alexnet-owt-7be5be79.pth, 233 MB) and the "
-    "heads alex.pth (https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/alex.pth, 6 kB)"
+    f"Pass two files: the backbone alexnet-owt-7be5be79.pth ({BACKBONE_URL}, 233 MB) and the heads "
+    f"alex.pth ({HEADS_URL}, 6 kB)"
 )
 
 
@@ -68,61 +73,56 @@ class Lpips(nn.Module):
         self.digest = ""
 
     def stages_of(self, pixels: Tensor) -> list[Tensor]:
-        """Pixels (b, 3, h, w) in [-1, 1] to five stages (b, c, h', w') of unit norm over channels."""
-        x, found = (pixels - self.get_buffer("shift")) / self.get_buffer("scale"), []
+        """Return five stages (b, c, h', w') of unit norm of pixels (b, 3, h, w) in [-1, 1]."""
+        x = (pixels - self.get_buffer("shift")) / self.get_buffer("scale")
+        features: list[Tensor] = []
         for k, stage in enumerate(self.stages):
-            if k in POOLED:
-                x = F.max_pool2d(x, 3, 2)
-            x = F.relu(stage(x))
-            found.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
-        return found
+            x = relu(stage(max_pool2d(x, 3, 2) if k in POOLED else x))
+            features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + EPSILON))
+        return features
 
     def forward(self, first: Tensor, second: Tensor, weights: Tensor | None = None) -> Tensor:
         """The distances (b,), float64, of pixels (b, 3, h, w) in [-1, 1]; differentiable.
 
-        ``weights`` (b, 1, h, w), not negative and not all 0, is averaged over the pixels of every place of a stage and weighs it there.
+        ``weights`` (b, 1, h, w), not negative and not all 0, is averaged over the pixels of every
+        position of a stage and weighs it there.
         """
-        found: list[Tensor] = []
-        for a, b, head in zip(
-            self.stages_of(first), self.stages_of(second), self.heads, strict=True
-        ):
-            places = head((a - b).square()).double()
+        total = torch.zeros(len(first), dtype=torch.float64, device=first.device)
+        stages = zip(self.stages_of(first), self.stages_of(second), self.heads, strict=True)
+        for a, b, head in stages:
+            distance = head((a - b).square()).double()
             if weights is None:
-                found.append(places.mean(dim=(1, 2, 3)))
+                total = total + distance.mean(dim=(1, 2, 3))
             else:
-                w = F.adaptive_avg_pool2d(weights.double(), places.shape[2:])
-                found.append((w * places).sum(dim=(1, 2, 3)) / w.sum(dim=(1, 2, 3)))
-        return torch.stack(found).sum(dim=0)
+                w = adaptive_avg_pool2d(weights.double(), distance.shape[2:])
+                total = total + (w * distance).sum(dim=(1, 2, 3)) / w.sum(dim=(1, 2, 3))
+        return total
 
 
 def load_lpips(backbone: Path, heads: Path, *, device: str = "cpu") -> Lpips:
-    """The LPIPS network from its two files (see the head of this file); ``.safetensors`` of the same names are read as well.
+    """The LPIPS network from its two files; ``.safetensors`` of the same names are read as well.
 
     Args:
-        backbone: state of torchvision's AlexNet; its classifier is left out.
+        backbone: state of torchvision's AlexNet; its classifier is not used.
         heads: state of the linear layers of LPIPS v0.1 for AlexNet.
-        device: see :func:`palpate.encoders.encoder_set.pick_device`.
+        device: see :func:`palpate.encoders.models.pick_device`.
 
     Raises:
-        PalpateError: if a file is missing, holds more than weights, or other weights; both files and their origin are named.
+        PalpateError: if a file is missing, holds more than weights, or other weights; both files
+            and their origin are named.
     """
-    places = [Path(backbone), Path(heads)]
-    missing = [str(path) for path in places if not path.is_file()]
-    if missing:
-        raise PalpateError(
-            "LPIPS must have the files of its backbone and of its heads",
-            f"no {', no '.join(missing)}",
-            FIX,
-        )
-    states = [_read(path) for path in places]
+    files = [Path(backbone), Path(heads)]
+    if missing := [str(path) for path in files if not path.is_file()]:
+        must = "LPIPS must have the files of its backbone and of its heads"
+        raise PalpateError(must, f"no {', no '.join(missing)}", FIX)
+    states = [_read(path) for path in files]
     network = Lpips()
-    for k, (place, *_) in enumerate(LAYERS):
+    for k, (index, *_) in enumerate(LAYERS):
         for part in ("weight", "bias"):
-            _fill(
-                getattr(network.stages[k], part), states[0], f"features.{place}.{part}", places[0]
-            )
+            parameter = network.stages[k].get_parameter(part)
+            _fill(parameter, states[0], f"features.{index}.{part}", files[0])
         _fill(
-            network.heads[k].get_parameter("weight"), states[1], f"lin{k}.model.1.weight", places[1]
+            network.heads[k].get_parameter("weight"), states[1], f"lin{k}.model.1.weight", files[1]
         )
     network.eval().requires_grad_(False)
     network.digest = digest_modules({"lpips": network}, {"version": "0.1", "net": "alex"})
@@ -141,87 +141,73 @@ def lpips_per_image(
     """LPIPS of each pair of images, at the size they have.
 
     Args:
-        generated: (n, h, w, 3 or 1) uint8, or float in [0, 1]; h, w >= 32. Published values are of 64 px patches, or of whole images.
-        reference: the same shape; image i is the partner of generated image i. One channel stands for three equal ones.
+        generated: (n, h, w, 3 or 1) uint8, or float in [0, 1]; h, w >= 32. Published values are of
+            64 px patches, or of whole images.
+        reference: the same shape; image i is the partner of generated image i.
         network: of :func:`load_lpips`.
-        mask: (n, h, w): the pixels whose distances are averaged, the others only lend the network their surroundings; default all.
+        mask: (n, h, w): the pixels whose distances are averaged; the others only lend the network
+            their surroundings. Default: all.
         batch: pairs at a time.
-        progress: told how many pairs are done.
+        progress: called with the number of pairs done.
 
     Returns:
         (n,) distances, 0 for identical images; lower is better. NaN where the mask is empty.
 
     Raises:
-        PalpateError: on other shapes, dtypes, ranges (image numbers are named), or images smaller than 32 x 32.
+        PalpateError: on other shapes, dtypes, ranges (image numbers are named), or images smaller
+            than 32 x 32.
     """
-    generated, reference = (
-        _array(name, v) for name, v in (("generated", generated), ("reference", reference))
-    )
-    _check(generated, reference)
-    mask = None if mask is None else _array("mask", mask)
-    if mask is not None and (mask.shape != generated.shape[:3] or mask.dtype != bool):
-        must = f"The mask must be of shape {generated.shape[:3]} and of truth values"
-        raise PalpateError(
-            must, f"shape {mask.shape}, dtype {mask.dtype}", "Pass one mask an image"
+    generated, reference = _images("generated", generated), _images("reference", reference)
+    shape = generated.shape
+    if reference.shape != shape:
+        must, got = "must have the shape of the generated images", f"{reference.shape} and {shape}"
+        fix = "Pass the same samples in the same order and size"
+        raise PalpateError(must, got, fix, argument="reference")
+    if min(shape[1:3]) < SMALLEST:
+        must, got = (
+            f"must be at least {SMALLEST} x {SMALLEST} for LPIPS",
+            f"{shape[1]} x {shape[2]}",
         )
-    if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
-        raise PalpateError(
-            "batch must be a whole number of at least 1", repr(batch), "Pass e.g. batch=64"
-        )
-    out = np.empty(len(generated), np.float64)
+        raise PalpateError(must, got, "Score larger images", argument="generated")
+    if mask is not None and (mask.shape != shape[:3] or mask.dtype != bool):
+        must, got = f"must be boolean of shape {shape[:3]}", f"{mask.dtype} of shape {mask.shape}"
+        raise PalpateError(must, got, "Pass one mask per image", argument="mask")
+    distances = np.empty(len(generated), np.float64)
     device = network.get_buffer("shift").device
-    with _exact():
-        for start in range(0, len(out), batch):
-            at = slice(start, start + batch)
-            weights = (
-                None
-                if mask is None
-                else torch.from_numpy(mask[at][:, None].astype(np.float32)).to(device)
-            )
-            out[at] = (
-                network(_pixels(generated[at], device), _pixels(reference[at], device), weights)
-                .cpu()
-                .numpy()
-            )
-            progress("LPIPS", min(start + batch, len(out)), len(out))
-    return out
+    with exact():
+        for start in range(0, len(distances), batch):
+            rows = slice(start, start + batch)
+            pair = (_pixels(images[rows], device) for images in (generated, reference))
+            weights = None
+            if mask is not None:
+                weights = torch.from_numpy(mask[rows][:, None].astype(np.float32)).to(device)
+            distances[rows] = network(*pair, weights).cpu().numpy()
+            progress("LPIPS", min(start + batch, len(distances)), len(distances))
+    return distances
 
 
 def _read(path: Path) -> Mapping[str, Any]:
     try:
-        state = (
-            load_file(path)
-            if path.suffix == ".safetensors"
-            else torch.load(path, map_location="cpu", weights_only=True)
-        )
-    except (
-        OSError,
-        RuntimeError,
-        ValueError,
-        EOFError,
-        KeyError,
-        pickle.UnpicklingError,
-        SafetensorError,
-    ) as error:
-        got = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (*UNREADABLE, EOFError) as error:
+        got = first_line(error)[:160]
         raise PalpateError(f"{path} must hold weights and nothing else", got, FIX) from None
     if not isinstance(state, Mapping):
-        raise PalpateError(
-            f"{path} must hold a table of weights by name", type(state).__name__, FIX
-        )
+        must, got = f"{path} must hold a table of weights by name", type(state).__name__
+        raise PalpateError(must, got, FIX)
     return state
 
 
 def _fill(parameter: Tensor, state: Mapping[str, Any], name: str, path: Path) -> None:
-    value = state.get(name)
-    shape = tuple(parameter.shape)
+    value, shape = state.get(name), tuple(parameter.shape)
     if not isinstance(value, Tensor) or tuple(value.shape) != shape:
         got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else "none of that name"
         raise PalpateError(f"{path} must hold {name} of shape {shape}", got, FIX)
     if not bool(torch.isfinite(value).all()):
-        raise PalpateError(
-            f"{name} in {path} must be finite", "NaN or infinity", "Fetch the file again"
-        )
+        must, fix = f"{name} in {path} must be finite", "Fetch the file again"
+        raise PalpateError(must, "NaN or infinity", fix)
     with torch.no_grad():
         parameter.copy_(value)
 
@@ -231,46 +217,18 @@ def _pixels(images: NDArray[Any], device: torch.device) -> Tensor:
     return torch.from_numpy(unit).to(device).permute(0, 3, 1, 2).expand(-1, 3, -1, -1) * 2 - 1
 
 
-def _array(name: str, images: Any) -> NDArray[Any]:
-    try:
-        return np.asarray(images.detach().cpu() if isinstance(images, Tensor) else images)
-    except (TypeError, ValueError) as error:
-        raise PalpateError(
-            f"The {name} {'images ' * (name != 'mask')}must be one array",
-            str(error).splitlines()[0],
-            "Stack them, of one size",
-        ) from None
-
-
-def _check(generated: NDArray[Any], reference: NDArray[Any]) -> None:
-    names: Sequence[tuple[str, NDArray[Any]]] = (("generated", generated), ("reference", reference))
-    for name, images in names:
-        if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
-            must = f"The {name} images must have shape (n, h, w, 3), n >= 1"
-            raise PalpateError(must, f"shape {images.shape}", "Stack them with channels last")
-        if images.dtype != np.uint8 and images.dtype.kind != "f":
-            raise PalpateError(
-                f"The {name} images must be uint8, or floats in [0, 1]",
-                f"dtype {images.dtype}",
-                "Convert them",
-            )
-        for number, image in enumerate(images if images.dtype.kind == "f" else ()):
-            low, high = float(image.min()), float(image.max())
-            if not (low >= -1e-6 and high <= 1 + 1e-6):  # also false for NaN
-                got = f"[{low:.4g}, {high:.4g}] in image {number}"
-                raise PalpateError(
-                    f"The {name} images must lie in [0, 1]", got, "Scale them to [0, 1]"
-                )
-    if generated.shape != reference.shape:
-        got, fix = (
-            f"shapes {generated.shape} and {reference.shape}",
-            "Pass the same samples in the same order and size",
-        )
-        raise PalpateError(
-            "Generated and reference images must pair one to one in one size", got, fix
-        )
-    if min(generated.shape[1:3]) < SMALLEST:
-        got = f"{generated.shape[1]} x {generated.shape[2]}"
-        raise PalpateError(
-            f"Images must be at least {SMALLEST} x {SMALLEST} for LPIPS", got, "Score larger images"
-        )
+def _images(argument: str, images: Any) -> NDArray[Any]:
+    """Images as an array of the documented shape, dtype and range."""
+    images = np.asarray(images.detach().cpu() if isinstance(images, Tensor) else images)
+    if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
+        must, got = "must have shape (n, h, w, 3), n >= 1", f"shape {images.shape}"
+        raise PalpateError(must, got, "Stack the images with channels last", argument=argument)
+    if images.dtype != np.uint8 and images.dtype.kind != "f":
+        must, got = "must be uint8, or floats in [0, 1]", f"dtype {images.dtype}"
+        raise PalpateError(must, got, "Convert the images", argument=argument)
+    for number, image in enumerate(images if images.dtype.kind == "f" else ()):
+        low, high = float(image.min()), float(image.max())
+        if not (low >= -1e-6 and high <= 1 + 1e-6):  # also false for NaN
+            got = f"[{low:.4g}, {high:.4g}] in image {number}"
+            raise PalpateError("must lie in [0, 1]", got, "Scale the images", argument=argument)
+    return images

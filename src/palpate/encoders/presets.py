@@ -1,7 +1,8 @@
-"""Presets of the encoders: size and training course, complete and typed, with what they cost on the row.
+"""Presets of the encoders: size, training course and cost.
 
-``paper`` follows paper section 3 and, where that is silent, TVL's published recipe (recipes section 3): 200 epochs, batch 256, AdamW
-(0.9, 0.95), weight decay 0.05, 10 epochs of warm-up, half a cosine to zero, learning rate 1.5e-4 x batch / 256 = 1.5e-4.
+``paper`` follows paper section 3 and, where that is silent, TVL's published recipe (recipes section
+3): 200 epochs, batch 256, AdamW (0.9, 0.95), weight decay 0.05, 10 epochs of warm-up, half a cosine
+to zero, learning rate 1.5e-4 x batch / 256 = 1.5e-4.
 """
 
 from __future__ import annotations
@@ -10,18 +11,65 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+import torch
+from torch import Tensor
+from torch.nn.functional import affine_grid, grid_sample
 from transformers import CLIPConfig, CLIPVisionConfig
 
 from palpate.core import PalpateError
-from palpate.encoders.preprocess import Augment
 from palpate.training.loop import LoopOptions
 
 Targets = Literal["diagonal", "identical-text"]
 
 
 @dataclass(frozen=True)
+class Augment:
+    """Random changes of training images; never used in evaluation (recipes, pitfall 5).
+
+    A random window of the square, resampled bilinearly, then ``gain * x + offset`` per image.
+
+    Attributes:
+        crop: the window's side is 1 - ``crop`` to 1 of the image's.
+        gain: standard deviation of the logarithm of the contrast factor.
+        offset: standard deviation of the brightness offset, in [0, 1] units.
+        flips: mirror each axis with probability 1/2. Off: a flip must hit both images of a pair or
+            none, and it swaps the sides that a sensor's colored lights come from.
+        quarter_turns: rotate by a random multiple of 90 degrees. Off, for the same reason.
+    """
+
+    crop: float = 0.1
+    gain: float = 0.1
+    offset: float = 0.05
+    flips: bool = False
+    quarter_turns: bool = False
+
+    def __call__(self, images: Tensor, generator: torch.Generator) -> Tensor:
+        """Change images (b, 3, h, w) in [0, 1]; values may leave [0, 1], as over-exposure would.
+
+        Args:
+            images: the batch, on any device.
+            generator: on the CPU; the only source of randomness.
+        """
+        n, device = len(images), images.device
+        scale = 1 - self.crop * torch.rand(n, generator=generator)
+        shift = (2 * torch.rand(n, 2, generator=generator) - 1) * (1 - scale)[:, None]
+        turns = torch.randint(0, 4, (n,), generator=generator) * self.quarter_turns
+        mirror = 1.0 - 2.0 * torch.randint(0, 2, (n, 2), generator=generator) * self.flips
+        gain = torch.exp(self.gain * torch.randn(n, generator=generator))
+        offset = self.offset * torch.randn(n, generator=generator)
+        angle = turns * (torch.pi / 2)
+        cos, sin = scale * torch.cos(angle), scale * torch.sin(angle)
+        rows = [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)]
+        window = torch.stack(rows, 1)
+        window[:, :, :2] *= mirror[:, None]
+        grid = affine_grid(window.to(device), list(images.shape), align_corners=False)
+        images = grid_sample(images, grid, align_corners=False, padding_mode="reflection")
+        return images * gain.to(device).view(n, 1, 1, 1) + offset.to(device).view(n, 1, 1, 1)
+
+
+@dataclass(frozen=True)
 class Size:
-    """A transformer: width, layers, attention heads; the feed-forward layer is four times as wide."""
+    """A transformer; its feed-forward layer is four times as wide."""
 
     width: int
     layers: int
@@ -30,7 +78,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Course:
-    """A training course; ``warmup`` is a fraction of all steps, everything else as in :class:`LoopOptions`."""
+    """A training course; ``warmup`` is a share of all steps, others as in :class:`LoopOptions`."""
 
     epochs: float
     batch: int
@@ -42,7 +90,7 @@ class Course:
     augment: Augment = field(default_factory=Augment)
 
     def options(self, n: int, seed: int, epochs: float | None = None) -> LoopOptions:
-        """The options for ``n`` training rows; a batch is never larger than the set, where rows would meet their own copies."""
+        """Return the options for ``n`` rows; no batch is larger than the set."""
         batch = max(1, min(self.batch, n))
         steps = max(1, math.ceil((self.epochs if epochs is None else epochs) * n / batch))
         return LoopOptions(
@@ -62,15 +110,19 @@ class EncoderPreset:
     """A complete set of encoders.
 
     Attributes:
-        name: for ``--preset``.
+        name: of the preset.
         pretrained: hub id or folder of the frozen CLIP, or None: a fresh one is trained first.
-        image, patch: sides in pixels of what the tactile encoder (and a fresh vision encoder) sees, and of its patches.
-        touch: size of the tactile encoder.
-        vision, text, dim, vocabulary, context: of a fresh CLIP; ``dim`` is the width of the common space, ``context`` in tokens.
-        touch_course, clip_course: how each is trained; None without a fresh CLIP.
-        targets: ``diagonal`` is the paper's loss; ``identical-text`` counts rows with equal captions as positives of each other in
-            the two text pairs (see :func:`palpate.encoders.contrastive.soft_targets`).
-        own_statistics: normalize pixels by the training side's mean and sd instead of CLIP's constants.
+        image, patch: sides in pixels of what the tactile (and a fresh vision) encoder sees, and of
+            its patches.
+        tactile: size of the tactile encoder.
+        vision, text, dim, vocabulary, context: of a fresh CLIP; ``dim`` is the width of the shared
+            space, ``context`` in tokens.
+        tactile_course, clip_course: how each is trained; None without a fresh CLIP.
+        targets: ``diagonal`` is the paper's loss; ``identical-text`` counts rows with equal
+            captions as positives of each other in the two text pairs
+            (:func:`palpate.encoders.contrastive.soft_targets`).
+        data_statistics: normalize pixels by the training part's mean and deviation instead of
+            CLIP's constants.
         cost: what it takes, and where that was measured.
     """
 
@@ -78,8 +130,8 @@ class EncoderPreset:
     pretrained: str | None
     image: int
     patch: int
-    touch: Size
-    touch_course: Course
+    tactile: Size
+    tactile_course: Course
     cost: str
     vision: Size | None = None
     text: Size | None = None
@@ -88,24 +140,21 @@ class EncoderPreset:
     vocabulary: int = 1024
     context: int = 32
     targets: Targets = "identical-text"
-    own_statistics: bool = True
+    data_statistics: bool = True
 
-    def touch_config(self, dim: int) -> CLIPVisionConfig:
-        """The tactile encoder's configuration for a common space of width ``dim``."""
-        return _vision(self.touch, self.image, self.patch, dim)
+    def tactile_config(self, dim: int) -> CLIPVisionConfig:
+        """The tactile encoder's configuration for a shared space of width ``dim``."""
+        return _vision(self.tactile, self.image, self.patch, dim)
 
     def clip_config(self, vocabulary: int) -> CLIPConfig:
-        """The fresh CLIP's configuration; ids of special tokens as in :mod:`palpate.encoders.tokenizer`.
+        """Return the fresh CLIP's configuration; ids of special tokens as in ``tokenizer``.
 
         Raises:
             PalpateError: if the preset takes a pretrained CLIP.
         """
         if self.vision is None or self.text is None:
-            raise PalpateError(
-                f"The preset {self.name} must describe a fresh CLIP",
-                f"it takes {self.pretrained}",
-                "Load that one, or use the preset mini",
-            )
+            must, got = "must describe a fresh CLIP", f"{self.name}, which takes {self.pretrained}"
+            raise PalpateError(must, got, "Pass a clip, or use the preset mini", argument="preset")
         vision = _vision(self.vision, self.image, self.patch, self.dim)
         text = {
             "hidden_size": self.text.width,
@@ -134,63 +183,54 @@ def _vision(size: Size, image: int, patch: int, dim: int) -> CLIPVisionConfig:
     )
 
 
-#: Photos of a surface have no up, and text does not care: turns and flips are free for the vision-text pair. For touch they stay off.
+# Photos of a surface have no up, and text does not care: turns and flips are free for the vision-
+# text pair.
 _MINI_VIEW = Augment(crop=0.2, gain=0.2, offset=0.1, flips=True, quarter_turns=True)
 _MINI_CLIP = Course(epochs=6, batch=32, lr=1e-3, weight_decay=0.1, augment=_MINI_VIEW)
-_MINI_TOUCH = Course(epochs=16, batch=128, lr=2e-3, weight_decay=0.1)
+_MINI_TACTILE = Course(epochs=16, batch=128, lr=2e-3, weight_decay=0.1)
 _TINY = Course(epochs=2, batch=8, lr=1e-3)
 _TVL = Course(epochs=200, batch=256, lr=1.5e-4, clip=None)
-_DATACOMP = "laion/CLIP-ViT-L-14-DataComp.XL-s13B-b90K"
 
-
-PRESETS: dict[str, EncoderPreset] = {
-    p.name: p
-    for p in (
-        #             name     pretrained  px  patch  tactile encoder        course        cost
-        EncoderPreset(
-            "tiny",
-            None,
-            16,
-            8,
-            Size(16, 1, 2),
-            _TINY,
-            "seconds; for tests",
-            vision=Size(16, 1, 2),
-            text=Size(16, 1, 2),
-            clip_course=_TINY,
-            dim=8,
-            vocabulary=300,
-            context=16,
-        ),
-        EncoderPreset(
-            "mini",
-            None,
-            64,
-            8,
-            Size(96, 3, 3),
-            _MINI_TOUCH,
-            "4,000 + 900 frames: about 65 + 33 CPU-s on one x86-64 core (AVX2)",
-            vision=Size(96, 3, 3),
-            text=Size(96, 2, 3),
-            clip_course=_MINI_CLIP,
-            dim=128,
-            vocabulary=1024,
-            context=32,
-        ),
-        EncoderPreset(
-            "paper",
-            _DATACOMP,
-            224,
-            14,
-            Size(1024, 24, 16),
-            _TVL,
-            "200 epochs on one A100 (the paper; hours not stated)",
-            dim=768,
-            targets="diagonal",
-            own_statistics=False,
-        ),
-    )
-}
+TINY = EncoderPreset(
+    name="tiny",
+    pretrained=None,
+    image=16,
+    patch=8,
+    tactile=Size(16, 1, 2),
+    tactile_course=_TINY,
+    cost="seconds; for tests",
+    vision=Size(16, 1, 2),
+    text=Size(16, 1, 2),
+    clip_course=_TINY,
+    dim=8,
+    vocabulary=300,
+    context=16,
+)
+MINI = EncoderPreset(
+    name="mini",
+    pretrained=None,
+    image=64,
+    patch=8,
+    tactile=Size(96, 3, 3),
+    tactile_course=_MINI_TACTILE,
+    cost="4,000 + 900 frames: about 65 + 33 CPU-s on one x86-64 core (AVX2)",
+    vision=Size(96, 3, 3),
+    text=Size(96, 2, 3),
+    clip_course=_MINI_CLIP,
+)
+PAPER = EncoderPreset(
+    name="paper",
+    pretrained="laion/CLIP-ViT-L-14-DataComp.XL-s13B-b90K",
+    image=224,
+    patch=14,
+    tactile=Size(1024, 24, 16),
+    tactile_course=_TVL,
+    cost="200 epochs on one A100 (the paper; hours not stated)",
+    dim=768,
+    targets="diagonal",
+    data_statistics=False,
+)
+PRESETS = {preset.name: preset for preset in (TINY, MINI, PAPER)}
 
 
 def preset(name: str) -> EncoderPreset:
@@ -200,9 +240,6 @@ def preset(name: str) -> EncoderPreset:
         PalpateError: if there is none of that name.
     """
     if name not in PRESETS:
-        raise PalpateError(
-            f"A preset of the encoders must be one of {', '.join(PRESETS)}",
-            repr(name),
-            "Choose one of these",
-        )
+        must = f"must be one of {', '.join(PRESETS)}"
+        raise PalpateError(must, repr(name), "Choose one of these", argument="preset")
     return PRESETS[name]

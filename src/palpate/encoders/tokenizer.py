@@ -1,8 +1,9 @@
-"""A small tokenizer for a fresh CLIP: byte-level BPE on lower-cased text, in the ``tokenizers`` file format.
+"""A small tokenizer for a fresh CLIP: byte-level BPE on lower-cased text.
 
-A text becomes ``<|startoftext|> pieces <|endoftext|>``, padded with ``<pad>``. Every byte is in the alphabet, so no text is
-unknown. CLIP pools the state at the *first* end-of-text token, and transformers reads the legacy id 2 as "take the largest
-id" instead: the ids here are 0 pad, 1 start, 2 unknown (never produced), 3 end, so that the pooling is by equality.
+A text becomes ``<|startoftext|> pieces <|endoftext|>``, padded with ``<pad>``. Every byte is in the
+alphabet, so no text is unknown. CLIP pools the state at the *first* end-of-text token, and
+transformers reads the legacy id 2 as "take the largest id": the ids here are 0 pad, 1 start, 2
+unknown (never produced), 3 end, so that the pooling is by equality.
 """
 
 from __future__ import annotations
@@ -31,34 +32,30 @@ PAD, START, UNKNOWN, END = SPECIAL = ("<pad>", "<|startoftext|>", "<unk>", "<|en
 def train_tokenizer(
     texts: Iterable[str], *, vocabulary: int = 1024, context: int = 32
 ) -> PreTrainedTokenizerFast:
-    """Learns a tokenizer from texts; the same texts, in any order and number, give the same one.
+    """Learn a tokenizer from texts; the same texts, in any order and number, give the same one.
 
     Args:
         texts: at least one text with a letter.
         vocabulary: largest number of tokens, special tokens and the 256 bytes included.
-        context: tokens a text may have, start and end included; longer texts are cut before the end token.
+        context: tokens a text may have, start and end included; longer texts are cut before the end
+            token.
 
     Raises:
-        PalpateError: without a text.
+        PalpateError: without a text, or with a vocabulary too small for the bytes.
     """
     distinct = sorted({text.strip() for text in texts} - {""})
     if not distinct:
-        raise PalpateError(
-            "A tokenizer needs at least one text",
-            "none",
-            "Fill the manifest's column text or material",
-        )
+        fix = "Fill the manifest's column text or material"
+        raise PalpateError("A tokenizer needs at least one text", "none", fix)
     alphabet = pre_tokenizers.ByteLevel.alphabet()
-    if vocabulary < len(alphabet) + len(SPECIAL):
-        raise PalpateError(
-            f"The vocabulary must hold the bytes and special tokens, {len(alphabet) + len(SPECIAL)}",
-            f"{vocabulary}",
-            "Choose e.g. 1024",
-        )
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])  # pyright: ignore[reportAttributeAccessIssue]
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)  # pyright: ignore[reportAttributeAccessIssue]
-    tokenizer.decoder = decoders.ByteLevel()  # pyright: ignore[reportAttributeAccessIssue]
+    smallest = len(alphabet) + len(SPECIAL)
+    if vocabulary < smallest:
+        must = f"must hold the bytes and special tokens, {smallest}"
+        raise PalpateError(must, f"{vocabulary}", "Choose e.g. 1024", argument="vocabulary")
+    tokenizer: Any = Tokenizer(models.BPE())
+    tokenizer.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Lowercase()])
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
+    tokenizer.decoder = decoders.ByteLevel()
     trainer = trainers.BpeTrainer(
         vocab_size=vocabulary,
         special_tokens=list(SPECIAL),
@@ -66,7 +63,7 @@ def train_tokenizer(
         show_progress=False,
     )
     tokenizer.train_from_iterator(distinct, trainer)
-    tokenizer.post_processor = processors.TemplateProcessing(  # pyright: ignore[reportAttributeAccessIssue]
+    tokenizer.post_processor = processors.TemplateProcessing(
         single=f"{START} $A {END}",
         special_tokens=[(START, SPECIAL.index(START)), (END, SPECIAL.index(END))],
     )
@@ -81,21 +78,18 @@ def train_tokenizer(
 
 
 def save_tokenizer(tokenizer: Any, folder: Path) -> None:
-    """Writes the tokenizer beside a model, so that ``AutoTokenizer`` of transformers 4 and 5 reads it.
+    """Write the tokenizer for ``AutoTokenizer`` of transformers 4 and 5.
 
-    How it was loaded, and how its last call cut and padded, is no part of it, and would make equal tokenizers differ.
+    How it was loaded, and how its last call cut and padded, is dropped: equal tokenizers are equal
+    files.
     """
-    if (
-        backend := getattr(tokenizer, "backend_tokenizer", None)
-    ) is not None:  # every call sets these anew
-        backend.no_truncation()
+    if (backend := getattr(tokenizer, "backend_tokenizer", None)) is not None:
+        backend.no_truncation()  # every call sets these anew
         backend.no_padding()
     tokenizer.save_pretrained(folder)
     path = Path(folder) / "tokenizer_config.json"
     config = json.loads(path.read_text(encoding="utf-8"))
-    if (
-        config.get("tokenizer_class") == "TokenizersBackend"
-    ):  # transformers 5's name, unknown to 4, which 5 still accepts
+    if config.get("tokenizer_class") == "TokenizersBackend":  # transformers 5's name, unknown to 4
         config["tokenizer_class"] = "PreTrainedTokenizerFast"
     config = {k: v for k, v in config.items() if k not in ("is_local", "local_files_only")}
     path.write_text(json.dumps(config, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

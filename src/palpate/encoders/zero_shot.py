@@ -1,7 +1,8 @@
-"""Zero-shot classification: an image takes the class whose texts lie nearest to it (Radford et al. 2021, section 3.1).
+"""Zero-shot classification: the class whose texts are nearest (Radford et al. 2021, 3.1).
 
-Each class has a few texts ("this is gravel", ...). Their embeddings t, each of length 1, make its prototype p_c = mean(t) / ||mean(t)||; the image
-embedding v gets the class with the largest v.p_c. Nothing is trained.
+Each class has a few texts ("this is gravel", ...). Their embeddings t, each of length 1, make its
+prototype p_c = mean(t) / ||mean(t)||; the image embedding v gets the class with the largest v.p_c.
+Nothing is trained.
 """
 
 from __future__ import annotations
@@ -34,55 +35,39 @@ def zero_shot_accuracy(
         split: digest, for the score.
 
     Returns:
-        A score in [0, 1]; ``details`` holds chance (1 / classes), recall by class, and the prompts' number.
+        A score in [0, 1]; ``details`` holds chance (1 / classes) and recall by class, ``settings``
+        the prompts.
 
     Raises:
-        PalpateError: without labels, on a label without prompts, a class without a text, or fewer than two classes.
+        PalpateError: on an image without label, a label without prompts, or fewer than two classes
+            with texts.
     """
-    labels = list(images.labels or ())
+    labels, classes = [str(label) for label in images.labels or ()], sorted(prompts)
     if not labels or "" in labels:
-        raise PalpateError(
-            "Zero-shot classification needs a label for every image",
-            f"{labels.count('') or 'all'} without",
-            "Leave these out",
-        )
-    classes = sorted(prompts)
-    if len(classes) < 2 or any(not prompts[name] for name in classes):
-        raise PalpateError(
-            "There must be at least two classes, each with a text",
-            f"{len(classes)} classes",
-            "Pass more prompts",
-        )
-    if unknown := sorted({str(label) for label in labels} - set(classes)):
-        raise PalpateError(
-            "Every label must be a class with prompts",
-            f"{len(unknown)} that are not, first {unknown[0]!r}",
-            "Add its texts",
-        )
-    prototypes = np.stack(
-        [
-            _unit(embed_texts(prompts[name], encoders).astype(np.float64).mean(axis=0))
-            for name in classes
-        ]
-    )
-    named = [classes[k] for k in (images.features.astype(np.float64) @ prototypes.T).argmax(axis=1)]
-    hit = np.array([a == b for a, b in zip(named, labels, strict=True)], dtype=float)
-    groups = list(images.groups) if images.groups is not None else list(images.ids)
+        must, got = "Zero-shot classification needs a label for every image", "images without"
+        raise PalpateError(must, got, "Skip these")
+    if len(classes) < 2 or not all(prompts.values()):
+        must, got = "must hold at least two classes, each with a text", f"{len(classes)} classes"
+        raise PalpateError(must, got, "Pass more prompts", argument="prompts")
+    if unknown := sorted(set(labels) - set(classes)):
+        must, got = "must hold every label", f"{len(unknown)} labels missing, first {unknown[0]!r}"
+        raise PalpateError(must, got, "Add its texts", argument="prompts")
+    embedded = (embed_texts(prompts[c], encoders).astype(np.float64) for c in classes)
+    means = np.stack([rows.mean(axis=0) for rows in embedded])
+    prototypes = means / np.linalg.norm(means, axis=1, keepdims=True)
+    chosen = (images.features.astype(np.float64) @ prototypes.T).argmax(axis=1)
+    hit = np.array([classes[k] == label for k, label in zip(chosen, labels, strict=True)], float)
     return mean_over_groups(
         "zero-shot accuracy",
         hit,
-        groups,
+        list(images.groups if images.groups is not None else images.ids),
         estimator="mean",
         subject=subject,
         split=split,
         encoder=images.encoder,
         settings={
-            "prompts": {name: list(prompts[name]) for name in classes},
+            "prompts": {c: list(prompts[c]) for c in classes},
             "text": encoders.digest("text"),
         },
         details={"chance": 1 / len(classes), "recall": recall_by_class(hit, labels)},
     )
-
-
-def _unit(x: np.ndarray) -> np.ndarray:
-    return x / np.linalg.norm(x)

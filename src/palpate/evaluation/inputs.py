@@ -405,7 +405,7 @@ def _read_path(path: Path, group: str) -> Samples:
             raise ProblemsError(problems, "Fix the rows, or import again and skip them")
         return _of_manifest(manifest, str(path), group)
     if _is_generated(path):
-        from palpate.diffusion.generate import Generated
+        from palpate.diffusion.generation import Generated
 
         folder = Generated.load(path)
         rows = [{"id": i, "tactile": f"images/{file}"} for i, file in folder.files.items()]

@@ -39,19 +39,19 @@ from palpate.core import (
     read_json,
     write_json,
 )
-from palpate.core.shipped import Part, is_shipped, shipped_folder
 from palpate.data.images import cached_images
 from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
 from palpate.diffusion.autoencoder_training import train_autoencoder
-from palpate.diffusion.generate import Generated, generate
+from palpate.diffusion.generation import Generated, generate
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import preset_named as diffusion_preset
-from palpate.diffusion.recipe import train_pipeline
-from palpate.encoders.contrastive import train_clip, train_touch
+from palpate.diffusion.training import train_pipeline
+from palpate.encoders.contrastive import train_clip, train_tactile
 from palpate.encoders.embed import texts_of
-from palpate.encoders.encoder_set import EncoderSet, load_clip, pick_device
+from palpate.encoders.encoder_set import EncoderSet, load_clip
+from palpate.encoders.models import Part, is_shipped, pick_device, shipped_folder
 from palpate.encoders.presets import preset as encoder_preset
 from palpate.evaluation.scoring import score
 from palpate.leakage.auditing import audit as audit_split
@@ -434,7 +434,7 @@ class _Pipeline:
             before, after = self.preset.touch_epochs
             if ready is not None:
                 start = EncoderSet.load(ready)
-                encoders = train_touch(
+                encoders = train_tactile(
                     manifest,
                     split,
                     frozen,
@@ -445,14 +445,14 @@ class _Pipeline:
                     **common,
                 )
             elif pretraining is None:
-                encoders = train_touch(
+                encoders = train_tactile(
                     manifest, split, frozen, self.encoder, folder / "training", **common
                 )
             else:
                 everything = Split.from_ids(
                     train=pretraining.ids, rule={"name": "pretraining"}, manifest=pretraining.digest
                 )
-                start = train_touch(
+                start = train_tactile(
                     pretraining,
                     everything,
                     frozen,
@@ -461,7 +461,7 @@ class _Pipeline:
                     epochs=before,
                     **common,
                 )
-                encoders = train_touch(
+                encoders = train_tactile(
                     manifest,
                     split,
                     frozen,
@@ -509,7 +509,7 @@ class _Pipeline:
                 folder / "training",
                 seed=self.options.seed,
                 background=self.options.background,
-                start=TactilePipeline.load(start) if start else None,
+                start=TactilePipeline.from_pretrained(start) if start else None,
                 cache=self.cache,
                 device=self.options.device,
                 progress=self.progress,
@@ -540,16 +540,16 @@ class _Pipeline:
             inputs | {"seed": self.options.seed} | self._digest("split", "data", "encoders"),
             build,
         )
-        return TactilePipeline.load(stage.folder / "model")
+        return TactilePipeline.from_pretrained(stage.folder / "model")
 
     def generated(self, manifest: Manifest, split: Split, pipeline: TactilePipeline) -> Generated:
         """A touch for each photo of the test part."""
 
         def build(folder: Path) -> dict[str, Any]:
             made = generate(
-                pipeline,
-                manifest=manifest.part(split, "test"),
-                out=folder / "touches",
+                manifest.part(split, "test"),
+                model=pipeline,
+                output=folder / "touches",
                 seed=self.options.seed,
                 progress=self.progress,
             )

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from palpate.core import Score, rng_for
-from palpate.core.shipped import is_shipped
 from palpate.data.manifest import Manifest
-from palpate.diffusion.generate import Generated
+from palpate.diffusion.generation import Generated
+from palpate.encoders.models import is_shipped
 from palpate.evaluation.scoring import BACKGROUND
 from palpate.report.notes import sentence
 from palpate.report.results import Audit, GalleryItem, Results

@@ -1,1 +1,1 @@
-"""Training: one engine for every model."""
+"""Training: one engine for every model (options, steps, checkpoints, averaging, log)."""

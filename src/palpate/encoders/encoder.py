@@ -1,0 +1,156 @@
+"""One encoder of a set, for images or texts in any form that people have them in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from palpate.core import PalpateError, Progress, quiet
+from palpate.data.images import SUFFIXES, read_image, square
+from palpate.data.manifest import Manifest
+from palpate.encoders.embed import embed, embed_images, embed_texts
+from palpate.encoders.encoder_set import EncoderSet, Modality
+from palpate.encoders.models import pick_device
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """The vision, text or tactile encoder of a set: images or texts to embeddings.
+
+    ::
+
+        encoder = Encoder.from_pretrained("palpate/mini", modality="tactile")
+        features = encoder.encode(["a.png", "b.png"])  # (2, 128) float32, L2-normalized
+
+    Attributes:
+        encoders: the set.
+        modality: ``vision``, ``text`` or ``tactile``.
+    """
+
+    encoders: EncoderSet
+    modality: Modality
+
+    def __post_init__(self) -> None:
+        if self.modality not in self.encoders.modalities:
+            must = f"must be one of {', '.join(self.encoders.modalities)} for these encoders"
+            raise PalpateError(must, repr(self.modality), "Choose another", argument="modality")
+
+    @classmethod
+    def from_pretrained(
+        cls, source: str | Path, *, modality: Modality, device: str = "auto"
+    ) -> Encoder:
+        """Load one encoder of a saved set.
+
+        Args:
+            source: a shipped name (``palpate/mini``), a folder of ``palpate train encoder`` or a
+                hub id.
+            modality: ``vision``, ``text`` or ``tactile``.
+            device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+
+        Raises:
+            PalpateError: if there is no such set, or it has no such encoder.
+        """
+        if modality not in get_args(Modality):
+            must = f"must be one of {', '.join(get_args(Modality))}"
+            raise PalpateError(must, repr(modality), "Choose one of these", argument="modality")
+        return cls(EncoderSet.load(source, device=str(pick_device(device))), modality)
+
+    @property
+    def dim(self) -> int:
+        """Width of the embeddings."""
+        return self.encoders.dim
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of weights, architecture and preprocessing."""
+        return self.encoders.digest(self.modality)
+
+    def encode(
+        self, inputs: Any, *, batch: int = 128, progress: Progress = quiet
+    ) -> NDArray[np.float32]:
+        """Embeddings of images or texts.
+
+        Args:
+            inputs: for images: a file or a folder of them, a PIL image, a list of files or PIL
+                images, a uint8 array (n, h, w, 3), a tensor (n, 3, h, w) of bytes or of floats in
+                [0, 1], or a manifest. For text: a string, a list of strings, or a manifest.
+            batch: images or texts at a time; changes the result by rounding only (1e-5).
+            progress: called with the number of inputs done.
+
+        Returns:
+            (n, dim) float32, L2-normalized, in the order of the inputs; a folder in the order of
+            its paths.
+
+        Raises:
+            PalpateError: if an image is unreadable, or the inputs are of another kind.
+        """
+        if isinstance(inputs, Manifest):
+            return np.asarray(embed(inputs, self.encoders, self.modality, batch=batch).features)
+        if self.modality == "text":
+            texts = [inputs] if isinstance(inputs, str) else list(inputs)
+            return embed_texts(texts, self.encoders, batch=batch, progress=progress)
+        images, size = list_images(inputs), self.encoders.preprocess(self.modality).resize
+        parts = [np.empty((0, self.dim), np.float32)]
+        for pixels in squares(images, size, batch):
+            parts.append(embed_images(pixels, self.encoders, self.modality, batch=batch))
+            done = sum(map(len, parts))
+            progress(f"embedding {self.modality}", done, len(images))
+        return np.concatenate(parts)
+
+
+def list_images(inputs: Any) -> list[Path | Image.Image]:
+    """Images in any form as a list of files and PIL images.
+
+    Args:
+        inputs: see :meth:`Encoder.encode`.
+
+    Raises:
+        PalpateError: for arrays of another type or shape, a missing path, or other objects.
+    """
+    if isinstance(inputs, str | Path):
+        path = Path(inputs)
+        if not path.is_dir():
+            return [path]
+        files = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
+        return sorted(files)
+    if isinstance(inputs, Image.Image):
+        return [inputs.convert("RGB")]
+    if hasattr(inputs, "shape"):
+        return [Image.fromarray(image) for image in _bytes(inputs)]
+    if isinstance(inputs, Sequence):
+        return [image for entry in inputs for image in list_images(entry)]
+    must, fix = "must be files, PIL images, arrays or tensors", "Pass e.g. a list of files"
+    raise PalpateError(must, type(inputs).__name__, fix, argument="images")
+
+
+def squares(
+    images: Sequence[Path | Image.Image], size: int, batch: int
+) -> Iterator[NDArray[np.uint8]]:
+    """Images as center squares (b, size, size, 3), a batch in memory at a time."""
+    for start in range(0, len(images), batch):
+        decoded = (
+            read_image(i) if isinstance(i, Path) else i for i in images[start : start + batch]
+        )
+        yield np.stack([square(image, size) for image in decoded])
+
+
+def _bytes(images: Any) -> NDArray[np.uint8]:
+    """An array or tensor as uint8 (n, h, w, 3)."""
+    array = np.asarray(images.detach().cpu() if hasattr(images, "detach") else images)
+    shape = array.shape
+    array = array[None] if array.ndim == 3 else array
+    if hasattr(images, "detach") and array.ndim == 4 and array.shape[1] == 3:
+        array = array.transpose(0, 2, 3, 1)
+        if array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1:
+            array = np.rint(array * 255).astype(np.uint8)
+    if array.ndim != 4 or array.shape[3] != 3 or array.dtype != np.uint8:
+        must = "must be uint8 (n, h, w, 3), or a tensor (n, 3, h, w) in [0, 1]"
+        got = f"{array.dtype} of shape {shape}"
+        raise PalpateError(must, got, "Scale to 0..255 and round", argument="images")
+    return np.ascontiguousarray(array)

@@ -1,0 +1,298 @@
+"""Models on disk: found by name, loaded whole, saved plainly, named by a digest.
+
+A name is a shipped model, a local folder, or a Hugging Face hub id, in that order: a *string* that
+begins with ``palpate/`` is a shipped name, whatever lies in the working directory; a folder
+``palpate/mini`` is named ``./palpate/mini``, or passed as a :class:`pathlib.Path`, which is always
+a folder. From the hub only JSON, text and safetensors are fetched, once. Shipped models are in the
+package, and no network is used::
+
+    palpate/mini/encoders/      vision, text and tactile; clip/ in it is a plain CLIP folder
+    palpate/mini/autoencoder/   autoencoder of tactile images
+    palpate/mini/generator/     photo to tactile image; refers to the other two by name and digest
+
+Weights may be saved in 16 bits. They are rounded in the model first, so that what is scored and
+digested is what is written: IEEE 754 half precision has 11 significant bits, so a weight of normal
+size changes by at most 2^-11 = 4.9e-4 of itself; from 65,520 on there is only infinity. Everything
+is computed in 32 bits.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import pickle
+import re
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from safetensors import SafetensorError
+
+from palpate.core import PalpateError
+from palpate.core.digest import canonical_json
+
+if TYPE_CHECKING:  # names are checked before torch is imported, which takes seconds
+    import torch
+    from torch import Tensor, nn
+
+Part = Literal["clip", "encoders", "autoencoder", "generator"]
+#: The shipped names, and the folder of each in :func:`shipped_root`.
+SHIPPED = {"palpate/mini": "mini"}
+#: Where the parts are in the folder of a name.
+PARTS: dict[Part, str] = {
+    "clip": "encoders/clip",
+    "encoders": "encoders",
+    "autoencoder": "autoencoder",
+    "generator": "generator",
+}
+PREFIX = "palpate/"
+FIX_MODEL = "Make one with: palpate train generator"
+HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+#: Raised for an unreachable hub, absent files, foreign formats and pickled objects.
+UNREADABLE = (
+    OSError,
+    ValueError,
+    RuntimeError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    SafetensorError,
+    pickle.UnpicklingError,
+)
+#: What palpate's saved folders hold, and the small files of a single model.
+PATTERNS = ("*.json", "*.txt", "*.md", "*.safetensors")
+SMALL_FILES = ("config.json", "palpate.json", "preprocessor_config.json")
+#: Settings of a transformers or diffusers model that decide what it computes; others name files or
+#: versions.
+ARCHITECTURE = """
+    hidden_size intermediate_size num_hidden_layers num_attention_heads image_size patch_size
+    num_channels vocab_size max_position_embeddings eos_token_id projection_dim hidden_act
+    layer_norm_eps
+
+    act_fn attention_head_dim block_out_channels class_embed_type cross_attention_dim
+    down_block_types downsample_padding flip_sin_to_cos freq_shift in_channels latent_channels
+    layers_per_block lookup_from_codebook mid_block_add_attention mid_block_scale_factor
+    mid_block_type norm_eps norm_num_groups norm_type num_vq_embeddings only_cross_attention
+    out_channels resnet_time_scale_shift scaling_factor time_embedding_type timestep_post_act
+    transformer_layers_per_block up_block_types use_linear_projection vq_embed_dim
+""".split()  # noqa: SIM905 - readable as a list of words
+
+
+def shipped_root() -> Path:
+    """The folder of the installed package, which holds the folders of :data:`SHIPPED`."""
+    return Path(__file__).resolve().parents[1]
+
+
+def is_shipped(name: object) -> bool:
+    """Whether ``name`` refers to a shipped model, known or not."""
+    return isinstance(name, str) and name.startswith(PREFIX)
+
+
+def shipped_folder(name: str | Path, part: Part) -> Path | None:
+    """The folder of one part of a shipped model, or None where ``name`` is no shipped name.
+
+    Raises:
+        PalpateError: for an unknown name that begins with ``palpate/``, or if the files are absent.
+    """
+    if not is_shipped(name):
+        return None
+    if name not in SHIPPED:
+        must = f"A name that begins with {PREFIX} must be one of {', '.join(SHIPPED)}"
+        fix = f"Choose one of these; a folder of that name is written ./{name}"
+        raise PalpateError(must, repr(name), fix)
+    folder = shipped_root() / SHIPPED[str(name)] / PARTS[part]
+    if not (folder / "palpate.json").is_file():
+        must, got = f"{name} must lie in the installed package", f"no {part} in {shipped_root()}"
+        raise PalpateError(must, got, "Install palpate again, from its wheel")
+    return folder
+
+
+def is_hub_id(name: str | Path) -> bool:
+    """Whether ``name`` is a hub id: a string ``owner/name``, not shipped and no folder here."""
+    if not isinstance(name, str) or is_shipped(name):
+        return False
+    return bool(HUB_ID.fullmatch(name)) and not Path(name).is_dir()
+
+
+def find_model(source: str | Path, part: Part, what: str, fix: str) -> Path:
+    """The local folder of a saved model, fetched from the hub where needed.
+
+    Args:
+        source: a shipped name, a folder, or a hub id; a :class:`~pathlib.Path` is always a folder.
+        part: which part of a shipped model.
+        what: role of the model, for the error (``"pipeline"``).
+        fix: how to get one, for the error.
+
+    Raises:
+        PalpateError: for an unknown shipped name, a missing folder, or a hub out of reach.
+    """
+    if (shipped := shipped_folder(source, part)) is not None:
+        return shipped
+    if is_hub_id(source):
+        return _fetch(str(source), PATTERNS, what, fix)
+    if not str(source) or not Path(source).is_dir():
+        must = f"The {what} must be a folder, one of {', '.join(SHIPPED)}, or a hub id (owner/name)"
+        raise PalpateError(must, f"no folder {source or repr('')}", fix)
+    return Path(source)
+
+
+def find_single(source: str | Path, part: Part, what: str, fix: str) -> tuple[str, Path]:
+    """Return what ``from_pretrained`` takes, and the local folder of the small files."""
+    if is_hub_id(source):  # small files first: a hub out of reach is queried once, not many times
+        return str(source), _fetch(str(source), SMALL_FILES, what, fix)
+    folder = find_model(source, part, what, fix)
+    return str(folder), folder
+
+
+def _fetch(name: str, patterns: Sequence[str], what: str, fix: str) -> Path:
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.utils import disable_progress_bars
+
+    disable_progress_bars()
+    try:
+        return Path(snapshot_download(name, allow_patterns=list(patterns)))
+    except (OSError, ValueError) as error:
+        must = f"The {what} {name} must be a hub id within reach, a local folder or a shipped model"
+        raise PalpateError(must, first_line(error).removeprefix("Got: "), fix) from None
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error, or its kind if it has none."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def load_model(kind: Any, name: str, must: str, fix: str, **options: Any) -> Any:
+    """``kind.from_pretrained(name)`` in float32, for evaluation, without gradients.
+
+    Raises:
+        PalpateError: ``must``, if files are absent, unreadable, or lack weights, which transformers
+            would draw at random.
+    """
+    try:
+        with silent():
+            model, report = kind.from_pretrained(name, output_loading_info=True, **options)
+    except UNREADABLE as error:
+        raise PalpateError(must, first_line(error), fix) from None
+    if missing := sorted(report["missing_keys"]):
+        got = f"{len(missing)} weights are missing, first {missing[0]}"
+        raise PalpateError(must, got, fix)
+    return model.float().eval().requires_grad_(False)
+
+
+def save_model(model: Any, folder: Path, *, half: bool) -> None:
+    """Call ``model.save_pretrained``, with ``half`` of a 16-bit copy of rounded weights.
+
+    Two entries of ``config.json`` would make equal models differ: the path that the model was
+    loaded from is removed, and ``dtype`` is that of the weights in this file in every part.
+    """
+    with silent():
+        (copy.deepcopy(model).half() if half else model).save_pretrained(folder)
+    path = Path(folder) / "config.json"
+    config = json.loads(path.read_text(encoding="utf-8"))
+    before = copy.deepcopy(config)
+    config.pop("_name_or_path", None)
+    if "dtype" in config:  # diffusers has none
+        parts = (v for k, v in config.items() if k.endswith("_config") and isinstance(v, dict))
+        for part in (config, *parts):
+            part["dtype"] = "float16" if half else str(model.dtype).removeprefix("torch.")
+    if config != before:
+        path.write_text(json.dumps(config, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def round_to_half(modules: Mapping[str, nn.Module]) -> float:
+    """Round the floating-point weights of modules to float16 values, in place; their type stays.
+
+    Returns:
+        The largest ``||after - before|| / ||before||`` of a tensor.
+
+    Raises:
+        PalpateError: if a weight is not finite in 16 bits; nothing is changed then.
+    """
+    states = {f"{part}.{k}": v for part, m in modules.items() for k, v in m.state_dict().items()}
+    before = {name: value for name, value in states.items() if value.is_floating_point()}
+    after = {name: value.half().to(value.dtype) for name, value in before.items()}
+    for name, value in after.items():
+        if not bool(value.isfinite().all()):
+            got = f"{name} with values up to {float(before[name].abs().max()):.3g}"
+            must = "Weights saved in 16 bits must be finite and below 65,520 in size"
+            raise PalpateError(must, got, "Save them in 32 bits")
+    change = 0.0
+    for name, value in before.items():
+        norm = float(value.double().norm())
+        change = max(change, float((after[name] - value).double().norm()) / (norm or 1.0))
+        value.copy_(after[name])  # the tensors of state_dict are the module's, without gradients
+    return change
+
+
+def architecture(config: Any) -> dict[str, Any]:
+    """Return the part of a model's configuration that belongs into a digest."""
+    get = config.get if isinstance(config, Mapping) else lambda name: getattr(config, name, None)
+    return {name: value for name in ARCHITECTURE if (value := get(name)) is not None}
+
+
+def digest_tensors(tensors: Mapping[str, Tensor], facts: Mapping[str, Any] | None = None) -> str:
+    """SHA-256 over facts (JSON) and names, types, shapes and values; the same on every device.
+
+    With facts the types are NumPy's names (``float32``), without them torch's (``torch.float32``):
+    digests of encoders and of diffusion models differ in that, and models that are in use carry
+    them.
+    """
+    state = hashlib.sha256(b"" if facts is None else canonical_json(dict(facts)).encode())
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().contiguous()
+        kind = str(value.dtype) if facts is None else str(value.dtype).removeprefix("torch.")
+        state.update(f"{name} {kind} {tuple(value.shape)}\n".encode())
+        state.update(value.numpy().tobytes())
+    return state.hexdigest()
+
+
+def digest_modules(modules: Mapping[str, nn.Module], facts: Mapping[str, Any]) -> str:
+    """:func:`digest_tensors` of the weights of modules, as ``module.name``."""
+    states = {part: module.state_dict() for part, module in modules.items()}
+    return digest_tensors({f"{p}.{k}": v for p, s in states.items() for k, v in s.items()}, facts)
+
+
+def move(module: nn.Module, device: torch.device) -> None:
+    """Move a module in place; transformers types ``to`` of its models wrongly."""
+    module.to(device)
+
+
+def pick_device(device: str | torch.device) -> torch.device:
+    """``auto`` is CUDA, else Apple's MPS, else the CPU; any other name is torch's.
+
+    Raises:
+        PalpateError: for a name that torch does not know or a device that is absent.
+    """
+    import torch
+
+    if device == "auto":
+        mps = torch.backends.mps.is_available()
+        device = "cuda" if torch.cuda.is_available() else "mps" if mps else "cpu"
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        must, fix = (
+            "must be auto, cpu, or a device of this machine",
+            "Choose auto, cpu, cuda or mps",
+        )
+        got = f"{str(device)!r}: {first_line(error)}"
+        raise PalpateError(must, got, fix, argument="device") from None
+    return torch.device(device)
+
+
+@contextmanager
+def silent() -> Generator[None]:
+    """No load reports or progress bars of transformers inside; its settings are restored."""
+    from transformers.utils import logging
+
+    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if bars:
+            logging.enable_progress_bar()

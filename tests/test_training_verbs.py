@@ -1,0 +1,119 @@
+"""`train_encoder` and `train_generator`, in Python and on the command line: results, resuming, mistakes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from palpate.cli import main
+from palpate.core import PalpateError, Split
+from palpate.diffusion import TactilePipeline, train_generator
+from palpate.encoders import EncoderSet, train_encoder
+
+
+@pytest.fixture
+def data(small_manifest, tmp_path):
+    """A data set of six videos, saved, and a split of it by video."""
+    videos = small_manifest.column("video")
+    parts = {"train": videos[:16] + videos[-16:]}
+    train = [i for i, v in zip(small_manifest.ids, videos, strict=True) if v in parts["train"]]
+    test = [i for i in small_manifest.ids if i not in train]
+    split = Split.from_ids(train=train, test=test, manifest=small_manifest.digest)
+    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
+    split.save(tmp_path / "split.json")
+    return small_manifest, split
+
+
+def stop_at(what, step):
+    def progress(name, done, total, remark=""):
+        if name == what and done == step:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    common = ["tag", "--split", "split.json", "--preset", "tiny", "--json"]
+    assert main(["train", "encoder", *common, "-o", "encoders"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    encoders = EncoderSet.load(tmp_path / "encoders")
+    assert facts["tactile"] == encoders.digest("tactile")
+    assert facts["split"] == encoders.card["split"] == data[1].digest
+    (row,) = encoders.card["scores"]
+    assert facts["test_material_accuracy"] == row["value"]
+    assert row["value"] >= 0
+    assert "linear probe of material" in (tmp_path / "encoders" / "README.md").read_text()
+    options = ["--clip", "encoders", "--steps", "2", "-o", "model"]
+    assert main(["train", "generator", *common, *options]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    pipeline = TactilePipeline.from_pretrained(tmp_path / "model")
+    assert (facts["digest"], facts["steps"], facts["source"]) == (pipeline.digest, 2, "text")
+    assert pipeline.encoders.digest("vision") == encoders.digest("vision")
+    assert pipeline.autoencoder.card["held_out"]["n"] == len(data[1].ids("test"))
+    photo = data[0].paths("vision")[0]
+    assert main(["generate", str(photo), "--model", "model", "-o", "t.png"]) == 0
+    assert not [p.name for p in tmp_path.iterdir() if p.name.endswith(".work")]
+    # The same again does not overwrite.
+    assert main(["train", "encoder", *common, "-o", "encoders"]) == 2
+    assert "--output must be absent or an empty folder" in capsys.readouterr().err
+
+
+def test_an_interrupted_training_ends_as_an_uninterrupted_one(data, tmp_path):
+    manifest, split = data
+    common = {"preset": "tiny", "device": "cpu"}
+    whole = train_encoder(manifest, split, **common)
+    stop = stop_at("training the tactile encoder", 3)
+    with pytest.raises(KeyboardInterrupt):
+        train_encoder(manifest, split, output=tmp_path / "e", progress=stop, **common)
+    assert not (tmp_path / "e").exists()
+    again = train_encoder(manifest, split, output=tmp_path / "e", **common)
+    assert again.digest("tactile") == whole.digest("tactile")
+    assert again.card["scores"] == whole.card["scores"]
+    options = {"steps": 4, "autoencoder": "palpate/mini", **common}
+    options["preset"] = "mini"
+    whole_pipeline = train_generator(manifest, split, whole, **options)
+    with pytest.raises(KeyboardInterrupt):
+        train_generator(
+            manifest,
+            split,
+            whole,
+            output=tmp_path / "g",
+            progress=stop_at("generator", 2),
+            **options,
+        )
+    pipeline = train_generator(manifest, split, whole, output=tmp_path / "g", **options)
+    assert pipeline.digest == whole_pipeline.digest
+    photo = manifest.paths("vision")[0]
+    one, other = (np.asarray(p(photo, steps=2).images[0]) for p in (pipeline, whole_pipeline))
+    assert np.array_equal(one, other)
+
+
+def test_a_set_of_encoders_or_a_clip_conditions_a_generator(data, tmp_path):
+    encoders = train_encoder(*data, preset="tiny", device="cpu")
+    encoders.save(tmp_path / "set")
+    made = [
+        train_generator(*data, clip, preset="tiny", steps=1, device="cpu")
+        for clip in (tmp_path / "set", tmp_path / "set" / "clip")
+    ]
+    assert made[0].digest == made[1].digest
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda m, s: train_encoder(m, s, preset="huge"), "`preset` must be one of tiny, mini"),
+        (lambda m, s: train_encoder(m, s, epochs=0), "`epochs` must be a positive number"),
+        (lambda m, s: train_encoder(m, s, clip="nowhere"), "no folder nowhere"),
+        (lambda m, s: train_encoder(m, Split.from_ids(test=m.ids)), "train part"),
+        (lambda m, s: train_generator(m, s, "nowhere", preset="tiny"), "no folder nowhere"),
+        (lambda m, s: train_generator(m, s, "palpate/mini", steps=0), "`steps` must be at least 1"),
+        (
+            lambda m, s: train_generator(m, s, "palpate/mini", preset="paper"),
+            "`autoencoder` must be given for the preset paper",
+        ),
+    ],
+)
+def test_mistakes_are_explained(data, call, message):
+    with pytest.raises(PalpateError, match=message):
+        call(*data)
