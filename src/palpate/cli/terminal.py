@@ -23,7 +23,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -61,13 +61,14 @@ RENAMED: dict[tuple[str, str], str] = {
     ("train generator", "--encoders"): "--clip",
     ("train generator", "--towers"): "--clip",
     ("split", "--group"): "--by",
+    ("generate", "--manifest"): "a positional argument: palpate generate tag/ --split noleak.json",
     ("audit", "--group"): "--by",
     ("audit", "--processes"): "--threads",
     ("import", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("validate", "--set"): "with the option's own name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",
-    ("generate", "--manifest"): "a positional argument: palpate generate tag/ --split noleak.json",
-    ("score", "--generated"): "positional arguments: palpate score generated/ --reference real/",
+    ("score", "MANIFEST"): "--reference",
+    ("score", "--controls"): "--no-controls",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' stands for every verb.
@@ -232,9 +233,10 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         raise PalpateError(must, got, f"See: palpate {name} --help") from None
 
 
-def _answer_renamed(name: str, args: Iterable[str]) -> None:
-    """Raise for an option of an earlier version, with its new name."""
-    for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
+def _answer_renamed(name: str, args: Sequence[str]) -> None:
+    """Raise for an option or a first argument of an earlier version, with its new name."""
+    first = ["MANIFEST"] if args and not args[0].startswith("-") else []
+    for option in (*first, *(arg.partition("=")[0] for arg in args if arg.startswith("--"))):
         if new := RENAMED.get((name, option)) or RENAMED.get(("", option)):
             must = f"{option} of palpate {name} is now written {new}"
             raise PalpateError(must, option, f"See: palpate {name} --help")
@@ -253,6 +255,8 @@ def error_line(verb: str, error: PalpateError) -> str:
         name = option_name(verb, argument)
         if isinstance(value, bool):
             return name if value else name.replace("--", "--no-", 1)
+        if isinstance(value, Mapping):  # e.g. columns={"vision": "rgb"}
+            value = [f"{key}={cell}" for key, cell in value.items()]
         values = value if isinstance(value, list | tuple) else [value]
         words = shlex.join(map(str, values))
         return f"{name} {words}" if name.startswith("-") else words
