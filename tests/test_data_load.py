@@ -6,8 +6,8 @@ import sys
 import polars as pl
 import pytest
 
-from data_forge import tree, write_image
-from forges import FORGES
+from data_fixtures import tree, write_image
+from format_trees import TREES
 from palpate import data
 from palpate.core import PalpateError, ProblemsError
 
@@ -75,10 +75,10 @@ def test_tables_without_images_are_loaded_for_audits(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in FORGES if name not in ("hf", "touch-and-go", "intervals")]
+    "name", [name for name in TREES if name not in ("hf", "touch-and-go", "intervals")]
 )
 def test_data_set_folders_load_as_they_import(name, tmp_path):
-    forged = FORGES[name](tmp_path / "forged")
+    forged = TREES[name](tmp_path / "forged")
     before = tree(tmp_path / "forged")
     loaded = data.load(forged.source, **forged.options)
     assert tree(tmp_path / "forged") == before
@@ -89,9 +89,9 @@ def test_data_set_folders_load_as_they_import(name, tmp_path):
 
 def test_raw_videos_are_loaded_without_images_on_request(tmp_path):
     pytest.importorskip("av", reason="PyAV is not installed")
-    from test_data_touch_and_go import forge
+    from test_data_touch_and_go import make_recordings
 
-    root = forge(tmp_path / "tag", raw=("a",))
+    root = make_recordings(tmp_path / "tag", raw=("a",))
     with pytest.raises(PalpateError, match="palpate import .* -o DIR") as caught:
         data.load(root)
     assert caught.value.argument == "source"

@@ -10,7 +10,7 @@ from palpate.data.formats.touch_and_go import import_touch_and_go
 from palpate.data.importing import validate_dataset, write_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import read_samples
-from test_data_touch_and_go import LINES, forge, shown
+from test_data_touch_and_go import LINES, make_recordings, shown
 
 
 def damage(path):
@@ -23,7 +23,7 @@ def damage(path):
 
 
 def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
-    root = forge(tmp_path / "tag", raw=("a", "b"))
+    root = make_recordings(tmp_path / "tag", raw=("a", "b"))
     assert validate_dataset(root).samples == 18
     damage(root / "dataset" / "b" / "gelsight.mp4")
     before = tree(root)
@@ -43,7 +43,7 @@ def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
 
 
 def test_a_stray_number_costs_nothing_and_what_looks_wrong_reaches_the_user(tmp_path):
-    root = forge(
+    root = make_recordings(
         tmp_path / "tag", extracted=("a", "spare"), lines=[f"a/{k:010d}.jpg,3" for k in range(3)]
     )
     place = root / "dataset" / "a"
@@ -87,7 +87,7 @@ def test_without_contact_frames_are_those_of_a_slow_search(tmp_path):
 
 
 def test_a_table_of_classes_of_ones_own_is_kept_for_the_lists_of_a_split(tmp_path):
-    root = forge(tmp_path / "tag", extracted=("a",))
+    root = make_recordings(tmp_path / "tag", extracted=("a",))
     (root / "category_reference.txt").write_text("Mat 3: 3\nWood: 15\n")
     manifest = import_touch_and_go(root, tmp_path / "out").manifest
     assert set(manifest.column("material")) == {"Mat 3", "Wood"}

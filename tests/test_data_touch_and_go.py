@@ -22,7 +22,7 @@ LINES = [f"{{}}/{k:010d}.jpg,3" for k in range(10, 16)] + [
 ]
 
 
-def make(root, *, raw=(), extracted=(), place="dataset", lines=None):
+def make_recordings(root, *, raw=(), extracted=(), place="dataset", lines=None):
     """A data set whose frames show their number; the sensor's show it too."""
     for name in raw:
         write_video(root / place / name / "video.mp4", 42)
@@ -51,7 +51,7 @@ def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
         "extracted": {"extracted": ("a", "b")},
         "mixed": {"raw": ("a",), "extracted": ("b",)},
     }
-    root = make(tmp_path / "tag", place=place, **names[layout])
+    root = make_recordings(tmp_path / "tag", place=place, **names[layout])
     result = import_touch_and_go(root, tmp_path / "out")
     manifest = result.manifest.require_valid()
     frames = [*range(10, 16), *range(17, 20)] * 2
@@ -76,7 +76,7 @@ def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
 
 
 def test_extracted_frames_go_before_the_raw_video(tmp_path):
-    root = make(tmp_path, extracted=("a",))
+    root = make_recordings(tmp_path, extracted=("a",))
     (root / "dataset" / "a" / "video.mp4").write_bytes(b"")
     assert find_videos(root)["a"].vision == root / "dataset" / "a" / "video_frame"
     assert import_touch_and_go(root, tmp_path / "out").facts["layout"] == "extracted"
@@ -84,7 +84,7 @@ def test_extracted_frames_go_before_the_raw_video(tmp_path):
 
 def spoil(root):
     """One of each kind of bad input; returns the expected problems."""
-    make(root, raw=("good", "cut", "nomoov"), extracted=("ext",))
+    make_recordings(root, raw=("good", "cut", "nomoov"), extracted=("ext",))
     cut = root / "dataset" / "cut" / "gelsight.mp4"
     cut.write_bytes(cut.read_bytes()[: cut.stat().st_size * 2 // 3])
     nomoov = root / "dataset" / "nomoov" / "video.mp4"
@@ -162,7 +162,7 @@ def test_skip_bad_imports_the_others_and_lists_the_same(tmp_path):
 
 
 def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatch):
-    root = make(tmp_path / "tag", raw=("a", "b"))
+    root = make_recordings(tmp_path / "tag", raw=("a", "b"))
     original = recordings.VideoFrames.extract
 
     def fail(self, expected, created, stop):
@@ -186,7 +186,7 @@ def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatc
 
 
 def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
-    root = make(tmp_path / "tag", raw=("a", "b", "c"))
+    root = make_recordings(tmp_path / "tag", raw=("a", "b", "c"))
     whole = import_touch_and_go(root, tmp_path / "whole")
 
     def stop(what, done, total, remark=""):
@@ -209,7 +209,7 @@ def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
 
 
 def test_cached_frames_of_other_settings_are_rejected(tmp_path):
-    root = make(tmp_path / "tag", raw=("a",))
+    root = make_recordings(tmp_path / "tag", raw=("a",))
     result = import_touch_and_go(root, tmp_path / "out", size=32, image_format="png")
     assert read_image(result.manifest.paths("tactile")[0]).size == (32, 32)
     assert result.manifest.column("tactile")[0].endswith("0000000010.png")
@@ -227,7 +227,7 @@ def test_background_is_a_typical_frame_where_the_recording_begins_with_a_contact
     tmp_path, layout
 ):
     lines = [f"a/{k:010d}.jpg,3" for k in range(0, 8)] + [f"b/{k:010d}.jpg,3" for k in range(40)]
-    root = make(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
+    root = make_recordings(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
     result = import_touch_and_go(root, tmp_path / "out")
     manifest = result.manifest.require_valid()
     assert result.facts["backgrounds"] == "none 1, typical 1"
@@ -243,7 +243,7 @@ def test_background_is_a_typical_frame_where_the_recording_begins_with_a_contact
 
 
 def test_a_mixed_import_can_be_moved_as_one_folder(tmp_path):
-    root = make(tmp_path / "tag", raw=("a",), extracted=("b",))
+    root = make_recordings(tmp_path / "tag", raw=("a",), extracted=("b",))
     result = import_touch_and_go(root, tmp_path / "out.partial")
     (tmp_path / "out.partial").rename(tmp_path / "out")
     shutil.rmtree(root)
@@ -254,7 +254,7 @@ def test_a_mixed_import_can_be_moved_as_one_folder(tmp_path):
 
 def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):
     lines = ["a/0000000020.jpg,3", "a/0000000016.jpg,-1", "a/0000000015.jpg,-1"]
-    root = make(tmp_path / "tag", extracted=("a",), lines=lines)
+    root = make_recordings(tmp_path / "tag", extracted=("a",), lines=lines)
     result = import_touch_and_go(root, tmp_path / "o1")
     assert shown(result.manifest, "background") == [14]
     (root / "only.txt").write_text("a/0000000020.jpg,3")
@@ -264,7 +264,7 @@ def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):
 
 
 def test_official_split_captions_and_objects(tmp_path):
-    root = make(tmp_path / "tag", extracted=("a", "b"))
+    root = make_recordings(tmp_path / "tag", extracted=("a", "b"))
     (root / "train.txt").write_text(
         "\n".join(f"a/{k:010d}.jpg,3" for k in range(10, 16)) + "\nelsewhere/0000000001.jpg,3"
     )
@@ -300,7 +300,7 @@ def test_official_split_captions_and_objects(tmp_path):
 
 def test_max_per_contact_takes_evenly_spaced_frames(tmp_path):
     lines = [f"a/{k:010d}.jpg,3" for k in range(10, 30)] + ["a/0000000035.jpg,3"]
-    root = make(tmp_path / "tag", extracted=("a",), lines=lines)
+    root = make_recordings(tmp_path / "tag", extracted=("a",), lines=lines)
     take = lambda **kw: import_touch_and_go(root, tmp_path / "out", **kw).manifest.column("frame")  # noqa: E731
     assert take(max_per_contact=1) == [20, 35]
     assert take(max_per_contact=4) == [12, 17, 22, 27, 35]
@@ -328,7 +328,7 @@ def test_missing_root_list_and_recordings_are_named(tmp_path):
 
 
 def test_a_link_out_of_the_data_set_is_reported(tmp_path):
-    make(tmp_path / "real", extracted=("a",))
+    make_recordings(tmp_path / "real", extracted=("a",))
     root = tmp_path / "tag"
     (root / "dataset").mkdir(parents=True)
     shutil.copy(tmp_path / "real" / "label.txt", root)
@@ -339,7 +339,7 @@ def test_a_link_out_of_the_data_set_is_reported(tmp_path):
 
 
 def test_one_frame_that_links_out_of_the_data_set_is_reported_or_skipped(tmp_path):
-    make(tmp_path, extracted=("a",))
+    make_recordings(tmp_path, extracted=("a",))
     frames = tmp_path / "dataset" / "a" / "gelsight_frame"
     listed = (tmp_path / "label.txt").read_text().split(",")[0].split("/")[1]
     (tmp_path.parent / f"{tmp_path.name}-outside.jpg").write_bytes((frames / listed).read_bytes())
