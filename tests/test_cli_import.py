@@ -55,7 +55,7 @@ MAPS = [
 
 def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path):
     args = ["import", table, "-o", tmp_path / "m", *MAPS, "--classes", table.parent / "classes.txt"]
-    status, out, err = call(capsys, *args, "--json")
+    status, out, _ = call(capsys, *args, "--json")
     facts = json.loads(out)
     assert (status, facts["samples"], facts["materials"], facts["skipped"]) == (0, 4, 2, [])
     assert [p["kind"] for p in facts["suspicious"]] == ["null-group"]

@@ -1,4 +1,6 @@
-"""Frame lists: the format's corners, every kind of bad line at once, and the facts of the official lists."""
+"""Frame lists: the format's corners, every kind of bad line at once, and the facts of the official
+lists.
+"""
 
 import subprocess
 import sys
@@ -180,7 +182,8 @@ def test_write_list_can_be_read_back_and_refuses_what_could_not(tmp_path):
 
 
 def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
-    text = "Inconclusive: -1 (Do not use)\nWood: 3 \nMetal:4\n'Synthetic  Fabric' : 8\n\"Ruber\": 10,\nOthers: 19"
+    text = "Inconclusive: -1 (Do not use)\nWood: 3 \nMetal:4\n'Synthetic  Fabric' : 8\n"
+    text += '"Ruber": 10,\nOthers: 19'
     found = read_categories(write(tmp_path / "c.txt", text))
     assert found == {
         -1: "Inconclusive",
@@ -234,7 +237,8 @@ def test_words_for_frames(tmp_path):
 
 
 def test_listing_loads_neither_pillow_nor_av():
-    code = "import sys, palpate.data.listing; sys.exit(any(m in sys.modules for m in ('PIL', 'av', 'torch')))"
+    code = "import sys, palpate.data.listing; "
+    code += "sys.exit(any(m in sys.modules for m in ('PIL', 'av', 'torch')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -8,7 +8,6 @@ import pytest
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.manifest import Manifest
 
-
 DATA = Path(__file__).parent / "data" / "formats"
 #: Digests that earlier versions gave; they must never change.
 DIGEST_2 = "730f22036d6ba75b3e1d68c3bc065d14110f3522aed3f911b107450c539c9219"

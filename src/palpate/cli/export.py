@@ -13,7 +13,7 @@ from palpate.cli.terminal import Common, OutPath, Terminal
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Write a manifest as a Hugging Face data set with its images inside, or as a table of paths."""
+    """Write a manifest as a Hugging Face data set with images inside, or as a table of paths."""
 
     manifest: Annotated[Path, tyro.conf.Positional]
     """Manifest file or the folder of an import."""
@@ -22,7 +22,9 @@ class Options(Common):
     to: Literal["hf", "csv", "jsonl", "parquet"]
     """The form: `hf` is datasets' save_to_disk."""
     split: Path | None = None
-    """Split file: parts of the Hugging Face data set; a column `split` of a table, and lists in the form of the data set."""
+    """Split file: parts of the Hugging Face data set; a column `split` of a table, and lists in the
+    form of the data set.
+    """
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:

@@ -27,14 +27,17 @@ class TableOptions:
     """Tables, folders of images, interval lists, Hugging Face data sets."""
 
     columns: Maps = ()
-    """Manifest columns as columns of yours, or as polars SQL over them (over `path` for a folder of images):
+    """Manifest columns as columns of yours, or as polars SQL over them (over `path` for a folder of
+    images):
     `--map vision=rgb tactile="replace(rgb, '_rgb', '_tac')" "video=substr(rgb, 1, 15)"`."""
     root: Path | None = None
     """Folder that paths are relative to (default: the folder of the table)."""
     side: Annotated[Literal["vision", "tactile"] | None, tyro.conf.arg(name="as")] = None
     """What a single folder of images shows."""
     classes: Path | None = None
-    """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers; -1 is inconclusive and skipped."""
+    """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers; -1 is
+    inconclusive and skipped.
+    """
     names: str | None = None
     """Columns of a table without a header line, separated by commas."""
     half_open: Switch = False
@@ -80,7 +83,9 @@ class FormatOptions:
     max_per_contact: int | None = None
     """Keep at most this many evenly spaced frames of each contact (Touch and Go)."""
     seed: int | None = None
-    """With `--max-per-contact`: 0 takes the middle of each stretch, others a random place (Touch and Go)."""
+    """With `--max-per-contact`: 0 takes the middle of each stretch, others a random place (Touch
+    and Go).
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +93,9 @@ class SourceOptions(Common):
     """What names a source and how to read it."""
 
     format: str = "auto"
-    """Name of the format; `auto` recognizes it. `palpate validate --list` shows all formats and their options."""
+    """Name of the format; `auto` recognizes it. `palpate validate --list` shows all formats and
+    their options.
+    """
     check: Literal["decode", "header", "none"] = "decode"
     """How images are checked: `decode` detects truncated files, `header` is quicker."""
     table: TableOptions = TableOptions()
@@ -99,12 +106,14 @@ class SourceOptions(Common):
 class Options(SourceOptions):
     """Turn a data set on disk into a manifest.
 
-    Reads any known data set, a table, folders of images, an interval list, or a Hugging Face data set.
-    Expressions of --map: docs/concepts/mapping.md.
+    Reads any known data set, a table, folders of images, an interval list, or a Hugging Face data
+    set. Expressions of --map: docs/concepts/mapping.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Root of the data set, a table (CSV, TSV, JSON lines, JSON, Parquet), or with `--format hf` a name on the hub."""
+    """Root of the data set, a table (CSV, TSV, JSON lines, JSON, Parquet), or with `--format hf` a
+    name on the hub.
+    """
     output: OutPath
     """Folder for manifest.parquet, the data set's own splits and extracted frames."""
     skip_bad: Switch = False

@@ -41,6 +41,7 @@ from palpate.core import (
     Problem,
     ProblemsError,
     Progress,
+    problem_lines,
     quiet,
 )
 from palpate.core.files import NO_ROOM
@@ -48,8 +49,6 @@ from palpate.core.files import NO_ROOM
 if TYPE_CHECKING:
     from palpate.report.results import Audit, Results
 
-#: Lines of problems shown in the terminal; ``--json`` gives all.
-SHOWN_PROBLEMS = 40
 #: Verb and option of earlier versions -> how it is written now. '' stands for every verb, and for
 #: the verb itself.
 RENAMED: dict[tuple[str, str], str] = {
@@ -200,10 +199,8 @@ class _LogProgress:
 
 def list_problems(problems: Sequence[Problem], say: Callable[[str], None]) -> None:
     """Print the first problems, one a line."""
-    for problem in problems[:SHOWN_PROBLEMS]:
-        say(f"  {problem}")
-    if len(problems) > SHOWN_PROBLEMS:
-        say(f"  ... and {len(problems) - SHOWN_PROBLEMS} more (--json lists all)")
+    for line in problem_lines(problems):
+        say(line)
 
 
 def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:

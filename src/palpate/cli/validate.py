@@ -14,7 +14,8 @@ from palpate.core import PalpateError
 
 Kind = Literal["missing", "invalid", "suspicious"]
 ShowList = Annotated[
-    Switch, tyro.conf.arg(name="list", help="Show the known formats, their facts and their options.")
+    Switch,
+    tyro.conf.arg(name="list", help="Show the known formats, their facts and their options."),
 ]
 
 

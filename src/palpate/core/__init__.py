@@ -7,6 +7,7 @@ from palpate.core.errors import (
     PalpateWarning,
     Problem,
     ProblemsError,
+    problem_lines,
 )
 from palpate.core.features import FeatureSet
 from palpate.core.files import (
@@ -52,6 +53,7 @@ __all__ = [
     "digest_lines",
     "inside",
     "plain",
+    "problem_lines",
     "quiet",
     "read_json",
     "read_record",

@@ -13,6 +13,9 @@ from typing import Any
 
 from palpate.core.plain import plain
 
+#: Problems that a printed list shows.
+SHOWN_PROBLEMS = 40
+
 
 class PalpateError(Exception):
     """A user's mistake: what must hold, what was given, how to fix it.
@@ -89,6 +92,13 @@ class Problem:
 
     def __str__(self) -> str:
         return f"{self.where}: {self.text}"
+
+
+def problem_lines(problems: Sequence[Problem]) -> list[str]:
+    """Return the first problems as lines of text, and how many more there are."""
+    lines = [f"  {problem}" for problem in problems[:SHOWN_PROBLEMS]]
+    more = len(problems) - SHOWN_PROBLEMS
+    return lines + [f"  ... and {more} more (JSON lists all)"] * (more > 0)
 
 
 class ProblemsError(PalpateError):

@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from palpate.data.exporting import Exported, export_dataset
     from palpate.data.imported import Imported, Validation
     from palpate.data.importing import import_dataset, validate
-    from palpate.data.reading import load
     from palpate.data.manifest import Manifest
+    from palpate.data.reading import load
 
 #: Public name -> its module, imported on first use, so that ``import palpate.data`` is free.
 _MODULES = {

@@ -53,7 +53,8 @@ def caption(material: str, sample_id: str, seed: int = 0) -> str:
     """Write a caption of how a sample of a material feels.
 
     Args:
-        material: any name; the 20 Touch and Go materials (in any case) have adjectives, others are named.
+        material: any name; the 20 Touch and Go materials (in any case) have adjectives, others are
+            named.
         sample_id: the sample; equal ids get equal captions.
         seed: of the draw.
     """

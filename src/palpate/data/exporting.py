@@ -69,7 +69,7 @@ class Exported:
     def __str__(self) -> str:
         quoted = [shlex.quote(str(p)) for p in (self.output, self.files[0], self.manifest.root)]
         if self.form == "hf":
-            way = f"datasets.load_from_disk({str(self.output)!r}), or again with: palpate import {quoted[0]}"
+            way = f"datasets.load_from_disk({str(self.output)!r}) or palpate import {quoted[0]}"
         else:
             table = next(path for path in self.files if path.parent == self.output)
             way = f"palpate import {shlex.quote(str(table))} --root {quoted[2]}"

@@ -1,4 +1,4 @@
-"""One modality of a recording: a folder of numbered images, or a video whose needed frames are cached as images.
+"""Frames of one modality of a recording: a folder of images, or a video with a cache of images.
 
 A cached frame is ``<cache>/%010d.jpg`` (quality 95, no chroma subsampling, since the color of a gel
 carries the surface normal) or ``.png``, written whole or not at all, so an interrupted run goes on
@@ -126,7 +126,7 @@ Frames = FolderFrames | VideoFrames
 
 
 def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
-    """Write (h, w, 3) atomically in the format of the suffix; a shorter side above ``size`` is reduced to it."""
+    """Write (h, w, 3) atomically, with its shorter side reduced to ``size`` if it is longer."""
     frame = Image.fromarray(image)
     if size is not None and min(frame.size) > size:
         scale = size / min(frame.size)
@@ -140,7 +140,7 @@ def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
 
 
 def nearest_to_median(frames: Frames, indices: Sequence[int]) -> tuple[int, NDArray[np.uint8]]:
-    """The frame nearest to the pixelwise median of some frames in mean absolute difference; the first of several.
+    """The frame with the least mean absolute difference to the pixelwise median of some frames.
 
     Returns:
         Its number and its image, (h, w, 3), 0 to 255.

@@ -1,9 +1,10 @@
 """Images: one reader (8-bit RGB, whole or rejected) and one writer (8-bit PNG, fixed range).
 
-Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit gray
-``v`` becomes ``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of an
-animation the first image counts. A batch for a network is the center square, resized by Pillow's
-antialiased bicubic filter. No step depends on the content of other images: the range is never stretched.
+Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit
+gray ``v`` becomes ``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of
+an animation the first image counts. A batch for a network is the center square, resized by Pillow's
+antialiased bicubic filter. No step depends on the content of other images: the range is never
+stretched.
 """
 
 from __future__ import annotations
@@ -128,8 +129,9 @@ def cached_images(
         manifest: the samples.
         column: ``vision``, ``tactile`` or ``background``.
         size: side of the squares, in pixels.
-        cache: folder for ``<column>-<size>-<digest>.npy``; None keeps the array in memory. The digest covers
-            paths, file sizes, modification times, ``size`` and ``column``, so a changed file is decoded again.
+        cache: folder for ``<column>-<size>-<digest>.npy``; None keeps the array in memory. The
+            digest covers paths, file sizes, modification times, ``size`` and ``column``, so a
+            changed file is decoded again.
         progress: progress callback.
 
     Returns:
@@ -208,7 +210,7 @@ def in_threads(
     threads: int | None = None,
     stop: Event | None = None,
 ) -> Iterator[tuple[T, R]]:
-    """Yield ``(item, function(item))`` as they finish; few are in flight, so that Ctrl-C and errors end it soon.
+    """Yield ``(item, function(item))`` as they finish; few are in flight, so errors end it soon.
 
     Args:
         function: the work.

@@ -8,15 +8,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from palpate.core import PalpateError, Problem, ProblemsError, Split
+from palpate.core import PalpateError, Problem, ProblemsError, Split, plain, problem_lines
 from palpate.data.manifest import Manifest
 
 if TYPE_CHECKING:
     from palpate.data.formats import Facts
 
 FIX = "Correct these, or skip the bad rows and list them"
-#: Problems that a printed result shows; ``to_json`` has all.
-SHOWN = 40
 #: Manifest column -> what its distinct values are called in a summary.
 COUNTED = {"video": "videos", "contact": "contacts", "material": "materials"}
 
@@ -47,7 +45,7 @@ class Imported:
         return self.manifest.facts
 
     def save(self, output: Path, created: list[Path]) -> Imported:
-        """Write ``splits/<name>.json`` and, last, ``manifest.parquet``; new files are added to ``created``.
+        """Write the splits and, last, ``manifest.parquet``; new files are added to ``created``.
 
         Splits of an earlier import into the same folder that this one lacks are removed.
         """
@@ -80,7 +78,7 @@ class Imported:
 
     def to_json(self) -> dict[str, Any]:
         """The summary, all problems and the facts as a JSON object."""
-        skipped, suspicious = _plain(self.skipped), _plain(self.suspicious)
+        skipped, suspicious = plain(self.skipped), plain(self.suspicious)
         lists = {"skipped": skipped, "suspicious": suspicious}
         return self.summary() | lists | {"facts": dict(self.facts)}
 
@@ -116,8 +114,8 @@ class Validation:
 
     def to_json(self) -> dict[str, Any]:
         """Facts, counts and all problems as a JSON object."""
-        lists = {kind: _plain(getattr(self, kind)) for kind in ("missing", "invalid", "suspicious")}
-        facts = asdict(self.facts)
+        lists = {kind: plain(getattr(self, kind)) for kind in ("missing", "invalid", "suspicious")}
+        facts = plain(self.facts)
         return {
             "format": self.format,
             "samples": self.samples,
@@ -174,7 +172,7 @@ def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> No
 
 @contextmanager
 def removing_on_error(output: Path) -> Generator[list[Path]]:
-    """Yield a list for every new file; on an error, though not on Ctrl-C, remove those files and empty folders."""
+    """Yield a list for new files, which are removed on an error, though not on Ctrl-C."""
     output = Path(output)
     existed = {p for p in (output, *output.parents) if p.exists()}
     created: list[Path] = []
@@ -190,23 +188,12 @@ def removing_on_error(output: Path) -> Generator[list[Path]]:
         raise
 
 
-def problem_lines(title: str, problems: Sequence[Problem]) -> list[str]:
-    """The first problems of a list under a title with their number; nothing if there are none."""
-    lines = [f"{title}: {len(problems)}"] if problems else []
-    lines += [f"  {problem}" for problem in problems[:SHOWN]]
-    more = len(problems) - SHOWN
-    return lines + [f"  ... and {more} more (JSON lists all)"] * (more > 0)
-
-
-def _plain(problems: Sequence[Problem]) -> list[dict[str, str]]:
-    return [asdict(problem) for problem in problems]
-
-
 def _text(title: str, rows: Mapping[str, Any], lists: Mapping[str, Sequence[Problem]]) -> str:
     """A table of names and values, and lists of problems, as text."""
     width = max(map(len, rows))
     cells = ((name, "-" if value is None else value) for name, value in rows.items())
     lines = [title, *(f"{name:<{width}}  {value}" for name, value in cells)]
     for name, problems in lists.items():
-        lines += problem_lines(name, problems)
+        if problems:
+            lines += [f"{name}: {len(problems)}", *problem_lines(problems)]
     return "\n".join(lines)

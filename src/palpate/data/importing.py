@@ -37,11 +37,12 @@ def import_dataset(
         skip_bad: skip and list bad rows instead of raising.
         check: how images are checked.
         progress: progress callback.
-        options: options of the format (``columns``, ``root``, ``size`` ...); None means the default.
+        options: options of the format (``columns``, ``root``, ``size`` ...); None means the
+            default.
 
     Raises:
-        PalpateError: if the source is missing or looks like no known format, an option does not belong to
-            the format, or the output holds other files.
+        PalpateError: if the source is missing or looks like no known format, an option does not
+            belong to the format, or the output holds other files.
         ProblemsError: with every bad row and file at once; nothing is left behind.
     """
     source, output = Path(source), Path(output)
@@ -96,13 +97,15 @@ def validate(
 
 
 def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
-    """Write a split in the form of the data set that the manifest came from, else as a CSV per part.
+    """Write a split in the form of the data set that the manifest came from, else as a CSV per
+    part.
 
     Returns:
         The files written.
 
     Raises:
-        PalpateError: if the split's ids are not in the manifest, or a sample lacks what the lists need.
+        PalpateError: if the split's ids are not in the manifest, or a sample lacks what the lists
+            need.
     """
     form = FORMATS.get(str(manifest.facts.get("format", "")))
     if form is not None and form.write_lists is not None:
@@ -157,7 +160,7 @@ def scan_options(name: str, form: Format, options: dict[str, Any]) -> dict[str, 
 
 
 def _given(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
-    """The options that were given, if they all belong to the format; ``size`` is ignored where no frames are decoded."""
+    """The options that were given, if all belong to the format; ``size`` may be without use."""
     given = {key: value for key, value in options.items() if value is not None}
     if "size" not in form.options:
         given.pop("size", None)

@@ -1,9 +1,9 @@
-"""Frame lists: one ``video/frame.ext,label`` per line, as Touch and Go and its derivatives ship them.
+"""Frame lists as Touch and Go ships them: one ``video/frame.ext,label`` per line.
 
-No header; the order is free; UTF-8, or UTF-16 with a byte-order mark; any line ends; the last line may
-lack one. The label is an integer: -1 is inconclusive, others are classes. The line is split at its last
-comma, so the name of a video may hold commas and spaces. The frame is the integer value of the file's
-stem; ``video/33.jpg`` and ``video/0000000033.png`` name the same frame.
+No header; the order is free; UTF-8, or UTF-16 with a byte-order mark; any line ends; the last line
+may lack one. The label is an integer: -1 is inconclusive, others are classes. The line is split at
+its last comma, so the name of a video may hold commas and spaces. The frame is the integer value of
+the file's stem; ``video/33.jpg`` and ``video/0000000033.png`` name the same frame.
 
 A **contact** is a maximal run of consecutive frames of one video with one label; contact ``k`` of a
 video, counted from 1 in the order of frames, is called ``video#000k``.
@@ -26,7 +26,7 @@ from palpate.data.texts import decoded, lines_of
 INCONCLUSIVE = -1
 PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
 #: A good line; the video takes all commas before the slash.
-LINE = r"^(?P<video>[^/\\]+)/(?P<stem>[0-9]{1,18})\.(?P<suffix>[A-Za-z0-9]+)\s*,\s*(?P<label>[+-]?[0-9]{1,18})$"
+LINE = r"^(?P<video>[^/\\]+)/(?P<stem>[0-9]{1,18})\.(?P<suffix>[A-Za-z0-9]+)\s*,\s*(?P<label>[+-]?[0-9]{1,18})$"  # noqa: E501
 #: Absolute paths, drive letters, and ``..`` as a component.
 CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)|^\.[/\\]"
 FIX = "Correct the lines, or skip the bad ones"
@@ -42,9 +42,10 @@ class FrameList:
         manifest: the usable rows in list order; image columns are null.
         skipped: bad rows that were skipped.
         inconclusive: number of rows with the label -1, skipped as well.
-        rows: the usable rows as a table ``source, line, id, video, frame, label, suffix``, in the order of
-            the manifest.
-        contact: table ``video, frame`` of every readable row, inconclusive ones included: all frames in contact.
+        rows: the usable rows as a table ``source, line, id, video, frame, label, suffix``, in the
+            order of the manifest.
+        contact: table ``video, frame`` of every readable row, inconclusive ones included: all
+            frames in contact.
     """
 
     manifest: Manifest
@@ -61,9 +62,11 @@ def read_list(
 
     Args:
         path: the list; its folder becomes the manifest's root.
-        skip_bad: skip and list bad rows instead of raising. Of a frame with two labels every row is bad.
-        categories: label -> class name. Default: ``category_reference.txt`` next to the list if there is
-            one, else a label stays as it is (``"3"``). With a table, a label that it lacks is a problem.
+        skip_bad: skip and list bad rows instead of raising. Of a frame with two labels every row is
+            bad.
+        categories: label -> class name. Default: ``category_reference.txt`` next to the list if
+            there is one, else a label stays as it is (``"3"``). With a table, a label that it lacks
+            is a problem.
 
     Raises:
         PalpateError: if there is no such file.
@@ -83,7 +86,7 @@ def read_lists(
     skip_bad: bool = False,
     categories: Mapping[int, str] | None = None,
 ) -> FrameList:
-    """Read several lists as one, so that frames in two of them are detected and contacts are numbered together.
+    """Read several lists as one: frames in two of them are detected, contacts numbered together.
 
     Args:
         paths: the lists, in order.
@@ -133,7 +136,8 @@ def contact_names(
         labels: (n,) classes that a contact must not mix, or None.
 
     Returns:
-        ``n`` names ``video#0001``; the numbers count the contacts of a video from 1 in the order of frames.
+        ``n`` names ``video#0001``; the numbers count the contacts of a video from 1 in the order of
+        frames.
     """
     video, label = pl.col("video"), pl.col("label")
     columns = {
@@ -150,7 +154,7 @@ def contact_names(
 
 
 def number_together(*manifests: Manifest) -> list[Manifest]:
-    """Number the contacts of lists that were read separately together, so that one name means one contact.
+    """Number the contacts of several lists together, so that one name means one contact.
 
     Manifests with a row that has no video or frame stay as they are.
     """
@@ -195,16 +199,17 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
 
 
 def write_table(path: Path, manifest: Manifest) -> Path:
-    """Write the rows of a manifest as CSV, without its empty columns; paths stay relative to its root."""
+    """Write a manifest as CSV, without its empty columns; paths stay relative to its root."""
     write_text(Path(path), manifest.filled().write_csv())
     return Path(path)
 
 
 def read_categories(path: Path) -> dict[int, str]:
-    """Read a category table: ``Name: id`` per line, with uneven spaces, optional quotes and remarks in brackets.
+    """Read a category table: ``Name: id`` per line; quotes and remarks in brackets are ignored.
 
     Returns:
-        id -> name, the inconclusive class (-1) included if it is listed; known misspellings are corrected.
+        id -> name, the inconclusive class (-1) included if it is listed; known misspellings are
+        corrected.
 
     Raises:
         PalpateError: if the file is missing or empty.
@@ -247,7 +252,7 @@ class FrameTable:
 
 
 def read_frame_table(path: Path) -> FrameTable:
-    """Read ``video/frame.jpg,words`` lines, with an optional header ``frame,...``; words may hold commas, quoted or not.
+    """Read ``video/frame.jpg,words`` lines; the header ``frame,...`` is optional, so are quotes.
 
     Raises:
         PalpateError: if the file is missing.
@@ -273,7 +278,7 @@ def read_frame_table(path: Path) -> FrameTable:
 
 
 def _frame_of(name: str) -> tuple[str, int] | None:
-    """(video, frame) of ``video/frame.ext``, or None for other paths and those that leave the data set."""
+    """(video, frame) of ``video/frame.ext``; None for other paths and those that leave the root."""
     match = re.match(PATH, name)
     if match is None or not match["stem"].isdecimal() or re.search(CLIMBS, name):
         return None
@@ -281,7 +286,7 @@ def _frame_of(name: str) -> tuple[str, int] | None:
 
 
 def _text(path: Path) -> str:
-    """The file as text; bytes that are neither UTF-8 nor UTF-16 with a byte-order mark become U+FFFD."""
+    """The file as text; what is neither UTF-8 nor UTF-16 becomes U+FFFD."""
     if not path.is_file():
         got = f"the folder {path}" if path.is_dir() else f"no file {path}"
         raise PalpateError("The list must be a file", got, "Check the path")

@@ -1,4 +1,4 @@
-"""The manifest: one row per sample (one surface at one instant), as a table with a root and a digest.
+"""The manifest: a table with one row per sample, a root folder and a digest.
 
 =============  =======  ==========================================================================
 column         type     meaning (null where the data set has none; never invented)
@@ -18,8 +18,8 @@ column         type     meaning (null where the data set has none; never invente
 ``domain``     string   recording condition that changes the look (rig, lighting)
 =============  =======  ==========================================================================
 
-Paths use ``/`` and may not leave the root. The digest is SHA-256 over the rows in order; it does not
-depend on the root, so a data set has one digest on every disk.
+Paths use ``/`` and may not leave the root. The digest is SHA-256 over the rows in order; it does
+not depend on the root, so a data set has one digest on every disk.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ class Manifest:
     Attributes:
         table: the rows, with exactly the columns of ``SCHEMA``.
         root: folder that the image paths are relative to.
-        facts: facts about the source (``dataset``, ``text_source`` ...), kept in the file, not in the digest.
+        facts: facts about the source (``dataset``, ``text_source`` ...), kept in the file, not in
+            the digest.
     """
 
     table: pl.DataFrame
@@ -180,7 +181,8 @@ class Manifest:
 
     @classmethod
     def join(cls, *manifests: Manifest) -> Manifest:
-        """The samples of several manifests in one, whose root is the folder that holds all their roots.
+        """The samples of several manifests in one, whose root is the folder that holds all their
+        roots.
 
         Raises:
             PalpateError: if two of them share an id.
@@ -205,12 +207,12 @@ class Manifest:
         return self.table.with_columns((pl.lit(prefix) + pl.col(n)).alias(n) for n in names)
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
-        """A row (a dictionary of the table) as a reference with absolute image paths, for reports."""
+        """A row of the table as a reference with absolute image paths, for reports."""
         full = {n: str(self.path(row[n]).resolve()) if row[n] else None for n in MODALITIES}
         return SampleRef(row["id"], row["video"], row["frame"], row["material"], **full)
 
     def problems(self, *, files: bool = True) -> list[Problem]:
-        """Everything wrong with the table: no rows, empty or duplicate ids, paths outside the root, missing files."""
+        """Everything wrong with the rows: bad ids, paths outside the root, missing files."""
         problems = [] if len(self) else [Problem("manifest", "empty", "there are no samples")]
         seen: dict[str, int] = {}
         for line, i in enumerate(self.column("id"), 1):
@@ -230,11 +232,8 @@ class Manifest:
         for name in IMAGE_COLUMNS:
             for line, value in enumerate(self.column(name), 1):
                 if value is not None and (kind := wrong(value)):
-                    no_file, outside = (
-                        f"no {name} file {value!r}",
-                        f"the path {value!r} leaves the root",
-                    )
-                    text = no_file if kind == "missing-file" else outside
+                    missing = kind == "missing-file"
+                    text = f"no file {value!r}" if missing else f"{value!r} leaves the root"
                     problems.append(Problem(f"row {line}", kind, text))
         return problems
 
@@ -249,7 +248,7 @@ class Manifest:
         return self
 
     def save(self, path: Path) -> None:
-        """Write Parquet, atomically, with format, digest and root (relative to the file) as metadata."""
+        """Write Parquet, atomically, with format, digest and relative root as metadata."""
         path = Path(path)
         metadata = {
             "palpate.format": FORMAT,
@@ -313,7 +312,7 @@ def write_parquet(
 ) -> None:
     """Write a table as Parquet, whole or not at all.
 
-    Encoded in memory and written by Python, so that a full disk is an OSError and no error of polars.
+    Written by Python, so that a full disk is an OSError and no error of polars.
 
     Raises:
         OSError: if the disk is full.

@@ -1,8 +1,9 @@
-"""Manifest columns as SQL expressions over the columns of a table, e.g. ``video = substr(path, 1, 15)``.
+"""Manifest columns as SQL expressions over the columns of a table, e.g. ``video = substr(path, 1,
+15)``.
 
-An expression is one of polars' SQL (:func:`polars.sql_expr`) over text cells. A text that is exactly the name of a
-column means that column, whatever characters it has. An expression may also use other mapped columns; columns of the
-table go first. See ``docs/concepts/mapping.md``.
+An expression is one of polars' SQL (:func:`polars.sql_expr`) over text cells. A text that is
+exactly the name of a column means that column, whatever characters it has. An expression may also
+use other mapped columns; columns of the table go first. See ``docs/concepts/mapping.md``.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from palpate.core import PalpateError
 #: What polars raises for expressions that it cannot parse or compute.
 ERRORS = (pl.exceptions.PolarsError, pl.exceptions.PanicException, ValueError, TypeError)
 FIX = "Use SQL functions on columns: substr, split_part, replace, regexp_replace, left, right, ||"
-#: The former expression language -> the same in SQL; groups are ``{0}``, ``{1}``; ``{start}`` counts from 1.
+#: The former expression language -> the same in SQL; groups are ``{0}``, ``{1}``; ``{start}``
+#: counts from 1.
 _X = r"((?:\w|\"[^\"]+\"|\((?:[^()]|\([^()]*\))*\))+)"
 _INNER = r"\(((?:[^()]|\((?:[^()]|\([^()]*\))*\))*)"
 _OLD_SPELLINGS: tuple[tuple[str, str], ...] = (
@@ -96,10 +98,12 @@ def compile_maps(
     Args:
         maps: target -> expression, or the name of a column.
         columns: of the table.
-        targets: what may be mapped; those that are columns by name and are not mapped are taken as they are.
+        targets: what may be mapped; those that are columns by name and are not mapped are taken as
+            they are.
 
     Raises:
-        PalpateError: on an unknown target, or an expression that cannot be parsed or names an unknown column.
+        PalpateError: on an unknown target, or an expression that cannot be parsed or names an
+            unknown column.
     """
     if unknown := sorted(set(maps) - set(targets)):
         raise PalpateError(
@@ -127,7 +131,9 @@ def compile_maps(
 
 
 def sql_spelling(text: str) -> str:
-    """An expression of the former language (``path[:15]``, ``stem(path)``) in SQL; other texts as they are."""
+    """An expression of the former language (``path[:15]``, ``stem(path)``) in SQL; other texts as
+    they are.
+    """
     for _ in range(9):  # expressions within expressions
         before = text
         for pattern, form in _OLD_SPELLINGS:

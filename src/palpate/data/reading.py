@@ -1,4 +1,4 @@
-"""Samples from whatever names them: a manifest, list, table, data frame or data-set folder; nothing is written."""
+"""Load samples from a manifest, list, table, data frame or data-set folder."""
 
 from __future__ import annotations
 
@@ -38,18 +38,20 @@ def load(
     """Load samples without writing anything.
 
     Args:
-        source: a manifest file or the folder of an import; a frame list (``video/frame.jpg,label`` per line); a
-            table file; a polars or pandas frame, or a list of dictionaries, with manifest columns; the folder of
-            a data set of any known format; or a folder of images of one modality.
+        source: a manifest file or the folder of an import; a frame list (``video/frame.jpg,label``
+            per line); a table file; a polars or pandas frame, or a list of dictionaries, with
+            manifest columns; the folder of a data set of any known format; or a folder of images of
+            one modality.
         format: name of the format, or ``auto``.
-        images: raise if samples have no image files because their frames are inside videos or tables. Frame
-            lists and tables without image columns never have images.
+        images: raise if samples have no image files because their frames are inside videos or
+            tables. Frame lists and tables without image columns never have images.
         skip_bad: skip bad rows instead of raising.
         progress: progress callback.
         options: options of the format, e.g. ``root`` and ``columns`` of a table.
 
     Raises:
-        PalpateError: if there is no such source, it is nothing of these, or its images must be imported first.
+        PalpateError: if there is no such source, it is nothing of these, or its images must be
+            imported first.
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
     keywords: dict[str, Any] = {
@@ -137,7 +139,7 @@ def is_list(path: Path) -> bool:
 
 
 def _one_modality(folder: Path, options: dict[str, Any]) -> dict[str, str]:
-    """``side`` for a folder of images of one modality: photos, unless a folder's name says tactile; else nothing."""
+    """``side`` for a folder of images of one modality: vision unless its name says tactile."""
     known = next((n for n, form in FORMATS.items() if form.detect(folder)), "")
     if "side" in options or known not in ("", "pairs"):
         return {}

@@ -1,7 +1,7 @@
-"""From listed frames of recordings with two modalities to manifest rows: open, choose backgrounds, check, extract.
+"""From listed frames of recordings to manifest rows: open, choose backgrounds, check, extract.
 
-Every step drops the rows that it cannot use and adds the reason to ``problems``, so that a user sees
-everything that is wrong with a data set at once.
+Every step drops the rows that it cannot use and adds the reason to ``problems``, so that a user
+sees everything that is wrong with a data set at once.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MODALITIES = ("vision", "tactile")
 
 @dataclass(frozen=True)
 class VideoFiles:
-    """One recording: each modality is a folder of frames, a video file, or None where it is missing."""
+    """One recording: each modality is a folder of frames, a video file, or None."""
 
     name: str
     vision: Path | None
@@ -128,8 +128,10 @@ class Recordings:
         suspicious: what looks wrong, but can be used.
         frames: recording -> modality -> frames, for those that could be opened.
         backgrounds: contact -> background image.
-        background_frames: contact -> the frame before it that is its background, where there is one.
+        background_frames: contact -> the frame before it that is its background, where there is
+            one.
         typical_of: contacts without such a frame -> their recording.
+        extracted: whether frames of videos are files by now.
         moved: image -> its copy below ``out``, where some recordings are videos and others folders.
     """
 
@@ -146,6 +148,7 @@ class Recordings:
     backgrounds: dict[str, Path] = field(default_factory=dict)
     background_frames: dict[str, int] = field(default_factory=dict)
     typical_of: dict[str, str] = field(default_factory=dict)
+    extracted: bool = False
     moved: dict[Path, Path] = field(default_factory=dict)
 
     def open(self, rows: Sequence[Row], progress: Progress) -> list[Row]:
@@ -189,7 +192,7 @@ class Recordings:
                 except PalpateError as error:
                     return f"bad-video: {source}: {error.got}"
             elif inside(self.root, os.path.relpath(source, self.root)) is None:
-                return f"outside-root: {source} is a link that leaves the data set; import from the folder that really holds it"
+                return f"outside-root: {source} is a link that leaves the data set"
             else:
                 opened[modality] = FolderFrames(source, self.root)
         return opened
@@ -199,7 +202,7 @@ class Recordings:
         opened = self.frames[row.video]
         length = min(map(len, opened.values()))
         if row.frame >= length:
-            text = f"frame {row.frame} is beyond the end of {row.video!r}: both modalities have {length} frames, counted from 0"
+            text = f"frame {row.frame} of {row.video!r}, which has {length} frames, counted from 0"
             self.problems.append(Problem(row.where, "beyond-end", text))
             return False
         missing = [frames for frames in opened.values() if not frames.has(row.frame)]
@@ -231,7 +234,7 @@ class Recordings:
                 self.typical_of[contact] = video
 
     def _without_contact(self, video: str) -> list[int]:
-        """Up to 15 evenly spaced frames without contact, 4 frames away from any where that leaves some."""
+        """Up to 15 evenly spaced frames without contact, if possible 4 frames away from any."""
         numbers = np.asarray(self.frames[video]["tactile"].numbers, np.int64)
         contact = np.array(sorted(self.in_contact.get(video, set())), np.int64)
         for margin in (BACKGROUND_BEFORE, 0):
@@ -273,7 +276,8 @@ class Recordings:
     def decode(self, rows: list[Row], progress: Progress, *, videos: bool = True) -> list[Row]:
         """Decode what ``extract`` would, and write nothing; keep the rows whose images are whole.
 
-        With ``videos=False`` only the typical frames of folders are determined, and every row stays.
+        With ``videos=False`` only the typical frames of folders are determined, and every row
+        stays.
         """
         whole: set[tuple[str, str, int]] = set()
 
@@ -306,6 +310,7 @@ class Recordings:
 
         typical = self._typical(rows, videos=True)
         self._run("extracting frames", [*jobs, *typical], work, rows, progress, save=True)
+        self.extracted = True
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
         rows = [
             row
@@ -408,7 +413,7 @@ class Recordings:
                     self.moved[path] = target
 
     def _require_same_settings(self, jobs: Sequence[_Job]) -> None:
-        """Record the settings of the extracted frames; reject a folder with frames of other settings or videos."""
+        """Record the settings of extracted frames; reject a folder with others."""
         if not jobs:
             return
         path = self.out / "images" / "settings.json"
@@ -430,7 +435,7 @@ class Recordings:
                     else f"{earlier} there, {settings} here"
                 )
                 raise PalpateError(
-                    f"The frames in {path.parent} must have been made from the same videos with the same settings",
+                    f"Frames in {path.parent} must be of the same videos and the same settings",
                     got,
                     "Choose another folder, or remove that one",
                 )
@@ -439,17 +444,25 @@ class Recordings:
             self.created.append(path)
         write_json(path, {**settings, "videos": videos})
 
-    def cells(self, rows: Sequence[Row], root: Path) -> list[dict[str, Any]]:
-        """Manifest cells of the rows; images that are not files yet have no path.
+    def cells(
+        self,
+        rows: Sequence[Row],
+        root: Path,
+        sensor: str | None = None,
+        words: Mapping[str, FrameTable | None] | None = None,
+    ) -> list[dict[str, Any]]:
+        """Manifest cells of the rows; frames inside videos have no path before ``extract``.
 
         Args:
             rows: frames of opened recordings.
             root: folder that the paths shall be relative to.
+            sensor: the tactile sensor.
+            words: further columns by (video, frame).
         """
         folders: dict[Path, str] = {}
 
-        def relative(path: Path | None) -> str | None:
-            if path is None:
+        def relative(frames: Frames, path: Path | None) -> str | None:
+            if path is None or (isinstance(frames, VideoFrames) and not self.extracted):
                 return None
             path = self.moved.get(path, path)
             if path.parent not in folders:
@@ -457,22 +470,18 @@ class Recordings:
             prefix = folders[path.parent]
             return path.name if prefix == "." else f"{prefix}/{path.name}"
 
-        table: list[dict[str, Any]] = []
+        tables = {name: table.values for name, table in (words or {}).items() if table is not None}
+        cells: list[dict[str, Any]] = []
         for row in rows:
             opened = self.frames[row.video]
-            images = {m: relative(frames.path(row.frame)) for m, frames in opened.items()}
-            images["background"] = relative(self.backgrounds.get(row.contact))
-            table.append(
-                {
-                    "id": row.id,
-                    "video": row.video,
-                    "frame": row.frame,
-                    "contact": row.contact,
-                    "material": row.material,
-                    **images,
-                }
-            )
-        return table
+            names = ("id", "video", "frame", "contact", "material")
+            row_cells = {name: getattr(row, name) for name in names} | {"sensor": sensor}
+            row_cells |= {m: relative(f, f.path(row.frame)) for m, f in opened.items()}
+            background = self.backgrounds.get(row.contact)
+            row_cells["background"] = relative(opened["tactile"], background)
+            row_cells |= {n: values.get((row.video, row.frame)) for n, values in tables.items()}
+            cells.append(row_cells)
+        return cells
 
     def manifest(
         self,
@@ -481,18 +490,13 @@ class Recordings:
         sensor: str,
         words: Mapping[str, FrameTable | None],
     ) -> Manifest:
-        """The manifest of the rows; ``words`` fills columns by (video, frame).
+        """The manifest of the rows.
 
         Its root is the data set if all recordings are folders of frames, else ``out``.
         """
         layout = self.layout(rows)
         root = (self.root if layout == "extracted" else self.out).resolve()
-        table = self.cells(rows, root)
-        for row in table:
-            row["sensor"] = sensor
-            for column, values in words.items():
-                if values is not None:
-                    row[column] = values.values.get((row["video"], row["frame"]))
+        table = self.cells(rows, root, sensor, words)
         kinds = Counter(
             "none"
             if c not in self.backgrounds

@@ -1,11 +1,11 @@
-"""From the text cells of a table to rows of a manifest: whole numbers, names of classes, parts of a split."""
+"""From the text cells of a table to rows of a manifest."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,8 @@ def manifest_rows(
 ) -> tuple[list[tuple[int, Row]], int]:
     """Rows of a manifest from mapped cells.
 
-    ``frame``, ``start`` and ``end`` become integers; with ``classes`` the number of a material becomes its name, and rows of number
+    ``frame``, ``start`` and ``end`` become integers; with ``classes`` the number of a material
+    becomes its name, and rows of number
     -1 (inconclusive) are skipped; ``split`` becomes the name of a part.
 
     Args:
@@ -61,13 +62,7 @@ def manifest_rows(
         wrong = [
             ("bad-map", f"the expression for {n} is empty here") for n, c in row.items() if not c
         ]
-        for name in INTEGERS:
-            if row.get(name):
-                number = _whole(row[name])
-                if number is None or number < 0:
-                    text = f"the {name} {row[name]!r} is not a whole number from 0"
-                    wrong.append(("bad-frame", text))
-                row[name] = number
+        wrong += _make_integers(row)
         material = row.get("material")
         if classes is not None and material is not None and material not in known:
             number = _whole(material)
@@ -90,8 +85,18 @@ def manifest_rows(
     return rows, inconclusive
 
 
+def _make_integers(row: Row) -> Iterator[tuple[str, str]]:
+    """Make integers of the cells that must be some; yield what is wrong as (kind, text)."""
+    for name in INTEGERS:
+        if row.get(name):
+            number = _whole(row[name])
+            if number is None or number < 0:
+                yield "bad-frame", f"the {name} {row[name]!r} is not a whole number from 0"
+            row[name] = number
+
+
 def read_classes(path: Path) -> dict[int, str]:
-    """Read a table of classes: ``Name: id`` lines, or CSV of id and name in either order, with or without a header.
+    """Read a table of classes: ``Name: id`` lines, or CSV of id and name in either order.
 
     Raises:
         PalpateError: if the file is missing or names no class.
@@ -133,17 +138,18 @@ def read_classes(path: Path) -> dict[int, str]:
 
 
 def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
-    """Report group columns that only some rows have, and words in them that mean null elsewhere; each with the first row."""
+    """Report group columns that only some rows have, and words in them that may mean null."""
     problems: list[Problem] = []
     for name in GROUPS:
         without = [where for where, row in rows if name not in row]
         if 0 < len(without) < len(rows):
-            text = f"{len(without)} of {len(rows)} rows have no {name}, so no split by {name} can place them; the first is {without[0]}"
+            text = f"{len(without)} of {len(rows)} rows have no {name}, so no split by {name} can"
+            text += f" place them; the first is {without[0]}"
             problems.append(Problem(str(source), "null-group", text))
         worded = [where for where, row in rows if str(row.get(name, "")).lower() in NULL_WORDS]
         if worded:
-            text = f"{len(worded)} of {len(rows)} rows have the {name} NA, NaN, None or null, taken as a name; the first is {worded[0]}"
-            text += ". An empty cell means that there is none"
+            text = f"{len(worded)} of {len(rows)} rows have the {name} NA, NaN, None or null, taken"
+            text += f" as a name; the first is {worded[0]}. For none, leave the cell empty"
             problems.append(Problem(str(source), "word-for-null", text))
     return problems
 

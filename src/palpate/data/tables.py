@@ -1,10 +1,11 @@
-"""Tables of anyone's data: CSV, TSV, JSON lines, JSON arrays, Parquet, data frames and lists of dictionaries.
+"""Tables: CSV, TSV, JSON lines, JSON arrays, Parquet, data frames, lists of dictionaries.
 
-Cells are read as texts; each row keeps its place for messages. CSV and TSV are UTF-8 (or UTF-16 with a byte-order
-mark), with any line ends; a ``.csv`` whose header has semicolons but no commas is split at those. A quoted cell may span
-lines; its row counts by its first. Rows of another width, lines that are not JSON, bytes that are not UTF-8 and quotation
-marks that stay open are problems of their line; blank lines are ignored. Items of a JSON array, rows of Parquet and of
-data frames are counted from 1. Only the requested columns are kept.
+Cells are read as texts; each row keeps its place for messages. CSV and TSV are UTF-8 (or UTF-16
+with a byte-order mark), with any line ends; a ``.csv`` whose header has semicolons but no commas is
+split at those. A quoted cell may span lines; its row counts by its first. Rows of another width,
+lines that are not JSON, bytes that are not UTF-8 and quotation marks that stay open are problems of
+their line; blank lines are ignored. Items of a JSON array, rows of Parquet and of data frames are
+counted from 1. Only the requested columns are kept.
 """
 
 from __future__ import annotations
@@ -56,11 +57,12 @@ class Table:
         """Read the rows.
 
         Returns:
-            (rows) with the requested columns as texts, null where empty, and the column ``LINE``. Bad rows are skipped and
-            join ``problems``.
+            (rows) with the requested columns as texts, null where empty, and the column ``LINE``.
+            Bad rows are skipped and join ``problems``.
 
         Raises:
-            PalpateError: if a column occurs twice in the header, or does not hold texts and numbers.
+            PalpateError: if a column occurs twice in the header, or does not hold texts and
+                numbers.
         """
         if double := [name for name in columns if self.names.count(name) > 1]:
             raise PalpateError(
@@ -92,7 +94,8 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
 
     Args:
         path: the file.
-        names: columns of a CSV or TSV file that has no header line; the file may then have any suffix.
+        names: columns of a CSV or TSV file that has no header line; the file may then have any
+            suffix.
 
     Raises:
         PalpateError: if the file is missing, or of another form.
@@ -117,7 +120,7 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
 
 
 def table_of(data: Any, name: str = "row") -> Table:
-    """A polars or pandas frame, or dictionaries, as a table; its rows are called ``row:1``, ``row:2`` ...
+    """A polars or pandas frame, or dictionaries, as a table with rows ``row:1``, ``row:2`` ...
 
     Raises:
         PalpateError: if the data is of another type.
@@ -137,7 +140,7 @@ def table_of(data: Any, name: str = "row") -> Table:
 
 
 def header_of(path: Path) -> list[str]:
-    """The columns of a table as far as its first row shows them; empty if it cannot be read. Quick, and never raises."""
+    """The columns that the first row of a table shows; empty if it cannot be read. Never raises."""
     suffix = Path(path).suffix.lower()
     try:
         if suffix == ".parquet":
@@ -252,7 +255,7 @@ def _of_objects(name: str, rows: Sequence[tuple[int, Any]], problems: list[Probl
 
 
 def _schema(path: Path) -> dict[str, pl.DataType]:
-    """Columns of a Parquet file, opened here since polars would take brackets in its name for a pattern."""
+    """Columns of a Parquet file; polars would take brackets in its name for a pattern."""
     with open(path, "rb") as file:
         return dict(pl.read_parquet_schema(file))
 

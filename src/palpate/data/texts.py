@@ -6,7 +6,7 @@ import codecs
 
 
 def decoded(data: bytes) -> str:
-    """Text of UTF-8, or of UTF-16 with a byte-order mark; what is neither becomes U+FFFD, and line ends stay as they are."""
+    """Decode UTF-8, or UTF-16 with a byte-order mark; other bytes become U+FFFD."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace")
     return data.decode("utf-8-sig", errors="replace")

@@ -1,11 +1,12 @@
 """Frames of a video file by their exact number.
 
 Frame ``k`` is the ``k``-th image in order of presentation, as a full decode would count it. The
-timestamps of all packets are read first (a pass over the file without decoding); sorted, they are the
+timestamps of all packets are read first (a pass over the file without decoding); sorted, they are
+the
 index: ``pts[k]``. To reach frame ``k`` the reader seeks to the last keyframe presented at or before
 ``pts[k]`` and decodes until exactly that timestamp; where decoding is already between that keyframe
-and ``k``, it continues from there. Rates and durations are not used, so B-frames, variable rates and
-clips that do not start at zero are exact.
+and ``k``, it continues from there. Rates and durations are not used, so B-frames, variable rates
+and clips that do not start at zero are exact.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from palpate.core import MissingExtraError, PalpateError
 
 
 class VideoReader:
-    """A video file as a sequence of RGB images: ``len(reader)``, ``reader[k]``, ``reader.frames([3, 4, 90])``.
+    """A video file as a sequence of RGB images: ``len(reader)``, ``reader[k]``, ``reader.frames([3,
+    4, 90])``.
 
     Use one reader per thread, as a context manager or with :meth:`close`.
 
@@ -82,7 +84,8 @@ class VideoReader:
         return self._last[1]
 
     def frames(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield ``(k, (h, w, 3) image)`` in the order given; rising numbers are decoded in one pass.
+        """Yield ``(k, (h, w, 3) image)`` in the order given; rising numbers are decoded in one
+        pass.
 
         Raises:
             PalpateError: as for a single frame.
@@ -106,7 +109,8 @@ class VideoReader:
         times: list[int] = []
         keys: list[tuple[int, int]] = []
         packets = cut = 0
-        # Where the index of the container is readable it counts what is presented; the header's count may
+        # Where the index of the container is readable it counts what is presented; the header's
+        # count may
         # include frames that an edit list removed.
         entries = getattr(self._stream, "index_entries", None)
         declared = len(entries) if entries else self._stream.frames
@@ -127,9 +131,9 @@ class VideoReader:
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
         except self._errors as error:
-            raise self._broken(
-                f"{packets} readable of {declared or 'an unknown number of'} frames ({_reason(error)})"
-            ) from None
+            total = declared or "an unknown number of"
+            got = f"{packets} readable of {total} frames ({_reason(error)})"
+            raise self._broken(got) from None
         if packets - cut < declared:
             raise self._broken(
                 f"{packets - cut} readable of {declared} declared frames: the file is cut short"
@@ -150,7 +154,8 @@ class VideoReader:
         image = None
         if last < k and self._pts[last] >= self._keys[max(key, 0)][0]:
             image = self._until(target)
-        # The demuxer may land on a later keyframe, or one may be undecodable: then try earlier ones.
+        # The demuxer may land on a later keyframe, or one may be undecodable: then try earlier
+        # ones.
         for _, time in [*reversed(self._keys[: key + 1]), (0, self._pts[0])]:
             if image is not None:
                 return image
@@ -168,7 +173,7 @@ class VideoReader:
         self._decoded = self._container.decode(self._stream)
 
     def _until(self, target: int) -> NDArray[np.uint8] | None:
-        """The frame with timestamp ``target``, or None if decoding starts after it or ends before it."""
+        """The frame with timestamp ``target``, or None if decoding does not meet it."""
         assert self._decoded is not None
         try:
             for frame in self._decoded:

@@ -127,7 +127,7 @@ def scan(
     work = _Whole(base, base, require_videos(base), {}, "jpg", None, [])
     listed = _read(work, source, columns, classes, half_open)
     rows, contacts = _prepared(work, listed, every, check, progress)
-    rows = work.decode(rows, progress) if check == "decode" else rows
+    rows = work.decode(rows, progress, videos=check == "decode")
     result = Scan(base, {"dataset": source.stem}, scan_rows(work, rows, check))
     for row, (_, cells) in zip(rows, result.rows, strict=True):
         cells |= {"material": None, **contacts[row.contact].words}

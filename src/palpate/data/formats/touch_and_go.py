@@ -143,8 +143,7 @@ def import_touch_and_go(
         rows = thin(rows_of(lists.listed), max_per_contact, seed)
         rows = _prepared(work, lists, rows, check, progress)
         rows = extracted(work, rows, root, skip_bad=skip_bad, progress=progress)
-        sensor = WORLD.sensor if "synthetic" in lists.facts else FACTS.sensor
-        manifest = work.manifest(rows, lists.facts, sensor, lists.words)
+        manifest = work.manifest(rows, lists.facts, lists.sensor, lists.words)
         splits, inconclusive = _splits(manifest, lists.official), lists.listed.inconclusive
         result = Imported(manifest, work.problems, splits, inconclusive, work.suspicious)
         return result.save(out, created)
@@ -160,7 +159,7 @@ def scan(
     """Check a data set without writing anything: lists, recordings, frames and images.
 
     With ``check="decode"`` the frames in use are decoded as an import would, those of raw videos
-    too. Rows carry paths only if every recording is extracted and ``check`` is ``none``.
+    too. Rows carry paths of extracted frames only if ``check`` is ``none``.
 
     Raises:
         PalpateError: if the root, the list or the recordings are missing.
@@ -170,8 +169,9 @@ def scan(
     lists = _read_lists(root, labels)
     work = Recordings(root, root, videos, lists.in_contact, "jpg", None, [])
     rows = _prepared(work, lists, rows_of(lists.listed), check, progress)
-    rows = work.decode(rows, progress) if check == "decode" else rows
-    result = Scan(root, lists.facts, scan_rows(work, rows, check))
+    rows = work.decode(rows, progress, videos=check == "decode")
+    result = Scan(root, lists.facts)
+    result.rows = scan_rows(work, rows, check, lists.sensor, lists.words)
     result.problems, result.suspicious = work.problems, work.suspicious
     result.inconclusive = lists.listed.inconclusive
     return result
@@ -256,10 +256,16 @@ def extracted(
     return rows
 
 
-def scan_rows(work: Recordings, rows: Sequence[FrameRow], check: Check) -> list[Row]:
+def scan_rows(
+    work: Recordings,
+    rows: Sequence[FrameRow],
+    check: Check,
+    sensor: str | None = None,
+    words: Mapping[str, FrameTable | None] | None = None,
+) -> list[Row]:
     """Rows of a scan; with paths if they are still to be checked and the frames are files."""
-    cells = work.cells(rows, work.root.resolve())
-    if check != "none" or work.layout(rows) != "extracted":
+    cells = work.cells(rows, work.root.resolve(), sensor, words)
+    if check != "none":
         for row in cells:
             row |= dict.fromkeys((*MODALITIES, "background"))
     return [(row.where, cell) for row, cell in zip(rows, cells, strict=True)]
@@ -285,6 +291,11 @@ class _Lists:
     words: Mapping[str, FrameTable | None]
     in_contact: Mapping[str, set[int]]
     facts: dict[str, str]
+
+    @property
+    def sensor(self) -> str:
+        """The tactile sensor."""
+        return WORLD.sensor if "synthetic" in self.facts else FACTS.sensor
 
     @property
     def problems(self) -> list[Problem]:
