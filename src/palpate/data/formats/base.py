@@ -2,9 +2,8 @@
 
 A format is one file with ``FACTS``, ``LOOKS_FOR``, ``detect``, ``scan`` and a ``FORMAT`` that joins
 them, named in ``palpate.data.formats.FORMATS``. The scan reads lists and folders and returns every
-row with everything that is wrong. :func:`finished` is what an
-import and a validation share, so both see the same problems. A format whose frames must be decoded
-first brings its own ``run``.
+row with everything that is wrong. An import and a validation share :func:`finished`, so both see
+the same problems. A format whose frames must be decoded first has a ``run``, too.
 """
 
 from __future__ import annotations

@@ -280,12 +280,9 @@ def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: 
         )
     known = {frame.key for frame in read.samples}
     read.contact = known | {frame.key for frame in unlisted if frame.key not in resting}
-    both = [frame.where for frame in read.samples if frame.key in resting]
-    text = "listed, but not_contact.json calls them untouched"
-    tvl.suspect_rows(result, both, "contact-and-not", text)
     unlisted = [frame for frame in unlisted if frame.key not in known]
-    both = [frame.where for frame in unlisted if frame.key in resting]
-    text = "in contact.json and in not_contact.json, so no samples"
+    both = [frame.where for frame in [*read.samples, *unlisted] if frame.key in resting]
+    text = "not_contact.json calls them untouched; samples only where a list has them"
     tvl.suspect_rows(result, both, "contact-and-not", text)
     unlisted = [frame for frame in unlisted if frame.key not in resting]
     if contact:
@@ -375,9 +372,9 @@ def _swap(
     for frame in frames:
         by_video[frame.video].append(frame)
     files: dict[str, tuple[list[Path], list[Path]]] = {}
-    for video, own in by_video.items():
-        some = [own[k] for k in sorted({0, len(own) // 2, len(own) - 1})]
-        sides = ([result.base / getattr(f, side) for f in some] for side in ("vision", "tactile"))
+    for video, group in by_video.items():
+        few = [group[k] for k in sorted({0, len(group) // 2, len(group) - 1})]
+        sides = ([result.base / getattr(f, side) for f in few] for side in ("vision", "tactile"))
         files[video] = next(sides), next(sides)
     seen = looks(files, progress)
     evidence: dict[str, str] = {}

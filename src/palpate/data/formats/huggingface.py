@@ -270,11 +270,11 @@ class _BatchReader:
         plain = self.maps.without(list(stored))
         texts = {n: pl.Series(self._texts(n), dtype=pl.String) for n in plain.columns}
         table = pl.DataFrame({ROW: range(self.count)}).with_columns(**texts)
-        found, inconclusive = manifest_rows(
+        usable, inconclusive = manifest_rows(
             plain.apply(table), self.count, self._where, classes, self.result.problems
         )
         self.result.inconclusive += inconclusive
-        for k, row in found:
+        for k, row in usable:
             row.setdefault("id", self._default_id(k, row))
             problems: list[tuple[str, str]] = []
             for target in (t for t in IMAGE_COLUMNS if t in self.maps.expressions):
