@@ -12,7 +12,7 @@ from format_trees import TREES
 from palpate.core import ProblemsError, Split
 from palpate.data.formats import FORMATS
 from palpate.data.formats.base import finished
-from palpate.data.importing import import_dataset, validate_dataset, write_lists
+from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 #: Takes what no other format recognized, so it may recognize trees of others too; it must be last.
@@ -122,7 +122,7 @@ def test_import_is_the_same_again_and_on_a_copied_tree(name, folder, made, whole
 
 
 def test_validation_of_a_whole_tree_finds_all_samples(name, made, whole):
-    result = validate_dataset(made.source, format=name, **made.options)
+    result = validate(made.source, format=name, **made.options)
     assert result.ok
     assert (result.format, result.facts) == (name, FORMATS[name].facts)
     assert result.samples == made.samples
@@ -147,7 +147,7 @@ def test_a_bad_image_is_reported_and_skipped_alone(name, folder, made, whole, tm
             victim.symlink_to(tmp_path / victim.name)
         else:
             victim.write_bytes(victim.read_bytes()[: victim.stat().st_size // 2])
-    report = validate_dataset(copy.source, format=name, **copy.options)
+    report = validate(copy.source, format=name, **copy.options)
     assert (bool(report.missing), bool(report.invalid)) == (how == "remove", how != "remove")
     with pytest.raises(ProblemsError) as caught:
         import_dataset(copy.source, tmp_path / "out", format=name, **copy.options)

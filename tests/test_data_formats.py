@@ -21,7 +21,7 @@ from format_trees import (
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats.base import Scan, few
 from palpate.data.formats.layout import natural, numbered
-from palpate.data.importing import import_dataset, validate_dataset, write_lists
+from palpate.data.importing import import_dataset, validate, write_lists
 
 BOM = b"\xef\xbb\xbf"
 
@@ -55,7 +55,7 @@ def test_numbers_are_integers_and_nothing_is_skipped_silently(tmp_path):
 def test_numbers_too_long_for_a_frame_are_suspicious(tmp_path, make, name, stray):
     made = make(tmp_path / "data")
     path = write_image(made.source / stray.format("9" * 20), 3)
-    result = validate_dataset(made.source, format=name)
+    result = validate(made.source, format=name)
     assert result.samples == made.samples
     assert path.name in of_kind(result.suspicious, "unknown-name").text
 
@@ -75,9 +75,9 @@ def test_links_out_of_the_tree_are_rejected_whether_broken_or_not(tmp_path, make
     path = import_dataset(source, tmp_path / "out", format=name).manifest.paths("tactile")[-1]
     path.rename(tmp_path / "outside.jpg")
     path.symlink_to(tmp_path / "outside.jpg")
-    assert kinds(validate_dataset(source, format=name).invalid) == {"outside-root": 1}
+    assert kinds(validate(source, format=name).invalid) == {"outside-root": 1}
     (tmp_path / "outside.jpg").unlink()
-    assert kinds(validate_dataset(source, format=name).invalid) == {"outside-root": 1}
+    assert kinds(validate(source, format=name).invalid) == {"outside-root": 1}
 
 
 # --- TaRF
@@ -134,7 +134,7 @@ def test_tarf_reports_everything_bad(tmp_path):
     test = [[bench, "0"], [office, "0009"], [office, "9"], ["../x_40_30", "1"], [office, "x"]]
     lists = json.dumps({"train": [*train, [bench]], "test": test, "extra": []}, indent=1)
     (root / "split_interval.json").write_bytes(BOM + lists.replace("\n", "\r\n").encode())
-    result = validate_dataset(root)
+    result = validate(root)
     assert kinds(result.missing) == {"unpaired": 2, "missing-folder": 2, "missing-file": 1}
     wrong = ("bad-image", "duplicate-frame", "unknown-part", "bad-line", "two-parts")
     wrong += ("duplicate-row", "outside-root", "bad-frame")
@@ -155,7 +155,7 @@ def test_tarf_broken_lists_and_empty_trees(tmp_path):
     root = make_tarf(tmp_path / "data").source
     for text in ("{", "[1]", '{"train": 3}'):
         (root / "split_interval.json").write_text(text)
-        assert kinds(validate_dataset(root).invalid) == {"bad-json": 1}, text
+        assert kinds(validate(root).invalid) == {"bad-json": 1}, text
     (tmp_path / "bare" / "touch").mkdir(parents=True)
     with pytest.raises(PalpateError, match="Got none"):
         import_dataset(tmp_path / "bare", tmp_path / "out", format="tarf")
@@ -216,7 +216,7 @@ def test_objectfolder_reports_everything_bad(tmp_path):
         write_image(path, 70)
     cut = root / "10" / "tactile_data" / "1" / "0" / "gelsight" / "1.png"
     cut.write_bytes(cut.read_bytes()[:-30])
-    result = validate_dataset(root)
+    result = validate(root)
     assert kinds(result.missing) == {"missing-folder": 2, "missing-frames": 1}
     wrong = ("two-labels", "bad-line", "bad-row", "duplicate-frame", "bad-image")
     assert kinds(result.invalid) == dict.fromkeys(wrong, 1)
@@ -271,7 +271,7 @@ def test_generation_reports_everything_bad(tmp_path):
     strange = "tasse à thé, bleue/ein"
     for side in ("touch", "vision"):
         write_image(root / side / f"{strange}.png", 90)
-    result = validate_dataset(root)
+    result = validate(root)
     assert kinds(result.missing) == {"unpaired": 2, "missing-folder": 1, "missing-file": 1}
     text = of_kind(result.missing, "missing-folder").text
     assert text == "no vision images here, for 4 in touch/10"
@@ -347,7 +347,7 @@ def test_ycb_slide_reports_everything_bad(tmp_path):
     (four / "frames" / "frame_0000001.jpg").unlink()
     (four / "frames" / "frame_0000002.jpg").write_bytes(b"no image")
     write_image(root / "real" / "my own cup" / "dataset_7" / "frames" / "frame_0000000.jpg", 9)
-    result = validate_dataset(root)
+    result = validate(root)
     assert kinds(result.missing) == {"unpaired": 4, "missing-frames": 1}
     first = [p.where.rpartition("dataset_0/")[2] for p in result.missing if "004" in p.where]
     lone = (

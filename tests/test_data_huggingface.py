@@ -12,7 +12,7 @@ from format_trees import hf_rows, save_hf
 from palpate.core import MissingExtraError, PalpateError, ProblemsError, Split
 from palpate.data.exporting import export_dataset
 from palpate.data.formats.huggingface_source import open_source
-from palpate.data.importing import import_dataset, validate_dataset
+from palpate.data.importing import import_dataset, validate
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 datasets = pytest.importorskip("datasets", reason="the extra hf is not installed")
@@ -181,7 +181,7 @@ def test_bad_rows_are_reported_with_their_place_and_images_outside_are_rejected(
         ("mine/train:4", "bad-frame"),
     ]
     assert not (tmp_path / "out").exists()
-    report = validate_dataset(source, columns=maps)
+    report = validate(source, columns=maps)
     assert sorted((p.where, p.kind) for p in [*report.missing, *report.invalid]) == reported
     assert len(import_dataset(source, tmp_path / "out", columns=maps, skip_bad=True).manifest) == 4
     texts = [
@@ -271,7 +271,7 @@ def test_numbers_that_are_no_class_are_reported_and_minus_one_is_inconclusive(tm
         info = json.loads(path.read_text())
         info["features"]["kind"] = {"names": ["Wood", "Rock"], "_type": "ClassLabel"}
         path.write_text(json.dumps(info))
-    report = validate_dataset(source, columns=MAPS)
+    report = validate(source, columns=MAPS)
     reported = [("mine/train:1", "unknown-label"), ("mine/validation:1", "unknown-label")]
     assert sorted((p.where, p.kind) for p in report.invalid) == reported
     assert report.samples == 5

@@ -8,7 +8,7 @@ from data_fixtures import number, tree, write_frames, write_video
 from palpate.core import PalpateError, ProblemsError, Split
 from palpate.data.formats.touch_and_go import import_touch_and_go
 from palpate.data.images import read_image
-from palpate.data.importing import import_dataset, validate_dataset, write_lists
+from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.listing import read_list
 
 
@@ -54,7 +54,7 @@ def test_intervals_give_what_a_frame_list_of_the_same_contacts_gives(tmp_path, r
     )
     assert shown(result.manifest, "background") == [6] * 6 + [9] * 3
     assert result.facts["format"] == "intervals"
-    report = validate_dataset(root / "list.csv", classes=root / "classes.txt")
+    report = validate(root / "list.csv", classes=root / "classes.txt")
     assert (report.ok, report.samples, report.format) == (True, 9, "intervals")
 
 
@@ -119,20 +119,20 @@ def test_what_looks_wrong_is_reported_by_import_and_validation(tmp_path):
         (str(tmp_path), "unlisted-video"),
     ]
     assert "frame 15 of 'a'" in result.suspicious[0].text
-    assert list(validate_dataset(tmp_path / "l.csv").suspicious) == result.suspicious
+    assert list(validate(tmp_path / "l.csv").suspicious) == result.suspicious
 
 
 def test_validation_decodes_raw_videos(tmp_path):
     root = recording(tmp_path / "d", "a", raw=True)
     (root / "l.csv").write_text(LIST)
-    assert validate_dataset(root / "l.csv").samples == 9
+    assert validate(root / "l.csv").samples == 9
     path = root / "a" / "gelsight.mp4"
     data = bytearray(path.read_bytes())
     start = data.index(b"mdat") + 4
     third = (len(data) - start) // 3
     data[start + third : start + 2 * third] = b"\xff" * third
     path.write_bytes(bytes(data))
-    report = validate_dataset(root / "l.csv")
+    report = validate(root / "l.csv")
     assert [p.kind for p in report.invalid] == ["bad-video"]
     with pytest.raises(ProblemsError) as caught:
         import_dataset(root / "l.csv", tmp_path / "out")
@@ -173,7 +173,7 @@ def test_every_bad_interval_is_reported_by_its_line(tmp_path):
         p.text for p in caught.value.problems if p.where.endswith(":3")
     )
     assert not (tmp_path / "out").exists()
-    report = validate_dataset(root / "l.csv")
+    report = validate(root / "l.csv")
     assert sorted((p.where, p.kind) for p in [*report.missing, *report.invalid]) == sorted(reported)
     result = import_dataset(root / "l.csv", tmp_path / "out", skip_bad=True)
     frames = result.manifest.table.select("video", "frame").rows()
@@ -199,7 +199,7 @@ def test_overlaps_are_those_of_a_slow_search(tmp_path):
             for j, (c, d) in enumerate(spans)
             if j != k and a <= d and c <= b
         }
-        report = validate_dataset(root / "l.csv", check="none")
+        report = validate(root / "l.csv", check="none")
         assert {int(p.where.rpartition(":")[2]) - 2 for p in report.invalid} == slow
 
 

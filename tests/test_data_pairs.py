@@ -9,7 +9,7 @@ import pytest
 from data_fixtures import tree, write_frames, write_image
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.formats import FORMATS
-from palpate.data.importing import import_dataset, validate_dataset
+from palpate.data.importing import import_dataset, validate
 from palpate.data.manifest import Manifest
 
 import_pairs = partial(import_dataset, format="pairs")
@@ -30,7 +30,7 @@ def write_table(path, text):
 
 
 def problems_of(table, **options):
-    invalid = validate_dataset(table, format="pairs", **options).invalid
+    invalid = validate(table, format="pairs", **options).invalid
     return [(p.where.rpartition(":")[2], p.kind) for p in invalid]
 
 
@@ -184,7 +184,7 @@ def test_paths_that_no_file_can_have(images):
     text = "\n".join(["vision", *paths, "../x.jpg", "v/0.jpg"])
     table = write_table(images / "t.csv", text)
     assert problems_of(table) == [("2", "bad-path"), ("8", "outside-root")]
-    missing = validate_dataset(table).missing
+    missing = validate(table).missing
     assert [int(p.where.rpartition(":")[2]) for p in missing] == [3, 4, 5, 6, 7]
 
 
@@ -324,7 +324,7 @@ def test_an_id_of_two_parts_is_in_neither_and_the_first_usable_row_keeps_it(imag
     table = write_table(images / "t.csv", "id,vision\na,v/0.jpg\na,v/1.jpg\n")
     assert problems_of(table) == [("2", "bad-image")]
     table = write_table(images / "t.csv", "vision,tactile\nv/2.jpg,t/1.jpg\nv/3.jpg,t/1.jpg\n")
-    (problem,) = validate_dataset(table).invalid
+    (problem,) = validate(table).invalid
     assert (problem.where, problem.kind) == (f"{table}:3", "duplicate-id")
     assert problem.text.endswith("made of the path since there is none: map a column to id")
 

@@ -7,7 +7,7 @@ import palpate.data.recordings as recordings
 from data_fixtures import tree, write_image
 from palpate.core import ProblemsError, Split
 from palpate.data.formats.touch_and_go import import_touch_and_go
-from palpate.data.importing import validate_dataset, write_lists
+from palpate.data.importing import validate, write_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import read_samples
 from test_data_touch_and_go import LINES, make_recordings, shown
@@ -24,10 +24,10 @@ def damage(path):
 
 def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
     root = make_recordings(tmp_path / "tag", raw=("a", "b"))
-    assert validate_dataset(root).samples == 18
+    assert validate(root).samples == 18
     damage(root / "dataset" / "b" / "gelsight.mp4")
     before = tree(root)
-    looked = validate_dataset(root)
+    looked = validate(root)
     assert [p.kind for p in looked.invalid] == ["bad-video"]
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(root, tmp_path / "out")
@@ -37,7 +37,7 @@ def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
         == len(import_touch_and_go(root, tmp_path / "out", skip_bad=True).manifest)
         < 18
     )
-    assert validate_dataset(root, check="header").ok
+    assert validate(root, check="header").ok
     assert len(read_samples(root)[0]) == 18  # who only wants the samples waits for no decoding
     assert tree(root) == before
 
@@ -56,7 +56,7 @@ def test_a_stray_number_costs_nothing_and_what_looks_wrong_reaches_the_user(tmp_
     found = import_touch_and_go(root, tmp_path / "out")
     assert found.manifest.ids == wanted.ids
     assert shown(found.manifest, "vision") == [0, 1, 2]
-    looked = validate_dataset(root)
+    looked = validate(root)
     assert looked.ok
     assert sorted((p.kind, p.where.removeprefix(str(root))) for p in looked.suspicious) == [
         ("duplicate-frame", "/dataset/a/video_frame/000001.jpg"),

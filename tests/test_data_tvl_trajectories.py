@@ -16,7 +16,7 @@ from palpate.core import PalpateError, ProblemsError, Split, quiet
 from palpate.data.formats import hct, swapped, tvl
 from palpate.data.formats.base import Scan
 from palpate.data.formats.hct import TRAJECTORY
-from palpate.data.importing import import_dataset, validate_dataset, write_lists
+from palpate.data.importing import import_dataset, validate, write_lists
 
 
 @pytest.fixture
@@ -407,7 +407,7 @@ def test_every_bad_row_of_hct_is_reported(tree, tmp_path):
     assert not (tmp_path / "out").exists()
     result = read(tree, tmp_path / "out", skip_bad=True)
     assert len(result.manifest) == 24 - 4 - 1
-    report = validate_dataset(tree)
+    report = validate(tree)
     assert (report.samples, kinds(report.missing) + kinds(report.invalid)) == (19, kinds(reported))
     assert kinds(report.missing) == {"missing-file": 2, "missing-folder": 2}
 

@@ -16,7 +16,7 @@ from format_trees import (
 )
 from palpate.core import PalpateError, Split
 from palpate.data.formats import visgel
-from palpate.data.importing import import_dataset, validate_dataset, write_lists
+from palpate.data.importing import import_dataset, validate, write_lists
 
 BOM = b"\xef\xbb\xbf"
 
@@ -85,7 +85,7 @@ def test_bad_lines(tmp_path):
         "caf\xe9",
     ]
     path.write_bytes(BOM + "\r\n".join(lines).encode("latin-1"))
-    result = validate_dataset(root)
+    result = validate(root)
     assert {(p.where, p.kind) for p in [*result.missing, *result.invalid]} == {
         (f"{path}:4", "duplicate-row"),
         (f"{path}:5", "bad-line"),
@@ -112,7 +112,7 @@ def test_lists_of_another_disk(tmp_path):
         lines = path.read_text().splitlines()
         moved = (" ".join(f"/mit/{name}" for name in line.split()) for line in lines)
         path.write_text("\n".join(moved))
-    assert kinds(validate_dataset(root).invalid) == {"outside-root": 3}  # one a recording
+    assert kinds(validate(root).invalid) == {"outside-root": 3}  # one a recording
     lists = (root / "data_lst").rename(tmp_path / "elsewhere")
     options = {"format": "visgel", "root": root / "data", "prefix": "/mit/data/"}
     result = import_dataset(lists, tmp_path / "out", **options)
@@ -134,7 +134,7 @@ def test_recordings_without_lists(tmp_path):
     root = tmp_path / "data" / "data_seen"
     (root / "2" / "rec" / "frame0000.jpg").unlink()
     (root / "10" / "rec" / "frame0002.jpg").unlink()
-    report = validate_dataset(root, format="visgel")
+    report = validate(root, format="visgel")
     assert (report.ok, report.samples) == (True, 5)
     assert kinds(report.suspicious) == {"no-background": 1, "frame-gap": 1}
 
@@ -151,7 +151,7 @@ def test_recordings_of_both_sides(tmp_path):
     (root / "data/data_seen/vision/1/rec_a/frame0002.jpg").unlink()
     for path in (root / "data/data_seen/vision/10/rec_a").iterdir():
         path.unlink()
-    report = validate_dataset(root, format="visgel")
+    report = validate(root, format="visgel")
     assert kinds(report.missing) == {"unpaired": 1, "missing-folder": 1}
     assert report.samples == 5 + 6
 
@@ -170,16 +170,16 @@ def test_contact_is_the_variance_of_the_laplacian(tmp_path):
     assert result.facts["min_contact"] == "18; 2 of 6 frames skipped"
     for k in (1, 2):
         write_image(root / "10" / "rec" / f"frame{k:04d}.jpg", 5)
-    report = validate_dataset(root, format="visgel")
+    report = validate(root, format="visgel")
     text = of_kind(report.suspicious, "flat-frames").text
     assert "4 of 6 measured frames touch nothing" in text
-    assert validate_dataset(root, format="visgel", check="header").suspicious == []
+    assert validate(root, format="visgel", check="header").suspicious == []
 
 
 @pytest.mark.parametrize(("values", "flat"), [((17.9, 18.0, 18.1), 2), ((18.0, 18.1, 18.1), None)])
 def test_contact_of_18_or_less_is_flat(tmp_path, monkeypatch, values, flat):
     root = make_visgel_recordings(tmp_path / "data").source
     monkeypatch.setattr(visgel, "_contacts", lambda *_: list(values))
-    texts = [p.text for p in validate_dataset(root, format="visgel").suspicious]
+    texts = [p.text for p in validate(root, format="visgel").suspicious]
     assert len(texts) == (flat is not None)
     assert all(f"{flat} of 3 measured frames touch nothing" in text for text in texts)

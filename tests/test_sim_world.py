@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from palpate.core import PalpateError, Split
-from palpate.data.importing import import_dataset, validate_dataset
+from palpate.data.importing import import_dataset, validate
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit
 from palpate.sim import MATERIALS, PRESETS, Video, World, WorldOptions, plan_world, write_world
@@ -102,7 +102,7 @@ def test_hct_has_the_layout_of_the_archive(hct):
 
 @pytest.mark.parametrize("place", [".", "hct"])
 def test_hct_is_valid(hct, place):
-    result = validate_dataset(hct.folder / place)
+    result = validate(hct.folder / place)
     assert (result.format, result.samples) == ("hct", hct.counts["contact_frames"])
     assert [*result.missing, *result.invalid, *result.suspicious] == []
 

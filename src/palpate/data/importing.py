@@ -182,6 +182,3 @@ def _contents(source: Path) -> str:
     names = sorted(p.name + "/" * p.is_dir() for p in source.iterdir())
     more = " ..." if len(names) > 8 else ""
     return f"a folder with {', '.join(names[:8])}{more}" if names else "an empty folder"
-
-
-validate_dataset = validate
