@@ -10,8 +10,8 @@ name           needs      score
 ``ssim``       pairs      structural similarity
 ``psnr``       pairs      peak signal-to-noise ratio
 ``ms-ssim``    pairs      structural similarity at several scales
-``contact``    pairs      residual, SSIM, PSNR, IoU and MS-SSIM of the contact alone; needs backgrounds
-``lpips``      pairs      LPIPS, and that of the contact where there are backgrounds; needs weights
+``contact``    pairs      residual, SSIM, PSNR, IoU, MS-SSIM of the contact; needs backgrounds
+``lpips``      pairs      LPIPS, also of the contact if there are backgrounds; needs weights
 =============  =========  ================================================================
 
 "Pairs" are a generated and a real image of one id.
@@ -57,7 +57,7 @@ BATCH = 256
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """Weights of encoders that palpate does not ship: Inception (TorchScript), a CLIP, LPIPS (backbone, heads)."""
+    """Weights that palpate does not ship: Inception (TorchScript), a CLIP, LPIPS (two files)."""
 
     inception: Path | str | None = None
     clip: Path | str | None = None
@@ -144,7 +144,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Companions to compute: on the encoder's features, on those of standard encoders, on pairs of images."""
+    """Companions: on the encoder's features, on those of standard encoders, on pairs of images."""
 
     default: bool
     features: Sequence[str]
@@ -213,14 +213,15 @@ def _require(
 
 
 def score_features(
-    names: Sequence[str], features: Features, *, default: bool, progress: Progress
+    names: Sequence[str], features: Features, default: bool, progress: Progress
 ) -> Outcome:
     """Compute companions on given features.
 
     Args:
         names: among :data:`FEATURES`.
         features: of generators, controls and reference.
-        default: whether nobody requested them: one that raises, or forms too many pairs, becomes a note.
+        default: whether nobody requested them: one that raises, or forms too many pairs, becomes a
+            note.
         progress: called with what is done.
     """
     outcome = Outcome()
@@ -284,13 +285,14 @@ def _kid(features: Features, _: Progress) -> Outcome:
 
 
 def _prdc(features: Features, progress: Progress) -> Outcome:
-    outcome, split = Outcome(), features.common["split"]
+    outcome = Outcome()
     for sets in features.batches():
         first = next(iter(sets.values()))
+        options: dict[str, Any] = {"split": features.common["split"], "progress": progress}
         results = {
-            name: prdc_rows(s.take(list(first.ids)), features.reference, subject=name, split=split, progress=progress)
+            name: prdc_rows(s.take(list(first.ids)), features.reference, subject=name, **options)
             for name, s in sets.items()
-        }  # fmt: skip
+        }
         # Precision and density average over generated rows, recall and coverage over real ones.
         groups = (first.groups, features.reference.groups) * 2
         for k, metric_groups in enumerate(groups):
@@ -390,8 +392,7 @@ def _lpips(pairs: Pairs) -> Outcome:
 
     def outcome_of(metric: str, values: Mapping[str, Any], **extra: Any) -> Outcome:
         scores = {
-            name: mean_score(metric, v, subject=name, **more, **extra)
-            for name, v in values.items()
+            name: mean_score(metric, v, subject=name, **more, **extra) for name, v in values.items()
         }
         return _with_differences(pairs, scores, lambda name: values[name])
 
@@ -421,7 +422,7 @@ def _lpips(pairs: Pairs) -> Outcome:
 
 
 def _contact_lpips(images: Images, pairs: Pairs, network: Any) -> NDArray[np.float64]:
-    """LPIPS (n,) of the differences to the background inside the contact mask; NaN where a real image is empty."""
+    """LPIPS (n,) of the differences to the background inside the contact mask; NaN if empty."""
     from palpate.encoders.perceptual import lpips_per_image
 
     assert pairs.background is not None

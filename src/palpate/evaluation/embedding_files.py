@@ -1,16 +1,17 @@
 """Embeddings from files and tables, as other people's code writes them. No torch, no pickles.
 
-==================  =====================================================================================
-file                content
-==================  =====================================================================================
-``.npy``            a float array (n, d); memory-mapped
-``.npz``            arrays ``features`` (n, d) and, optionally, ``ids``, ``labels``, ``groups`` (n strings)
-                    and ``encoder`` (a string): what :meth:`palpate.core.FeatureSet.save` writes
-``.safetensors``    tensor ``features`` (n, d) of F64, F32, F16 or BF16; optionally, in the metadata,
-                    ``ids``, ``labels`` and ``groups`` as JSON lists, ``encoder`` as text; memory-mapped
-``.parquet``        columns ``id``, ``features`` (a list per row) or ``f0`` .. ``f<d-1>``; optionally
-                    ``material`` or ``label``, ``video`` or ``group``; ``encoder`` in the file's metadata
-==================  =====================================================================================
+================  ================================================================================
+file              content
+================  ================================================================================
+``.npy``          a float array (n, d); memory-mapped
+``.npz``          arrays ``features`` (n, d) and, optionally, ``ids``, ``labels``, ``groups`` (n
+                  strings) and ``encoder`` (a string): what ``FeatureSet.save`` writes
+``.safetensors``  tensor ``features`` (n, d) of F64, F32, F16 or BF16; optionally, in the metadata,
+                  ``ids``, ``labels`` and ``groups`` as JSON lists, ``encoder`` as text;
+                  memory-mapped
+``.parquet``      columns ``id``, ``features`` (a list per row) or ``f0`` .. ``f<d-1>``; optionally
+                  ``material`` or ``label``, ``video`` or ``group``; ``encoder`` in the metadata
+================  ================================================================================
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ SAFE_TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "BF16": "<u2"}
 
 @dataclass(frozen=True)
 class Embeddings:
-    """Features (n, d), possibly memory-mapped, with n ids, labels and groups where the source has them.
+    """Features (n, d), possibly memory-mapped, with n ids, labels and groups where known.
 
     ``widened`` names the half-precision type that the features were converted from, if any.
     """
@@ -56,8 +57,8 @@ def read_embeddings(path: Path) -> Embeddings:
     """Read one file of embeddings; half precision is widened to float32.
 
     Raises:
-        PalpateError: if the file is unreadable or empty, its features are not floats (n, d), its columns
-            have other lengths, or an id occurs twice.
+        PalpateError: if the file is unreadable or empty, its features are not floats (n, d), its
+            columns have other lengths, or an id occurs twice.
     """
     reader = _READERS[path.suffix.lower()]
     try:
@@ -127,7 +128,7 @@ def _read_npz(path: Path) -> Embeddings:
 
 
 def _read_safetensors(path: Path) -> Embeddings:
-    """The format is a length (8 bytes, little endian), a JSON header of that length, and the tensors' bytes."""
+    """Read a length (8 bytes, little endian), a JSON header of that length, and bytes."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         length = int.from_bytes(file.read(8), "little")
@@ -225,6 +226,15 @@ def _table_features(table: pl.DataFrame, source: str) -> NDArray[Any]:
         must = f"Every row of {source} must have features of one width ({width})"
         raise PalpateError(must, got, "Embed these samples again, or drop their rows")
     return lists.explode().to_numpy().reshape(len(table), -1)
+
+
+def as_polars(frame: Any) -> pl.DataFrame:
+    """A polars or pandas frame as polars."""
+    import polars as pl
+
+    if isinstance(frame, pl.DataFrame):
+        return frame
+    return pl.DataFrame({str(name): frame[name].tolist() for name in frame.columns}, strict=False)
 
 
 def first_of(columns: Sequence[str], names: Sequence[str]) -> str | None:

@@ -1,22 +1,22 @@
-"""What a leak is worth: material accuracy under a given split and under leak-free ones of the same shares.
+"""What a leak is worth: material accuracy under a given split and under leak-free ones.
 
-Under a leaking split a test image nearly repeats in train, so remembering is enough; under a leak-free one
-the classifier must know the material. The difference, in points of accuracy, is what leaking is worth. Two
-classifiers measure it: 1-NN (remembers everything) and a linear probe (remembers little), on raw pixels or
-on any embeddings.
+Under a leaking split a test image nearly repeats in train, so remembering is enough; under a
+leak-free one the classifier must know the material. The difference, in points of accuracy, is what
+leaking is worth. Two classifiers measure it: 1-NN (remembers everything) and a linear probe
+(remembers little), on raw pixels or on any embeddings.
 
-What is held equal: the samples (train and test of the given split, of materials that can be compared), the
-shares, the number of train samples (larger train parts are thinned evenly), the features and their
-reduction (fitted to each train part alone), the classifiers, and how the probe's penalty is chosen (on the
-train part, leaving out groups).
+What is held equal: the samples (train and test of the given split, of materials that can be
+compared), the shares, the number of train samples (larger train parts are thinned evenly), the
+features and their reduction (fitted to each train part alone), the classifiers, and how the probe's
+penalty is chosen (on the train part, leaving out groups).
 
-What can be compared: a material needs two groups, one for each part, and must occur in both parts of the
-given and of every leak-free split.
+What can be compared: a material needs two groups, one for each part, and must occur in both parts
+of the given and of every leak-free split.
 
-Intervals: 95 %, leaving out one group at a time. Leaving out video v removes its test samples from both
-splits at once (the clean side pools the test samples of all its splits), so what is easy or hard about v
-cancels in the difference. Train parts stay as they are: the interval says how the number would vary with
-other test videos, not with other train videos.
+Intervals: 95 %, leaving out one group at a time. Leaving out video v removes its test samples from
+both splits at once (the clean side pools the test samples of all its splits), so what is easy or
+hard about v cancels in the difference. Train parts stay as they are: the interval says how the
+number would vary with other test videos, not with other train videos.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class _Design:
     settings: dict[str, Any]
 
 
-def impact(
+def impact(  # noqa: PLR0913
     manifest: Manifest,
     split: Split,
     *,
@@ -111,10 +111,11 @@ def impact(
     Args:
         manifest: the samples, with materials.
         split: the split in question; its train and test parts are compared.
-        group: column that the leak-free splits keep whole and that intervals are made over; ``auto``
-            takes what the data set has.
-        features: ``pixels`` (tactile, tactile minus background, vision: those that the manifest has), or
-            name -> features, as a :class:`FeatureSet` or an (n, d) array in the order of ``manifest.ids``.
+        group: column that the leak-free splits keep whole and that intervals are made over;
+            ``auto`` takes what the data set has.
+        features: ``pixels`` (tactile, tactile minus background, vision: those that the manifest
+            has), or name -> features, as a :class:`FeatureSet` or an (n, d) array in the order of
+            ``manifest.ids``.
         seeds: one leak-free split each; the clean accuracy is that of their test samples together.
         size: side of the pixels.
         components: columns kept by the PCA; features of no more columns are not reduced.
@@ -125,12 +126,12 @@ def impact(
 
     Returns:
         A row for each kind of features and classifier. The headline is about the first one: 1-NN on
-        tactile pixels (vision without tactile), or on the first of ``features``; the rule is fixed so
-        that nobody picks the largest number.
+        tactile pixels (vision without tactile), or on the first of ``features``; the rule is fixed
+        so that nobody picks the largest number.
 
     Raises:
-        PalpateError: without two materials that can be compared, with nulls in the group column, or on
-            features that are missing, of another length, or not finite.
+        PalpateError: without two materials that can be compared, with nulls in the group column, or
+            on features that are missing, of another length, or not finite.
         ProblemsError: naming every missing or unreadable image.
     """
     _check(features, seeds, components)
@@ -182,7 +183,9 @@ def impact(
 def _check(features: Features, seeds: Sequence[int], components: int) -> None:
     if isinstance(features, str) and features != "pixels":
         fix = "Pass name -> embeddings"
-        raise PalpateError("must be 'pixels' or a mapping", repr(features), fix, argument="features")
+        raise PalpateError(
+            "must be 'pixels' or a mapping", repr(features), fix, argument="features"
+        )
     if not seeds or len(set(seeds)) < len(seeds):
         must, example = "must hold at least one seed, each once", {"seeds": (0, 1, 2)}
         raise PalpateError(must, f"{list(seeds)}", "", argument="seeds", example=example)
@@ -192,7 +195,7 @@ def _check(features: Features, seeds: Sequence[int], components: int) -> None:
 
 
 def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) -> _Design:
-    """Choose the samples and materials that can be compared, and make the leak-free splits of them."""
+    """Choose the samples and materials that can be compared, and make leak-free splits."""
     manifest.take(split.ids("train", "test"))  # names ids that are missing
     for part in ("train", "test"):
         if not split.ids(part):
@@ -279,7 +282,9 @@ def _incomparable(
     if len(groups) - len(reasons) < 2:
         counts = ", ".join(f"{n} {why}" for why, n in Counter(reasons.values()).most_common())
         got = f"{len(groups) - len(reasons)} of {len(groups)} ({counts})"
-        must = f"There must be two materials in two or more {column}s and in both parts of each split"
+        must = (
+            f"There must be two materials in two or more {column}s and in both parts of each split"
+        )
         fix = "Add recordings, or choose a finer group (of contacts train and test share videos)"
         got = got if reasons else f"{len(groups)} material"
         raise PalpateError(must, got, fix, example={"group": "contact"})
@@ -333,7 +338,7 @@ def _qualifications(
 def _classify(
     source: Source, parts: _Parts, design: _Design, components: int
 ) -> tuple[dict[str, Table], float, float]:
-    """Both classifiers on one split: a table each, the probe's penalty, the share of variance kept."""
+    """Classify under one split: two tables, the probe's penalty, the share of variance kept."""
     shape = (len(design.groups), len(design.materials))
     size, seed = int(design.settings["train_samples"]), int(design.settings["seeds"][0])
     group, material = design.group, design.material

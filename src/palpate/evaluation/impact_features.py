@@ -1,12 +1,13 @@
-"""Features that the impact of a leak is measured on, and their reduction by a PCA of the train part alone.
+"""Features that the impact of a leak is measured on, and their reduction by a PCA of train.
 
-Pixels: the center square as ``size x size`` RGB, row by row. Given features are used as they are if their
-rows have length 1 (Euclidean order is then the order by cosine); otherwise their columns are standardized
-by the train part.
+Pixels: the center square as ``size x size`` RGB, row by row. Given features are used as they are if
+their rows have length 1 (Euclidean order is then the order by cosine); otherwise their columns are
+standardized by the train part.
 
-Reduction: with m the mean of at most ``FIT_ROWS`` train rows X and V the leading right singular vectors of
-X - m, a row x becomes (x - m) V. V comes from a subspace iteration with a seeded start (Halko, Martinsson,
-Tropp 2011, algorithm 4.4), exact where all columns are kept. Nothing is whitened.
+Reduction: with m the mean of at most ``FIT_ROWS`` train rows X and V the leading right singular
+vectors of X - m, a row x becomes (x - m) V. V comes from a subspace iteration with a seeded start
+(Halko, Martinsson, Tropp 2011, algorithm 4.4), exact where all columns are kept. Nothing is
+whitened.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from palpate.core import FeatureSet, Note, PalpateError, Progress, quiet, rng_fo
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 
-#: Train rows that the PCA is fitted to; more change 128 components by less than the choice of the split.
+#: Train rows that the PCA is fitted to; more change 128 components by less than the choice of the
+#: split.
 FIT_ROWS = 10_000
 #: Rows in memory at a time as floats.
 BLOCK = 4096
@@ -57,7 +59,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Reduction:
-    """``((x - mean) / spread) @ axes``, fitted to train; ``explained`` is the share of variance kept."""
+    """``((x - mean) / spread) @ axes``; ``explained`` is the share of variance kept."""
 
     mean: NDArray[np.float32]
     spread: NDArray[np.float32]
@@ -88,7 +90,9 @@ def pixel_sources(
     if size < 4:
         fix, example = "Choose a larger size", {"size": 32}
         raise PalpateError("must be at least 4", f"{size}", fix, argument="size", example=example)
-    nulls = {name: manifest.table[name].null_count() for name in ("tactile", "vision", "background")}
+    nulls = {
+        name: manifest.table[name].null_count() for name in ("tactile", "vision", "background")
+    }
     present = [name for name in ("tactile", "vision") if nulls[name] < len(manifest)]
     if not present:
         fix = "Fill one of the columns, or pass features by name"
@@ -123,7 +127,8 @@ def array_sources(
         rows: their numbers in the manifest.
 
     Raises:
-        PalpateError: for no features, another number of rows, missing ids, or values that are not finite.
+        PalpateError: for no features, another number of rows, missing ids, or values that are not
+            finite.
     """
     if not features:
         fix = "Pass 'pixels', or name -> array"
@@ -179,7 +184,8 @@ def fit_reduction(source: Source, train: Rows, components: int, seed: int) -> Re
     Args:
         source: the features.
         train: rows of the train part, in an order that does not follow the content.
-        components: columns to keep; features of no more columns are only centered (and standardized).
+        components: columns to keep; features of no more columns are only centered (and
+            standardized).
         seed: of the start.
     """
     used = train if len(train) <= FIT_ROWS else train[np.arange(FIT_ROWS) * len(train) // FIT_ROWS]

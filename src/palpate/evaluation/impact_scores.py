@@ -1,14 +1,14 @@
-"""Classifiers and intervals of the impact of a leak: 1-NN with ties, even thinning, the paired jackknife.
+"""Parts of the impact of a leak: 1-NN with ties, even thinning, the paired jackknife.
 
-1-NN: a test row x gets the label of the train row z with the smallest ||x - z||^2. Equal images are common
-(an untouched gel, a frame stored twice), so where several train rows are equally near, the hit is the share
-of them with the right label: what a random choice among them would score on average. Equally near means
-within the rounding of float32, ``TIE (||x||^2 + max ||z||^2)``.
+1-NN: a test row x gets the label of the train row z with the smallest ||x - z||^2. Equal images are
+common (an untouched gel, a frame stored twice), so where several train rows are equally near, the
+hit is the share of them with the right label: what a random choice among them would score on
+average. Equally near means within the rounding of float32, ``TIE (||x||^2 + max ||z||^2)``.
 
-Tables: hits and samples of a test part by group g and class c, (G, C). The accuracy is sum hits / sum
-samples, or the mean over classes of that ratio. Jackknife: theta_g is the statistic without row g,
-SE^2 = (G-1)/G sum_g (theta_g - mean theta)^2, interval theta +- t(G-1) SE. For a difference both tables
-lose row g at once, so what a group does to both cancels.
+Tables: hits and samples of a test part by group g and class c, (G, C). The accuracy is sum hits /
+sum samples, or the mean over classes of that ratio. Jackknife: theta_g is the statistic without row
+g, SE^2 = (G-1)/G sum_g (theta_g - mean theta)^2, interval theta +- t(G-1) SE. For a difference both
+tables lose row g at once, so what a group does to both cancels.
 """
 
 from __future__ import annotations
@@ -87,11 +87,11 @@ def nearest_hits(
 
 
 def thin(rows: Codes, groups: Codes, classes: Codes, count: int, seed: int) -> Codes:
-    """Evenly chosen rows: every class keeps its share (at least one row), and within it every group.
+    """Choose rows evenly: every class keeps its share (at least one row), and so every group.
 
-    Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class the
-    rows, sorted by group and at random within it, are taken at equal steps from a random start, so a
-    group keeps its share to within one row.
+    Each class gets ``count * n_c / n`` rows, rounded so that the sum is ``count``; within a class
+    the rows, sorted by group and at random within it, are taken at equal steps from a random start,
+    so a group keeps its share to within one row.
 
     Args:
         rows: row numbers to choose from.
@@ -146,18 +146,21 @@ def jackknife(
 
     Args:
         plus: table of one test part.
-        minus: table of the other, over the same groups and classes; None for the accuracy of ``plus`` alone.
+        minus: table of the other, over the same groups and classes; None for the accuracy of
+            ``plus`` alone.
         balanced: mean over classes of their accuracies, over the classes that are left.
 
     Returns:
-        (value, interval, groups). The interval is at 95 %, cut to the possible range; None with fewer
-        than two groups, where a table has samples of one group only, or where no group changes
-        anything (no variation is no evidence of certainty).
+        (value, interval, groups). The interval is at 95 %, cut to the possible range; None with
+        fewer than two groups, where a table has samples of one group only, or where no group
+        changes anything (no variation is no evidence of certainty).
     """
     tables = [plus] if minus is None else [plus, minus]
     used = np.any([table.samples.sum(axis=1) > 0 for table in tables], axis=0)
     signs = (1.0, -1.0)
-    value = sum(sign * accuracy(table, balanced) for sign, table in zip(signs, tables, strict=False))
+    value = sum(
+        sign * accuracy(table, balanced) for sign, table in zip(signs, tables, strict=False)
+    )
     without = sum(
         sign
         * _accuracy(

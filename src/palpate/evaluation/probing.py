@@ -1,4 +1,4 @@
-"""What the embeddings of an encoder know: a linear probe from the train part, scored on the test part."""
+"""What an encoder's embeddings know: a linear probe of the material, and retrieval."""
 
 from __future__ import annotations
 
@@ -30,18 +30,21 @@ def probe(
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Results:
-    """Score how well an encoder's embeddings name the material, and find the other modality's image.
+    """Score how well embeddings name the material and find the other modality's image.
 
     Args:
         data: a manifest with materials and images of the modality, or its file or folder.
-        split: a split or its file; the probe is fitted to its train part and scored on its test part.
+        split: a split or its file; the probe is fitted to its train part and scored on its test
+            part.
         encoder: name or folder of a set of encoders, or an ``EncoderSet``.
         modality: whose encoder.
-        group: column whose values stay together in cross-validation and intervals; ``auto`` takes what
-            the split kept whole, else the video.
-        balanced: average the accuracy over materials instead of samples, and weight the probe's rows so.
-        top: ranks within which retrieval must find the image of the same sample in the other modality
-            (vision for tactile and the other way round); skipped where the data lack it, or if empty.
+        group: column whose values stay together in cross-validation and intervals; ``auto`` takes
+            what the split kept whole, else the video.
+        balanced: average the accuracy over materials instead of samples, and weight the probe's
+            rows so.
+        top: ranks within which retrieval must find the image of the same sample in the other
+            modality (vision for tactile and the other way round); skipped where the data lack it,
+            or if empty.
         seed: of the folds of the cross-validation.
         cache: folder for embeddings, which an interrupted run finds again.
         progress: called with what is done.

@@ -10,7 +10,7 @@ from palpate.core import Score, rng_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.encoders.models import is_shipped
-from palpate.evaluation.scoring import BACKGROUND
+from palpate.evaluation.controls import BACKGROUND
 from palpate.report.notes import sentence
 from palpate.report.results import Audit, GalleryItem, Results
 from palpate.studies.pipeline import PipelineOutcome
