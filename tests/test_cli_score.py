@@ -1,4 +1,4 @@
-"""``palpate score`` and ``palpate probe``: parse, one call, tables and files; errors in one line."""
+"""``palpate score`` and ``palpate probe``: one call, tables and files; errors in one line."""
 
 import errno
 import json
@@ -18,7 +18,16 @@ from palpate.evaluation import scoring
 from palpate.report.results import Results
 from score_calls import IDS, LABELS, by_key, feature_sets, paint
 
-PAIR = ("--generated", "near.npz", "--reference", "real.npz", "--companions", "none", "--permutations", "0")
+PAIR = (
+    "--generated",
+    "near.npz",
+    "--reference",
+    "real.npz",
+    "--companions",
+    "none",
+    "--permutations",
+    "0",
+)
 
 
 @pytest.fixture
@@ -44,7 +53,9 @@ def run(*args, **options):
 
 
 def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
-    Path("labels.csv").write_text("id,material\n" + "".join(f"{i},{m}\n" for i, m in zip(IDS, LABELS, strict=True)))
+    Path("labels.csv").write_text(
+        "id,material\n" + "".join(f"{i},{m}\n" for i, m in zip(IDS, LABELS, strict=True))
+    )
     Split.from_ids(train=IDS[24:], test=IDS[:24], rule={}, manifest="m").save(Path("s.json"))
     options = ("--sigma", "10", "median", "--normalize", "yes", "--presets", "paper", "--seed", "3")
     files = ("--labels", "labels.csv", "--split", "s.json", "--names", "ours")
@@ -52,15 +63,24 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
     assert status == 0, err
     scores = by_key(Results.from_json(json.loads(out)))
     want = scoring.score(
-        "near.npz", "real.npz", names=["ours"], labels="labels.csv", split="s.json", sigma=[10, "median"],
-        normalize=True, presets=["paper"], companions=[], permutations=0, seed=3,
+        "near.npz", "real.npz", names=["ours"], labels="labels.csv", split="s.json",
+        sigma=[10, "median"], normalize=True, presets=["paper"], companions=[], permutations=0, seed=3,
     )  # fmt: skip
     assert {k: s.value for k, s in scores.items()} == {k: s.value for k, s in by_key(want).items()}
     assert json.loads(out)["commands"][0].startswith("palpate score --generated near.npz")
 
 
 def test_the_terminal_shows_scores_and_differences(capsys, sets):
-    args = ("--generated", "near.npz", "far.npz", "--reference", "real.npz", "--names", "ours [x]", "theirs")
+    args = (
+        "--generated",
+        "near.npz",
+        "far.npz",
+        "--reference",
+        "real.npz",
+        "--names",
+        "ours [x]",
+        "theirs",
+    )
     status, out, err = call(capsys, *args)
     assert status == 0, err
     head, tail = out.split("Differences on the same samples, a - b", 1)
@@ -73,7 +93,8 @@ def test_the_terminal_shows_scores_and_differences(capsys, sets):
 def test_embeddings_load_no_torch_and_the_results_make_a_page(sets):
     code = (
         "import sys; from palpate.cli import main\n"
-        "args = 'score --generated near.npz far.npz --reference real.npz -o s.json --latex t.tex -q'\n"
+        "args = 'score --generated near.npz far.npz --reference real.npz -q '\n"
+        "args += '-o s.json --latex t.tex'\n"
         "assert main(args.split()) == 0\n"
         "assert not {'torch', 'transformers', 'safetensors'} & set(sys.modules)\n"
         "assert main(['report', 's.json', '-o', 'page.html', '-q']) == 0"
@@ -94,7 +115,9 @@ def test_scores_of_pixels_need_no_torch(tmp_path):
         "assert main(args.split()) == 0\n"
         "assert 'torch' not in sys.modules"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert "MS-SSIM" in done.stdout
 
@@ -138,7 +161,16 @@ def test_a_killed_run_goes_on_from_its_embeddings_and_leaves_no_cache(tmp_path):
     pytest.importorskip("torch")
     for seed, name in enumerate(("real", "made")):
         paint(tmp_path / name, map(str, range(60)), seed)
-    args = ("--generated", "made", "--reference", "real", "--encoder", "palpate/mini", "-o", "s.json")
+    args = (
+        "--generated",
+        "made",
+        "--reference",
+        "real",
+        "--encoder",
+        "palpate/mini",
+        "-o",
+        "s.json",
+    )
     args = (*args, "--companions", "none", "--presets", "paper")
     process = subprocess.Popen(
         [sys.executable, "-m", "palpate", "score", *args, "--permutations", "200000"], cwd=tmp_path,
@@ -165,9 +197,19 @@ def test_probe_scores_material_and_retrieval(capsys, tmp_path, small_manifest):
     pytest.importorskip("torch")
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
     ids = small_manifest.ids
-    split = Split.from_ids(train=ids[:24], test=ids[24:], rule={"group": "video"}, manifest=small_manifest.digest)
+    split = Split.from_ids(
+        train=ids[:24], test=ids[24:], rule={"group": "video"}, manifest=small_manifest.digest
+    )
     split.save(tmp_path / "s.json")
-    args = (tmp_path / "m", "--split", tmp_path / "s.json", "--encoder", "palpate/mini", "-o", tmp_path / "p.json")
+    args = (
+        tmp_path / "m",
+        "--split",
+        tmp_path / "s.json",
+        "--encoder",
+        "palpate/mini",
+        "-o",
+        tmp_path / "p.json",
+    )
     status, out, err = call(capsys, *args, verb="probe")
     assert status == 0, err
     results = Results.load(tmp_path / "p.json")

@@ -1,4 +1,4 @@
-"""What leaking costs: against brute force, explicit loops, and worlds in which the price is known."""
+"""What leaking costs: against brute force, loops, and worlds in which the price is known."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_a_table_sums_by_group_and_class() -> None:
 def loop_jackknife(
     samples: list[tuple[str, int, int, float]], balanced: bool
 ) -> tuple[float, float]:
-    """Value and half-width by deleting groups from a list of (group, side, class, hit) one at a time."""
+    """Value and half-width by deleting groups of (group, side, class, hit) one at a time."""
 
     def statistic(rows: list[tuple[str, int, int, float]]) -> float:
         out = 0.0
@@ -218,7 +218,7 @@ def test_directions_without_spread_in_train_are_left_out() -> None:
 
 
 def test_a_leak_of_known_worth() -> None:
-    """Features that name the video and nothing else: 1-NN is always right when it saw the video, and guesses when it did not."""
+    """Features that name the video alone: 1-NN is right when it saw the video, else it guesses."""
     manifest = videos()
     found = impact(
         manifest,
@@ -227,7 +227,7 @@ def test_a_leak_of_known_worth() -> None:
         seeds=(0, 1),
     )
     row = found.rows[0]
-    # A new video's one-hot is equally far from all train rows, a quarter of which have its material.
+    # A new video is equally far from all train rows, a quarter of which have its material.
     assert (row.features, row.classifier, row.given, row.chance) == ("video", "1-NN", 1.0, 0.25)
     assert (row.clean, row.cost) == pytest.approx((0.25, 0.75), abs=1e-6)
     assert (found.rows[1].given, found.rows[1].clean) == (1.0, pytest.approx(0.25))
@@ -251,7 +251,7 @@ def test_no_leak_costs_nothing_where_the_material_is_known() -> None:
 
 
 def test_a_run_is_the_explicit_one() -> None:
-    """The clean side by hand: leak-free splits, standardized by train, 1-NN by brute force, test samples of all seeds together."""
+    """The clean side by hand: standardized by train, 1-NN by loops, all seeds together."""
     manifest = videos(3, 6, 6)
     rng = np.random.default_rng(5)
     video, material = manifest.column("video"), manifest.column("material")
@@ -384,7 +384,8 @@ def test_tactile_minus_background_is_the_difference(small_manifest: Manifest) ->
         for c in ("tactile", "background")
     ]
     np.testing.assert_array_equal(
-        by_name["tactile minus background"].reshape(2, 32, 32, 3), np.array(raw[0]) - np.array(raw[1])
+        by_name["tactile minus background"].reshape(2, 32, 32, 3),
+        np.array(raw[0]) - np.array(raw[1]),
     )
     assert notes == []
 
@@ -495,9 +496,11 @@ from pathlib import Path
 from palpate.core import Split
 from palpate.data.manifest import Manifest
 from palpate.evaluation.impact import impact
-rows = [{"id": f"{v}/{k}", "video": str(v), "frame": k, "material": f"m{v % 2}"} for v in range(6) for k in range(4)]
+frames = [(v, k) for v in range(6) for k in range(4)]
+rows = [{"id": f"{v}/{k}", "video": str(v), "frame": k, "material": f"m{v % 2}"} for v, k in frames]
 m = Manifest.from_rows(rows, Path())
-print(impact(m, Split({i: "test" if i.endswith("0") else "train" for i in m.ids}), features={"x": np.eye(24)}).headline)
+split = Split({i: "test" if i.endswith("0") else "train" for i in m.ids})
+print(impact(m, split, features={"x": np.eye(24)}).headline)
 sys.exit("torch" in sys.modules)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -506,7 +509,9 @@ sys.exit("torch" in sys.modules)
 
 
 @pytest.mark.slow
-def test_the_five_real_clips_can_be_compared_by_contact_only(real_data: Path, tmp_path: Path) -> None:
+def test_the_five_real_clips_can_be_compared_by_contact_only(
+    real_data: Path, tmp_path: Path
+) -> None:
     manifest = import_touch_and_go(
         real_data / "touch_and_go" / "clips", tmp_path / "out", size=64
     ).manifest

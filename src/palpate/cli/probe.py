@@ -8,12 +8,21 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, guard_output, require_extra
+from palpate.cli.terminal import (
+    Common,
+    OptionalOutPath,
+    Switch,
+    Terminal,
+    guard_output,
+    require_extra,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Fit a linear probe to an encoder's embeddings of the train part, and score it on the test part: material accuracy, and retrieval of the other modality."""
+    """Score what an encoder's embeddings know: the material, by a linear probe fitted to the train
+    part, and the image of the other modality, by retrieval; on the test part of a split.
+    """
 
     manifest: Annotated[Path, tyro.conf.Positional]
     """Manifest file or the folder of an import."""
@@ -24,7 +33,8 @@ class Options(Common):
     modality: Literal["tactile", "vision"] = "tactile"
     """Whose encoder."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
-    """What stays together in cross-validation and intervals; `auto` takes what the split kept whole, else the video."""
+    """What stays together in cross-validation and intervals; `auto` takes what the split kept
+    whole, else the video."""
     balanced: Switch = False
     """Average the accuracy over materials instead of samples."""
     output: OptionalOutPath = None

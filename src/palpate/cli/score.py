@@ -25,17 +25,21 @@ class Options(Common):
     """
 
     generated: tuple[Path, ...]
-    """What to score, one entry a generator: folders of images or of `palpate generate`, manifests, or embeddings (.npy, .npz, .safetensors, .parquet)."""
+    """What to score, one entry a generator: folders of images or of `palpate generate`, manifests,
+    or embeddings (.npy, .npz, .safetensors, .parquet)."""
     reference: Path
     """The real tactile images, of the same kinds. Ids are relative file names."""
     encoder: str | None = None
-    """Folder of `palpate train encoder`, a hub id, or palpate/mini; the tactile encoder gives the features. Embeddings need none."""
+    """Folder of `palpate train encoder`, a hub id, or palpate/mini; the tactile encoder gives the
+    features. Embeddings need none."""
     split: Path | None = None
-    """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe and the controls."""
+    """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe
+    and the controls."""
     names: tuple[str, ...] = ()
     """Names of the generators in the tables, instead of those of their folders and files."""
     labels: Path | None = None
-    """CSV or Parquet file with the columns id, material, video, in place of what the inputs have."""
+    """CSV or Parquet file with the columns id, material, video, in place of what the inputs
+    have."""
     groups: Path | None = None
     """The same for groups alone, where labels and groups are in two files."""
     output: OptionalOutPath = None
@@ -43,7 +47,8 @@ class Options(Common):
     latex: Path | None = None
     """Write the tables as LaTeX (booktabs; longtable for many differences)."""
     presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ()
-    """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole videos together. Default: both, or `paper` without groups."""
+    """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole
+    videos together. Default: both, or `paper` without groups."""
     sigma: tuple[str, ...] = ("10",)
     """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it)."""
     estimator: Literal["unbiased", "biased", "grouped"] | None = None
@@ -63,9 +68,11 @@ class Options(Common):
     lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
     """The two files of LPIPS: AlexNet's weights and the heads."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
-    """What stays together in halves and intervals; `auto` takes what the split kept whole, else the video."""
+    """What stays together in halves and intervals; `auto` takes what the split kept whole, else the
+    video."""
     cache: Path | None = None
-    """Folder for embeddings and decoded images. Default: one next to -o, for a run that is interrupted; removed at the end."""
+    """Folder for embeddings and decoded images. Default: one next to -o, for a run that is
+    interrupted; removed at the end."""
     controls: bool = True
     """With a split: score the no-contact image and real images of the same material as well."""
     seed: int = 0
@@ -80,19 +87,17 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     names = ("encoder", "split", "labels", "groups", "group", "estimator", "backend", "controls")
     names += ("inception", "clip", "lpips", "permutations", "seed")
     cache = _cache(options)
+    arguments: dict[str, Any] = {name: getattr(options, name) for name in names}
+    arguments |= {
+        "names": options.names or None,
+        "presets": options.presets or None,
+        "sigma": [_number_or_word(text) for text in options.sigma],
+        "normalize": {"check": "check", "yes": True, "no": False}[options.normalize],
+        "companions": _companions(options),
+        "cache": cache,
+    }
     with terminal.progress() as progress:
-        results = score(
-            list(options.generated),
-            options.reference,
-            names=options.names or None,
-            presets=options.presets or None,
-            sigma=[_number_or_word(text) for text in options.sigma],
-            normalize={"check": "check", "yes": True, "no": False}[options.normalize],
-            companions=_companions(options),
-            cache=cache,
-            progress=progress,
-            **{name: getattr(options, name) for name in names},
-        )
+        results = score(list(options.generated), options.reference, progress=progress, **arguments)
     results = replace(results, commands=[terminal.command])
     try:
         terminal.show(results)  # before saving: a full disk loses nothing

@@ -120,11 +120,12 @@ def _read_npz(path: Path) -> Embeddings:
     with np.load(path, allow_pickle=False) as data:
         arrays = {name: data[name] for name in data if name in Embeddings.__annotations__}
     encoder = arrays["encoder"].reshape(-1) if "encoder" in arrays else np.zeros(0)
-    columns = [
+    ids, labels, groups = (
         [str(v) for v in arrays[name].reshape(-1)] if name in arrays else None
         for name in ("ids", "labels", "groups")
-    ]
-    return Embeddings(arrays["features"], *columns, str(encoder[0]) if encoder.size else None)
+    )
+    name = str(encoder[0]) if encoder.size else None
+    return Embeddings(arrays["features"], ids, labels, groups, name)
 
 
 def _read_safetensors(path: Path) -> Embeddings:
@@ -146,13 +147,13 @@ def _read_safetensors(path: Path) -> Embeddings:
     x: NDArray[Any] = np.memmap(path, dtype, "r", 8 + length + start, shape)
     if kind == "BF16":
         x = (x.astype(np.uint32) << 16).view(np.float32)
-    columns = [
+    ids, labels, groups = (
         [str(v) for v in _json_list(metadata[name])] if name in metadata else None
         for name in ("ids", "labels", "groups")
-    ]
+    )
     encoder = metadata.get("encoder")
     widened = "bfloat16" if kind == "BF16" else ""
-    return Embeddings(x, *columns, None if encoder is None else str(encoder), widened)
+    return Embeddings(x, ids, labels, groups, encoder and str(encoder), widened)
 
 
 def _json_list(text: str) -> list[Any]:

@@ -88,7 +88,8 @@ def score_family(
         }
         least = None
         if train is not None:
-            least = tmmd(train, features.reference, **{**options, "permutations": 0}).value
+            fast: dict[str, Any] = {**options, "permutations": 0}
+            least = tmmd(train, features.reference, **fast).value
         for some in features.batches():
             result = compare(some, features.reference, floor=floor, **options)
             assert result.excess is not None  # `compare` always gives it

@@ -69,7 +69,8 @@ class Reduction:
     def apply(self, source: Source, rows: Rows) -> NDArray[np.float32]:
         """The reduced features of some rows, (rows, components)."""
         blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
-        return np.vstack([((source.read(b) - self.mean) / self.spread) @ self.axes for b in blocks])
+        reduced = [((source.read(b) - self.mean) / self.spread) @ self.axes for b in blocks]
+        return np.vstack(reduced).astype(np.float32, copy=False)
 
 
 def pixel_sources(

@@ -139,7 +139,7 @@ def score(  # noqa: PLR0913
         split=split,
         reserved=(REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL),
     )
-    weights = {"inception": inception, "clip": clip, "lpips": lpips}
+    weights: dict[str, Any] = {"inception": inception, "clip": clip, "lpips": lpips}
     encoders = None
     if inputs.reference.features is None:
         if encoder is None and not companions:
@@ -268,11 +268,12 @@ class _Run:
         from palpate.encoders.embed import embed, embed_images
 
         digest = self.encoders.digest("tactile")
-        if samples.manifest is None:
+        if samples.images is not None:
             x = embed_images(samples.images, self.encoders, "tactile", progress=self.progress)
             return samples.feature_set(x, digest)
         folder = samples.folder(self.cache) if self.keep else None
         options: dict[str, Any] = {"keep_pixels": False, "progress": self.progress}
+        assert samples.manifest is not None
         x = embed(samples.manifest, self.encoders, "tactile", cache=folder, **options)
         return samples.feature_set(x.features, digest)
 
