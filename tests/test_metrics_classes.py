@@ -1,4 +1,4 @@
-"""Metrics over classes: the null of their halves, what counts as a denominator near 0, and a floor over the same classes."""
+"""Metrics over classes: the null of halves, denominators near 0, floors over the same classes."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scipy import stats
 
 from palpate.core import FeatureSet
 from palpate.metrics import ci_tmmd, compare, d_tmmd, four_scores, i_tmmd
-from test_metrics_tactile import codes, change, keep, world
+from test_metrics_tactile import change, codes, keep, world
 
 OFF_DIAGONAL = {"denominator": "mean_off_diagonal"}
 
@@ -54,7 +54,7 @@ def means_off_diagonal(score):
 
 
 def in_errors(s):
-    """D-TMMD, and its mean divergences (C,) of a class from the others in jackknife errors, each recomputed without each video."""
+    """D-TMMD, and divergences (C,) of a class from the others in recomputed jackknife errors."""
     score = d_tmmd(s, **OFF_DIAGONAL)
     assert "leave-one-group-out" in score.interval_method
     out = [
@@ -159,7 +159,7 @@ def videos_of(per_video, *, videos=12, spread=0.5, draw=0, prefix="", classes=2)
 
 @pytest.mark.parametrize("options", [{}, {"estimator": "biased"}])
 def test_halves_of_whole_videos_have_a_floor_of_as_many_frames_alone(options):
-    """The same videos with other numbers of frames have another share of pairs inside videos, so another value for the same E."""
+    """Other numbers of frames have another share of pairs inside videos: another value, one E."""
     few, many, equal = (videos_of(n, draw=k, prefix=str(k)) for k, n in enumerate((2, 40, 2)))
     for score in four_scores(few, many, floor=many, permutations=0, **options)[1:]:
         assert score.floor is None
@@ -257,7 +257,7 @@ def test_where_classes_are_left_out_so_they_are_of_differences():
 
 @pytest.mark.parametrize("seed", [1, 2, 6])
 def test_sets_that_leave_out_other_things_are_compared_over_classes(seed):
-    """A generator whose classes hardly separate has no D-TMMD without some videos; the same generator's classes can still be left out."""
+    """Without some videos there is no D-TMMD; classes can still be left out."""
     rng, of = np.random.default_rng(seed), np.repeat(np.arange(16), 3)
 
     def drawn(apart):
@@ -284,7 +284,7 @@ def test_sets_that_leave_out_other_things_are_compared_over_classes(seed):
 
 
 def test_the_excess_over_classes_is_that_of_the_classes():
-    """E of real touches without some video is unknown (a class has videos of one frame), so classes are left out, of their E and not of their distance."""
+    """A class cannot spare a video: classes are left out, of E and not of the distance."""
     a, b = (
         change(
             world(3, classes=4, videos=3, frames=4, draw=k),

@@ -1,7 +1,9 @@
-"""The error bars of the grouped quantities are true: 95 % intervals cover 92 to 99 %, permutations of videos reject 3 to 8 % of true nulls.
+"""Error bars of the grouped quantities: 95 % intervals cover 92 to 99 %.
 
-300 replicates a design, a third each with 12, 24 and 40 videos; the truth is that of infinitely many videos. Frame-level intervals and permutations, on the
-same features without groups, fail. The same simulation at full length is ``benchmarks/metric_coverage.py``, its tables ``docs/studies/metric_coverage.md``.
+300 replicates a design, a third each with 12, 24 and 40 videos; the truth is that of infinitely
+many videos. Frame-level intervals and permutations, on the same features without groups, fail. The
+same at full length is ``benchmarks/metric_coverage.py``, its tables
+``docs/studies/metric_coverage.md``.
 """
 
 import sys
@@ -36,14 +38,14 @@ def share(tallies, name):
 
 
 def test_truth_is_that_of_a_closed_form():
-    # Without effects of class, normalized rows aside: E k of Gaussians has a closed form, (s/(s+v))^(d/2) exp(-|m|^2 / (2 (s+v))).
+    # Without effects of class E k of Gaussians has a closed form.
     model = study.Model.make()
     rng = np.random.default_rng(0)
     labels = np.zeros(20_000, dtype=np.intp)
     raw = study.Model(model.mean, 0 * model.classes, model.shift)
     rows, _ = raw.frames(rng, raw.videos(rng, len(labels)), labels, np.full(len(labels), 2))
     first, second = rows[0::2], rows[1::2]
-    # To first order E = 1000 (variance of the video effect) / sigma^2, of which normalizing keeps the part across the mean.
+    # To first order E = 1000 (variance of the video effect across the mean) / sigma^2.
     expected = 1000 * ((first - first.mean(0)) * (second - second.mean(0))).sum(axis=1).mean() / 100
     found = study.truth_of(raw, videos=40_000)
     np.testing.assert_allclose(found.mixture, expected, rtol=0.03)
@@ -69,7 +71,7 @@ def test_tmmd_by_video_covers_and_frames_fail(model, truth, kind):
     low, high = study.COVERAGE
     assert low <= share(tallies, "TMMD") <= high
     assert study.REJECTION[0] <= rejected["videos"] <= study.REJECTION[1]
-    # Under a true null a jackknife errs on the wide side: the pairs' own share of the variance is counted twice.
+    # Under a true null a jackknife errs on the wide side: it counts the variance of pairs twice.
     assert share(tallies, "TMMD null") >= low
     assert share(tallies, "TMMD, frames") < low
     assert rejected["frames"] > study.REJECTION[1]

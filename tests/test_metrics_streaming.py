@@ -1,4 +1,4 @@
-"""Streaming classes against the functions: batches, merging, pickles, processes, and what they reject."""
+"""Streaming classes against the functions: batches, merging, pickles, processes, bad input."""
 
 import multiprocessing
 import pickle

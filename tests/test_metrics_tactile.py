@@ -1,4 +1,4 @@
-"""TMMD, I-, CI-, D-TMMD against loops over pairs, the jackknife against recomputation, and every undefined case."""
+"""TMMD, I-, CI-, D-TMMD against loops over pairs, their jackknife, and every undefined case."""
 
 import itertools
 import json
@@ -18,7 +18,7 @@ from test_metrics_mmd import loop_mmd, unit_rows
 
 
 def world(seed, classes=3, videos=4, frames=3, d=6, draw=None, prefix="", encoder="e" * 64):
-    """Features with class, video and frame effects; ``videos`` and ``frames`` may be cycled over classes."""
+    """Features with class, video and frame effects; tuples of sizes are cycled over classes."""
     fixed, rng = (
         np.random.default_rng(seed),
         np.random.default_rng([seed, 7 if draw is None else draw]),
@@ -219,7 +219,7 @@ def test_tmmd_jackknife_equals_leaving_each_group_out(preset, shared):
 
 
 def share(of, name=None):
-    """(s_A + s_B) of halves of whole groups: what E is multiplied by, from the sizes of the groups."""
+    """What E is multiplied by in halves of whole groups, from the sizes of the groups."""
     sizes = np.unique(
         [v for v, c in zip(of.groups, of.labels, strict=True) if name in (None, c)],
         return_counts=True,
@@ -229,7 +229,7 @@ def share(of, name=None):
 
 
 def test_free_jackknife_equals_leaving_each_group_out():
-    """E without each group is computed anew; the sizes of the groups stay those of the whole set."""
+    """E without each group is computed anew; the group sizes stay those of the whole set."""
     s = world(5, classes=3, videos=(3, 4), frames=(2, 4, 3))
     out = [keep(s, np.array(s.groups) != v) for v in sorted(set(s.groups))]
     names = ["m0", "m1", "m2"]
@@ -463,6 +463,24 @@ def test_undefined_scores_have_a_reason():
     ):
         assert (score.value, codes(score)[0]) == (None, f"undefined:{reason}")
         assert re.match(f"Undefined: .*{text}", sentence(score.notes[0]))
+
+
+def test_names_with_stops_and_commas_are_names():
+    """A material called "Sandpaper No. 5" in every place that names a class or a group."""
+    names = {"m0": "Sandpaper No. 5", "m1": "Undefined: wool. 50 %", "m2": "a, b: {c}"}
+    s = world(15, classes=3, videos=4, frames=3)
+    labels = [names[v] for v in s.labels]
+    renamed = change(s, labels=labels, groups=[f"No. {g}. x" for g in s.groups])
+    for function in (i_tmmd, ci_tmmd, d_tmmd):
+        assert function(renamed).value == pytest.approx(function(s).value, abs=1e-12)
+    assert set(ci_tmmd(renamed).details["per_class"]) == set(names.values())
+    bare = without_groups(world(18, classes=1, videos=40, frames=1))
+    few = [list(names.values())[k % 3] for k in range(37)] + ["Rare No. 1"] * 3
+    score = d_tmmd(change(bare, labels=few))
+    assert score.details["excluded"] == {"Rare No. 1": "few-samples"}
+    note = next(n for n in score.notes if n.code == "unstable-denominators")
+    assert all(name in sentence(note) for name in score.details["unstable"])
+    assert Score.from_json(json.loads(json.dumps(score.to_json()))).notes == score.notes
 
 
 def test_collapse_is_named():

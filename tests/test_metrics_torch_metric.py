@@ -1,4 +1,4 @@
-"""The streaming metrics as torchmetrics.Metric: two gloo processes, collections, forward, copies, devices, state dicts."""
+"""The streaming metrics as torchmetrics.Metric: processes, collections, forward, state dicts."""
 
 import copy
 import pickle
@@ -70,7 +70,7 @@ def rank(number, where, out):
             feed(metric, r, real=True)
         synced = metric.compute().item(), metric.score().to_json()
         rows = (
-            metric.plain.score_of(metric._state()).n if number == 0 else None
+            metric.plain.score_of(metric._read(metric.records)).n if number == 0 else None
         )  # unsynchronized again
         metric.update(g.features[:0])
         found[name] = (*synced, rows, metric.compute().item())

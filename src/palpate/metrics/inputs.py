@@ -64,7 +64,8 @@ def feature_set(
     """
     if isinstance(features, FeatureSet):
         given: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups}
-        changed = {k: column(k, v, len(features.ids)) for k, v in given.items() if v is not None}
+        n = len(features.ids)
+        changed: dict[str, Any] = {k: column(k, v, n) for k, v in given.items() if v is not None}
         if encoder is not None:
             changed["encoder"] = encoder
         return replace(features, **changed) if changed else features
@@ -108,7 +109,7 @@ def is_foreign(x: Any) -> bool:
 
 def release(x: Any) -> None:
     """Drop the pages of an array on disk that were read; they would count as memory."""
-    pages = getattr(x, "_mmap", None)
+    pages: Any = getattr(x, "_mmap", None)
     if isinstance(x, np.memmap) and hasattr(pages, "madvise") and x.mode != "c":
         pages.madvise(mmap.MADV_DONTNEED)  # in mode "c" the caller's changes would be lost
 
@@ -168,7 +169,10 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
         raise invalid(name, must, str(len(x)), "Pass more samples")
     if kind in ("float16", "bfloat16"):
         _warn_widened(name, kind)
-    x = _at_least_float32(x)
+    return _checked_norms(name, _at_least_float32(x), normalize)
+
+
+def _checked_norms(name: str, x: Any, normalize: Normalize) -> Any:
     norms = row_norms(x)
     fix = "Check what those rows were made from"
     if (bad := ~np.isfinite(norms)).any():

@@ -171,11 +171,11 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     a, b, *others = same_units(a, b, *([floor] if floor and use_floor else []))
     x, y = a.score, b.score
     if x.value is None or y.value is None:
-        return _as_difference(x, y, None, {}, Note("undefined", {"reason": "score"}))
+        return _as_difference(x, y, None, {}, note=Note("undefined", {"reason": "score"}))
     value, level, df = x.value - y.value, x.level, len(a.units) - 1
     if not a.units or list(a.units) != list(b.units):
         reason = "different-units" if a.units else "no-units"
-        return _as_difference(x, y, value, {}, Note("no-interval", {"reason": reason}))
+        return _as_difference(x, y, value, {}, note=Note("no-interval", {"reason": reason}))
     tested = _test(value, _error(a.replicates - b.replicates), df, level)
     interval, below, above = tested
     note = Note("no-interval", {"reason": "no-change"}) if interval is None else None
@@ -192,7 +192,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
         of_gap = _test(gap, _error(moved), df, level)
         details = {"gap": gap, "gap_interval": of_gap[0], "p_difference": p}
         details |= _verdict(x, y, gap, of_gap)
-    return _as_difference(x, y, value, details, note, interval, method)
+    return _as_difference(x, y, value, details, note=note, interval=interval, method=method)
 
 
 def _error(replicates: Array) -> float:
@@ -231,7 +231,8 @@ def _as_difference(
     y: Score,
     value: float | None,
     details: Mapping[str, Any],
-    note: Note | None,
+    *,
+    note: Note | None = None,
     interval: Interval | None = None,
     method: str = "",
 ) -> Score:
@@ -246,7 +247,7 @@ def _as_difference(
         null=None,
         floor=None,
         details={"a": x.subject, "b": y.subject, **empty, **details},
-        notes=[note] if note else [],
+        notes=(note,) if note else (),
     )
 
 
@@ -278,15 +279,15 @@ def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | N
     kept = delta[finite]
     names = None if groups is None else [g for g, ok in zip(groups, finite, strict=True) if ok]
     if not len(kept):
-        return _as_difference(x, y, None, {}, Note("undefined", {"reason": "no-images"}))
+        return _as_difference(x, y, None, {}, note=Note("undefined", {"reason": "no-images"}))
     value, (interval, method) = float(kept.mean()), mean_interval(kept, names, x.level)
     if interval is None:
         note = Note("no-interval", {"reason": "few-images"})
-        return _as_difference(x, y, value, _verdict(x, y, value, (None, 0.5, 0.5)), note)
+        return _as_difference(x, y, value, _verdict(x, y, value, (None, 0.5, 0.5)), note=note)
     df = (len(kept) if names is None else len(set(names))) - 1
     error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
     details = _verdict(x, y, value, _test(value, error, df, x.level))
-    return _as_difference(x, y, value, details, None, interval, f"paired, {method}")
+    return _as_difference(x, y, value, details, interval=interval, method=f"paired, {method}")
 
 
 def holm(differences: Sequence[Score]) -> list[Score]:

@@ -63,7 +63,7 @@ class Sweep:
     spread: Array
 
 
-def kernel_sums(  # noqa: PLR0913
+def kernel_sums(
     parts: Sequence[Any],
     segment: Index,
     unit: Index,
@@ -110,7 +110,14 @@ def kernel_sums(  # noqa: PLR0913
     cheap = size <= max(STATE_BYTES, rows * width * 4)
     many = rows >= max(LEAST_ROWS, ROWS_A_WIDTH * width)
     if backend == "moments" or (backend == "auto" and not reason and cheap and many):
-        sweep = _moments(parts, items, number.reshape(-1), segments, kernel, spread)
+        sweep = _moments(
+            parts,
+            items,
+            number.reshape(-1),
+            segments=segments,
+            sigma=float(kernel.bandwidth or 0),
+            spread=spread,
+        )
         remainder = bound(sweep.sums)
         if backend == "moments" or remainder <= tolerance:
             return sweep
@@ -129,11 +136,12 @@ def _moments(
     parts: Sequence[Any],
     items: Index,
     number: Index,
+    *,
     segments: int,
-    kernel: Any,
+    sigma: float,
     spread: Sequence[Index],
 ) -> Sweep:
-    moments, first = Moments.empty(center_of(parts), kernel.bandwidth, items.shape[1]), 0
+    moments, first = Moments.empty(center_of(parts), sigma, items.shape[1]), 0
     for part in parts:
         for k in range(0, len(part), STREAM):
             slab = part[k : k + STREAM]
@@ -158,58 +166,58 @@ def blocked_sums(
     order = np.lexsort((unit, segment))
     segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
     new = (np.diff(segment, prepend=-1) != 0) | (np.diff(unit, prepend=unit[:1]) != 0)
-    item = np.cumsum(new) - 1
-    items, first = int(new.sum()), np.flatnonzero(new)
-    joined = items <= MOST_ITEMS
-    pairs = _Pairs(x, order, kernel)
-    want_rows = bool(len(spread)) or not joined
-    blocks = _slices(len(order), max(1, min(block, max(SMALL_BLOCK, -(-len(order) // 8)))))
-    # Per block, indicators of the items and segments that occur in it.
-    of_item = [_indicators(item[b], pairs.z) for b in blocks] if joined else []
-    of_segment = [_indicators(segment[b], pairs.z) for b in blocks] if want_rows else []
+    item, first, n = np.cumsum(new) - 1, np.flatnonzero(new), len(order)
+    pairs, joined = _Pairs(x, order, kernel), len(first) <= MOST_ITEMS
+    blocks = _slices(n, max(1, min(block, max(SMALL_BLOCK, -(-n // 8)))))
+    by_item = _Cells(item, len(first), blocks, pairs.z) if joined else None
+    by_segment = _Cells(segment, segments, blocks, pairs.z) if spread or not joined else None
+    rows = np.zeros((n if by_segment else 0, segments))
 
     def sums_of(pair: tuple[int, int]) -> tuple[Any, ...]:
         i, j = pair
         k = pairs.block(blocks[i], blocks[j], diagonal=0 if i == j else None)
-        by_item = host(of_item[i][1].T @ k @ of_item[j][1]) if joined else None
-        if not want_rows:
-            return by_item, None, None, None
-        (_, left), (_, right) = of_segment[i], of_segment[j]
-        down = None if i == j else host(k.T @ left)
-        return by_item, host(k @ right), down, host(left.T @ (k * k) @ right)
+        items = by_item.sums(k, i, j) if by_item else None
+        if by_segment is None:
+            return items, None, None, None
+        marks = by_segment.marks
+        across, down = host(k @ marks[j]), host(k.T @ marks[i])
+        return items, across, down, by_segment.sums(k * k, i, j)
 
-    total, squares = np.zeros((items,) * 2 if joined else (0, 0)), np.zeros((segments,) * 2)
-    rows = np.zeros((len(order) if want_rows else 0, segments))
     todo = [(i, j) for i in range(len(blocks)) for j in range(i, len(blocks))]
-    for (i, j), (by_item, across, down, square) in zip(
-        todo, in_threads(sums_of, todo, x), strict=True
-    ):
-        mirror = i != j
-        if joined:
-            _add(total, of_item[i][0], of_item[j][0], by_item, mirror=mirror)
-        if want_rows:
-            rows[blocks[i], of_segment[j][0]] += across
-            if down is not None:
-                rows[blocks[j], of_segment[i][0]] += down
-            _add(squares, of_segment[i][0], of_segment[j][0], square, mirror=mirror)
-    centered = []
-    for s in spread:
-        at = np.isin(segment, s)
-        centered.append(centered_squares(squares[np.ix_(s, s)].sum(), rows[at][:, s].sum(axis=1)))
-    diagonal = pairs.diagonal()
-    if joined:
-        n, diagonal = (np.bincount(item, w, items).astype(float) for w in (None, diagonal))
-        sums = PairSums.from_block(
-            total, n, diagonal, segment[first], unit[first], segments=segments
+    for (i, j), sums in zip(todo, in_threads(sums_of, todo, x), strict=True):
+        if by_item:
+            by_item.add(sums[0], i, j)
+        if by_segment:
+            rows[blocks[i], by_segment.present[j]] += sums[1]
+            if i != j:
+                rows[blocks[j], by_segment.present[i]] += sums[2]
+            by_segment.add(sums[3], i, j)
+    squares = by_segment.total if by_segment else np.zeros((0, 0))
+    centered = [
+        centered_squares(
+            float(squares[np.ix_(s, s)].sum()), rows[np.isin(segment, s)][:, s].sum(axis=1)
+        )
+        for s in spread
+    ]
+    if by_item:
+        weights = (np.ones(n), pairs.diagonal())
+        size, diagonal = (np.bincount(item, w, len(first)).astype(np.float64) for w in weights)
+        of_items = PairSums.from_block(
+            by_item.total, size, diagonal, segment[first], unit[first], segments=segments
         )
     else:
-        same = np.zeros_like(rows)
-        for at in split_by(unit):
-            for part in _slices(len(at), block if len(at) > 1 else 0):
-                k = pairs.block(at[part], at, diagonal=part.start)
-                same[at[part]] = host(k @ like(one_hot(segment[at], segments), k))
-        sums = PairSums(np.ones(len(order)), rows, same, diagonal, segment, unit)
-    return Sweep(sums, np.array(centered).reshape(-1, 3))
+        same = _same_unit(pairs, segment, unit, np.zeros_like(rows), block)
+        of_items = PairSums(np.ones(n), rows, same, pairs.diagonal(), segment, unit)
+    return Sweep(of_items, np.array(centered).reshape(-1, 3))
+
+
+def _same_unit(pairs: _Pairs, segment: Index, unit: Index, same: Array, block: int) -> Array:
+    """(N, S) sums of each sample with those of its unit, into ``same``."""
+    for at in split_by(unit):
+        for part in _slices(len(at), block if len(at) > 1 else 0):
+            k = pairs.block(at[part], at, diagonal=part.start)
+            same[at[part]] = host(k @ like(one_hot(segment[at], same.shape[1]), k))
+    return same
 
 
 class _Pairs:
@@ -259,18 +267,31 @@ def _slices(n: int, step: int) -> list[slice]:
     return [slice(i, min(i + step, n)) for i in range(0, n, step)] if step else []
 
 
-def _indicators(cell: Index, z: Any) -> tuple[Index, Any]:
-    """The cells that occur, ascending, and (n, R) float64 indicators of them on the device of z."""
-    present = np.unique(cell)
-    marks = (cell[:, None] == present).astype(np.float64)
-    xp = array_namespace(z)
-    return present, marks if xp is array_namespace(marks) else xp.astype(like(marks, z), xp.float64)
+class _Cells:
+    """Sums over blocks by pair of cells (items, or segments).
 
+    Attributes:
+        present: of each block the cells that occur, ascending.
+        marks: of each block (n, R) indicators of these, in float64 on the device of the rows.
+        total: (C, C) sums so far.
+    """
 
-def _add(total: Array, rows: Index, columns: Index, part: Array, *, mirror: bool) -> None:
-    total[np.ix_(rows, columns)] += part
-    if mirror:
-        total[np.ix_(columns, rows)] += part.T
+    def __init__(self, cell: Index, cells: int, blocks: Sequence[slice], z: Any) -> None:
+        self.present = [np.unique(cell[b]) for b in blocks]
+        wide = array_namespace(z).astype(z[:0], array_namespace(z).float64)
+        marks = (cell[b][:, None] == p for b, p in zip(blocks, self.present, strict=True))
+        self.marks = [like(m.astype(np.float64), wide) for m in marks]
+        self.total = np.zeros((cells, cells))
+
+    def sums(self, k: Any, i: int, j: int) -> Array:
+        """The sums of a block of values."""
+        return host(self.marks[i].T @ k @ self.marks[j])
+
+    def add(self, sums: Array, i: int, j: int) -> None:
+        """Add the sums of block (i, j), and of its mirror image."""
+        self.total[np.ix_(self.present[i], self.present[j])] += sums
+        if i != j:
+            self.total[np.ix_(self.present[j], self.present[i])] += sums.T
 
 
 def centered_squares(squares: float, row_sums: Array) -> tuple[float, float, float]:

@@ -117,7 +117,7 @@ def scored(  # noqa: PLR0913
             "bound": plain(float(bound)) if value is not None else None,
             "version": __version__,
         },
-        notes=notes,
+        notes=tuple(notes),
         settings={
             **table.kernel.settings(),
             **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)},
@@ -186,7 +186,7 @@ def excess_of(one: Scored) -> Scored | None:
         floor=d.get("E_floor"),
         estimator="unbiased",
         seed=None,
-        notes=notes,
+        notes=tuple(notes),
         details={k: d[k] for k in kept if k in d} | {"bound": bound if known else None},
     )
     units = one.units if len(one.excess) else ()
@@ -234,7 +234,7 @@ def with_floor(one: Scored, floor: Scored) -> Scored:
     if reason and one.score.value is not None:
         notes.append(Note("no-floor", {"reason": reason}))
     value = None if reason else floor.score.value
-    score = replace(one.score, floor=value, details={**details, **more}, notes=notes)
+    score = replace(one.score, floor=value, details={**details, **more}, notes=tuple(notes))
     return replace(one, score=score)
 
 

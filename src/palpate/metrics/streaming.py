@@ -246,7 +246,7 @@ class StreamingMetric:
         repeated = len(generated.ids) - len(set(generated.ids))
         if not repeated:
             return score
-        return replace(score, notes=[*score.notes, Note("repeated-ids", {"count": repeated})])
+        return replace(score, notes=(*score.notes, Note("repeated-ids", {"count": repeated})))
 
     def _scored(self, generated: FeatureSet, real: FeatureSet | None) -> Score:
         return reference_free(type(self).function, generated, self.options, real).score

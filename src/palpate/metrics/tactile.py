@@ -17,6 +17,7 @@ classes that are excluded are in ``details``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Unpack
 
 import numpy as np
@@ -43,7 +44,7 @@ from palpate.metrics.tables import Table, build_table, class_estimate, estimate
 INDEPENDENT = Note("independent-samples")
 
 
-def tmmd(  # noqa: PLR0913
+def tmmd(
     generated: Any,
     reference: Any,
     *,
@@ -244,8 +245,10 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     if reason:
         least, n = plan.min_samples, len(generated.ids)
         notes = [Note("undefined", {"reason": reason, "least": least, "n": n})]
-    spread = table.spread[:1]
-    return _mean_of_halves("I-TMMD", table, generated, plan, sums, spread, details, notes)
+    given: dict[str, Any] = {"details": details, "notes": notes}
+    return _mean_of_halves(
+        "I-TMMD", table, generated, plan, sums=sums, spread=table.spread[:1], **given
+    )
 
 
 def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
@@ -268,18 +271,21 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         }
         for k, name in enumerate(details["classes"])
     }
-    return _mean_of_halves("CI-TMMD", table, generated, plan, sums, spread, details, [])
+    return _mean_of_halves(
+        "CI-TMMD", table, generated, plan, sums=sums, spread=spread, details=details
+    )
 
 
-def _mean_of_halves(  # noqa: PLR0913
+def _mean_of_halves(
     metric: str,
     table: Table,
     generated: FeatureSet,
     plan: Plan,
+    *,
     sums: PairSums,
     spread: Array,
     details: dict[str, Any],
-    notes: list[Note],
+    notes: Sequence[Note] = (),
 ) -> Scored:
     """The mean of dist^2 between the halves of K sets (Eq. 3: K = 1, Eq. 4), given 2K segments."""
     design = design_of(sums.totals, plan)
@@ -348,8 +354,9 @@ def _design(design: Design, sizes: Array, plan: Plan) -> Array:
 
 def _halves_bound(sums: PairSums, plan: Plan) -> Array:
     """(K,) bounds of the distances between halves; zeros where sums are exact."""
-    exact = sums.bound is None
-    return np.zeros(sums.segments // 2) if exact else halves_bound(sums.bound.totals, plan)
+    if sums.bound is None:
+        return np.zeros(sums.segments // 2)
+    return halves_bound(sums.bound.totals, plan)
 
 
 def unfit(sums: PairSums, segments: list[int], plan: Plan) -> str:
