@@ -342,7 +342,7 @@ def test_printed_page_opens_what_is_folded(chromium, page_file):
     context = chromium.new_context(viewport={"width": 800, "height": 900})
     page = context.new_page()
     page.goto(page_file.as_uri())
-    ask = """[...document.querySelectorAll('details img')].map(i => i.getBoundingClientRect().width > 0 && i.checkVisibility())"""
+    ask = """[...document.querySelectorAll('details:not([open]) img')].map(i => i.getBoundingClientRect().width > 0 && i.checkVisibility())"""
     folded = page.evaluate(ask)
     page.emulate_media(media="print")
     page.wait_for_function(

@@ -337,6 +337,10 @@ def _file_error(error: OSError) -> PalpateError:
     return PalpateError(f"{place} must be readable and writable", got, fix)
 
 
+def _complain(line: str) -> None:
+    sys.stderr.write(f"{line}\n")
+
+
 def _write_json(data: Any) -> None:
     encoding = (getattr(sys.stdout, "encoding", None) or "").lower()
     ascii_only = not encoding.replace("-", "").startswith("utf")
@@ -357,9 +361,9 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         return status
     except (PalpateError, OSError) as caught:
         error = caught if isinstance(caught, PalpateError) else _file_error(caught)
-        sys.stderr.write(f"palpate {name}: {error_line(name, error)}\n")
+        _complain(f"palpate {name}: {error_line(name, error)}")
         if isinstance(error, ProblemsError):
-            list_problems(error.problems, lambda line: sys.stderr.write(f"{line}\n"))
+            list_problems(error.problems, _complain)
         if as_json:
             _write_json(error.to_json())
         return USER_ERROR

@@ -132,9 +132,9 @@ class FeatureSet:
         """Read what :meth:`save` wrote; never a pickle."""
         with np.load(path, allow_pickle=False) as data:
             names = ("ids", "labels", "groups")
-            ids, labels, groups = (data[k].tolist() if k in data else None for k in names)
+            ids, labels, groups = (data[k].tolist() if k in data else [] for k in names)
             encoder = str(data["encoder"]) if "encoder" in data else None
-            return cls(ids, data["features"], labels, groups, encoder)
+            return cls(ids, data["features"], labels or None, groups or None, encoder)
 
 
 def _array(features: Any) -> np.ndarray:

@@ -272,8 +272,6 @@ LEAKAGE: dict[str, Sentence] = {
 }
 
 
-
-
 def confidence(share: float) -> str:
     """A share in [0, 1] in percent, never rounded to certainty."""
     return "> 99.9 %" if share > 0.999 else "< 0.1 %" if share < 0.001 else f"{100 * share:.1f} %"
@@ -324,29 +322,42 @@ EVALUATION: dict[str, Sentence] = {
         "train and test samples"
     ),
     "ahead": _ahead,
-    "below-floor": "{metric}, {subject}: below the floor of real images, so these vary less than real "
-    "ones do; that is not better",
+    "below-floor": (
+        "{metric}, {subject}: below the floor of real images, so these vary less than real "
+        "ones do; that is not better"
+    ),
     "companion-skipped": "{name} skipped: {must}; got {got}",
-    "copies": "{subject}: {copies} of {n} generated rows are bit for bit rows of the reference: a copy "
-    "is not a generator",
-    "encoder-of-other-split": "The tactile encoder was trained on another split: it may have seen test "
-    "samples",
+    "copies": (
+        "{subject}: {copies} of {n} generated rows are bit for bit rows of the reference: a copy "
+        "is not a generator"
+    ),
+    "encoder-of-other-split": (
+        "The tactile encoder was trained on another split: it may have seen test samples"
+    ),
     "encoder-without-split": "The tactile encoder comes without a record of its split",
-    "generator-of-other-split": "The generator was not trained on this split: it may have seen test "
-    "samples",
+    "generator-of-other-split": (
+        "The generator was not trained on this split: it may have seen test samples"
+    ),
     "kid-interval": "The spread over random subsets that others print with KID is no interval; this one is",
     "no-differences": "No differences between generators: their rows have no ids, and differ in number",
     "no-interval-streamed": "No interval: neither groups nor repeats are known",
     "no-pairs": "Scores of pairs of images skipped: generated and reference share no id",
-    "outside-test-part": "{name}: {skipped} of {n} samples lie outside the split's test part, and were "
-    "skipped",
-    "resized": "Pixels are compared at {size} x {size}, the generators' size: the reference's {side} px "
-    "were resized, and smaller images score higher",
+    "outside-test-part": (
+        "{name}: {skipped} of {n} samples lie outside the split's test part, and were skipped"
+    ),
+    "resized": (
+        "Pixels are compared at {size} x {size}, the generators' size: the reference's {side} px "
+        "were resized, and smaller images score higher"
+    ),
     "row-pairs": "Row k of every generator is taken for the same sample: the rows have no ids",
-    "streamed": "Streamed, as there are too many rows to hold: TMMD alone, without interval, p-value or "
-    "companions",
-    "too-many-rows": "{name} skipped: it forms all pairs of more than {rows:,} rows; request it with "
-    "{arg:companions}",
+    "streamed": (
+        "Streamed, as there are too many rows to hold: TMMD alone, without interval, p-value or "
+        "companions"
+    ),
+    "too-many-rows": (
+        "{name} skipped: it forms all pairs of more than {rows:,} rows; request it with "
+        "{arg:companions}"
+    ),
     "widened": "The features in {source}: {type} was widened to float32; its rounding stays",
     "within-bound": "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments",
 }

@@ -198,17 +198,17 @@ def environment() -> Environment:
         lstrip_blocks=True,
         auto_reload=False,
     )
+    functions: dict[str, Any] = {
+        "hints": text.HINTS,
+        "how_to_read": text.HOW_TO_READ,
+        "open_pairs": OPEN_PAIRS,
+        "table_facts": table_facts,
+        "long_list": LONG_LIST,
+        "like_rows": _like_rows,
+    }
     for module in (audits, plots, sentences):
-        functions = {k: v for k, v in vars(module).items() if callable(v) and not k.startswith("_")}
-        env.globals.update(functions)
-    env.globals.update(
-        hints=text.HINTS,
-        how_to_read=text.HOW_TO_READ,
-        open_pairs=OPEN_PAIRS,
-        table_facts=table_facts,
-        long_list=LONG_LIST,
-        like_rows=_like_rows,
-    )
+        functions |= {k: v for k, v in vars(module).items() if callable(v)}
+    env.globals.update(functions)
     names = ("count", "number", "percent", "plural")
     env.filters.update({name: getattr(text, name) for name in names})
     env.filters.update(

@@ -284,7 +284,7 @@ def score_histogram(signal: Signal, label: str, data: str = "train") -> Markup:
             f"{score_text(a)} to {score_text(b)}: {count(n)}"
             for (a, b), n in zip(pairwise(edges), counts, strict=True)
         ]
-        top = f"{number(100 * max(counts) / (sum(counts) or 1))}\u00a0%"
+        top = f"{100 * max(counts) / (sum(counts) or 1):.2g}\u00a0%"
         panels.append(Panel(f"{name} ({count(sum(counts))})", counts, titles, kinds, top))
     ticks, digits = ticks_of(low, high, 6)
     marker = (share(signal.threshold), f"flagged from {score_text(signal.threshold)}")

@@ -52,8 +52,9 @@ class LeakPair:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> LeakPair:
         """The inverse of ``dataclasses.asdict``."""
-        samples = {name: SampleRef(**data[name]) for name in ("test", "train")}
-        return cls(**{**data, **samples})
+        fields: dict[str, Any] = dict(data)
+        fields |= {name: SampleRef(**data[name]) for name in ("test", "train")}
+        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,9 @@ class ImpactRow:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> ImpactRow:
         """The inverse of ``dataclasses.asdict``."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+        fields: dict[str, Any] = dict(data)
+        fields |= {k: tuple(v) for k, v in data.items() if isinstance(v, list)}
+        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -159,9 +162,10 @@ class Impact:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Impact:
         """The inverse of ``dataclasses.asdict``."""
-        rows = [ImpactRow.from_json(row) for row in data["rows"]]
-        notes = [Note.from_json(note) for note in data.get("notes", ())]
-        return cls(**{**data, "rows": rows, "notes": notes})
+        fields: dict[str, Any] = dict(data)
+        fields["rows"] = [ImpactRow.from_json(row) for row in data["rows"]]
+        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
+        return cls(**fields)
 
 
 @dataclass(frozen=True)

@@ -251,7 +251,7 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
         preset = str(score.settings.get("preset", ""))
         key = (place, preset, score.split or "", _features(metric), reference)
         groups.setdefault(key, []).append(score)
-    several = [len({key[k] for key in groups}) > 1 for k in (2, 4)]
+    several = [len({key[k] for key in groups} - {""}) > 1 for k in (2, 4)]
     tables: list[Table] = []
     for key, members in sorted(groups.items(), key=lambda item: item[0][0]):
         place, preset, split, features, _ = key

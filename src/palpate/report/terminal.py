@@ -127,7 +127,9 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     """Return the finding, a line for each signal, the notes and what leaking costs."""
     lines = [audit_line(audit)]
     if audit.groups_in_all:
-        lines.append(f"  {audit.groups_shared} of {audit.groups_in_all} {audit.group} groups are shared")
+        lines.append(
+            f"  {audit.groups_shared} of {audit.groups_in_all} {audit.group} groups are shared"
+        )
     if audit.gap_min is not None:
         gaps = f"{audit.gap_min} to {audit.gap_max} frames, median {audit.gap_median}"
         lines.append(f"  gap to the nearest train frame of the video: {gaps}")
