@@ -1,23 +1,23 @@
 """Train the models that ship with palpate (``palpate/mini``), score them on unseen worlds, and
 write their cards.
 
-    python recipes/mini.py --work runs/mini                     # everything: worlds, encoders, autoencoder, generator, scores
-    python recipes/mini.py --work runs/mini --only autoencoder  # one part and what it needs; parts may run side by side after "worlds"
-    python recipes/mini.py --work runs/mini --ship              # and put the result into src/palpate/mini
-    python recipes/mini.py --work runs/mini --verify            # score what is shipped again and compare with its cards
+    python recipes/mini.py --work runs/mini                     # everything
+    python recipes/mini.py --work runs/mini --only autoencoder  # one part and what it needs
+    python recipes/mini.py --work runs/mini --ship              # and write src/palpate/mini
+    python recipes/mini.py --work runs/mini --verify            # score what ships again
 
 Stopped half-way, the same command goes on. Only worlds of the seeds
 ``palpate.sim.presets.MINI_SEEDS`` are read, which nothing else may use:
 
-=============  ========  ====================================================================================
+=============  ========  =========================================================================
 world          seed      read by
-=============  ========  ====================================================================================
+=============  ========  =========================================================================
 gelsight       900000    every part
 digit          900001    the autoencoder alone: the other look of the sensor
-one unit       900002    the generator alone: one gel unit, because a photo does not show which of several is used
+one unit       900002    the generator alone: one gel unit, as a photo does not show which is used
 new gelsight   900050    scores: new objects, videos and gel units
 new digit      900051    scores of the autoencoder
-=============  ========  ====================================================================================
+=============  ========  =========================================================================
 
 Weights are rounded to 16 bits before anything is scored, so the scores are those of the shipped
 files; what rounding costs is in the cards.
@@ -76,15 +76,15 @@ AUTOENCODER = (
 GENERATOR_STEPS = 8_000
 PARTS = ("worlds", "clip", "encoders", "autoencoder", "generator", "scores")
 LIMITS = (
-    "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. Real photos and real tactile images are out of its range.",
-    "Made to show mechanisms and to test code offline; never compare its numbers with those of real data sets.",
+    "Knows only the procedural world of palpate: 20 simulated materials and a simulated gel. "
+    "Real photos and real tactile images are out of its range.",
+    "Made to show mechanisms and to test code offline; never compare its numbers with those of "
+    "real data sets.",
 )
 
 
 def main() -> int:
-    """Runs the asked parts; the exit status is 1 if ``--verify`` finds other scores than the cards
-    say.
-    """
+    """Run the requested parts; exit with 1 if ``--verify`` gives other scores than the cards."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -125,7 +125,7 @@ def main() -> int:
 
 
 def say(line: str) -> None:
-    """A line for whoever watches, at once."""
+    """Print a line at once."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
@@ -418,16 +418,15 @@ class Recipe:
             said = {row["score"]: row["value"] for row in cards[part]["scores"]}
             if missing := sorted(set(said) - {row["score"] for row in scored}):
                 bad += len(missing)
-                say(
-                    f"{part}: the card has scores that are no longer made: {', '.join(missing)}  DIFFERS"
-                )
+                say(f"{part}: the card has former scores: {', '.join(missing)}  DIFFERS")
             for row in scored:
                 value, card = row["value"], said.get(row["score"])
                 same = card is not None and abs(value - card) <= 0.002 * max(1.0, abs(card))
                 bad += not same
-                told = "nothing" if card is None else f"{card:.4g}"
+                known = "nothing" if card is None else f"{card:.4g}"
                 say(
-                    f"{part}: {row['score']}: {value:.4g}, the card says {told}{'' if same else '  DIFFERS'}"
+                    f"{part}: {row['score']}: {value:.4g}, the card says {known}"
+                    f"{'' if same else '  DIFFERS'}"
                 )
         return 1 if bad else 0
 

@@ -158,7 +158,8 @@ def scores_table(target: Path) -> str:
             interval = " to ".join(f"{v:.3g}" for v in row.get("interval", ()))
             chance = f"{row['chance']:.3g}" if "chance" in row else ""
             lines.append(
-                f"| {part} | {row['score']} | {row['value']:.4g} | {interval} | {chance} | {row['in 32 bits']:.4g} |"
+                f"| {part} | {row['score']} | {row['value']:.4g} | {interval} | {chance} "
+                f"| {row['in 32 bits']:.4g} |"
             )
     return "\n".join(lines)
 

@@ -62,7 +62,7 @@ def score_all(
         worlds: ``gelsight``, ``new gelsight``, ``digit`` and ``new digit``.
         cache: folder for decoded pixels and embeddings.
         folder: for the generated images; None puts them into ``cache``.
-        progress: told what is being done.
+        progress: called while the work goes on.
     """
     return {
         "encoders": score_encoders(
@@ -83,14 +83,14 @@ def score_all(
 
 def prompts(options: WorldOptions) -> dict[str, list[str]]:
     """Material -> the named sentences of the world, for each name that its pieces have."""
-    found: dict[str, list[str]] = {}
+    named: dict[str, list[str]] = {}
     for material in MATERIALS:
         nouns = {
             make_object(options, ObjectRef(material, k)).surface.noun for k in range(NAMED_OBJECTS)
         }
         sentences = (t.format(phrase=noun) for noun in sorted(nouns) for t in NAMED)
-        found[material] = [f"{s[0].upper()}{s[1:]}." for s in sentences]
-    return found
+        named[material] = [f"{s[0].upper()}{s[1:]}." for s in sentences]
+    return named
 
 
 def score_encoders(
@@ -136,19 +136,19 @@ def score_autoencoder(
     rows: Rows = []
     for look, name in (("gelsight", "new gelsight"), ("digit", "new digit")):
         images = cached_images(worlds[name], "tactile", 64, cache, progress)
-        found = measure_reconstruction(autoencoder, np.asarray(images))
+        result = measure_reconstruction(autoencoder, np.asarray(images))
         values = {
-            "PSNR [dB]": found.psnr,
-            "PSNR without quantization [dB]": found.psnr_free,
-            "SSIM": found.ssim,
-            "codebook perplexity": found.perplexity,
-            "codes never used": found.dead,
+            "PSNR [dB]": result.psnr,
+            "PSNR without quantization [dB]": result.psnr_free,
+            "SSIM": result.ssim,
+            "codebook perplexity": result.perplexity,
+            "codes never used": result.dead,
         }
         rows += [
-            {"score": f"{what}, {look}", "value": float(value), "n": found.n}
+            {"score": f"{what}, {look}", "value": float(value), "n": result.n}
             for what, value in values.items()
         ]
-    rows.append({"score": "codes", "value": float(found.codes), "n": found.codes})
+    rows.append({"score": "codes", "value": float(result.codes), "n": result.codes})
     return rows
 
 

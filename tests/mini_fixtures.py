@@ -25,7 +25,7 @@ def make_encoders(seed: int = 0) -> EncoderSet:
 
 
 def write_shipped(root: Path, monkeypatch) -> TactilePipeline:
-    """Write ``root/mini`` as the package holds it and make ``palpate/mini`` refer to it; returns the generator."""
+    """Write ``root/mini``, make ``palpate/mini`` refer to it, and return the generator."""
     monkeypatch.setattr(models, "shipped_root", lambda: root)
     encoders = make_encoders()
     encoders.save(root / "mini" / "encoders", half=True)

@@ -1,4 +1,4 @@
-"""``palpate generate``: a photo in, an image out, with the shipped generator; mistakes in one line."""
+"""``palpate generate``: a photo in, an image out; mistakes in one line."""
 
 import json
 import subprocess

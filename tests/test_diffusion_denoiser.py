@@ -159,7 +159,8 @@ def test_loss_is_equation_1(prediction):
     value, logs = loss(model, rows, torch.Generator().manual_seed(5), 0)
     x, t, seen, _ = model.seen
     assert torch.equal(seen, tokens)
-    # The network sees sqrt(a) z + sqrt(1 - a) eps: recover eps, and with answer 0 the loss is the mean square of the target.
+    # The network sees sqrt(a) z + sqrt(1 - a) eps: recover eps. With answer 0 the loss is the mean
+    # square of the target.
     a = torch.tensor(np.cumprod(1 - np.linspace(0.0015**0.5, 0.0195**0.5, 1000) ** 2))[t].reshape(
         -1, 1, 1, 1
     )

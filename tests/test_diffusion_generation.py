@@ -1,4 +1,4 @@
-"""Generating: from photos to memory, one PNG, or a folder with an index; resuming; broken photos."""
+"""Generating to memory, one PNG, or a folder with an index; resuming; broken photos."""
 
 import json
 from dataclasses import replace

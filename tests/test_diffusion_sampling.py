@@ -52,7 +52,7 @@ def test_gaussian_data_come_out_with_their_mean_and_spread(method, steps, tolera
         seed=0,
     )
     noise = starting_noise(ids, SHAPE, 0)
-    # The probability flow of a Gaussian is z^0 = mean + spread * z^T (up to the signal left at T), sample by sample.
+    # The probability flow of a Gaussian is z^0 = mean + spread * z^T, up to the signal left at T.
     assert float(z.mean()) == pytest.approx(MEAN + SPREAD * float(noise.mean()), abs=tolerance)
     assert float(z.std()) == pytest.approx(SPREAD * float(noise.std()), rel=3 * tolerance)
     assert torch.allclose(z, MEAN + SPREAD * noise, atol=0.1)

@@ -1,4 +1,4 @@
-"""A generator that goes on from another: it begins with those weights, and only where it speaks the same language."""
+"""A generator that goes on from another one, in the same space only."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The loss against a slow loop; training of a tactile encoder and of a fresh CLIP: what moves, what does not, what it refuses."""
+"""The loss against a slow loop; training of a tactile encoder and of a fresh CLIP."""
 
 import math
 from dataclasses import replace
@@ -33,7 +33,7 @@ FEELS = {
 
 
 def make_world(root, videos=8, frames=3, size=16):
-    """Photos and touches of four materials, each video its own; the material decides the pattern of both pictures."""
+    """Videos of four materials; the material decides the pattern of photo and tactile image."""
     rows = []
     for v in range(videos):
         material = list(FEELS)[v % 4]
@@ -291,7 +291,7 @@ def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
 
 
 def test_test_side_is_never_read(world, clip, tmp_path):
-    """The same train side with other test samples, whose files are even missing, trains the same encoder."""
+    """The same train part with other test samples, even missing files, gives the same encoder."""
     split = by_video(world)
     digest = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
         "tactile"

@@ -1,4 +1,4 @@
-"""Embeddings of a manifest: the cache computes nothing twice and nothing stale; batches do not matter."""
+"""Embeddings of a manifest: nothing is computed twice, nothing stale is used."""
 
 import os
 

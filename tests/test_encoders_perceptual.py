@@ -1,4 +1,4 @@
-"""LPIPS: against convolutions and sums written out in NumPy; files of the published formats with random weights; refusals."""
+"""LPIPS against convolutions and sums in NumPy, with random weights in the published formats."""
 
 import numpy as np
 import pytest
@@ -180,7 +180,7 @@ def test_files_are_refused_by_name_and_never_unpickled(files, states, tmp_path):
         load_lpips(files[0], tmp_path / "list.pth")
     with pytest.raises(
         PalpateError,
-        match=r"alex.pth must hold features.0.weight of shape \(64, 3, 11, 11\). Got none of that name",
+        match=r"must hold features.0.weight of shape \(64, 3, 11, 11\). Got none of that name",
     ):
         load_lpips(files[1], files[0])  # the two files, swapped
     torch.save(states[1] | {"lin2.model.1.weight": torch.ones(1, 256, 1, 1)}, tmp_path / "vgg.pth")

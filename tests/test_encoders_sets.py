@@ -1,4 +1,4 @@
-"""Frozen encoders, the small tokenizer and the preprocessing: saved and loaded they give the same embeddings, in transformers' own layout."""
+"""Encoders, tokenizer and preprocessing: saved and loaded, they give the same embeddings."""
 
 import json
 import types

@@ -1,4 +1,4 @@
-"""Standard encoders from local weights: any TorchScript module, any CLIP folder; digests; refusals that name the file."""
+"""Standard encoders from local weights: TorchScript modules and CLIP folders; digests."""
 
 import json
 import pickle

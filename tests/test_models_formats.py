@@ -1,4 +1,4 @@
-"""Models that earlier versions wrote: they load, compute the same, and are written in today's format."""
+"""Models of earlier formats load, compute the same, and are saved in the current format."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The recipe of the shipped models, in small: every part, its resumption, the shipped folder, and the check of the cards."""
+"""The recipe of the shipped models, in small: its parts, resuming, shipping, verifying."""
 
 import importlib
 import shutil

@@ -1,4 +1,4 @@
-"""The training loop: stopped and started again, it takes the same steps; nothing harmful is ever kept."""
+"""The training loop: interrupted and resumed, it takes the same steps."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""`train_encoder` and `train_generator`, in Python and on the command line: results, resuming, mistakes."""
+"""`train_encoder` and `train_generator`, in Python and on the command line."""
 
 import json
 

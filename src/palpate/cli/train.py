@@ -20,8 +20,8 @@ class Options(Common):
     split: Path
     """Split file; only its train part is trained on."""
     clip: str
-    """Vision and text encoders that condition the generator: folder of `palpate train encoder` or of
-    a CLIP, hub id, or palpate/mini."""
+    """Encoders that condition the generator: folder of `palpate train encoder` or of a CLIP, hub
+    id, or palpate/mini."""
     output: OutPath
     """Folder for the pipeline; must be new or empty."""
     autoencoder: str | None = None

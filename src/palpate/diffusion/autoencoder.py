@@ -197,14 +197,10 @@ class LatentStats:
         cls, latents: Tensor | NDArray[Any], scale: Literal["std", "one"] = "std"
     ) -> LatentStats:
         """The statistics of latents (n, c, h, w), n >= 1, summed in double precision."""
-        total, square, count = 0.0, 0.0, 0
-        for start in range(0, len(latents), 256):
-            part = np.asarray(latents[start : start + 256], dtype=np.float64)
-            total = total + part.sum(axis=(0, 2, 3))
-            square = square + (part**2).sum(axis=(0, 2, 3))
-            count += part.shape[0] * part.shape[2] * part.shape[3]
-        mean = np.asarray(total) / count
-        std = np.sqrt(np.maximum(np.asarray(square) / count - mean**2, 1e-12))
+        z = np.asarray(latents)
+        mean = z.mean(axis=(0, 2, 3), dtype=np.float64)
+        square = np.einsum("nchw,nchw->c", z, z, dtype=np.float64) / (z.size / z.shape[1])
+        std = np.sqrt(np.maximum(square - mean**2, 1e-12))
         return cls(tuple(map(float, mean)), tuple(map(float, std)), scale)
 
     def normalize(self, latents: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
 from palpate.diffusion.autoencoder import Autoencoder, to_bytes
 from palpate.encoders.encoder_set import seeded, to_unit
+from palpate.metrics.images import psnr_per_image, ssim_per_image
 from palpate.training.loop import LoopOptions, fit
 
 
@@ -248,41 +249,20 @@ class Reconstruction:
 def measure_reconstruction(
     autoencoder: Autoencoder, images: NDArray[np.uint8], batch: int = 64
 ) -> Reconstruction:
-    """Scores reconstructions of bytes (n, h, w, 3), a batch at a time."""
+    """Score reconstructions of bytes (n, h, w, 3), a batch at a time."""
     device = next(autoencoder.parameters()).device
     codes = int(autoencoder.vq.config["num_vq_embeddings"])
     counts = np.zeros(codes, dtype=np.int64)
-    rows: dict[str, list[Tensor]] = {"psnr": [], "psnr_free": [], "ssim": []}
+    rows: list[NDArray[np.float64]] = []
     for start in range(0, len(images), batch):
-        x = to_unit(images[start : start + batch], device, signed=True)
-        z = autoencoder.latents(x)
+        pixels = np.asarray(images[start : start + batch])
+        z = autoencoder.latents(to_unit(pixels, device, signed=True))
         # Rounded to bytes first: what is scored is the image that a user gets.
-        bytes_of = (to_bytes(autoencoder.image(z, quantize=q)[0]) for q in (True, False))
-        y, free = (to_unit(pixels, device, signed=True) for pixels in bytes_of)
-        for name, image in (("psnr", y), ("psnr_free", free)):
-            error = (image - x).square().mean((1, 2, 3)).clamp_min(1e-12)
-            rows[name].append(10 * torch.log10(4 / error))
-        rows["ssim"].append(_ssim((x + 1) / 2, (y + 1) / 2))
+        made, free = (to_bytes(autoencoder.image(z, quantize=q)[0]) for q in (True, False))
+        psnr = [psnr_per_image(image, pixels) for image in (made, free)]
+        rows.append(np.stack([*psnr, ssim_per_image(made, pixels)]))
         counts += np.bincount(autoencoder.codes(z).flatten().cpu().numpy(), minlength=codes)
     share = counts[counts > 0] / counts.sum()
-    mean = {name: float(torch.cat(values).double().mean()) for name, values in rows.items()}
+    psnr, psnr_free, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))
     perplexity, dead = float(np.exp(-(share * np.log(share)).sum())), int((counts == 0).sum())
-    return Reconstruction(len(images), **mean, perplexity=perplexity, dead=dead, codes=codes)
-
-
-def _ssim(x: Tensor, y: Tensor) -> Tensor:
-    """Return the SSIM of each image (n, 3, h, w) in [0, 1], where the window fits."""
-    offset = torch.arange(11, dtype=x.dtype, device=x.device) - 5
-    window = torch.exp(-offset.square() / (2 * 1.5**2))
-    window = window / window.sum()
-
-    def blur(z: Tensor) -> Tensor:
-        rows = nn.functional.conv2d(z.flatten(0, 1).unsqueeze(1), window.reshape(1, 1, 1, -1))
-        both = nn.functional.conv2d(rows, window.reshape(1, 1, -1, 1))
-        return both.unflatten(0, x.shape[:2]).squeeze(2)
-
-    mx, my = blur(x), blur(y)
-    vx, vy, cov = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
-    c1, c2 = 0.01**2, 0.03**2
-    ratio = (2 * mx * my + c1) * (2 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-    return ratio.mean((1, 2, 3))
+    return Reconstruction(len(images), psnr, psnr_free, ssim, perplexity, dead, codes)

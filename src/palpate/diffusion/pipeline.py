@@ -177,8 +177,8 @@ class TactilePipeline:
         sampler = self.sampler_with(guidance=guidance, steps=steps)
         if len(images) == 1:  # not among the copies that fill a batch: a fraction of the time
             sampler = replace(sampler, batch=1)
-        ground = None if background is None else self._squares(list_images(background), self.size)
-        embedded = self.embed(self._squares(images, self.vision_size))
+        ground = None if background is None else squares(list_images(background), self.size)
+        embedded = self.embed(squares(images, self.vision_size))
         made: list[Image.Image] = []
         for start in range(0, len(ids), sampler.batch):
             rows = slice(start, start + sampler.batch)
@@ -192,11 +192,6 @@ class TactilePipeline:
             made += map(Image.fromarray, arrays)
             progress("generating", len(made), len(ids))
         return TactileImages(made)
-
-    @staticmethod
-    def _squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
-        parts = [np.empty((0, size, size, 3), np.uint8), *squares(images, size, EMBED)]
-        return np.concatenate(parts)
 
     @cached_property
     def digest(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -96,12 +96,12 @@ class Encoder:
             texts = [inputs] if isinstance(inputs, str) else list(inputs)
             return embed_texts(texts, self.encoders, batch=batch, progress=progress)
         images, size = list_images(inputs), self.encoders.preprocess(self.modality).resize
-        parts = [np.empty((0, self.dim), np.float32)]
-        for pixels in squares(images, size, batch):
-            parts.append(embed_images(pixels, self.encoders, self.modality, batch=batch))
-            done = sum(map(len, parts))
-            progress(f"embedding {self.modality}", done, len(images))
-        return np.concatenate(parts)
+        features = np.empty((len(images), self.dim), np.float32)
+        for start in range(0, len(images), batch):
+            pixels = squares(images[start : start + batch], size)
+            features[start : start + batch] = embed_images(pixels, self.encoders, self.modality)
+            progress(f"embedding {self.modality}", start + len(pixels), len(images))
+        return features
 
 
 def list_images(inputs: Any) -> list[Path | Image.Image]:
@@ -129,15 +129,12 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
     raise PalpateError(must, type(inputs).__name__, fix, argument="images")
 
 
-def squares(
-    images: Sequence[Path | Image.Image], size: int, batch: int
-) -> Iterator[NDArray[np.uint8]]:
-    """Images as center squares (b, size, size, 3), a batch in memory at a time."""
-    for start in range(0, len(images), batch):
-        decoded = (
-            read_image(i) if isinstance(i, Path) else i for i in images[start : start + batch]
-        )
-        yield np.stack([square(image, size) for image in decoded])
+def squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
+    """Decode images to center squares (n, size, size, 3)."""
+    pixels = np.empty((len(images), size, size, 3), np.uint8)
+    for k, image in enumerate(images):
+        pixels[k] = square(read_image(image) if isinstance(image, Path) else image, size)
+    return pixels
 
 
 def _bytes(images: Any) -> NDArray[np.uint8]:
