@@ -137,3 +137,22 @@ def test_importing_a_room_has_no_effects():
     done = python(code)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
+
+
+def test_no_module_imports_itself_in_a_circle():
+    """Strongly connected components of the import graph have one module each."""
+    import grimp
+    import numpy as np
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = grimp.build_graph("palpate", exclude_type_checking_imports=True)
+    modules = sorted(graph.modules)
+    index = {name: k for k, name in enumerate(modules)}
+    edges = np.array(
+        [(index[a], index[b]) for a in modules for b in graph.find_modules_directly_imported_by(a)]
+    )
+    matrix = csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(modules),) * 2)
+    count, label = connected_components(matrix, directed=True, connection="strong")
+    circles = [[m for m in modules if label[index[m]] == k] for k in range(count)]
+    assert not [circle for circle in circles if len(circle) > 1]

@@ -1,0 +1,77 @@
+"""The public face of palpate: its names, their signatures, and what importing it costs."""
+
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import palpate as pp
+from palpate.cli import VERBS, main
+
+TOP = Path(__file__).resolve().parents[1]
+#: Public function -> its parameters in order; keywords behind the star.
+SIGNATURES = {}
+
+
+def parameters(function):
+    shown = []
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY and "*" not in shown:
+            shown.append("*")
+        prefix = {parameter.VAR_KEYWORD: "**", parameter.VAR_POSITIONAL: "*"}.get(
+            parameter.kind, ""
+        )
+        shown.append(prefix + parameter.name)
+    return " ".join(shown)
+
+
+def test_public_names():
+    assert pp.__all__ == sorted(pp.__all__, key=lambda name: (name.islower(), name))
+    assert set(pp.__all__) | {"__version__"} == set(dir(pp))
+    for name in pp.__all__:
+        value = getattr(pp, name)
+        assert value.__doc__, name
+        assert getattr(pp, name) is value
+    with pytest.raises(AttributeError, match="no attribute 'tower'"):
+        pp.tower  # noqa: B018
+    rooms = {module.name for module in pkgutil.iter_modules(pp.__path__)}
+    assert not rooms & set(pp.__all__)
+
+
+@pytest.mark.parametrize("name", SIGNATURES)
+def test_public_signatures(name):
+    function = pp
+    for part in name.split("."):
+        function = getattr(function, part)
+    assert parameters(function) == SIGNATURES[name]
+
+
+def test_importing_palpate_loads_no_library():
+    code = (
+        "import sys, palpate; bad = {'torch', 'polars', 'numpy', 'tyro', 'rich'} & set(sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", f"{code}; assert not bad, bad"]).returncode == 0
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_no_help_says_tower(verb, capsys):
+    with pytest.raises(SystemExit):
+        main([*verb.split(), "--help"])
+    assert "tower" not in capsys.readouterr().out.lower()
+
+
+def test_tower_is_a_word_of_format_1_alone():
+    """No public name, column or written JSON key has it; readers of version 1 may."""
+    for path in (TOP / "src").rglob("*.py"):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if re.search("tower", line, re.IGNORECASE):
+                assert re.search(r"format.?1|FORMAT_1|towers?[\"'/]|`towers?`", line), (
+                    f"{path}: {line}"
+                )
+    for path in (TOP / "src" / "palpate" / "mini").rglob("*"):
+        if path.suffix in (".json", ".md"):
+            assert "tower" not in path.read_text(encoding="utf-8").lower(), path
