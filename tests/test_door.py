@@ -14,7 +14,35 @@ from palpate.cli import VERBS, main
 
 TOP = Path(__file__).resolve().parents[1]
 #: Public function -> its parameters in order; keywords behind the star.
-SIGNATURES = {}
+SIGNATURES = {
+    "audit": (
+        "train_or_data test * split pretrain by near_frames images modalities "
+        "false_positives encoder impact name worst cache threads root skip_bad progress"
+    ),
+    "generate": (
+        "photos * model output split part seed guidance steps batch skip_bad device progress"
+    ),
+    "load": "source * format images skip_bad progress **options",
+    "probe": "data split * encoder modality group balanced top seed cache progress",
+    "score": (
+        "generated reference * encoder split names labels groups group presets sigma "
+        "estimator backend normalize companions controls inception clip lpips "
+        "permutations seed cache progress"
+    ),
+    "split": ("data * by train val seed folds near noleak nulls tolerance cache skip_bad progress"),
+    "train_encoder": "data split * preset clip output epochs targets seed device progress",
+    "train_generator": (
+        "data split clip * preset autoencoder output source background steps seed device progress"
+    ),
+    "validate": "source * format check progress **options",
+    "Encoder.from_pretrained": "source * modality device",
+    "Encoder.encode": "self inputs * batch progress",
+    "TactilePipeline.from_pretrained": "source * device",
+    "TactilePipeline.__call__": "self photos * ids seed guidance steps background progress",
+    "World.__init__": "self options * cache",
+    "Manifest.load": "path root",
+    "Split.from_ids": "* rule manifest **parts",
+}
 
 
 def parameters(function):

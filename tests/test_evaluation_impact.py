@@ -265,9 +265,7 @@ def test_a_run_is_the_explicit_one() -> None:
     size, y = found.settings["train_samples"], np.array(material)
     assert size == 72
     hits: list[list[float]] = []
-    plans = [
-        leak_free_split(manifest, train=72 / 108, by="video", seed=s) for s in (0, 1, 2)
-    ]
+    plans = [leak_free_split(manifest, train=72 / 108, by="video", seed=s) for s in (0, 1, 2)]
     assert [p.digest for p in plans] == list(found.clean_splits)
     for parts in (split, *plans):
         side = np.array([parts.parts[i] for i in manifest.ids])

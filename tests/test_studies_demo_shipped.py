@@ -88,14 +88,20 @@ def test_shipped_models_take_the_place_of_three_stages(mini, tmp_path):
 def test_from_scratch_and_the_variant_with_backgrounds_start_from_nothing(mini, tmp_path):
     done = run_pipeline(replace(OPTIONS, from_scratch=True), tmp_path / "a")
     assert {"pretraining", "clip", "autoencoder"} <= set(done.stages)
-    assert TactilePipeline.from_pretrained(tmp_path / "a" / "generator" / "model").training["start"] is None
+    assert (
+        TactilePipeline.from_pretrained(tmp_path / "a" / "generator" / "model").training["start"]
+        is None
+    )
     assert (
         EncoderSet.load(tmp_path / "a" / "encoders" / "encoders").card["start_card"].get("data")
         is None
     )
     assert any("trained in this run" in n for n in summarize(done, "x").notes)
     run_pipeline(replace(OPTIONS, background=True), tmp_path / "b")
-    assert TactilePipeline.from_pretrained(tmp_path / "b" / "generator" / "model").training["start"] is None
+    assert (
+        TactilePipeline.from_pretrained(tmp_path / "b" / "generator" / "model").training["start"]
+        is None
+    )
 
 
 def test_a_world_that_the_shipped_models_saw_is_refused(mini, tmp_path):
