@@ -249,26 +249,6 @@ def train(folder, **changes):
     return train_denoiser(z, conditions, **settings | changes)
 
 
-def test_training_resumes_to_the_same_weights(tmp_path):
-    whole = train(tmp_path / "a")
-
-    def stop(what, done, total, remark=""):
-        if done == 7:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "b", progress=stop)
-    again = train(tmp_path / "b")
-    for (name, a), b in zip(whole.state_dict().items(), again.state_dict().values(), strict=True):
-        assert torch.equal(a, b), name
-    # Another schedule is another run: the old checkpoint is not used.
-    other = train(tmp_path / "b", schedule=Schedule(prediction="v_prediction"))
-    assert not all(
-        torch.equal(a, b)
-        for a, b in zip(whole.state_dict().values(), other.state_dict().values(), strict=True)
-    )
-
-
 def test_training_does_not_touch_global_randomness(tmp_path):
     z, conditions = data()
     torch.manual_seed(3)
@@ -295,43 +275,6 @@ def test_saved_denoiser_is_the_same(tmp_path):
         assert torch.equal(a, b), name
     # Only vision conditioned the training, but the text mean is known too, so text can drive it.
     assert torch.isfinite(again.means).all()
-
-
-def test_mistakes_are_explained(tmp_path):
-    z, conditions = data()
-    with pytest.raises(PalpateError, match="needs embeddings of text, vision"):
-        train_denoiser(
-            z,
-            {"text": conditions["text"]},
-            stats=PLAIN,
-            unet=UNET,
-            policy=replace(POLICY, source="mixed"),
-            schedule=Schedule(),
-            loop=LOOP,
-            folder=tmp_path,
-        )
-    with pytest.raises(PalpateError, match=r"\[0, 1\)"):
-        ConditionPolicy(width=3, dropout=1.0)
-
-
-@pytest.mark.parametrize("modulate", [False, True])
-def test_the_token_reaches_the_output_and_a_saved_denoiser_is_the_same(tmp_path, modulate):
-    from dataclasses import replace
-
-    policy = ConditionPolicy(width=8)
-    torch.manual_seed(0)
-    net = build_unet(
-        replace(UNET, modulate=modulate), channels=3, size=8, width=8, background=False
-    )
-    model = Denoiser(net, policy).eval()
-    assert (net.class_embedding is not None) == modulate
-    x, t, c = torch.randn(2, 3, 8, 8), torch.tensor([3, 700]), torch.randn(2, 8)
-    with torch.no_grad():
-        out = model(x, t, model.tokens(c, "text"))
-        assert not torch.allclose(out, model(x, t, model.null_tokens(2)), atol=1e-4)
-        model.save(tmp_path / "unet")
-        again = Denoiser.load(tmp_path / "unet", policy)
-        torch.testing.assert_close(again(x, t, again.tokens(c, "text")), out)
 
 
 def test_the_token_reaches_the_output_through_the_time_embedding_alone():

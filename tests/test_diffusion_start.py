@@ -42,7 +42,7 @@ def same(a, b) -> bool:
     )
 
 
-def test_it_begins_with_the_weights_of_the_other_and_leaves_those_alone(tmp_path):
+def test_it_begins_with_the_given_weights_and_leaves_those_alone(tmp_path):
     start = make_pipeline().denoiser
     kept = [p.clone() for p in start.unet.parameters()]
     assert same(train(tmp_path / "a", 0, start), start)
@@ -55,7 +55,7 @@ def test_it_begins_with_the_weights_of_the_other_and_leaves_those_alone(tmp_path
     assert same(train(tmp_path / "d", 2, start), moved)
 
 
-def test_another_geometry_is_refused(tmp_path):
+def test_another_geometry_is_rejected(tmp_path):
     start = make_pipeline().denoiser
     with pytest.raises(PalpateError, match="geometry of the preset"):
         train(
@@ -75,7 +75,7 @@ def test_a_learned_unconditional_token_goes_along(tmp_path):
     assert torch.equal(made.null, start.null)
 
 
-def test_other_encoders_autoencoders_and_schedules_are_refused(small_manifest, tmp_path):
+def test_other_encoders_autoencoders_and_schedules_are_rejected(small_manifest, tmp_path):
     encoders = make_encoders()
     start = replace(make_pipeline(width=encoders.dim), encoders=EncoderSet(encoders.clip))
     manifest = Manifest(small_manifest.table, small_manifest.root, {"synthetic": "yes"})

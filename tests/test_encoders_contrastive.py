@@ -134,7 +134,7 @@ def test_bad_weights(weights):
         three_way(a, a, a, 1.0, weights=weights)
 
 
-def test_gradient_goes_to_the_touch_encoder_and_the_temperature_only(world):
+def test_gradient_goes_to_the_tactile_encoder_and_the_temperature_only(world):
     clip = new_clip(TINY, world.column("text"), seed=0)
     model = TactileModel(new_tactile(TINY.tactile_config(clip.dim), seed=1))
     text = clip.encode_text(world.column("text")[:6])
@@ -193,7 +193,7 @@ def clip(world, tmp_path_factory):
     return train_clip(world, by_video(world), TINY, tmp_path_factory.mktemp("clip"), device="cpu")
 
 
-def test_training_moves_touch_alone_and_says_what_it_used(world, clip, tmp_path):
+def test_training_moves_the_tactile_encoder_alone_and_records_its_data(world, clip, tmp_path):
     split = by_video(world)
     before = clip.digest("vision"), clip.digest("text")
     encoders = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu")
@@ -226,46 +226,26 @@ def test_training_moves_touch_alone_and_says_what_it_used(world, clip, tmp_path)
     assert again.digest("tactile") == encoders.digest("tactile")
 
 
-def test_training_depends_on_the_seed_alone_and_resumes(world, clip, tmp_path):
+def test_training_depends_on_the_seed_and_the_train_part_alone(world, clip, tmp_path):
     split = by_video(world)
-    digest = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
-        "tactile"
-    )
-    torch.manual_seed(99)
 
-    def stop(what, done, total, remark=""):
-        if what == "training the tactile encoder" and done == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_tactile(
-            world,
-            split,
-            clip,
-            quick(),
-            tmp_path / "b",
-            device="cpu",
-            progress=stop,
-            cache=tmp_path / "cache",
-        )
-    assert (
-        train_tactile(
-            world, split, clip, quick(), tmp_path / "b", device="cpu", cache=tmp_path / "cache"
-        ).digest("tactile")
-        == digest
-    )
-    assert (
-        train_tactile(world, split, clip, quick(), tmp_path / "b", device="cpu", seed=1).digest(
+    def digest(name, manifest=world, **change):
+        options = {"device": "cpu", **change}
+        return train_tactile(manifest, split, clip, quick(), tmp_path / name, **options).digest(
             "tactile"
         )
-        != digest
-    )
-    assert (
-        train_tactile(
-            world, split, clip, quick(), tmp_path / "c", device="cpu", targets="diagonal"
-        ).digest("tactile")
-        != digest
-    )
+
+    base = digest("a")
+    torch.manual_seed(99)
+    state = torch.get_rng_state()
+    rows = world.table.to_dicts()
+    for row in rows:
+        if split.parts[row["id"]] == "test":
+            row.update(tactile="absent.png", vision="absent.png", text="other words")
+    assert digest("b", Manifest.from_rows(rows, world.root), cache=tmp_path / "cache") == base
+    assert torch.equal(torch.get_rng_state(), state)
+    assert digest("b", seed=1) != base
+    assert digest("c", targets="diagonal") != base
 
 
 def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
@@ -290,31 +270,6 @@ def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
         )
 
 
-def test_test_side_is_never_read(world, clip, tmp_path):
-    """The same train part with other test samples, even missing files, gives the same encoder."""
-    split = by_video(world)
-    digest = train_tactile(world, split, clip, quick(), tmp_path / "a", device="cpu").digest(
-        "tactile"
-    )
-    rows = world.table.to_dicts()
-    for row in rows:
-        if split.parts[row["id"]] == "test":
-            row.update(tactile="absent.png", vision="absent.png", text="other words")
-    other = Manifest.from_rows(rows, world.root)
-    assert (
-        train_tactile(other, split, clip, quick(), tmp_path / "b", device="cpu").digest("tactile")
-        == digest
-    )
-
-
-def test_global_random_state_is_left_alone(world, tmp_path):
-    torch.manual_seed(7)
-    state = torch.get_rng_state()
-    clip = train_clip(world, by_video(world), TINY, tmp_path / "clip", device="cpu")
-    train_tactile(world, by_video(world), clip, quick(), tmp_path / "tactile", device="cpu")
-    assert torch.equal(torch.get_rng_state(), state)
-
-
 def test_fresh_clip_learns(world, tmp_path):
     course = replace(TINY.clip_course, epochs=40.0, batch=18, lr=1e-2)
     clip = train_clip(
@@ -325,49 +280,29 @@ def test_fresh_clip_learns(world, tmp_path):
     assert not any(p.requires_grad for p in clip.model.parameters())
 
 
-def test_refusals(world, clip, tmp_path):
-    empty = Split.from_ids(test=world.ids)
-    with pytest.raises(PalpateError, match="train part"):
-        train_tactile(world, empty, clip, TINY, tmp_path, device="cpu")
-    with pytest.raises(PalpateError, match="train part"):
-        train_clip(world, empty, TINY, tmp_path, device="cpu")
-    rows = world.table.to_dicts()
-    rows[2]["tactile"] = None
-    with pytest.raises(PalpateError, match=r"tactile image.*v0/2"):
-        train_tactile(
-            Manifest.from_rows(rows, world.root),
-            by_video(world),
-            clip,
-            TINY,
-            tmp_path,
-            device="cpu",
-        )
-    rows[2].update(tactile="gone.png")
-    with pytest.raises(PalpateError, match="1 bad-image"):
-        train_tactile(
-            Manifest.from_rows(rows, world.root),
-            by_video(world),
-            clip,
-            TINY,
-            tmp_path,
-            device="cpu",
-        )
-    rows[2].update(tactile=rows[1]["tactile"], text=None, material=None)
-    with pytest.raises(PalpateError, match=r"text or a material.*v0/2"):
-        train_tactile(
-            Manifest.from_rows(rows, world.root),
-            by_video(world),
-            clip,
-            TINY,
-            tmp_path,
-            device="cpu",
-        )
-    with pytest.raises(PalpateError, match=r"1 that are not, first .nobody"):
-        train_tactile(world, Split.from_ids(train=["nobody"]), clip, TINY, tmp_path, device="cpu")
-    with pytest.raises(PalpateError, match="fresh CLIP"):
+def test_mistakes_are_explained(world, clip, tmp_path):
+    def train(rows=None, split=None, **options):
+        manifest = world if rows is None else Manifest.from_rows(rows, world.root)
+        options = {"device": "cpu", **options}
+        train_tactile(manifest, split or by_video(world), clip, TINY, tmp_path, **options)
+
+    def changed(**change):
+        rows = world.table.to_dicts()
+        rows[2].update(change)
+        return rows
+
+    for options, message in (
+        ({"split": Split.from_ids(test=world.ids)}, "train part"),
+        ({"split": Split.from_ids(train=["nobody"])}, r"1 that are not, first .nobody"),
+        ({"rows": changed(tactile=None)}, r"tactile image.*v0/2"),
+        ({"rows": changed(tactile="gone.png")}, "1 bad-image"),
+        ({"rows": changed(text=None, material=None)}, r"text or a material.*v0/2"),
+        ({"device": "abacus"}, "`device` must be auto"),
+    ):
+        with pytest.raises(PalpateError, match=message):
+            train(**options)
+    with pytest.raises(PalpateError, match="must describe a fresh CLIP"):
         train_clip(world, by_video(world), preset("paper"), tmp_path, device="cpu")
-    with pytest.raises(PalpateError, match="device"):
-        train_tactile(world, by_video(world), clip, TINY, tmp_path, device="abacus")
 
 
 def test_paper_preset_is_the_paper():

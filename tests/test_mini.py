@@ -32,7 +32,7 @@ from palpate.encoders.models import (
 from palpate.training.cards import model_card, write_model_cards
 
 MINI = shipped_root() / "mini"
-needs_mini = pytest.mark.skipif(not MINI.is_dir(), reason="no models in src/palpate/mini yet")
+LOADERS = [load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.from_pretrained]
 
 
 @pytest.fixture
@@ -92,19 +92,16 @@ def test_a_folder_of_the_same_name_does_not_shadow_what_ships(mini):
         assert EncoderSet.load(own).digest("tactile") == here.digest("tactile")
 
 
-@pytest.mark.parametrize(
-    "load", [load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.from_pretrained]
-)
-def test_names_that_mean_nothing_are_told(mini, load, no_network):
+@pytest.mark.parametrize("load", LOADERS)
+def test_names_of_no_model_are_explained(mini, load, no_network):
+    message = r"must be one of palpate/mini\. Got 'palpate/.*folder .* is written \./palpate"
     for name in ("palpate/maxi", "palpate/", "palpate/mini/", "palpate/mini/../mini"):
-        with pytest.raises(
-            PalpateError,
-            match=r"must be one of palpate/mini\. Got 'palpate/.*folder .* is written \./palpate",
-        ):
+        with pytest.raises(PalpateError, match=message):
             load(name)
-    for name in ("no-such", "a/b/c", "../x"):
-        with pytest.raises(PalpateError):
+    for name in ("no-such", "a/b/c", "../x", "", "./palpate/mini"):
+        with pytest.raises(PalpateError) as error:
             load(name)
+        assert error.value.got == f"no folder {name or repr('')}"
     assert no_network == []
 
 
@@ -119,24 +116,10 @@ def test_an_installation_without_the_files_says_so(tmp_path, monkeypatch):
 def test_what_may_be_asked_of_the_hub(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "owner" / "local").mkdir(parents=True)
-    names = ("owner/name", "openai/clip-vit-large-patch14", "a.b/c_d-1.0")
-    assert [n for n in names if is_hub_id(n)] == list(names)
-    assert not any(
-        map(
-            is_hub_id,
-            (
-                "owner/local",
-                "palpate/mini",
-                "name",
-                "a/b/c",
-                "../a",
-                "/a/b",
-                "./a/b",
-                "",
-                Path("owner/name"),
-            ),
-        )
-    )
+    for name in ("owner/name", "openai/clip-vit-large-patch14", "a.b/c_d-1.0"):
+        assert is_hub_id(name)
+    others = ("owner/local", "palpate/mini", "name", "a/b/c", "../a", "/a/b", "./a/b", "")
+    assert not any(map(is_hub_id, (*others, Path("owner/name"))))
     assert shipped_folder(Path("palpate/mini"), "clip") is None
 
 
@@ -161,7 +144,7 @@ def test_a_hub_id_works_like_a_folder(mini, tmp_path, monkeypatch):
 
 
 def test_a_hub_out_of_reach_is_a_mistake_in_one_line(monkeypatch, no_network):
-    for load in (load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.from_pretrained):
+    for load in LOADERS:
         with pytest.raises(
             PalpateError,
             match=r"o/none must be a hub id within reach, a local folder or a shipped model",
@@ -208,14 +191,6 @@ def test_half_is_rounded_first_and_read_back_to_the_same_digest(tmp_path):
         stored["quantize.embedding.weight"].float(), model.vq.quantize.embedding.weight
     )
     assert model.halve() == 0  # rounded once is rounded for good
-
-
-def test_a_whole_pipeline_in_half(tmp_path):
-    pipeline = replace(make_pipeline(), encoders=None)
-    before = pipeline.digest  # kept by the object: must not outlive the rounding
-    pipeline.save(tmp_path / "p", half=True)
-    assert TactilePipeline.from_pretrained(tmp_path / "p").digest == pipeline.digest != before
-    assert {v.dtype for v in weights(tmp_path / "p" / "unet").values()} == {torch.float16}
 
 
 def test_rounding_is_measured_and_refused_where_it_makes_infinity():
@@ -271,14 +246,6 @@ def test_a_generator_that_refers_carries_no_copies_and_checks_what_it_finds(
     (folder / "palpate.json").write_text(json.dumps(about | {"shared": "../../encoders"}))
     with pytest.raises(PalpateError, match="`shared` must be one of palpate/mini"):
         TactilePipeline.from_pretrained("palpate/mini")
-
-
-def test_changed_clip_weights_are_noticed(mini):
-    note = shipped_folder("palpate/mini", "clip") / "palpate.json"
-    about = json.loads(note.read_text())
-    note.write_text(json.dumps(about | {"digests": about["digests"] | {"text": "0" * 64}}))
-    with pytest.raises(PalpateError, match=r"text encoder in .* must match its digest"):
-        load_clip("palpate/mini")
 
 
 def test_a_card_is_made_of_the_json_alone(mini):
@@ -358,7 +325,6 @@ def size(folder: Path) -> int:
     return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
 
 
-@needs_mini
 def test_what_ships_is_small_enough_complete_and_16_bit():
     assert set(SHIPPED) == {"palpate/mini"}
     assert all((MINI / place / "palpate.json").is_file() for place in PARTS.values())
@@ -372,7 +338,6 @@ def test_what_ships_is_small_enough_complete_and_16_bit():
         }
 
 
-@needs_mini
 def test_what_ships_loads_and_answers_without_a_network(no_network):
     encoders, pipeline = (
         EncoderSet.load("palpate/mini"),
@@ -386,7 +351,6 @@ def test_what_ships_loads_and_answers_without_a_network(no_network):
     assert no_network == []
 
 
-@needs_mini
 @pytest.mark.parametrize("place", sorted(set(PARTS.values())))
 def test_the_cards_of_what_ships_are_whole_and_current(place):
     about = json.loads((MINI / place / "palpate.json").read_text())
@@ -397,7 +361,6 @@ def test_the_cards_of_what_ships_are_whole_and_current(place):
 
 
 @pytest.mark.slow
-@needs_mini
 def test_a_fresh_process_with_the_hub_switched_off(tmp_path):
     code = (
         "import socket\n"
@@ -441,14 +404,3 @@ def test_equal_encoders_are_equal_files(half, tmp_path):
     other.save(tmp_path / "c")
     made.save(tmp_path / "d")
     assert digest_folder(tmp_path / "c") == digest_folder(tmp_path / "d")
-
-
-@pytest.mark.parametrize(
-    "load", [load_clip, EncoderSet.load, Autoencoder.load, TactilePipeline.from_pretrained]
-)
-@pytest.mark.parametrize("name", ["", "./palpate/mini"])
-def test_names_of_no_folder_are_told_as_such(load, name, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(PalpateError) as error:
-        load(name)
-    assert error.value.got == f"no folder {name or repr('')}"
