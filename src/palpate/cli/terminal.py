@@ -59,6 +59,7 @@ RENAMED: dict[tuple[str, str], str] = {
     ("", "--encoders"): "--encoder",
     ("train generator", "--encoders"): "--clip",
     ("train generator", "--towers"): "--clip",
+    ("train generator", "--encoder"): "--clip",
     ("split", "--group"): "--by",
     ("generate", "--manifest"): "a positional argument: palpate generate tag/ --split noleak.json",
     ("audit", "--group"): "--by",
