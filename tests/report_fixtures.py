@@ -165,7 +165,10 @@ def impact():
         ),
         ImpactRow("tactile minus background", "1-NN", 0.61, 0.401, 0.209, None, None, None, 0.0526),
     ]
-    headline = "A 1-NN on tactile pixels reaches 71.4 % under this split and 38.2 % without the leak: it costs 33.2 points [26.2, 40.1]."
+    headline = (
+        "A 1-NN on tactile pixels reaches 71.4 % under this split and 38.2 % without the leak: it "
+        "costs 33.2 points [26.2, 40.1]."
+    )
     return Impact(
         rows,
         headline,

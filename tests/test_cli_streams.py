@@ -1,4 +1,4 @@
-"""Standard streams that end, are closed, are full or know few letters: they change neither the exit status nor what is written to files."""
+"""Streams that end, are closed, full or lack letters change neither exit status nor files."""
 
 import json
 import os
@@ -53,7 +53,7 @@ def unread():
 
 
 def palpate(*args, closed=None, **how):
-    """The finished process; ``closed`` is a stream that the shell closes before the start. Streams are buffered, as they are for a user."""
+    """Run a process; ``closed`` is a stream that the shell closes before the start."""
     env = {
         name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"
     } | how.pop("env", {})
@@ -98,7 +98,7 @@ def test_streams_that_are_closed_leave_status_and_files(here):
     "args",
     [(*SCORE, "-o", "o.json"), (*SCORE, "-o", "o.json", "--json"), (*NOPE, "--json"), ("--help",)],
 )
-def test_a_full_disk_behind_standard_output_is_told_and_the_file_is_written(here, args):
+def test_a_full_disk_behind_standard_output_is_an_error_and_the_file_is_written(here, args):
     with open("/dev/full", "w") as full:
         done = palpate(*args, stdout=full, stderr=subprocess.PIPE, text=True)
     assert (
@@ -127,15 +127,15 @@ def test_letters_that_a_stream_lacks_are_question_marks_and_json_stays_whole(her
 
 
 class Plain:
-    """A stream that somebody put in the place of standard output: neither a coding nor a file."""
+    """A stream in place of standard output, with neither an encoding nor a file."""
 
     def __init__(self, error=None):
-        self.said, self.error = "", error
+        self.text, self.error = "", error
 
     def write(self, text):
         if self.error is not None:
             raise self.error
-        self.said += text
+        self.text += text
 
     def flush(self):
         pass
@@ -148,7 +148,7 @@ def test_a_stream_need_not_be_a_file(monkeypatch, capsys):
     out = Plain()
     monkeypatch.setattr("sys.stdout", out)
     assert main(["score", "--generated", "nope.npy", "--reference", "nope.npy", "--json"]) == 2
-    assert json.loads(out.said)["must"]
+    assert json.loads(out.text)["must"]
     monkeypatch.setattr("sys.stdout", Plain(OSError(5, "Input/output error")))
     assert main(["--help"]) == 2
     assert "Got Input/output error" in capsys.readouterr().err

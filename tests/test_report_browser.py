@@ -1,199 +1,93 @@
-"""The page in a real browser, from disk: no request, no console message, every picture decoded, nothing wider than the window.
+"""The page in a browser, from disk: no request, no message, every image decoded, no overflow.
 
-Screenshots are kept in ``$PALPATE_ARTIFACTS`` (default ``artifacts/``). The browser is Debian's chromium, or ``$PALPATE_CHROMIUM``.
+Screenshots are kept in ``$PALPATE_ARTIFACTS`` (default ``artifacts/``). The browser is Debian's
+chromium, or ``$PALPATE_CHROMIUM``.
 """
 
+import dataclasses
 import os
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from palpate.core import Note, SampleRef, Score
+from palpate.core import SampleRef
 from palpate.report import write_report
-from palpate.report.results import Audit, GalleryItem, LeakPair, Results
-from report_fixtures import clean_audit, full_audit, images, pretraining_audit
+from palpate.report.results import GalleryItem, LeakPair, Results
+from report_fixtures import (
+    clean_audit,
+    difference,
+    full_audit,
+    full_results,
+    images,
+    pretraining_audit,
+    score,
+    small_audit,
+    text_note,
+)
 
 LONG = "a_recording_with_a_name_that_no_line_of_a_phone_can_hold_2024_11_21_rig_b"
 
 pytestmark = pytest.mark.browser
 
 
-def touch(rng, kind, side):
-    """A gel with a soft light and a relief of one of three kinds; (side, side, 3) uint8."""
-    y, x = np.mgrid[0:side, 0:side] / side
-    phase = rng.uniform(0, 6)
-    relief = (
-        np.sin(40 * x + phase),
-        np.sin(25 * x + phase) * np.sin(25 * y),
-        np.cos(60 * np.hypot(x - 0.5, y - 0.5) + phase),
-    )[kind]
-    light = np.stack([0.6 - 0.3 * y, 0.5 + 0.1 * x, 0.45 + 0.3 * y], axis=-1)
-    return (
-        (
-            255
-            * (
-                light
-                + 0.12 * relief[..., None] * np.array([1, -0.4, -1])
-                + rng.normal(0, 0.01, (side, side, 3))
-            )
-        )
-        .clip(0, 255)
-        .astype(np.uint8)
-    )
-
-
-def forged(folder):
-    """Results that use everything a page can hold, long names and undefined values among it."""
-    rng = np.random.default_rng(0)
-    materials = ("wood", "gravel", "synthetic fabric")
-    gallery = []
-    for k in range(48):
-        kind, side = k % 3, 64 if k % 2 else 200
-        names = [f"{what}{k}.png" for what in ("photo", "touch", "made")]
-        for name in names:
-            Image.fromarray(touch(rng, kind, side)).save(folder / name)
-        sample = SampleRef(
-            f"{LONG}/{k}",
-            LONG if k == 0 else f"video{k % 5}",
-            10 * k,
-            materials[kind],
-            names[0],
-            names[1],
-        )
-        gallery.append(GalleryItem(sample, names[2], names[1] if k == 3 else None))
-    gallery.append(
-        GalleryItem(SampleRef("lost", material="wood", vision=f"{LONG}/{LONG}.png"), "absent.png")
-    )
-    pairs = [
-        LeakPair(a.sample, b.sample, 3 * k + 1) for k, (a, b) in enumerate(pairwise(gallery[:9]))
+def long_results(folder):
+    """Results with every section, long names and undefined values."""
+    results = full_results(folder, 48, 200)
+    lost = SampleRef("lost", LONG, 3, material="wood", vision=f"{LONG}/{LONG}.png")
+    gallery = [*results.gallery, GalleryItem(lost, "absent.png")]
+    gallery[3] = dataclasses.replace(gallery[3], background=gallery[3].generated)
+    shown = [item.sample for item in gallery[:9]]
+    pairs = [LeakPair(a, b, 3 * k + 1) for k, (a, b) in enumerate(pairwise(shown))]
+    scores = [
+        score(metric, subject, notes=(text_note(LONG),), split="5b" * 32)
+        for metric in ("TMMD", "I-TMMD", "CI-TMMD")
+        for subject in ("generated", "real", f"baseline {LONG}")
     ]
-    rows = [
-        {"material": m, "train": 900, "test": 90, "groups_train": 9, "groups_test": 3}
-        for m in materials
-    ]
-    audits = [
-        Audit(
-            "Orig",
-            "video",
-            91982,
-            29879,
-            120,
-            106,
-            100,
-            29597,
-            29597 / 29879,
-            0,
-            31,
-            304.0,
-            2485,
-            [0, 30, 90, 300, 900, 2500],
-            [0, 2400, 12080, 13002, 2115],
-            pairs,
-            rows,
-            [Note("text", {"text": "One remark."})],
-            "9f" * 32,
-        ),
-        Audit(
-            "NoLeak", "video", 97000, 24000, 101, 25, 0, 0, 0.0, 0, materials=rows, split="5b" * 32
-        ),
-    ]
-    common = {
-        "estimator": "grouped",
-        "bandwidth": 10.0,
-        "scale": 1000.0,
-        "encoder": "ab" * 32,
-        "split": "5b" * 32,
-        "n": 24000,
-    }
-    scores = []
-    for k, metric in enumerate(("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD")):
-        for subject, value in {"generated": 1.4 + k, "real": 0.05, f"baseline {LONG}": 2.9}.items():
-            scores.append(
-                Score(
-                    metric,
-                    subject,
-                    value,
-                    (0.8 * value, 1.2 * value),
-                    null=(-0.05, 0.06),
-                    floor=0.05,
-                    note=LONG,
-                    **common,
-                )
-            )
-    matrix = rng.uniform(0, 3, (18, 18)).tolist()
-    scores.append(
-        Score(
-            "D-TMMD",
-            "background",
-            None,
-            note="Undefined: one picture.",
-            details={"matrix": matrix},
-            **common,
-        )
-    )
-    scores.append(
-        Score(
-            "SSIM",
-            "generated",
-            0.49,
-            (0.47, 0.51),
-            higher_is_better=True,
-            settings={"path": f"/{LONG}/{LONG}"},
-        )
-    )
-    settings = {
-        "data": {
-            "root": f"/data/{LONG}/{LONG}",
-            "digest": "cd" * 32,
-            "split": {"seed": 0, "rule": {"group": "video"}},
-        },
-        LONG: [LONG] * 40,
-    }
-    facts = [
-        "99.06 % of the test frames come from a video that train holds as well.",
-        f"A fact about {LONG}.",
-        "Real touch scores 0.05.",
-    ]
-    return Results(
-        f"Touch from sight, {LONG}",
-        facts,
-        audits,
-        scores,
-        gallery,
-        settings,
-        [Note("text", {"text": "Synthetic data."})],
-        [f"palpate audit {LONG} --out {LONG}"],
+    matrix = np.random.default_rng(0).uniform(0, 3, (18, 18)).tolist()
+    details = {"matrix": matrix}
+    scores.append(score("D-TMMD", "background", None, details=details, split="5b" * 32))
+    scores.append(difference("generated", LONG, split="5b" * 32))
+    scores.append(score("SSIM", "generated", 0.49, settings={"path": f"/{LONG}/{LONG}"}))
+    settings = {"data": {"root": f"/data/{LONG}/{LONG}", "digest": "cd" * 32}, LONG: [LONG] * 40}
+    return dataclasses.replace(
+        results,
+        title=f"Touch from sight, {LONG}",
+        facts=["99.06 % of the test frames leak.", f"A fact about {LONG}.", "Real: 0.05."],
+        audits=[small_audit(pairs), small_audit(name="NoLeak", leaked_fraction=0.0, gap_counts=())],
+        scores=scores,
+        gallery=gallery,
+        settings=settings,
+        commands=[f"palpate audit {LONG} -o {LONG}"],
     )
 
 
 @pytest.fixture(scope="module")
 def page_file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
-    return write_report(forged(folder), folder / "page.html").page
+    return write_report(long_results(folder), folder / "page.html").page
 
 
 def opened(chromium, file, width, scheme):
-    """The page, the folder for screenshots, and lists that fill with what the page says and asks for."""
+    """The page, the folder of screenshots, and lists that fill with its messages and requests."""
     artifacts = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
     artifacts.mkdir(parents=True, exist_ok=True)
     page = chromium.new_context(
         viewport={"width": width, "height": 900}, color_scheme=scheme
     ).new_page()
-    said, asked = [], []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
+    messages, requests = [], []
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
     page.goto(file.as_uri())
-    return page, artifacts, said, asked
+    return page, artifacts, messages, requests
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 360])
 def test_page_in_chromium(chromium, page_file, width, scheme):
-    page, artifacts, said, asked = opened(chromium, page_file, width, scheme)
+    page, artifacts, messages, requests = opened(chromium, page_file, width, scheme)
     for state in ("folded", "open"):
         if state == "open":
             page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
@@ -208,9 +102,11 @@ def test_page_in_chromium(chromium, page_file, width, scheme):
     page.context.close()
     assert len(pictures) == 48 * 3 + 1 + 8 * 4
     assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in pictures)
-    assert [url for url in asked if url != page_file.as_uri() and not url.startswith("data:")] == []
-    assert page_file.as_uri() in asked
-    assert said == []
+    assert [
+        url for url in requests if url != page_file.as_uri() and not url.startswith("data:")
+    ] == []
+    assert page_file.as_uri() in requests
+    assert messages == []
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +127,7 @@ def audit_page(tmp_path_factory):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 360])
 def test_audits_in_chromium(chromium, audit_page, width, scheme):
-    page, artifacts, said, asked = opened(chromium, audit_page, width, scheme)
+    page, artifacts, messages, requests = opened(chromium, audit_page, width, scheme)
     page.screenshot(path=artifacts / f"audits-{width}-{scheme}.png", full_page=True)
     page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
@@ -248,9 +144,7 @@ def test_audits_in_chromium(chromium, audit_page, width, scheme):
         return boxes.every((a, k) => boxes.every((b, j) => j <= k || a.right <= b.left || b.right <= a.left || a.bottom - 2 <= b.top || b.bottom - 2 <= a.top));
     })"""
     assert page.evaluate(apart) == [True] * 6  # no label lies on another
-    if (
-        width == 360
-    ):  # the tables of signals and of the cost are read downwards; nothing of them, nor of the matrix, is cut off
+    if width == 360:  # nothing of the tables of signals and costs nor of the matrix is cut off
         assert page.evaluate(
             "[...document.querySelectorAll('.stack, .matrix')].every(t => t.scrollWidth <= t.parentElement.clientWidth)"
         )
@@ -266,9 +160,9 @@ def test_audits_in_chromium(chromium, audit_page, width, scheme):
     page.context.close()
     assert roles
     assert [
-        url for url in asked if url != audit_page.as_uri() and not url.startswith("data:")
+        url for url in requests if url != audit_page.as_uri() and not url.startswith("data:")
     ] == []
-    assert said == []
+    assert messages == []
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -299,7 +193,7 @@ def luminance(color):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_has_the_contrast_that_wcag_asks_for(chromium, page_file, scheme):
+def test_text_has_the_contrast_of_wcag(chromium, page_file, scheme):
     context = chromium.new_context(color_scheme=scheme)
     page = context.new_page()
     page.goto(page_file.as_uri())

@@ -3,15 +3,18 @@
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from palpate.core import Note
+from palpate.report import notes
 from palpate.report.latex import LONG, escape
 from palpate.report.results import Results
-from palpate.report.terminal import as_text
+from palpate.report.terminal import as_text, print_result
 from report_fixtures import difference, full_audit, full_results, score, text_note
 
 NASTY = r"100% & {x} $_#^~ <b> \input{a} | `c` [d]"
@@ -62,11 +65,6 @@ def test_a_narrow_terminal_cuts_no_number(results, width):
 
 
 def test_arguments_are_options_on_the_command_line_and_keywords_in_python(capsys):
-    from rich.console import Console
-
-    from palpate.report import notes
-    from palpate.report.terminal import print_result
-
     shown = Results("T", scores=[score(notes=(Note("planted", {}),))])
     notes.SENTENCES["planted"] = "Pass {arg:backend=blocked}"
     try:
@@ -75,6 +73,17 @@ def test_arguments_are_options_on_the_command_line_and_keywords_in_python(capsys
     finally:
         del notes.SENTENCES["planted"]
     assert "Pass --backend blocked" in capsys.readouterr().out
+
+
+def test_every_note_that_a_room_makes_has_a_sentence():
+    source = Path(notes.__file__).parents[1]
+    codes = {
+        code
+        for path in source.rglob("*.py")
+        for code in re.findall(r'Note\(\s*"([a-z0-9-]+)"', path.read_text(encoding="utf-8"))
+    }
+    assert len(codes) > 50
+    assert codes <= set(notes.SENTENCES)
 
 
 def test_an_audit_is_a_readable_summary():

@@ -65,9 +65,9 @@ def test_shipped_models_take_the_place_of_three_stages(mini, tmp_path):
     bound = done.stages["generator"].facts["autoencoder on test touches"]
     assert (bound["n"], bound["codes"]) == (len(done.split.ids("test")), 64)
     results = summarize(done, "palpate demo")
-    (note,) = [n for n in results.notes if "shipped with palpate (palpate/mini)" in n]
-    assert "the tactile encoder's starting weights" in note
-    assert not [n for n in results.notes if "trained in this run" in n]
+    (note,) = [n for n in results.notes if n.code == "models-shipped"]
+    assert "the starting weights of the tactile encoder" in note.params["models"]
+    assert "models-of-this-run" not in {n.code for n in results.notes}
     assert results.settings["models"] == done.models
     lines: list[str] = []
     run_pipeline(OPTIONS, tmp_path / "run", say=lines.append)
@@ -96,7 +96,7 @@ def test_from_scratch_and_the_variant_with_backgrounds_start_from_nothing(mini, 
         EncoderSet.load(tmp_path / "a" / "encoders" / "encoders").card["start_card"].get("data")
         is None
     )
-    assert any("trained in this run" in n for n in summarize(done, "x").notes)
+    assert "models-of-this-run" in {n.code for n in summarize(done, "x").notes}
     run_pipeline(replace(OPTIONS, background=True), tmp_path / "b")
     assert (
         TactilePipeline.from_pretrained(tmp_path / "b" / "generator" / "model").training["start"]

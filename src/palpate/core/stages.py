@@ -1,7 +1,8 @@
 """Run folders: a pipeline as named stages, each kept under the digest of what it read.
 
 ``run/NAME/stage.json`` marks a finished stage and holds its inputs, facts and time. A stage is
-built in ``run/NAME.partial`` and renamed when complete. Running again with the same inputs reuses
+built in ``run/NAME.partial``, its inputs next to it in ``run/NAME.partial.json``, and renamed when
+complete. Running again with the same inputs reuses
 it; with other inputs the stage, and so every stage that read it, is built again. A killed stage
 finds its partial folder again if the inputs are the same, and may resume from there.
 """
@@ -95,7 +96,7 @@ def _build(
     build: Callable[[Path], Mapping[str, Any] | None],
 ) -> Stage:
     part = final.with_name(f"{final.name}.partial")
-    begun = part / "inputs.json"
+    begun = final.with_name(f"{final.name}.partial.json")
     if _record(begun).get("digest") != digest:
         shutil.rmtree(part, ignore_errors=True)
     try:
@@ -109,14 +110,15 @@ def _build(
     try:
         facts = dict(build(part) or {})
     except PalpateError:
-        if [p.name for p in part.iterdir()] == [begun.name]:  # no work to resume from
-            shutil.rmtree(part)
+        if not any(part.iterdir()):  # no work to resume from
+            part.rmdir()
+            begun.unlink()
         raise
     seconds = round(time.monotonic() - start, 2)
     write_json(part / "stage.json", {**record, "facts": facts, "seconds": seconds})
-    begun.unlink()
     shutil.rmtree(final, ignore_errors=True)
     part.replace(final)
+    begun.unlink()
     return Stage(final, digest, facts, seconds, reused=False)
 
 

@@ -361,7 +361,41 @@ EVALUATION: dict[str, Sentence] = {
     "widened": "The features in {source}: {type} was widened to float32; its rounding stays",
     "within-bound": "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments",
 }
+
+
+def _stand_in(style: Style) -> str:
+    return (
+        "They replace the pretrained models of the paper; "
+        f"{style:clip} and {style:autoencoder} take those"
+    )
+
+
 OTHER: dict[str, Sentence] = {
+    "synthetic-data": (
+        "The data are synthetic: palpate's procedural world. It shows mechanisms (leaks, guidance, "
+        "what the metrics reward); never compare its numbers with those of real data"
+    ),
+    "models-of-this-run": lambda p, style: (
+        f"Small and trained in this run, on another synthetic world and the train part: "
+        f"{' and '.join(p['models'])}. {_stand_in(style)}"
+    ),
+    "models-shipped": lambda p, style: (
+        f"Small, shipped with palpate ({p['name']}) and trained on synthetic worlds of reserved "
+        f"seeds, none of them this data: {', '.join(p['models'])}. {_stand_in(style)}"
+    ),
+    "template-texts": (
+        "This data set has no texts: training used template texts made from the material, so text "
+        "carries no more than the label, and class-aware scores (CI- and D-TMMD, material "
+        "accuracy) favor such a generator"
+    ),
+    "gel-names-material": (
+        "The no-contact image alone names the material in {share:.0%} of the test samples, far "
+        "above chance: each video has its gel look, and the probe has learned that. Material "
+        "accuracy under this split measures the video, not the contact"
+    ),
+    "files-skipped": lambda p, _: (
+        f"{len(p['problems'])} bad rows or files were skipped: {few(p['problems'])}"
+    ),
     "text": "{text}",
     "excluded-classes": _excluded_classes,
     "nearer-to-floor": (
@@ -383,10 +417,8 @@ OTHER: dict[str, Sentence] = {
 SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | OTHER
 
 
-def sentence(note: Note | str, style: Style = PYTHON) -> str:
+def sentence(note: Note, style: Style = PYTHON) -> str:
     """Return a note in words, without a full stop at the end."""
-    if isinstance(note, str):  # until every room makes notes
-        return note
     template = SENTENCES.get(note.code)
     if template is None:  # a note of another version of palpate
         return ", ".join([note.code, *(f"{k} {v}" for k, v in note.params.items())])

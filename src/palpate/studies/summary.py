@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from palpate.core import Score, rng_for
+from palpate.core import Note, Score, rng_for
 from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.encoders.models import is_shipped
 from palpate.evaluation.controls import BACKGROUND
-from palpate.report.notes import sentence
 from palpate.report.results import Audit, GalleryItem, Results
 from palpate.studies.pipeline import PipelineOutcome
 
@@ -19,22 +18,6 @@ from palpate.studies.pipeline import PipelineOutcome
 GALLERY = 40
 #: Rows a touch: its frames look alike.
 PER_TOUCH = 2
-SYNTHETIC = (
-    "The data are synthetic: palpate's procedural world. It shows mechanisms (leaks, guidance, what the metrics reward); its numbers are never "
-    "to be compared with those of real data."
-)
-SMALL_MODELS = (
-    "Small and trained in this run, on another synthetic world and the train part: {}. They stand where pretrained models stand in the paper; "
-    "--clip and --autoencoder take those."
-)
-SHIPPED_MODELS = (
-    "Small, shipped with palpate ({}) and trained on synthetic worlds of reserved seeds, none of them this data: {}. They stand where pretrained "
-    "models stand in the paper; --clip and --autoencoder take those."
-)
-LABEL_TEXT = (
-    "This data set has no texts: training used template texts made from the material, so text carries no more than the label, and class-aware scores "
-    "(CI- and D-TMMD, material accuracy) favor such a generator."
-)
 
 
 def summarize(outcome: PipelineOutcome, command: str) -> Results:
@@ -142,33 +125,22 @@ def gallery(manifest: Manifest, generated: Generated, seed: int) -> list[Gallery
     ]
 
 
-def _notes(outcome: PipelineOutcome) -> list[str]:
-    notes: list[str] = []
-    if outcome.manifest.facts.get("synthetic"):
-        notes.append(SYNTHETIC)
-    notes += _model_notes(outcome)
-    notes += [sentence(note) + "." for note in outcome.split.notes]
+def _notes(outcome: PipelineOutcome) -> list[Note]:
+    notes = [Note("synthetic-data")] if outcome.manifest.facts.get("synthetic") else []
+    notes += [*_model_notes(outcome), *outcome.split.notes]
     if outcome.manifest.table["text"].null_count():
-        notes.append(LABEL_TEXT)
+        notes.append(Note("template-texts"))
     blank = _find(outcome.scores, "material accuracy", BACKGROUND)
-    if (
-        blank is not None
-        and blank.value is not None
-        and blank.value > 2 * float(blank.details.get("chance") or 1)
-    ):
-        notes.append(
-            f"The empty gel alone names the material in {blank.value:.0%} of the test samples, far above chance: each video has its own gel look, and the probe "
-            "has learned that. Material accuracy under this split measures the video, not the touch."
-        )
+    chance = float(blank.details.get("chance") or 1) if blank is not None else 1.0
+    if blank is not None and blank.value is not None and blank.value > 2 * chance:
+        notes.append(Note("gel-names-material", {"share": blank.value}))
     if skipped := outcome.stages["data"].facts.get("skipped"):
-        notes.append(
-            f"{len(skipped)} bad rows or files were skipped: {'; '.join(skipped[:5])}{' ...' if len(skipped) > 5 else ''}"
-        )
+        notes.append(Note("files-skipped", {"problems": skipped}))
     return notes
 
 
-def _model_notes(outcome: PipelineOutcome) -> list[str]:
-    """Which of the models are small stand-ins, and what they saw."""
+def _model_notes(outcome: PipelineOutcome) -> list[Note]:
+    """Which of the models are small stand-ins, and what they have seen."""
     roles = {"clip": "the frozen vision and text encoders", "autoencoder": "the frozen autoencoder"}
     trained = [what for role, what in roles.items() if outcome.models[role] is None]
     by_name: dict[str, list[str]] = {}
@@ -176,11 +148,9 @@ def _model_notes(outcome: PipelineOutcome) -> list[str]:
         if (name := outcome.models[role]) and is_shipped(name):
             by_name.setdefault(name, []).append(what)
             if role == "clip":
-                by_name[name].append(
-                    "the tactile encoder's starting weights, which were then trained on the train part"
-                )
-    shipped = [SHIPPED_MODELS.format(name, ", ".join(what)) for name, what in by_name.items()]
-    return ([SMALL_MODELS.format(" and ".join(trained))] if trained else []) + shipped
+                by_name[name].append("the starting weights of the tactile encoder")
+    notes = [Note("models-of-this-run", {"models": trained})] if trained else []
+    return notes + [Note("models-shipped", {"name": n, "models": m}) for n, m in by_name.items()]
 
 
 def _next_steps(outcome: PipelineOutcome) -> list[str]:
