@@ -6,6 +6,7 @@ chromium, or ``$PALPATE_CHROMIUM``.
 
 import dataclasses
 import os
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
@@ -63,126 +64,123 @@ def long_results(folder):
     )
 
 
+OVERFLOW = """document.documentElement.scrollWidth > window.innerWidth
+    || [...document.body.children].some(e => e.getBoundingClientRect().right > window.innerWidth)"""
+#: Whether each histogram holds all of its parts, and whether no label lies on another.
+INSIDE = """[...document.querySelectorAll('svg.histogram')].map(s => {
+    const box = s.getBoundingClientRect();
+    return [...s.querySelectorAll('text, rect, line')].every(e => {
+        const b = e.getBoundingClientRect();
+        return b.left >= box.left - 0.5 && b.right <= box.right + 0.5
+            && b.top >= box.top - 0.5 && b.bottom <= box.bottom + 0.5;
+    });
+})"""
+APART = """[...document.querySelectorAll('svg.histogram')].map(s => {
+    const boxes = [...s.querySelectorAll('text')].map(e => e.getBoundingClientRect());
+    const above = (a, b) => a.bottom - 2 <= b.top, left = (a, b) => a.right <= b.left;
+    return boxes.every((a, k) => boxes.every((b, j) =>
+        j <= k || left(a, b) || left(b, a) || above(a, b) || above(b, a)));
+})"""
+UNCUT = """[...document.querySelectorAll('.stack, .matrix')]
+    .every(t => t.scrollWidth <= t.parentElement.clientWidth)"""
+ROLES = """[...document.querySelectorAll('.stack tbody td')]
+    .every(e => e.getAttribute('role') === 'cell')"""
+#: Colors of shaded cells and drawings, and of all text, on what is behind them.
+DRAWN = """[...document.querySelectorAll('.matrix td, svg.histogram text')].map(e => {
+    const options = {willReadFrequently: true};
+    const canvas = document.createElement('canvas').getContext('2d', options);
+    const rgb = color => {
+        canvas.fillStyle = color;
+        canvas.fillRect(0, 0, 1, 1);
+        return `rgb(${canvas.getImageData(0, 0, 1, 1).data.slice(0, 3)})`;
+    };
+    const style = getComputedStyle(e), text = e.closest('svg') !== null;
+    const paper = getComputedStyle(document.body).backgroundColor;
+    const clear = text || style.backgroundColor === 'rgba(0, 0, 0, 0)';
+    return rgb(text ? style.fill : style.color) + '|' + rgb(clear ? paper : style.backgroundColor);
+})"""
+WRITTEN = """[...document.querySelectorAll('main *, header *, footer *')]
+    .filter(e => [...e.childNodes].some(n => n.nodeType === 3 && n.data.trim()))
+    .filter(e => !e.closest('svg, .heat'))
+    .map(e => {
+        const color = e => getComputedStyle(e).backgroundColor;
+        let b = e;
+        while (b && color(b) === 'rgba(0, 0, 0, 0)') b = b.parentElement;
+        return getComputedStyle(e).color + '|' + color(b ?? document.body);
+    })"""
+FOLDED = """[...document.querySelectorAll('details:not([open]) img')]
+    .map(i => i.getBoundingClientRect().width > 0 && i.checkVisibility())"""
+FOCUS = (
+    """[document.activeElement.tagName, document.activeElement.getAttribute('aria-label') ?? '']"""
+)
+UNFOLD = "document.querySelectorAll('details').forEach(d => { d.open = true })"
+
+
 @pytest.fixture(scope="module")
 def page_file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     return write_report(long_results(folder), folder / "page.html").page
 
 
-def opened(chromium, file, width, scheme):
-    """The page, the folder of screenshots, and lists that fill with its messages and requests."""
-    artifacts = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
-    artifacts.mkdir(parents=True, exist_ok=True)
-    page = chromium.new_context(
-        viewport={"width": width, "height": 900}, color_scheme=scheme
-    ).new_page()
+@pytest.fixture(scope="module")
+def audit_page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("audits")
+    names = images(folder, 16)
+    row = {"group": LONG, "train": 91982, "val": 12000, "test": 29879, "leaking": 29879}
+    long = full_audit(names, name=LONG, matrix=[row])
+    audits = [full_audit(names), clean_audit(), pretraining_audit(names), long]
+    return write_report(Results("Audits", audits=audits), folder / "page.html").page
+
+
+@contextmanager
+def opened(chromium, file, width=1280, scheme="light"):
+    """The page; it must neither request anything else nor print a message."""
+    viewport = {"width": width, "height": 900}
+    context = chromium.new_context(viewport=viewport, color_scheme=scheme)
+    page = context.new_page()
     messages, requests = [], []
     page.on("console", lambda message: messages.append(message.text))
     page.on("pageerror", lambda error: messages.append(str(error)))
     page.on("request", lambda request: requests.append(request.url))
     page.goto(file.as_uri())
-    return page, artifacts, messages, requests
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 360])
-def test_page_in_chromium(chromium, page_file, width, scheme):
-    page, artifacts, messages, requests = opened(chromium, page_file, width, scheme)
-    for state in ("folded", "open"):
-        if state == "open":
-            page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
-        page.screenshot(path=artifacts / f"page-{width}-{scheme}-{state}.png", full_page=True)
-        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), state
-        assert page.evaluate(
-            "Math.max(...[...document.body.children].map(e => e.getBoundingClientRect().right)) <= window.innerWidth"
-        )
-    pictures = page.evaluate(
-        "[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])"
-    )
-    page.context.close()
-    assert len(pictures) == 48 * 3 + 1 + 8 * 4
-    assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in pictures)
-    assert [
-        url for url in requests if url != page_file.as_uri() and not url.startswith("data:")
-    ] == []
-    assert page_file.as_uri() in requests
-    assert messages == []
-
-
-@pytest.fixture(scope="module")
-def audit_page(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("audits")
-    names = images(folder, 16)
-    long = full_audit(
-        names,
-        name=LONG,
-        matrix=[{"group": LONG, "train": 91982, "val": 12000, "test": 29879, "leaking": 29879}],
-    )
-    results = Results(
-        "Audits", audits=[full_audit(names), clean_audit(), pretraining_audit(names), long]
-    )
-    return write_report(results, folder / "page.html").page
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 360])
-def test_audits_in_chromium(chromium, audit_page, width, scheme):
-    page, artifacts, messages, requests = opened(chromium, audit_page, width, scheme)
-    page.screenshot(path=artifacts / f"audits-{width}-{scheme}.png", full_page=True)
-    page.evaluate("document.querySelectorAll('details').forEach(d => { d.open = true })")
-    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
-    inside = """[...document.querySelectorAll('svg.histogram')].map(s => {
-        const box = s.getBoundingClientRect();
-        return [...s.querySelectorAll('text, rect, line')].every(e => {
-            const b = e.getBoundingClientRect();
-            return b.left >= box.left - 0.5 && b.right <= box.right + 0.5 && b.top >= box.top - 0.5 && b.bottom <= box.bottom + 0.5;
-        });
-    })"""
-    assert page.evaluate(inside) == [True] * 6
-    apart = """[...document.querySelectorAll('svg.histogram')].map(s => {
-        const boxes = [...s.querySelectorAll('text')].map(e => e.getBoundingClientRect());
-        return boxes.every((a, k) => boxes.every((b, j) => j <= k || a.right <= b.left || b.right <= a.left || a.bottom - 2 <= b.top || b.bottom - 2 <= a.top));
-    })"""
-    assert page.evaluate(apart) == [True] * 6  # no label lies on another
-    if width == 360:  # nothing of the tables of signals and costs nor of the matrix is cut off
-        assert page.evaluate(
-            "[...document.querySelectorAll('.stack, .matrix')].every(t => t.scrollWidth <= t.parentElement.clientWidth)"
-        )
-        assert (
-            page.evaluate(
-                "getComputedStyle(document.querySelector('.stack td'), '::before').content"
-            )
-            == '"Flagged"'
-        )
-    roles = page.evaluate(
-        "[...document.querySelectorAll('.stack tbody td')].every(e => e.getAttribute('role') === 'cell')"
-    )
-    page.context.close()
-    assert roles
-    assert [
-        url for url in requests if url != audit_page.as_uri() and not url.startswith("data:")
-    ] == []
-    assert messages == []
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_shaded_counts_and_drawings_can_be_read(chromium, audit_page, scheme):
-    context = chromium.new_context(color_scheme=scheme)
-    page = context.new_page()
-    page.goto(audit_page.as_uri())
-    pairs = page.evaluate("""[...document.querySelectorAll('.matrix td, svg.histogram text')].map(e => {
-        const canvas = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
-        const rgb = color => { canvas.fillStyle = color; canvas.fillRect(0, 0, 1, 1); return `rgb(${canvas.getImageData(0, 0, 1, 1).data.slice(0, 3)})`; };
-        const style = getComputedStyle(e), text = e.closest('svg') !== null;
-        const paper = getComputedStyle(document.body).backgroundColor;
-        const clear = text || style.backgroundColor === 'rgba(0, 0, 0, 0)';
-        return rgb(text ? style.fill : style.color) + '|' + rgb(clear ? paper : style.backgroundColor);
-    })""")
+    yield page
     context.close()
-    assert len(pairs) > 100
-    for pair in set(pairs):
-        a, b = sorted((luminance(c) for c in pair.split("|")), reverse=True)
-        assert (a + 0.05) / (b + 0.05) >= 4.5, pair
+    assert {url for url in requests if not url.startswith("data:")} == {file.as_uri()}
+    assert messages == []
+
+
+def screenshot(page, name):
+    folder = Path(os.environ.get("PALPATE_ARTIFACTS", "artifacts"))
+    folder.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=folder / f"{name}.png", full_page=True)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 360])
+def test_the_page_fits_and_decodes_every_image(chromium, page_file, width, scheme):
+    with opened(chromium, page_file, width, scheme) as page:
+        for state in ("folded", "open"):
+            if state == "open":
+                page.evaluate(UNFOLD)
+            screenshot(page, f"page-{width}-{scheme}-{state}")
+            assert not page.evaluate(OVERFLOW), state
+        ask = "[...document.images].map(i => [i.complete, i.naturalWidth, i.alt.length])"
+        decoded = page.evaluate(ask)
+    assert len(decoded) == 48 * 3 + 1 + 8 * 4
+    assert all(complete and natural > 0 and alt > 0 for complete, natural, alt in decoded)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 360])
+def test_audits_fit_and_no_label_lies_on_another(chromium, audit_page, width, scheme):
+    with opened(chromium, audit_page, width, scheme) as page:
+        screenshot(page, f"audits-{width}-{scheme}")
+        page.evaluate(UNFOLD)
+        assert not page.evaluate(OVERFLOW)
+        assert page.evaluate(INSIDE) == page.evaluate(APART) == [True] * 6
+        if width == 360:  # nothing of the tables of signals, costs and groups is cut off
+            assert page.evaluate(UNCUT)
+        assert page.evaluate(ROLES)
 
 
 def luminance(color):
@@ -193,57 +191,35 @@ def luminance(color):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_has_the_contrast_of_wcag(chromium, page_file, scheme):
-    context = chromium.new_context(color_scheme=scheme)
-    page = context.new_page()
-    page.goto(page_file.as_uri())
-    pairs = page.evaluate("""[...new Set([...document.querySelectorAll('main *, header *, footer *')]
-        .filter(e => [...e.childNodes].some(n => n.nodeType === 3 && n.data.trim()) && !e.closest('svg, .heat'))
-        .map(e => {
-            let b = e;
-            while (b && getComputedStyle(b).backgroundColor === 'rgba(0, 0, 0, 0)') b = b.parentElement;
-            return getComputedStyle(e).color + '|' + getComputedStyle(b ?? document.body).backgroundColor;
-        }))]""")
-    context.close()
-    assert len(pairs) >= 5
-    for pair in pairs:
-        a, b = sorted((luminance(c) for c in pair.split("|")), reverse=True)
-        assert (a + 0.05) / (b + 0.05) >= 4.5, pair
+def test_everything_has_the_contrast_of_wcag(chromium, page_file, audit_page, scheme):
+    for file, ask in ((audit_page, DRAWN), (page_file, WRITTEN)):
+        with opened(chromium, file, scheme=scheme) as page:
+            pairs = set(page.evaluate(ask))
+        assert len(pairs) >= 5
+        for pair in pairs:
+            a, b = sorted(map(luminance, pair.split("|")), reverse=True)
+            assert (a + 0.05) / (b + 0.05) >= 4.5, pair
 
 
-def test_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_file):
-    context = chromium.new_context(viewport={"width": 360, "height": 900})
-    page = context.new_page()
-    page.goto(page_file.as_uri())
+def test_the_keyboard_reaches_the_sections_and_the_wide_tables(chromium, page_file):
     reached = []
-    for _ in range(40):
-        page.keyboard.press("Tab")
-        reached.append(
-            page.evaluate(
-                "[document.activeElement.tagName, document.activeElement.getAttribute('aria-label') ?? '']"
-            )
-        )
-    context.close()
+    with opened(chromium, page_file, 360) as page:
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            reached.append(page.evaluate(FOCUS))
     tags = [tag for tag, _ in reached]
     assert tags[:6] == ["A"] * 6
     assert "SUMMARY" in tags
-    assert any(
-        tag == "DIV" and label.startswith("Table: Tactile features") for tag, label in reached
-    )
+    assert any(tag == "DIV" and label.startswith("Table: Tactile") for tag, label in reached)
 
 
-def test_printed_page_opens_what_is_folded(chromium, page_file):
-    context = chromium.new_context(viewport={"width": 800, "height": 900})
-    page = context.new_page()
-    page.goto(page_file.as_uri())
-    ask = """[...document.querySelectorAll('details:not([open]) img')].map(i => i.getBoundingClientRect().width > 0 && i.checkVisibility())"""
-    folded = page.evaluate(ask)
-    page.emulate_media(media="print")
-    page.wait_for_function(
-        "getComputedStyle(document.querySelector('details'), '::details-content').contentVisibility === 'visible'"
-    )
-    printed = page.evaluate(ask)
-    context.close()
+def test_a_printed_page_opens_what_is_folded(chromium, page_file):
+    with opened(chromium, page_file, 800) as page:
+        folded = page.evaluate(FOLDED)
+        page.emulate_media(media="print")
+        style = "getComputedStyle(document.querySelector('details'), '::details-content')"
+        page.wait_for_function(f"{style}.contentVisibility === 'visible'")
+        printed = page.evaluate(FOLDED)
     assert len(folded) == len(printed) > 10
     assert not any(folded)
     assert all(printed)

@@ -134,7 +134,7 @@ def test_a_demo_killed_between_a_stages_last_file_and_its_mark_heals(whole, tmp_
     for name in STAGES:  # the state of each stage just before it is marked as finished
         mark = out / name / "stage.json"
         record = json.loads(mark.read_text())
-        (out / name / "inputs.json").write_text(
+        (out / f"{name}.partial.json").write_text(
             json.dumps({"digest": record["digest"], "inputs": record["inputs"]})
         )
         mark.unlink()
@@ -282,7 +282,7 @@ def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
         "audit tag --split s.json -o audit.json --fail-over 0",
         "train encoder tag --split s.json -o encoders --preset tiny",
         "train generator tag --split s.json --clip encoders -o model --preset tiny --background",
-        "generate --model model --manifest tag --split s.json -o made",
+        "generate tag --split s.json --model model -o made",
         "score --generated made --reference tag --split s.json --encoder encoders -o scores.json --json",
         "report audit.json scores.json -o page.html",
     ):

@@ -1,10 +1,10 @@
 """Run folders: a pipeline as named stages, each kept under the digest of what it read.
 
 ``run/NAME/stage.json`` marks a finished stage and holds its inputs, facts and time. A stage is
-built in ``run/NAME.partial``, its inputs next to it in ``run/NAME.partial.json``, and renamed when
-complete. Running again with the same inputs reuses
-it; with other inputs the stage, and so every stage that read it, is built again. A killed stage
-finds its partial folder again if the inputs are the same, and may resume from there.
+built in ``run/NAME.partial``, with its inputs in ``run/NAME.partial.json``, and renamed when
+complete. Running again with the same inputs reuses it; with other inputs the stage, and so every
+stage that read it, is built again. A killed stage finds its partial folder again if the inputs are
+the same, and may resume from there.
 """
 
 from __future__ import annotations
