@@ -1,12 +1,10 @@
-"""The tactile sensor: a gel pad, pressed with a given force, lit by three colored lights, with or
-without markers.
+"""The tactile sensor: a gel pad, pressed with a given force and lit by three colored lights.
 
 - Press: a Winkler foundation. The gap between relief and gel dome is g; the approach d is solved
-  exactly from mean(max(g + d, 0)) = load (sort g, then the k largest values touch for the k at
-  which d_k = (N load - sum of k) / k is consistent).
+  exactly from mean(max(g + d, 0)) = load.
 - Membrane: penetration p = max(g + d, 0), limited to h = G tanh(p / G) for a gel of depth G, grip
-  w = p / (p + :data:`GRIP_MM`). From m = h, each blur of ``relax_mm`` gives m <- S m + w (h - S m):
-  the gel follows what presses hard, and bridges the hollows and the rim, so that a contact ends
+  w = p / (p + :data:`GRIP_MM`). From m = h, each blur S of ``relax_mm`` gives m <- S m + w (h - S
+  m): the gel follows what presses hard, and bridges the hollows and the rim, so that a contact ends
   softly. ``optical_mm`` follows.
 - Light: with n the normal of m + texture,
   I = ((ambient + sum_k color_k F_k(x, y) max(0, n . l_k)) V (1 - q m) (1 - 0.96 ink) gain)^gamma.
@@ -15,11 +13,9 @@ without markers.
   background is the same formula with m = 0.
 - Markers: a jittered grid of small squarish dots of ink, large round ones where they are worn, and
   dust; they move with the gel.
-- A unit is drawn on 256 x 256 points and averaged down, so that it looks the same at every image
-  size.
+- A unit is drawn on 256 x 256 points and averaged down, so that it looks the same at every size.
 
-The numbers of the look ``gelsight`` are fitted to the real clips, see
-``benchmarks/world_fidelity.py``.
+The look ``gelsight`` is fitted to the real clips, see ``benchmarks/world_fidelity.py``.
 """
 
 from __future__ import annotations
@@ -38,43 +34,34 @@ from palpate.sim.arrays import (
     grid,
     resample,
     sample_clipped,
-    slopes,
     smooth,
     smoothstep,
+    turned,
 )
 from palpate.sim.objects import WorldObject
 from palpate.sim.options import VERSION, WorldOptions
 
 #: Points a side that a unit is drawn on.
 DRAWN = 256
-#: Penetration in mm at which the gel follows the object half the way; below it, it bridges the
-#: hollows instead.
+#: Penetration in mm at which the gel follows the object half the way; below, it bridges hollows.
 GRIP_MM = 0.04
 #: The lights are green, blue and red.
 _PURE = np.eye(3)[[1, 2, 0]]
+_Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class _Look:
-    """The optics that a family of units has in common; a tuple has one value a light: green, blue,
-    red.
+    """The optics of a family of units; a triple has a value for each light: green, blue, red."""
 
-    Attributes:
-        azimuth: of the lights in radians, x to the right and y down; elevation: range of theirs in
-            degrees.
-        mixed: share of white in each light; gain: brightness; fall: near-field slope; hump: loss of
-            the light away from the middle.
-        ambient: light without direction, RGB; spread: deviation of the logarithms of mixed, gain,
-            fall and ambient between units.
-    """
-
-    azimuth: tuple[float, float, float]
-    elevation: tuple[float, float]
-    mixed: float
-    gain: tuple[float, float, float]
-    fall: tuple[float, float, float]
-    hump: tuple[float, float, float]
-    ambient: tuple[float, float, float]
+    azimuth: _Triple  # radians, x to the right and y down
+    elevation: tuple[float, float]  # range in degrees
+    mixed: float  # share of white in each light
+    gain: _Triple  # brightness
+    fall: _Triple  # near-field slope
+    hump: _Triple  # loss of the light away from the middle
+    ambient: _Triple  # light without direction, RGB
+    # Deviation between units of the logarithms of mixed, gain, fall and ambient.
     spread: tuple[float, float, float, float]
 
 
@@ -106,224 +93,154 @@ _LOOKS = {
 
 @dataclass(frozen=True)
 class Sensor:
-    """One gel unit at one image size n.
+    """One gel unit at one image size n."""
 
-    Attributes:
-        look, unit, size: which it is; pad: its side in mm; px: pixel size in mm.
-        field: near-field factor of each light, shape (3, n, n); color: their RGB, (3, 3); light:
-            unit vectors towards them, (3, 3).
-        ambient: RGB, (3,); veil: vignette times dirt, (n, n); texture, dome: gel relief in mm, (n,
-            n).
-        ink: opacity of the markers in [0, 1], (n, n), or None without markers.
-        dim: loss of light for each mm of indentation; gel: depth that can be indented, in mm;
-            relax, optical: blurs in mm.
-        gamma, noise: tone exponent, and deviation of the image noise.
-    """
-
-    look: str
-    unit: int
     size: int
-    pad: float
-    px: float
-    field: Array
-    color: Array
-    light: Array
-    ambient: Array
-    veil: Array
-    texture: Array
-    dome: Array
-    ink: Array | None
-    dim: float
-    gel: float
-    relax: tuple[float, ...]
-    optical: float
+    pad: float  # side in mm
+    px: float  # pixel size in mm
+    field: Array  # near-field factor of each light, (3, n, n)
+    color: Array  # RGB of each light, (3, 3)
+    light: Array  # unit vectors towards the lights, (3, 3)
+    ambient: Array  # RGB, (3,)
+    veil: Array  # vignette times dirt, (n, n)
+    texture: Array  # fine relief of the gel in mm, (n, n)
+    dome: Array  # its doming in mm, (n, n)
+    ink: Array | None  # opacity of the markers in [0, 1], (n, n)
+    dim: float  # loss of light for each mm of indentation
+    gel: float  # depth that can be indented, in mm
+    relax: tuple[float, ...]  # blurs of the membrane in mm
+    optical: float  # blur of the optics in mm
     gamma: float
-    noise: float
-
-
-def make_sensor(options: WorldOptions, unit: int) -> Sensor:
-    """A unit of the family ``options.look``; the family is the same product in every world, the
-    unit depends on the seed.
-    """
-    return _make(
-        WorldOptions(
-            materials=options.materials, **{name: getattr(options, name) for name in _UNIT_OPTIONS}
-        ),
-        unit,
-    )
+    noise: float  # deviation of the image noise
 
 
 #: The options that a unit depends on.
-_UNIT_OPTIONS = (
-    "look",
-    "seed",
-    "size",
-    "pad_mm",
-    "gel_mm",
-    "relax_mm",
-    "optical_mm",
-    "dome_mm",
-    "markers",
-    "dirt",
-    "vignette",
-    "sensor_noise",
-)
+_UNIT_OPTIONS = ("look", "seed", "size", "pad_mm", "gel_mm", "relax_mm", "optical_mm")
+_UNIT_OPTIONS += ("dome_mm", "markers", "dirt", "vignette", "sensor_noise")
+
+
+def make_sensor(options: WorldOptions, unit: int) -> Sensor:
+    """Make a unit of ``options.look``: the family is the same in every world, the unit is not."""
+    used = {name: getattr(options, name) for name in _UNIT_OPTIONS}
+    return _make(WorldOptions(materials=options.materials, **used), unit)
 
 
 @lru_cache(maxsize=64)
 def _make(options: WorldOptions, unit: int) -> Sensor:
     look, pad = _LOOKS[options.look], options.pad_mm
     family: np.random.Generator = rng_for(0, "sensor family", VERSION, options.look)
-    rng: np.random.Generator = options.rng("sensor", options.look, unit)
+    rng = options.rng("sensor", options.look, unit)
     spread = [math.exp(s * rng.normal()) for s in look.spread]
     azimuth = [a + rng.normal(0.0, 0.05) for a in look.azimuth]
     elevation = np.deg2rad(family.uniform(*look.elevation, 3))
     mixed = look.mixed * spread[0]
-    color = (_PURE * (1.0 - mixed) + mixed) * (
-        np.exp(rng.normal(0.0, 0.05, (3, 1))) * np.asarray(look.gain)[:, None] * spread[1]
-    )
-    light = np.stack(
-        [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-        ],
-        1,
-    )
+    gain = np.exp(rng.normal(0.0, 0.05, (3, 1))) * np.asarray(look.gain)[:, None] * spread[1]
+    flat = np.cos(elevation)
+    light = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], 1)
     y, x = grid(DRAWN)
     square = x * x + y * y
     field: list[Array] = []
-    for a, fall, hump in zip(azimuth, look.fall, look.hump, strict=True):
-        along = (math.cos(a) * x + math.sin(a) * y) * (fall * spread[2])
-        field.append(np.clip(1.0 + along + 0.35 * along * along - hump * square, 0.08, None))
+    for angle, fall, hump in zip(azimuth, look.fall, look.hump, strict=True):
+        a = turned(y, x, angle)[0] * (fall * spread[2])
+        field.append(np.clip(1.0 + a + 0.35 * a * a - hump * square, 0.08, None))
     veil = (1.0 - rng.uniform(*options.vignette) * square) * (1.0 + options.dirt * _dirt(rng))
-    texture = ndimage.gaussian_filter(
-        rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 0.3 / (pad / DRAWN)
-    )
+    texture = ndimage.gaussian_filter(_white(rng), 0.3 / (pad / DRAWN))
     texture *= 0.0022 / float(texture.std())
     dome = square * ((pad / 2.0) ** 2 / (2.0 * rng.uniform(*options.dome_mm)))
-    ink = (
-        _markers(options.markers, pad, rng)
-        if options.look == "gelsight" and options.markers
-        else None
-    )
+    inked = options.look == "gelsight" and options.markers
+    ink = _markers(options.markers, pad, rng) if inked else None
     down = lambda a: resample(f32(a), options.size)  # noqa: E731
     return Sensor(
-        options.look,
-        unit,
-        options.size,
-        pad,
-        pad / options.size,
-        np.stack([down(f) for f in field]),
-        f32(color),
-        f32(light),
-        f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3)),
-        down(veil),
-        down(texture),
-        down(dome),
-        None if ink is None else down(ink),
-        rng.normal(0.03, 0.06),
-        options.gel_mm,
-        options.relax_mm,
-        options.optical_mm,
-        rng.uniform(0.9, 1.1),
-        rng.uniform(*options.sensor_noise),
+        size=options.size,
+        pad=pad,
+        px=pad / options.size,
+        field=np.stack([down(f) for f in field]),
+        color=f32((_PURE * (1.0 - mixed) + mixed) * gain),
+        light=f32(light),
+        ambient=f32(np.asarray(look.ambient) * spread[3] * rng.uniform(0.97, 1.03, 3)),
+        veil=down(veil),
+        texture=down(texture),
+        dome=down(dome),
+        ink=None if ink is None else down(ink),
+        dim=rng.normal(0.03, 0.06),
+        gel=options.gel_mm,
+        relax=options.relax_mm,
+        optical=options.optical_mm,
+        gamma=rng.uniform(0.9, 1.1),
+        noise=rng.uniform(*options.sensor_noise),
     )
+
+
+def _white(rng: np.random.Generator) -> Array:
+    return rng.standard_normal((DRAWN, DRAWN), dtype=np.float32)
 
 
 def _dirt(rng: np.random.Generator) -> Array:
-    """Uneven coating, specks and scratches as a change of brightness around 0, on the drawn
-    grid.
-    """
+    """Draw uneven coating, specks and scratches: a change of brightness around 0."""
     y, x = grid(DRAWN)
-    low = ndimage.gaussian_filter(
-        rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), DRAWN / 7, mode="reflect"
-    )
-    fine = ndimage.gaussian_filter(rng.standard_normal((DRAWN, DRAWN), dtype=np.float32), 1.6)
+    low = ndimage.gaussian_filter(_white(rng), DRAWN / 7, mode="reflect")
+    fine = ndimage.gaussian_filter(_white(rng), 1.6)
     dirt = low * (0.018 / float(low.std())) + fine * (0.004 / float(fine.std()))
     for _ in range(int(rng.integers(2, 9))):
         cx, cy, width = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.008, 0.03)
-        dirt -= rng.uniform(0.03, 0.18) * np.exp(
-            ((x - cx) ** 2 + (y - cy) ** 2) * (-0.5 / width**2)
-        )
+        square = (x - cx) ** 2 + (y - cy) ** 2
+        dirt -= rng.uniform(0.03, 0.18) * np.exp(square * (-0.5 / width**2))
     for _ in range(int(rng.integers(0, 4))):
-        angle, offset, middle = (
-            rng.uniform(0.0, math.pi),
-            rng.uniform(-1.0, 1.0),
-            rng.uniform(-0.5, 0.5),
-        )
-        across = (x * math.cos(angle) + y * math.sin(angle) - offset) * (1.0 / 0.012)
-        along = y * math.cos(angle) - x * math.sin(angle) - middle
-        dirt += rng.uniform(0.01, 0.05) * np.exp(-across * across) * (np.abs(along) < 0.35)
+        angle, offset = rng.uniform(0.0, math.pi), rng.uniform(-1.0, 1.0)
+        middle = rng.uniform(-0.5, 0.5)
+        across, length = turned(y, x, angle)
+        across, length = (across - offset) * (1.0 / 0.012), length - middle
+        dirt += rng.uniform(0.01, 0.05) * np.exp(-across * across) * (np.abs(length) < 0.35)
     return dirt
 
 
 def _markers(rows: int, pad: float, rng: np.random.Generator) -> Array:
-    """Opacity of the ink, on the drawn grid: a jittered grid of small squarish dots, the worn ones
-    among them large and round; dust.
+    """Draw the opacity of the ink: a jittered grid of small dots, worn ones among them, and dust.
 
     The grid has a pitch of 0.96 pad / rows and begins anywhere, so that a unit shows ``rows`` or
     one more a side. A small dot has a radius of 0.2 mm at the pitch of 8 rows on 14 mm and shrinks
-    with a finer pitch.
+    with a finer pitch. Worn dots are large and round.
     """
     ink = np.zeros((DRAWN, DRAWN), np.float32)
     step, mm = 2.0 * 0.96 / rows, 2.0 / pad
     scale = min(1.0, step / (0.24 * 14.0 / pad)) * mm
     first = -1.0 - step * rng.uniform(0.0, 1.0, 2)
     wear_x, wear_y, wear = rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0), rng.uniform(0.15, 0.5)
-    for i in range(rows + 3):
-        for j in range(rows + 3):
-            cy, cx = (
-                first[0] + (i * step + rng.normal(0.0, 0.012)),
-                first[1] + (j * step + rng.normal(0.0, 0.012)),
-            )
-            worn = rng.random() < 0.07 + 0.75 * math.exp(
-                -((cx - wear_x) ** 2 + (cy - wear_y) ** 2) / (2.0 * wear * wear)
-            )
-            radius = (rng.uniform(0.26, 0.40) if worn else rng.uniform(0.16, 0.215)) * scale
-            aspect, dark = rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.0)
-            _dot(ink, (cy, cx), radius, aspect=aspect, dark=dark, power=2.0 if worn else 4.0)
+    for i, j in np.ndindex(rows + 3, rows + 3):
+        cy = first[0] + (i * step + rng.normal(0.0, 0.012))
+        cx = first[1] + (j * step + rng.normal(0.0, 0.012))
+        square = (cx - wear_x) ** 2 + (cy - wear_y) ** 2
+        worn = rng.random() < 0.07 + 0.75 * math.exp(-square / (2.0 * wear * wear))
+        radius = (rng.uniform(0.26, 0.40) if worn else rng.uniform(0.16, 0.215)) * scale
+        shape = (rng.uniform(0.85, 1.2), rng.uniform(0.93, 1.0), 2.0 if worn else 4.0)
+        _dot(ink, (cy, cx), radius, shape)
     for _ in range(int(rng.integers(0, 14))):
         place = (rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0))
         radius = rng.uniform(0.03, 0.09) * mm
-        aspect, dark = rng.uniform(0.6, 1.6), rng.uniform(0.4, 0.9)
-        _dot(ink, place, radius, aspect=aspect, dark=dark, power=2.0)
+        _dot(ink, place, radius, (rng.uniform(0.6, 1.6), rng.uniform(0.4, 0.9), 2.0))
     return ink
 
 
-def _dot(
-    ink: Array,
-    place: tuple[float, float],
-    radius: float,
-    *,
-    aspect: float,
-    dark: float,
-    power: float,
-) -> None:
-    """Draws one dot (|x|^power + |y|^power < radius^power) of opacity ``dark`` at ``place`` (y, x)
-    in [-1, 1].
+def _dot(ink: Array, place: tuple[float, float], radius: float, shape: _Triple) -> None:
+    """Draw |x / aspect|^power + |y|^power < radius^power at ``place`` (y, x) in [-1, 1].
+
+    ``shape`` is the aspect, the opacity and the power.
     """
+    aspect, dark, power = shape
     y, x = grid(DRAWN)
     reach = 1.3 * radius + 0.02
-    (top, bottom), (left, right) = (
-        [int(v) for v in np.searchsorted(y.ravel(), (c - reach, c + reach))] for c in place
-    )
-    if bottom > top and right > left:
-        distance = (
-            np.abs((x[:, left:right] - place[1]) / aspect) ** power
-            + np.abs(y[top:bottom] - place[0]) ** power
-        ) ** (1.0 / power)
-        part = np.s_[top:bottom, left:right]
-        ink[part] = np.maximum(
-            ink[part], smoothstep(distance, radius + 0.006, radius - 0.006) * dark
-        )
+    rows, columns = (slice(*np.searchsorted(y[:, 0], (c - reach, c + reach))) for c in place)
+    part = ink[rows, columns]
+    dx, dy = np.abs((x[:, columns] - place[1]) / aspect), np.abs(y[rows] - place[0])
+    distance = (dx**power + dy**power) ** (1.0 / power)
+    np.maximum(part, smoothstep(distance, radius + 0.006, radius - 0.006) * dark, out=part)
 
 
 def solve_approach(gap: Array, load: float) -> float:
-    """The d for which mean(max(gap + d, 0)) equals ``load`` (> 0), in mm.
+    """Solve mean(max(gap + d, 0)) = ``load`` (> 0) for d, in mm.
 
-    With the gaps sorted downwards and their running sums S_k, the k largest touch if d_k = (N load
-    - S_k) / k lifts gap k but not gap k + 1.
+    With the gaps sorted downwards and their running sums S_k, the k largest are in contact if
+    d_k = (N load - S_k) / k lifts gap k but not gap k + 1.
     """
     ordered = np.sort(gap, axis=None)[::-1].astype(np.float64)
     d = (load * ordered.size - np.cumsum(ordered)) / np.arange(1, ordered.size + 1)
@@ -334,65 +251,60 @@ def solve_approach(gap: Array, load: float) -> float:
 def gap_of(
     body: WorldObject, sensor: Sensor, relief: Array, load: float, tilt: tuple[float, float]
 ) -> Array:
-    """Relief of the object minus the gel's dome, tilted and curved, in mm, shape (n, n); soft
-    objects flatten under the load.
+    """Return the relief minus the gel's dome, tilted and curved, in mm, shape (n, n).
+
+    Soft objects flatten under the load.
     """
     y, x = grid(sensor.size)
     half = sensor.pad / 2.0
     if body.surface.softness:
         relief = relief * (1.0 - 0.5 * body.surface.softness * min(1.0, load / 0.3))
-    return (
-        relief
-        - sensor.dome
-        - (x * (half * tilt[0]) + y * (half * tilt[1]))
-        - x * x * (body.curvature / 2.0 * half * half)
-    )
+    slope = x * (half * tilt[0]) + y * (half * tilt[1])
+    return relief - sensor.dome - slope - x * x * (body.curvature / 2.0 * half * half)
 
 
 def press(sensor: Sensor, gap: Array, load: float) -> tuple[Array, Array]:
-    """Presses the gel until the mean penetration equals ``load`` mm.
+    """Press the gel until the mean penetration equals ``load`` mm.
 
     Returns:
         Membrane displacement in mm and the contact mask, both of shape (n, n).
     """
     penetration = gap + solve_approach(gap, load)
-    contact = penetration > 0.0
-    held = np.maximum(penetration, 0.0)
-    grip = held / (held + GRIP_MM)
-    held = np.tanh(held * (1.0 / sensor.gel)) * sensor.gel
-    membrane = held
+    indented = np.maximum(penetration, 0.0)
+    grip = indented / (indented + GRIP_MM)
+    membrane = indented = np.tanh(indented * (1.0 / sensor.gel)) * sensor.gel
     for blur in sensor.relax:
         membrane = smooth(membrane, blur / sensor.px)
-        membrane += grip * (held - membrane)
-    return smooth(membrane, sensor.optical / sensor.px), contact
+        membrane += grip * (indented - membrane)
+    return smooth(membrane, sensor.optical / sensor.px), penetration > 0.0
 
 
 def marker_shift(
     sensor: Sensor, membrane: Array, shear: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """Displacement (dy, dx) of the markers in pixels: dragged by ``shear`` (mm per mm of depth),
-    pushed apart where the gel is deep.
+    """Displace the markers: (dy, dx) in pixels.
+
+    They are dragged by ``shear`` (mm per mm of depth) and pushed apart where the gel is deep.
     """
     depth = smooth(np.minimum(membrane, 1.0), sensor.size / 10)
-    slope_y, slope_x = slopes(depth, sensor.px)
+    slope_y, slope_x = np.gradient(depth, sensor.px)
     unit = 1.0 / sensor.px
-    return f32(depth * (shear[1] * unit) - slope_y * (0.107 * unit)), f32(
-        depth * (shear[0] * unit) - slope_x * (0.107 * unit)
-    )
+    dy = f32(depth * (shear[1] * unit) - slope_y * (0.107 * unit))
+    return dy, f32(depth * (shear[0] * unit) - slope_x * (0.107 * unit))
 
 
 def shade(
     sensor: Sensor, membrane: Array, gain: Array, shift: tuple[Array, Array] | None = None
 ) -> Array:
-    """The image of the gel, shape (n, n, 3), in [0, 1.2]^gamma, without noise.
+    """Render the gel, shape (n, n, 3), in [0, 1.2]^gamma, without noise.
 
     Args:
-        sensor: the gel unit.
+        sensor: gel unit.
         membrane: displacement in mm, (n, n); zeros give the background image.
         gain: white balance of the recording, RGB, (3,).
         shift: displacement of the markers in pixels, or None.
     """
-    slope_y, slope_x = slopes(membrane + sensor.texture, sensor.px)
+    slope_y, slope_x = np.gradient(membrane + sensor.texture, sensor.px)
     upright = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
     light = [
         np.maximum((slope_x * float(lx) + slope_y * float(ly) + float(lz)) * upright, 0.0) * field
@@ -407,8 +319,6 @@ def shade(
         veil = veil * (1.0 - 0.96 * ink)
     image = np.empty((sensor.size, sensor.size, 3), np.float32)
     for c in range(3):
-        total = sum(light[k] * float(sensor.color[k, c]) for k in range(3)) + float(
-            sensor.ambient[c]
-        )
-        image[..., c] = total * veil * float(gain[c])
+        total = sum(light[k] * float(sensor.color[k, c]) for k in range(3))
+        image[..., c] = (total + float(sensor.ambient[c])) * veil * float(gain[c])
     return np.clip(image, 0.0, 1.2) ** sensor.gamma

@@ -1,4 +1,4 @@
-"""Leather and fabrics."""
+"""Soft goods: leather and fabrics."""
 
 from __future__ import annotations
 
@@ -12,35 +12,31 @@ from palpate.sim.tile import Tile
 
 
 def leather(tile: Tile, rng: np.random.Generator) -> Surface:
-    """Pebbled, fine-grained, or stitched."""
-    kind = pick(rng, "pebbled", "pebbled", "fine", "fine", "stitched")
-    size = rng.uniform(0.8, 1.5) if kind == "fine" else rng.uniform(1.5, 2.6)
+    """Draw pebbled, fine-grained, or stitched leather."""
+    kind, draw = pick(rng, "pebbled", "pebbled", "fine", "fine", "stitched"), rng.uniform
+    size = draw(0.8, 1.5) if kind == "fine" else draw(1.5, 2.6)
     cells = tile.cells(size)
     gap = tile.warp(cells.far - cells.near, 0.15)
-    pebble = smoothstep(gap * (1.0 / size), 0.0, rng.uniform(0.2, 0.4))
-    folds = np.maximum(tile.ridged(2.0, 14.0, 2.2, 3.0, rng.uniform(0.0, math.pi)) - 1.0, 0.0)
-    height = pebble * rng.uniform(0.05, 0.14) + tile.noise(4.0, 20.0, 2.5) * 0.06 - 0.08 * folds
+    pebble = smoothstep(gap * (1.0 / size), 0.0, draw(0.2, 0.4))
+    folds = np.maximum(tile.ridged(2.0, 14.0, 2.2, 3.0, draw(0.0, math.pi)) - 1.0, 0.0)
+    height = pebble * draw(0.05, 0.14) + tile.noise(4.0, 20.0, 2.5) * 0.06 - 0.08 * folds
     if flip(rng, 0.7):
-        color = hsv(rng.uniform(0.02, 0.1), rng.uniform(0.3, 0.75), rng.uniform(0.12, 0.6))
+        color = hsv(draw(0.02, 0.1), draw(0.3, 0.75), draw(0.12, 0.6))
     else:
-        color = hsv(rng.random(), rng.uniform(0.0, 0.7), rng.uniform(0.08, 0.7))
+        color = hsv(rng.random(), draw(0.0, 0.7), draw(0.08, 0.7))
     albedo = tint(color, (0.72 + 0.28 * pebble) * (1.0 + 0.06 * tile.noise(2.0, 20.0)))
-    words: tuple[str, ...] = ("supple", "fine-grained" if kind == "fine" else "pebbled", "soft")
     if kind == "stitched":
-        line, _ = tile.lines(16.0, 0.0)
-        stitch = smoothstep(line, 0.8, 0.3) * smoothstep(
-            np.sin(tile.wave(2.6, math.pi / 2.0)), -0.3, 0.2
-        )
+        seam = smoothstep(tile.lines(16.0, 0.0), 0.8, 0.3)
+        stitch = seam * smoothstep(np.sin(tile.wave(2.6, math.pi / 2.0)), -0.3, 0.2)
         height, albedo = height + stitch * 0.3, blend(albedo, hsv(0.12, 0.2, 0.85), stitch)
-        words = ("supple", "stitched", "soft")
-    return Surface(height, albedo, kind, words, gloss=rng.uniform(0.15, 0.45), softness=0.35)
+    words = ("supple", "fine-grained" if kind == "fine" else kind, "soft")
+    return Surface(height, albedo, kind, words, gloss=draw(0.15, 0.45), softness=0.35)
 
 
 def _weave(tile: Tile, rng: np.random.Generator, kind: str, step: float, wobble: float) -> Array:
-    """A woven or knitted relief in about [0, 1] with threads ``step`` mm apart."""
-    angle = math.pi / 4.0 * int(rng.integers(2))
-    wobble *= rng.uniform(0.05, 0.35)
-    u, v = tile.wave(step, angle, wobble), tile.wave(step, angle + math.pi / 2.0, wobble)
+    """Draw a woven or knitted relief in about [0, 1] with threads ``step`` mm apart."""
+    angle = pick(rng, 0.0, math.pi / 4.0)
+    u, v = tile.waves(step, angle, wobble * rng.uniform(0.05, 0.35))
     if kind == "plain":
         over = smoothstep(np.sin(u) * np.sin(v), -0.35, 0.35)
         return over * np.abs(np.sin(u)) ** 0.7 + (1.0 - over) * np.abs(np.sin(v)) ** 0.7
@@ -55,48 +51,34 @@ def _weave(tile: Tile, rng: np.random.Generator, kind: str, step: float, wobble:
     return smoothstep(np.cos(u) + np.cos(v), 0.9, -0.3)  # mesh
 
 
+_SYNTHETIC = {"twill": "woven", "knit": "knitted", "mesh": "meshed", "rib": "ribbed"}
+_SYNTHETIC |= {"plain": "woven"}
+
+
 def synthetic_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
-    """Twill, knit, mesh, rib, or plain weave of fine even threads; a third of them striped, which
-    nobody can feel.
-    """
-    kind = pick(rng, "twill", "knit", "mesh", "rib", "plain")
-    relief = _weave(
-        tile, rng, kind, rng.uniform(1.8, 3.6) if kind == "mesh" else rng.uniform(1.0, 2.2), 1.0
-    )
-    height = relief * rng.uniform(0.12, 0.28) + tile.noise(6.0, 30.0, 3.0) * 0.12
+    """Draw a fabric of fine even threads; a third of them striped, which cannot be felt."""
+    kind, draw = pick(rng, *_SYNTHETIC), rng.uniform
+    relief = _weave(tile, rng, kind, draw(1.8, 3.6) if kind == "mesh" else draw(1.0, 2.2), 1.0)
+    height = relief * draw(0.12, 0.28) + tile.noise(6.0, 30.0, 3.0) * 0.12
     tone = 0.55 + 0.45 * np.clip(relief * (1.0 / float(relief.max())), 0.0, 1.0)
-    albedo = tint(hsv(rng.random(), rng.uniform(0.1, 1.0), rng.uniform(0.15, 0.9)), tone)
+    albedo = tint(hsv(rng.random(), draw(0.1, 1.0), draw(0.15, 0.9)), tone)
     if flip(rng, 0.35):
-        stripe = smoothstep(
-            np.sin(tile.wave(rng.uniform(8.0, 20.0), rng.uniform(0.0, math.pi))), -0.1, 0.1
-        )
+        stripe = smoothstep(np.sin(tile.wave(draw(8.0, 20.0), draw(0.0, math.pi))), -0.1, 0.1)
         albedo = blend(albedo, tint(hsv(rng.random(), 0.7, 0.7), tone), stripe)
-    first = {
-        "twill": "woven",
-        "plain": "woven",
-        "knit": "knitted",
-        "mesh": "meshed",
-        "rib": "ribbed",
-    }[kind]
-    return Surface(
-        height, albedo, kind, (first, "fine", "soft"), gloss=rng.uniform(0.1, 0.35), softness=0.6
-    )
+    words = (_SYNTHETIC[kind], "fine", "soft")
+    return Surface(height, albedo, kind, words, gloss=draw(0.1, 0.35), softness=0.6)
 
 
 def natural_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
-    """Coarse plain weave, knit, or corded, of uneven fuzzy threads."""
-    kind = pick(rng, "plain", "plain", "knit", "rib")
-    relief = _weave(tile, rng, kind, rng.uniform(1.8, 4.2), 2.5)
-    fuzz = tile.strokes(260, 5.0, 0.3, angle=0.0, spread=3.0, height=0.16)
-    height = (
-        relief * rng.uniform(0.2, 0.45)
-        + fuzz * rng.uniform(0.3, 1.0)
-        + tile.noise(5.0, 30.0, 3.0) * 0.15
-    )
+    """Draw coarse plain weave, knit, or corded fabric of uneven fuzzy threads."""
+    kind, draw = pick(rng, "plain", "plain", "knit", "rib"), rng.uniform
+    relief = _weave(tile, rng, kind, draw(1.8, 4.2), 2.5)
+    fuzz = tile.strokes(260, 5.0, 0.3, spread=3.0, height=0.16)
+    height = relief * draw(0.2, 0.45) + fuzz * draw(0.3, 1.0) + tile.noise(5.0, 30.0, 3.0) * 0.15
     if flip(rng, 0.6):
-        color = hsv(rng.uniform(0.06, 0.14), rng.uniform(0.05, 0.4), rng.uniform(0.45, 0.95))
+        color = hsv(draw(0.06, 0.14), draw(0.05, 0.4), draw(0.45, 0.95))
     else:
-        color = hsv(rng.random(), rng.uniform(0.2, 0.7), rng.uniform(0.2, 0.8))
+        color = hsv(rng.random(), draw(0.2, 0.7), draw(0.2, 0.8))
     tone = 0.5 + 0.5 * np.clip(relief * (1.0 / float(relief.max())), 0.0, 1.0)
     albedo = tint(color, tone * (1.0 + 0.1 * tile.noise(0.4, 6.0, 1.0)))
     first = {"plain": "coarsely woven", "knit": "knitted", "rib": "corded"}[kind]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from palpate.core import PalpateError
 from palpate.sim.arrays import Array, f32
 from palpate.sim.tile import Tile
 
+T = TypeVar("T")
 #: Highest and deepest relief in mm; far above what a gel can feel.
 HIGHEST_MM = 50.0
 
@@ -63,14 +64,20 @@ class Material:
     subtypes: tuple[str, ...] = ()
 
 
-def pick(rng: np.random.Generator, *choices: str) -> str:
-    """One of ``choices`` with equal probability."""
+def pick(rng: np.random.Generator, *choices: T) -> T:
+    """Draw one of ``choices`` with equal probability."""
     return choices[int(rng.integers(len(choices)))]
 
 
 def flip(rng: np.random.Generator, share: float) -> bool:
-    """True with probability ``share``."""
+    """Return True with probability ``share``."""
     return bool(rng.random() < share)
+
+
+def rising(height: Array) -> Array:
+    """Scale heights to [0, 1]."""
+    low, high = float(height.min()), float(height.max())
+    return (height - low) * (1.0 / (high - low + 1e-9))
 
 
 def plain(tile: Tile, color: Array) -> Array:
