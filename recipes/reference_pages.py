@@ -16,7 +16,8 @@ import sys
 from pathlib import Path
 
 from palpate.cli import VERBS, main
-from palpate.sim import MATERIALS, WorldOptions
+from palpate.sim import MATERIALS
+from palpate.sim.options import option_groups
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "reference"
 GROUPS = {
@@ -48,10 +49,8 @@ def world_options() -> str:
             "| option | default | allowed | meaning |",
             "|---|---|---|---|",
         ]
-        for field in dataclasses.fields(WorldOptions):
+        for field in option_groups()[group]:
             limits, default = field.metadata, field.default
-            if limits["group"] != group:
-                continue
             values = default if isinstance(default, tuple) else (default,)
             allowed = {
                 "choice": ", ".join(f"`{c}`" for c in limits.get("choices", ())),

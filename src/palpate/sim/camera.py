@@ -119,7 +119,7 @@ def _stained(options: WorldOptions, albedo: Array, video: int, number: int) -> A
 def light_object(
     options: WorldOptions, camera: Camera, body: WorldObject, video: int, number: int
 ) -> Scene:
-    """Light the tile of ``body``, object ``number`` of the video, and blur it to the view's pixels."""
+    """Light the tile of ``body``, object ``number`` of the video, blurred to the view's pixels."""
     height, px, surface = body.surface.height, body.px, body.surface
     softened = ndimage.gaussian_filter(height, 0.6, mode="wrap")
     slope_y = (np.roll(softened, -1, 0) - np.roll(softened, 1, 0)) * (0.5 / px)

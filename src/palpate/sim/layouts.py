@@ -1,32 +1,22 @@
 """The files of a world in each layout, so that ids are those that ``palpate import`` gives.
 
-=============  ===========================
-================================================================= layout         id
-         vision image, tactile image, background
-=============  ===========================
-================================================================= ``frames``
-``20260101_000000/``         ``dataset/<video>/video_frame/0000000012.jpg``,
-               ``0000000012``               ``gelsight_frame/``; background: the frame 4 before the
-               contact
-``videos``     as above                     none: frames lie in ``video.mp4`` and ``gelsight.mp4``
-``hct``        ``data2/4-1702596295.70/12`` ``data2/4-1702596295.70/vision/12-0.0207.jpg``,
-``tactile/``,
-                                            ``background.png``
-=============  ===========================
-=================================================================
+- ``frames``, ids ``20260101_000000/0000000012``: Touch and Go's tree
+  ``dataset/<video>/video_frame/0000000012.jpg`` and ``gelsight_frame/``. The background is the
+  tactile frame 4 before the contact.
+- ``videos``: the same ids; the frames are in ``video.mp4`` and ``gelsight.mp4``.
+- ``hct``, ids ``data2/4-1702596295.70/12``: ``data2/4-1702596295.70/vision/12-0.0207.jpg``,
+  ``tactile/`` and ``background.png``. HCT names a recording by a number that is used again and its
+  start in Unix seconds, and a frame by its number and a latency in seconds. Its rigs ``data1,
+  data2 ...`` are our gel units.
 
-HCT names a recording by a number that is used again and its start in Unix seconds, and a frame by
-its number and a latency in seconds. Its rigs ``data1, data2 ...`` are our gel units. Its lists, one
-set a rig:
+Touch and Go's lists: ``label.txt``, ``train.txt``, ``test.txt`` (``<video>/0000000012.jpg,3``; the
+latter two shuffled and without a final newline, as the official ones), ``category_reference.txt``,
+and the additional ``objects.csv`` and ``captions.csv``. HCT's lists, a set for each rig:
 
 - ``train.csv``, ``test.csv``: ``url,tactile,tactile_background,caption``, shuffled.
 - ``contact.json``, ``not_contact.json``: ``{"tactile": [..], "vision": [..], "background": [..]}``.
 - ``finetune.json``: the training rows again, ``[{image, tactile, tactile_background,
   conversations}]``.
-
-Touch and Go's lists: ``label.txt``, ``train.txt``, ``test.txt`` (``<video>/0000000012.jpg,3``; the
-latter two shuffled and without a final newline, as the official ones), ``category_reference.txt``,
-and our own ``objects.csv`` and ``captions.csv``.
 """
 
 from __future__ import annotations
@@ -54,15 +44,17 @@ _HCT_NUMBERS = 7
 _HCT_QUESTION = (
     "<image>\nThis is a tactile image of a synthetic surface. Describe how it feels, in adjectives."
 )
+#: Rows of the lists of train and test.
+Parts = Mapping[str, Sequence[Row]]
 
 
 def rig_of(plan: VideoPlan) -> str:
-    """``data1`` for the first gel unit: HCT's rig, the manifest's domain."""
+    """Return HCT's rig, the manifest's domain: ``data1`` for the first gel unit."""
     return f"data{plan.sensor + 1}"
 
 
 def video_id(options: WorldOptions, plan: VideoPlan) -> str:
-    """The video as the manifest names it."""
+    """Return the video as the manifest names it."""
     if options.layout != "hct":
         return plan.name
     start = datetime.datetime.strptime(plan.name, "%Y%m%d_%H%M%S").replace(tzinfo=datetime.UTC)
@@ -71,23 +63,23 @@ def video_id(options: WorldOptions, plan: VideoPlan) -> str:
 
 
 def sample_id(options: WorldOptions, plan: VideoPlan, frame: int) -> str:
-    """The id of a contact frame."""
+    """Return the id of a contact frame."""
     number = str(frame) if options.layout == "hct" else f"{frame:010d}"
     return f"{video_id(options, plan)}/{number}"
 
 
 def contact_id(options: WorldOptions, plan: VideoPlan, contact: int) -> str:
-    """The contact as the manifest names it; unique across videos, counted from 1."""
+    """Return the contact as the manifest names it; unique across videos, counted from 1."""
     return f"{video_id(options, plan)}#{contact + 1:04d}"
 
 
 def manifest_root(options: WorldOptions, folder: Path) -> Path:
-    """The folder that image paths start at."""
+    """Return the folder that image paths start at."""
     return folder / "hct" if options.layout == "hct" else folder
 
 
 def video_folder(options: WorldOptions, plan: VideoPlan) -> str:
-    """The folder of a video, relative to the manifest's root."""
+    """Return the folder of a video, relative to the manifest's root."""
     return video_id(options, plan) if options.layout == "hct" else f"dataset/{plan.name}"
 
 
@@ -101,24 +93,19 @@ def _image_folders(options: WorldOptions) -> tuple[str, str]:
     return ("vision", "tactile") if options.layout == "hct" else ("video_frame", "gelsight_frame")
 
 
-def image_paths(options: WorldOptions, row: Row) -> dict[str, str]:
-    """Paths of ``vision``, ``tactile``, ``background`` relative to the manifest's root; {} for
-    videos.
-    """
+def image_paths(options: WorldOptions, plan: VideoPlan, frame: int, contact: int) -> dict[str, str]:
+    """Return paths of vision, tactile and background under the manifest's root; {} for videos."""
     if options.layout == "videos":
         return {}
-    folder, (vision, tactile) = video_folder(options, row.video), _image_folders(options)
-    name = _frame_name(options, row.video, row.frame)
-    if options.layout == "hct":
-        background = f"{folder}/background.png"
-    else:
-        passive = first_contact(options, row.contact) - BACKGROUND_OFFSET
-        background = f"{folder}/{tactile}/{_frame_name(options, row.video, passive)}"
-    return {
-        "vision": f"{folder}/{vision}/{name}",
-        "tactile": f"{folder}/{tactile}/{name}",
-        "background": background,
-    }
+    folder, sides = video_folder(options, plan), _image_folders(options)
+    name = _frame_name(options, plan, frame)
+    background = "background.png"
+    if options.layout != "hct":
+        free = first_contact(options, contact) - BACKGROUND_OFFSET
+        background = f"{sides[1]}/{_frame_name(options, plan, free)}"
+    paths = (f"{sides[0]}/{name}", f"{sides[1]}/{name}", background)
+    keys = ("vision", "tactile", "background")
+    return {key: f"{folder}/{path}" for key, path in zip(keys, paths, strict=True)}
 
 
 def write_video_files(options: WorldOptions, video: Video, folder: Path) -> None:
@@ -141,7 +128,7 @@ def _write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
     """Write uint8 images (size, size, 3) as H.264, constant rate factor 18, so that bytes repeat.
 
     One thread; x264 without the code whose rounding depends on the processor; frames converted
-    before they reach the encoder, because its own conversion makes its decisions differ from run to
+    before they reach the encoder, because its conversion makes its decisions differ from run to
     run.
     """
     import av
@@ -159,7 +146,7 @@ def _write_mp4(path: Path, images: Iterable[np.ndarray], size: int) -> None:
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """CSV with bare line feeds."""
+    """Return CSV with bare line feeds."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -170,77 +157,69 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 def list_files(
     options: WorldOptions,
     plans: list[VideoPlan],
-    train: Sequence[Row],
-    test: Sequence[Row],
+    parts: Parts,
     captions: Mapping[str, Sequence[str]],
 ) -> dict[str, str]:
-    """The lists of the layout by path.
+    """Return the lists of the layout by path.
 
     Args:
         options: the world's.
         plans: all videos.
-        train: rows for training in the order of the list.
-        test: the others.
-        captions: video name -> one caption a contact.
+        parts: rows of ``train`` and ``test`` in the order of the lists.
+        captions: video name -> a caption for each contact.
     """
     if options.layout == "hct":
-        return _hct_lists(options, plans, train, test, captions)
+        rigs = sorted({rig_of(plan) for plan in plans})
+        files = {rig: _rig_lists(options, plans, parts, captions, rig) for rig in rigs}
+        return {f"hct/{rig}/{name}": text for rig in rigs for name, text in files[rig].items()}
     rows = list(contact_rows(options, plans))
     path: Callable[[Row], str] = lambda row: f"{row.video.name}/{row.frame:010d}.jpg"  # noqa: E731
-    lines = {
-        name: [f"{path(r)},{MATERIALS[r.object.material].label}" for r in part]
-        for name, part in (("label", rows), ("train", train), ("test", test))
-    }
+    line = {row: f"{path(row)},{MATERIALS[row.object.material].label}" for row in rows}
+    objects = ((path(row), row.object.name) for row in rows)
     texts = ((path(row), captions[row.video.name][row.contact]) for row in rows)
     return {
-        "label.txt": "".join(f"{line}\n" for line in lines["label"]),
+        "label.txt": "".join(f"{text}\n" for text in line.values()),
         "category_reference.txt": "".join(f"{n}: {m.label}\n" for n, m in MATERIALS.items()),
-        "train.txt": "\n".join(lines["train"]),
-        "test.txt": "\n".join(lines["test"]),
-        "objects.csv": csv_text(("frame", "object"), ((path(r), r.object.name) for r in rows)),
+        **{f"{name}.txt": "\n".join(line[row] for row in part) for name, part in parts.items()},
+        "objects.csv": csv_text(("frame", "object"), objects),
         "captions.csv": csv_text(("frame", "text"), texts),
     }
 
 
-def _hct_lists(
+def _rig_lists(
     options: WorldOptions,
     plans: list[VideoPlan],
-    train: Sequence[Row],
-    test: Sequence[Row],
+    parts: Parts,
     captions: Mapping[str, Sequence[str]],
+    rig: str,
 ) -> dict[str, str]:
+    def paths(plan: VideoPlan, frame: int) -> dict[str, str]:
+        """Return image paths relative to the rig."""
+        full = image_paths(options, plan, frame, 0)
+        return {key: path.removeprefix(f"{rig}/") for key, path in full.items()}
+
     files: dict[str, str] = {}
-    touching = {row.frame for row in contact_rows(options, plans[:1])}
-    for rig in sorted({rig_of(plan) for plan in plans}):
-        cells = {
-            name: [
-                (*_hct_paths(options, r.video, r.frame), captions[r.video.name][r.contact])
-                for r in part
-                if rig_of(r.video) == rig
-            ]
-            for name, part in (("train", train), ("test", test))
-        }
-        header = ("url", "tactile", "tactile_background", "caption")
-        lists = {f"{name}.csv": csv_text(header, rows) for name, rows in cells.items() if rows}
-        for name, wanted in (("contact", True), ("not_contact", False)):
-            frames = [f for f in written_frames(options) if (f in touching) is wanted]
-            paths = [_hct_paths(options, p, f) for p in plans if rig_of(p) == rig for f in frames]
-            keys = (("tactile", 1), ("vision", 0), ("background", 2))
-            lists[f"{name}.json"] = json.dumps({k: [p[at] for p in paths] for k, at in keys}) + "\n"
-        lists["finetune.json"] = (
-            json.dumps([_conversation(*cell) for cell in cells["train"]]) + "\n"
-        )
-        files |= {f"hct/{rig}/{name}": text for name, text in lists.items()}
-    return files
+    talks: list[dict[str, object]] = []
+    for name, part in parts.items():
+        rows: list[tuple[str, ...]] = []
+        for row in part:
+            if rig_of(row.video) == rig:
+                caption = captions[row.video.name][row.contact]
+                rows.append((*paths(row.video, row.frame).values(), caption))
+        if rows:
+            header = ("url", "tactile", "tactile_background", "caption")
+            files[f"{name}.csv"] = csv_text(header, rows)
+        talks += [_conversation(*row) for row in rows if name == "train"]
+    in_contact = {row.frame for row in contact_rows(options, plans[:1])}
+    for name, wanted in (("contact", True), ("not_contact", False)):
+        frames = [frame for frame in written_frames(options) if (frame in in_contact) is wanted]
+        images = [paths(plan, k) for plan in plans if rig_of(plan) == rig for k in frames]
+        keys = ("tactile", "vision", "background")
+        files[f"{name}.json"] = json.dumps({k: [p[k] for p in images] for k in keys}) + "\n"
+    return files | {"finetune.json": json.dumps(talks) + "\n"}
 
 
 def _conversation(vision: str, tactile: str, background: str, caption: str) -> dict[str, object]:
     turns = [{"from": "human", "value": _HCT_QUESTION}, {"from": "gpt", "value": caption}]
     images = {"image": vision, "tactile": tactile, "tactile_background": background}
     return {**images, "conversations": turns}
-
-
-def _hct_paths(options: WorldOptions, plan: VideoPlan, frame: int) -> tuple[str, str, str]:
-    """Vision, tactile and background relative to the rig."""
-    folder, name = video_id(options, plan).split("/", 1)[1], _frame_name(options, plan, frame)
-    return f"{folder}/vision/{name}", f"{folder}/tactile/{name}", f"{folder}/background.png"

@@ -1,8 +1,8 @@
 """The train/test cut of a world, and exactly what it leaks.
 
-``leak.csv`` is what an audit must find: one row a test sample in the order of the manifest, with 1
-    or 0 for a
-shared video, contact and object, the gap in frames, and the nearest train sample of the same video.
+``leak.csv`` is what an audit must find: a row for each test sample in the order of the manifest,
+with 1 or 0 for a shared video, contact and object, the gap in frames, and the nearest train sample
+of the same video.
 """
 
 from __future__ import annotations
@@ -12,25 +12,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from palpate.core import PalpateError
-from palpate.sim.layouts import csv_text, sample_id
+from palpate.sim.layouts import Parts, csv_text, sample_id
 from palpate.sim.options import WorldOptions
 from palpate.sim.plan import Row, VideoPlan, spread
 
 LEAK_COLUMNS = ("id", "video_in_train", "contact_in_train", "object_in_train", "gap", "nearest")
-Unit = tuple[int, ...]
+_UNITS = {"frame": "contact frames", "contact": "contacts", "none": "videos"}
 
 
-def _unit(options: WorldOptions, row: Row) -> Unit:
-    """What goes to train or test as a whole: a frame, a contact or a video."""
-    key = {"frame": row.frame, "contact": row.contact}
-    video = row.video.index
-    return (video,) if options.leak == "none" else (video, key[options.leak])
+def _unit(options: WorldOptions, row: Row) -> tuple[int, ...]:
+    """Return what goes to train or test as a whole: a frame, a contact or a video."""
+    key = {"frame": (row.frame,), "contact": (row.contact,), "none": ()}
+    return (row.video.index, *key[options.leak])
 
 
-def cut(
-    options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]
-) -> tuple[list[Row], list[Row]]:
-    """Train and test rows, both shuffled: the world's split, which leaks as ``options.leak`` says.
+def cut(options: WorldOptions, plans: Sequence[VideoPlan], rows: Sequence[Row]) -> Parts:
+    """Cut rows into train and test, both shuffled; it leaks as ``options.leak`` says.
 
     Raises:
         PalpateError: if there are fewer than two frames, contacts or videos to cut.
@@ -38,40 +35,29 @@ def cut(
     rng = options.rng("cut", "touch" if options.leak == "contact" else options.leak)
     units = list(dict.fromkeys(_unit(options, row) for row in rows))
     if len(units) < 2:
-        what = {"frame": "contact frames", "contact": "contacts", "none": "videos"}[options.leak]
-        must = f"must have at least two {what} to cut"
+        must = f"must have at least two {_UNITS[options.leak]} to cut"
         raise PalpateError(must, str(len(units)), "Choose a larger world", argument="leak")
     order = [units[k] for k in rng.permutation(len(units))]
     if options.leak == "none":  # material by material
         materials = [options.names.index(plan.objects[0].material) for plan in plans]
         order.sort(key=lambda unit: materials[unit[0]])
-    chosen = {order[k] for k in spread(len(order), options.test)}
-    if (
-        not chosen
-    ):  # the share is too small for one unit, or leaves none: each list has at least one
-        chosen = {order[0]}
-    elif len(chosen) == len(order):
+    # A share too small or too large for a whole unit still gives each list at least one.
+    chosen = {order[k] for k in spread(len(order), options.test)} or {order[0]}
+    if len(chosen) == len(order):
         chosen.discard(order[-1])
     shuffled = [rows[k] for k in rng.permutation(len(rows))]
     train = [row for row in shuffled if _unit(options, row) not in chosen]
-    return train, [row for row in shuffled if _unit(options, row) in chosen]
+    return {"train": train, "test": [row for row in shuffled if _unit(options, row) in chosen]}
 
 
 @dataclass(frozen=True)
 class Leak:
-    """What a test row shares with train.
-
-    Attributes:
-        row: the test row.
-        contact, object: whether train has frames of the same.
-        nearest: the nearest train frame of the same video (of two, the earlier); None if train has
-            none.
-    """
+    """What a test row shares with train."""
 
     row: Row
-    contact: bool
-    object: bool
-    nearest: int | None
+    contact: bool  # whether train has frames of the same contact
+    object: bool  # whether train has frames of the same object
+    nearest: int | None  # nearest train frame of the same video (of two, the earlier)
 
     @property
     def gap(self) -> int | None:
@@ -79,33 +65,33 @@ class Leak:
         return None if self.nearest is None else abs(self.nearest - self.row.frame)
 
 
-def leaks(train: Sequence[Row], test: Sequence[Row]) -> list[Leak]:
-    """The exact leak of every test row, by video and frame."""
+def leaks(parts: Parts) -> list[Leak]:
+    """Return the exact leak of every test row, by video and frame."""
     frames: dict[int, list[int]] = {}
-    for row in train:
+    for row in parts["train"]:
         frames.setdefault(row.video.index, []).append(row.frame)
-    contacts = {(row.video.index, row.contact) for row in train}
-    objects = {row.object for row in train}
+    contacts = {(row.video.index, row.contact) for row in parts["train"]}
+    objects = {row.object for row in parts["train"]}
     result: list[Leak] = []
-    for row in sorted(test, key=lambda row: (row.video.index, row.frame)):
+    for row in sorted(parts["test"], key=lambda row: (row.video.index, row.frame)):
         video, at = row.video.index, row.frame
         nearest = min(frames.get(video, ()), key=lambda f: (abs(f - at), f), default=None)
         result.append(Leak(row, (video, row.contact) in contacts, row.object in objects, nearest))
     return result
 
 
-def leak_counts(train: Sequence[Row], test: Sequence[Row]) -> dict[str, int | float | None]:
-    """How many test frames share a video, contact or object with train, and the gaps."""
-    rows = leaks(train, test)
+def leak_counts(parts: Parts) -> dict[str, int | float | None]:
+    """Count the test frames that share a video, contact or object with train, and the gaps."""
+    rows, test = leaks(parts), len(parts["test"])
     gaps = [leak.gap for leak in rows if leak.gap is not None]
     in_contacts = [(leak.row.video.index, leak.row.contact) for leak in rows if leak.contact]
     in_objects = [leak.row.object for leak in rows if leak.object]
     return {
-        "test_frames": len(test),
+        "test_frames": test,
         "test_frames_in_shared_videos": len(gaps),
         "test_frames_in_shared_contacts": len(in_contacts),
         "test_frames_of_shared_objects": len(in_objects),
-        "leaked_fraction": len(gaps) / len(test),
+        "leaked_fraction": len(gaps) / test,
         "videos_shared": len({leak.row.video.index for leak in rows if leak.nearest is not None}),
         "contacts_shared": len(set(in_contacts)),
         "objects_shared": len(set(in_objects)),
@@ -115,10 +101,10 @@ def leak_counts(train: Sequence[Row], test: Sequence[Row]) -> dict[str, int | fl
     }
 
 
-def leak_file(options: WorldOptions, train: Sequence[Row], test: Sequence[Row]) -> str:
-    """The text of ``leak.csv``."""
+def leak_file(options: WorldOptions, parts: Parts) -> str:
+    """Return the text of ``leak.csv``."""
     rows: list[tuple[object, ...]] = []
-    for leak in leaks(train, test):
+    for leak in leaks(parts):
         video, at = leak.row.video, leak.nearest
         gap, nearest = ("", "") if at is None else (leak.gap, sample_id(options, video, at))
         flags = (int(at is not None), int(leak.contact), int(leak.object))

@@ -1,10 +1,8 @@
 """How a hand moves the sensor: the contacts of a video, and the state of the sensor at each frame.
 
-The contacts of a video revisit one place of the object (``revisit_mm``; a share ``jump`` of them
-goes far away).
-The sensor comes down during the free frames, then presses, holds, slides and lifts: over the phase
-    p in [0, 1] of
-a contact the load follows (0.45 + 0.55 sin(pi (0.12 + 0.76 p)))^2.
+The contacts of a video revisit a place of the object (``revisit_mm``; a share ``jump`` of them goes
+far away). The sensor comes down during the free frames, then presses, holds, slides and lifts: over
+the phase p in [0, 1] of a contact the load follows (0.45 + 0.55 sin(pi (0.12 + 0.76 p)))^2.
 """
 
 from __future__ import annotations
@@ -21,9 +19,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class Contact:
-    """One contact: place (x, y) on the tile and slide in mm, rotation in radians, peak load in mm,
-    tilt, shear.
-    """
+    """A contact: place (x, y) on the tile, slide and peak load in mm, rotation in radians."""
 
     place: Pair
     slide: Pair
@@ -35,60 +31,48 @@ class Contact:
 
 @dataclass(frozen=True)
 class State:
-    """The sensor at one frame.
+    """The sensor at a frame."""
 
-    Attributes:
-        contact: number of the contact in the video.
-        touching: whether it is in contact.
-        place: middle of the pad on the tile in mm.
-        rotation: of the pad in radians.
-        load: mean indentation in mm, 0 without contact.
-        tilt: slope of the pad.
-        shear: drag in mm per mm of depth.
-        lift: 0 in contact to 1 far away.
-    """
-
-    contact: int
-    touching: bool
-    place: Pair
-    rotation: float
-    load: float
-    tilt: Pair
-    shear: Pair
-    lift: float
+    contact: int  # number of the contact in the video
+    in_contact: bool
+    place: Pair  # middle of the pad on the tile in mm
+    rotation: float  # of the pad in radians
+    load: float  # mean indentation in mm, 0 without contact
+    tilt: Pair  # slope of the pad
+    shear: Pair  # drag in mm per mm of depth
+    lift: float  # 0 in contact to 1 far away
 
 
 def make_contacts(options: WorldOptions, plan: VideoPlan) -> list[Contact]:
-    """The contacts of a video."""
+    """Draw the contacts of a video."""
     contacts: list[Contact] = []
     rng = options.rng("motion", plan.index)
+    normal, draw = rng.normal, rng.uniform
     home, turn, last = (0.0, 0.0), 0.0, -1
     lightest, heaviest = map(math.log, options.load_mm)
-    for number in plan.touched:
+    for number in plan.object_index:
         first = number != last  # on this object
         if first:
-            home, last = (rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM)), number
-            turn = rng.uniform(0.0, 2.0 * math.pi)
+            home, last = (draw(0.0, TILE_MM), draw(0.0, TILE_MM)), number
+            turn = draw(0.0, 2.0 * math.pi)
         far = bool(rng.random() < options.jump) and not first
-        away = (rng.uniform(0.0, TILE_MM), rng.uniform(0.0, TILE_MM))
-        near_x = home[0] + options.revisit_mm * rng.normal()
-        near_y = home[1] + options.revisit_mm * rng.normal()
+        away = (draw(0.0, TILE_MM), draw(0.0, TILE_MM))
+        near = (home[0] + options.revisit_mm * normal(), home[1] + options.revisit_mm * normal())
         reach = options.slide_mm[int(rng.integers(len(options.slide_mm)))]
-        contacts.append(
-            Contact(
-                place=away if far else (near_x, near_y),
-                slide=(reach * rng.normal(), reach * rng.normal()),
-                rotation=turn + rng.normal(0.0, 0.5 if far else 0.1),
-                load=math.exp(rng.uniform(lightest, heaviest)),
-                tilt=(options.tilt * rng.normal(), options.tilt * rng.normal()),
-                shear=(options.shear * rng.normal(), options.shear * rng.normal()),
-            )
+        contact = Contact(
+            place=away if far else near,
+            slide=(reach * normal(), reach * normal()),
+            rotation=turn + normal(0.0, 0.5 if far else 0.1),
+            load=math.exp(draw(lightest, heaviest)),
+            tilt=(options.tilt * normal(), options.tilt * normal()),
+            shear=(options.shear * normal(), options.shear * normal()),
         )
+        contacts.append(contact)
     return contacts
 
 
 def state_at(options: WorldOptions, plan: VideoPlan, contacts: list[Contact], frame: int) -> State:
-    """The state of the sensor at ``frame``; depends on no other frame."""
+    """Return the state of the sensor at ``frame``; it depends on no other frame."""
     number, step = divmod(frame, options.free_frames + options.frames_per_contact)
     contact = contacts[number]
     rng = options.rng("state", plan.index, frame)

@@ -1,4 +1,4 @@
-"""Objects: one drawn piece of a material, with the curvature of the body that it covers."""
+"""Objects: a drawn piece of a material, with the curvature of the body that it covers."""
 
 from __future__ import annotations
 
@@ -6,35 +6,27 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numpy as np
-
 from palpate.core import rng_for
 from palpate.sim.materials import MATERIALS, Material, Surface, draw_surface
-from palpate.sim.options import VERSION, WorldOptions
+from palpate.sim.options import VERSION, Span, WorldOptions
 from palpate.sim.plan import ObjectRef
 from palpate.sim.tile import TILE_MM
 
 
 @dataclass(frozen=True)
 class WorldObject:
-    """An object that can be seen and touched.
-
-    Attributes:
-        ref: its name.
-        surface: relief, albedo, gloss, softness and words.
-        px: pixel size of the tile in mm.
-        curvature: 1 / radius in 1/mm along x of the pad, positive for a bulge; 0 for flat.
-    """
+    """An object."""
 
     ref: ObjectRef
     surface: Surface
-    px: float
-    curvature: float
+    px: float  # pixel size of the tile in mm
+    curvature: float  # 1 / radius in 1/mm along x of the pad, positive for a bulge; 0 for flat
 
 
 def make_object(options: WorldOptions, ref: ObjectRef) -> WorldObject:
-    """The object of that name; depends on the seed, the name, the tile size and how objects are
-    curved alone.
+    """Make the object of that name.
+
+    It depends on the seed, the name, the tile size and the options of curvature alone.
 
     Raises:
         PalpateError: if the material draws something invalid.
@@ -45,10 +37,10 @@ def make_object(options: WorldOptions, ref: ObjectRef) -> WorldObject:
 
 @lru_cache(maxsize=6)
 def _make(
-    seed: int, ref: ObjectRef, material: Material, shape: tuple[int, float, tuple[float, float]]
+    seed: int, ref: ObjectRef, material: Material, shape: tuple[int, float, Span]
 ) -> WorldObject:
     tile, curved, (smallest, largest) = shape
-    rng: np.random.Generator = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
+    rng = rng_for(seed, "world", VERSION, "object", ref.material, ref.number)
     surface = draw_surface(ref.material, material, tile, rng)
     flat = rng.random() >= curved
     bulge = 1.0 if rng.random() < 0.5 else -0.3

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -29,185 +29,128 @@ WORLD_FORMAT_2 = "palpate-world/2"
 #: The background of a contact is the frame this many before its first.
 BACKGROUND_OFFSET = 4
 Span = tuple[float, float]
-#: Names and values of format 2, over which the digests of VERSION 2 are taken.
+#: The first option of each group.
+_FIRST = {"seed": "world", "objects_per_material": "amounts", "curved": "physics", "hard": "photos"}
+#: Names of format 2, over which the digests of VERSION 2 are taken.
 _FORMAT_2 = {"contacts_per_video": "touches_per_video", "frames_per_contact": "frames_per_touch"}
 
 
-def _number(default: float, low: float, high: float, meaning: str, group: str = "amounts") -> Any:
+def _number(default: float, low: float, high: float, meaning: str) -> Any:
     """A number in [low, high]; a whole one where ``low`` is an int."""
-    limits = {"kind": "number", "low": low, "high": high, "help": meaning, "group": group}
-    return field(default=default, metadata=limits)
+    return field(default=default, metadata=_limits("number", meaning, low, high))
 
 
-def _span(default: Span, low: float, high: float, meaning: str, group: str = "physics") -> Any:
+def _span(default: Span, low: float, high: float, meaning: str) -> Any:
     """A range (low, high) that values are drawn from."""
-    limits = {"kind": "span", "low": low, "high": high, "help": meaning, "group": group}
-    return field(default=default, metadata=limits)
+    return field(default=default, metadata=_limits("span", meaning, low, high))
 
 
-def _series(
-    default: tuple[float, ...], low: float, high: float, meaning: str, group: str = "physics"
-) -> Any:
+def _series(default: tuple[float, ...], low: float, high: float, meaning: str) -> Any:
     """Up to eight numbers in [low, high]."""
-    limits = {"kind": "series", "low": low, "high": high, "help": meaning, "group": group}
-    return field(default=default, metadata=limits)
+    return field(default=default, metadata=_limits("series", meaning, low, high))
 
 
-def _choice(default: str, choices: tuple[str, ...], meaning: str, group: str = "amounts") -> Any:
-    limits = {"kind": "choice", "choices": choices, "help": meaning, "group": group}
-    return field(default=default, metadata=limits)
+def _choice(meaning: str, *choices: str) -> Any:
+    """One of a few words, by default the first."""
+    return field(default=choices[0], metadata=_limits("choice", meaning) | {"choices": choices})
+
+
+def _share(default: float, meaning: str) -> Any:
+    return _number(default, 0.0, 1.0, meaning)
+
+
+def _limits(kind: str, meaning: str, low: float = 0, high: float = 0) -> dict[str, Any]:
+    return {"kind": kind, "low": low, "high": high, "help": meaning}
 
 
 @dataclass(frozen=True)
 class WorldOptions:
     """Everything that decides a world; equal options give equal bytes.
 
-    Every field has its range, its meaning and its group in its metadata, from which the command
-    line and the documentation are made.
+    Every field has its range and meaning in its metadata, from which the command line and the
+    documentation are made.
 
     Raises:
         PalpateError: if an option is out of range; :class:`~palpate.core.ProblemsError` if several
             are.
     """
 
-    seed: int = _number(
-        0, 0, 2**31 - 1, "worlds of different seeds share no object, video or text", "world"
-    )
-    size: int = _number(
-        64, 16, 256, "side of the images in pixels; even for layout videos", "world"
-    )
+    # world
+    seed: int = _number(0, 0, 2**31 - 1, "worlds of different seeds share no object, video, text")
+    size: int = _number(64, 16, 256, "side of the images in pixels; even for layout videos")
     materials: tuple[str, ...] | int = field(
-        default=20,
-        metadata={
-            "kind": "materials",
-            "help": "names of materials, or how many, spread over the table",
-            "group": "world",
-        },
+        default=20, metadata=_limits("materials", "names, or how many, spread over the table")
     )
     look: Literal["gelsight", "digit"] = _choice(
-        "gelsight",
-        ("gelsight", "digit"),
-        "sensor family: with markers, or darker and without",
-        "world",
+        "sensor family: with markers, or darker and without", "gelsight", "digit"
     )
-    leak: Literal["frame", "contact", "none"] = _choice(
-        "contact",
-        ("frame", "contact", "none"),
-        "how train and test lists are cut: by random frame, random whole contact, or video",
-        "world",
+    leak: Literal["contact", "frame", "none"] = _choice(
+        "what the lists of train and test cut: whole contacts, frames, or videos (no leak)",
+        *("contact", "frame", "none"),
     )
     layout: Literal["frames", "videos", "hct"] = _choice(
-        "frames",
-        ("frames", "videos", "hct"),
-        "Touch and Go as JPEG frames or as H.264 videos, or HCT",
-        "world",
+        "Touch and Go as JPEG frames or as H.264 videos, or HCT", "frames", "videos", "hct"
     )
-    test: float = _number(0.25, 0.01, 0.99, "share of the contact frames in the test list", "world")
-    tile: int = _number(
-        256,
-        64,
-        1024,
-        "pixels a side of an object's 64 mm: 256 fits 64 px images, 512 fits 128 px",
-        "world",
-    )
+    test: float = _number(0.25, 0.01, 0.99, "share of the contact frames in the test list")
+    tile: int = _number(256, 64, 1024, "pixels a side of an object's 64 mm; 512 for 128 px images")
+    # amounts
     objects_per_material: int = _number(5, 1, 10_000, "objects of each material that have videos")
     balance: Literal["uniform", "touch-and-go"] = _choice(
-        "uniform",
-        ("uniform", "touch-and-go"),
-        "equal classes, or classes as unequal as in Touch and Go",
+        "equal classes, or as unequal as in Touch and Go", "uniform", "touch-and-go"
     )
     videos_per_object: int = _number(1, 1, 100, "videos of each object")
-    two_videos: float = _number(0.0, 0.0, 1.0, "share of the objects with one video more")
+    two_videos: float = _share(0.0, "share of the objects with an additional video")
     contacts_per_video: int = _number(4, 1, 100, "contacts in a video")
     frames_per_contact: int = _number(3, 1, 200, "frames of a contact")
-    free_frames: int = _number(
-        5, BACKGROUND_OFFSET + 1, 200, "frames without contact before each contact"
-    )
+    free_frames: int = _number(5, BACKGROUND_OFFSET + 1, 200, "free frames before each contact")
     free_written: Literal["all", "background"] = _choice(
-        "all",
-        ("all", "background"),
-        "write all frames without contact, or only those that show the background",
+        "free frames to write: all, or only those that show the background", "all", "background"
     )
-    objects_per_video: int = _number(3, 1, 14, "a mixed video touches 2 to this many objects")
-    mixed: float = _number(0.12, 0.0, 1.0, "share of the videos that touch several objects")
-    sensors: int = _number(3, 1, 100, "gel units; each video uses one")
-    named: float = _number(
-        0.5, 0.0, 1.0, "share of the captions that name the material; others say how it feels"
-    )
-    curved: float = _number(0.4, 0.0, 1.0, "share of the objects that are curved", "physics")
-    radius_mm: Span = _span(
-        (25.0, 90.0), 5.0, 1000.0, "range of their radius (as dents 3.3 times flatter)"
-    )
-    pad_mm: float = _number(
-        14.0, 5.0, 30.0, "side of the gel pad; at most the lower end of view_mm", "physics"
-    )
-    gel_mm: float = _number(
-        1.6, 0.5, 10.0, "depth of the gel; at least the upper end of load_mm", "physics"
-    )
+    objects_per_video: int = _number(3, 1, 14, "a mixed video has 2 to this many objects")
+    mixed: float = _share(0.12, "share of the videos with several objects")
+    sensors: int = _number(3, 1, 100, "gel units; each video uses one of them")
+    named: float = _share(0.5, "share of captions that name the material; others only adjectives")
+    # physics
+    curved: float = _share(0.4, "share of the objects that are curved")
+    radius_mm: Span = _span((25.0, 90.0), 5.0, 1000.0, "their radius (of dents 3.3 times)")
+    pad_mm: float = _number(14.0, 5.0, 30.0, "side of the gel pad; at most the low end of view_mm")
+    gel_mm: float = _number(1.6, 0.5, 10.0, "depth of the gel; at least the high end of load_mm")
     relax_mm: tuple[float, ...] = _series(
-        (2.4, 0.9, 0.35),
-        0.01,
-        10.0,
-        "blurs of the free membrane, the contact imposed again after each",
+        (2.4, 0.9, 0.35), 0.01, 10.0, "blurs of the free membrane; contact is restored after each"
     )
-    optical_mm: float = _number(0.14, 0.0, 2.0, "blur of the sensor's optics", "physics")
-    dome_mm: Span = _span((30.0, 80.0), 10.0, 1000.0, "range of the radius of a unit's domed gel")
-    markers: int = _number(
-        8, 0, 40, "rows of markers a side of a gelsight pad; 0 for none", "physics"
-    )
-    dirt: float = _number(
-        1.0, 0.0, 10.0, "factor on uneven coating, specks and scratches", "physics"
-    )
-    vignette: Span = _span((0.03, 0.16), 0.0, 0.9, "range of the darkening at half the pad's side")
-    sensor_noise: Span = _span(
-        (0.002, 0.006), 0.0, 0.2, "range of a unit's image noise (deviation, of 1)"
-    )
-    load_mm: Span = _span(
-        (0.09, 0.42), 0.005, 1.5, "range of a contact's peak load as mean indentation, log-uniform"
-    )
-    revisit_mm: float = _number(
-        3.5, 0.0, 32.0, "deviation of the places that a video touches around its first", "physics"
-    )
-    jump: float = _number(
-        0.25, 0.0, 1.0, "share of the contacts that go far away instead", "physics"
-    )
+    optical_mm: float = _number(0.14, 0.0, 2.0, "blur of the sensor's optics")
+    dome_mm: Span = _span((30.0, 80.0), 10.0, 1000.0, "radius of a unit's domed gel")
+    markers: int = _number(8, 0, 40, "rows of markers a side of a gelsight pad; 0 for none")
+    dirt: float = _number(1.0, 0.0, 10.0, "factor on uneven coating, specks and scratches")
+    vignette: Span = _span((0.03, 0.16), 0.0, 0.9, "darkening at half the pad's side")
+    sensor_noise: Span = _span((0.002, 0.006), 0.0, 0.2, "image noise of a unit (deviation, of 1)")
+    load_mm: Span = _span((0.09, 0.42), 0.005, 1.5, "peak load as mean indentation, log-uniform")
+    revisit_mm: float = _number(3.5, 0.0, 32.0, "deviation of a video's contacts around its first")
+    jump: float = _share(0.25, "share of the contacts that go far away instead")
     slide_mm: tuple[float, ...] = _series(
-        (0.0, 1.5, 5.0),
-        0.0,
-        32.0,
-        "deviations, one drawn per contact, of how far the sensor slides",
+        (0.0, 1.5, 5.0), 0.0, 32.0, "deviations, one drawn per contact, of the sensor's slide"
     )
-    tilt: float = _number(0.045, 0.0, 0.5, "deviation of the pad's slope", "physics")
-    shear: float = _number(0.7, 0.0, 5.0, "deviation of the drag in mm per mm of depth", "physics")
-    hard: float = _number(
-        0.5, 0.0, 1.0, "factor on all in the photos that is irrelevant to contact", "photos"
-    )
-    view_mm: Span = _span(
-        (30.0, 45.0), 15.0, 45.25, "range of the width of the photo, log-uniform", "photos"
-    )
-    elevation_deg: Span = _span((18.0, 75.0), 1.0, 89.0, "range of the sun's height", "photos")
-    hand: float = _number(
-        0.6, 0.0, 1.0, "share of the videos with a hand in view, at hard 0.5", "photos"
-    )
-    shadow: float = _number(0.5, 0.0, 1.0, "share with a cast shadow, at hard 0.5", "photos")
-    edge: float = _number(
-        0.35, 0.0, 1.0, "share with the edge of the object in view, at hard 0.5", "photos"
-    )
-    stains: float = _number(1.0, 0.0, 10.0, "factor on the number of stains and stickers", "photos")
-    sway: float = _number(1.0, 0.0, 10.0, "factor on the slow drift of the camera", "photos")
+    tilt: float = _number(0.045, 0.0, 0.5, "deviation of the pad's slope")
+    shear: float = _number(0.7, 0.0, 5.0, "deviation of the drag in mm per mm of depth")
+    # photos
+    hard: float = _share(0.5, "factor on all in the photos that is irrelevant to contact")
+    view_mm: Span = _span((30.0, 45.0), 15.0, 45.25, "width of the photo, log-uniform")
+    elevation_deg: Span = _span((18.0, 75.0), 1.0, 89.0, "height of the sun")
+    hand: float = _share(0.6, "share of the videos with a hand in view, at hard 0.5")
+    shadow: float = _share(0.5, "share with a cast shadow, at hard 0.5")
+    edge: float = _share(0.35, "share with the edge of the object in view, at hard 0.5")
+    stains: float = _number(1.0, 0.0, 10.0, "factor on the number of stains and stickers")
+    sway: float = _number(1.0, 0.0, 10.0, "factor on the slow drift of the camera")
     blur_px: tuple[float, ...] = _series(
-        (0.35, 0.6, 1.1),
-        0.0,
-        5.0,
-        "deviations, one drawn per video, of the blur in pixels at 128 px",
-        "photos",
+        (0.35, 0.6, 1.1), 0.0, 5.0, "blurs in pixels at 128 px, one drawn per video"
     )
 
     def __post_init__(self) -> None:
-        for option in dataclasses.fields(self):
+        fields = dataclasses.fields(self)
+        for option in fields:
             object.__setattr__(self, option.name, _normal(getattr(self, option.name), option))
-        errors = [e for f in dataclasses.fields(self) for e in _check(f, getattr(self, f.name))]
-        errors += [] if errors else self._inconsistent()
+        errors = [e for option in fields for e in _check(option, getattr(self, option.name))]
+        errors = errors or list(self._inconsistent())
         if len(errors) == 1:
             raise errors[0]
         if errors:
@@ -249,18 +192,26 @@ class WorldOptions:
         return digest_json({"version": VERSION, "options": self.format_2()})
 
     def format_2(self) -> dict[str, Any]:
-        """The options under the names of format 2, for digests that do not change with names."""
+        """Return the options under the names of format 2, over which digests are taken."""
         values = {_FORMAT_2.get(k, k): v for k, v in dataclasses.asdict(self).items()}
         return values | {"leak": "touch" if self.leak == "contact" else self.leak}
 
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
-        """A generator that depends on VERSION, the seed, the purpose and the ids alone."""
+        """Return a generator that depends on VERSION, the seed, the purpose and the ids alone."""
         return rng_for(self.seed, "world", VERSION, purpose, *ids)
 
 
+def option_groups() -> dict[str, list[dataclasses.Field[Any]]]:
+    """Return the options of each group: world, amounts, physics, photos."""
+    options = dataclasses.fields(WorldOptions)
+    starts = [k for k, option in enumerate(options) if option.name in _FIRST]
+    ends = [*starts[1:], len(options)]
+    return {_FIRST[options[a].name]: list(options[a:b]) for a, b in zip(starts, ends, strict=True)}
+
+
 def _normal(value: Any, option: dataclasses.Field[Any]) -> Any:
-    """One form of every value: tuples for lists, floats for whole numbers, names for a count."""
-    kind, low = option.metadata["kind"], option.metadata.get("low")
+    """Return a single form of every value: tuples for lists, floats, names for a count."""
+    kind, low = option.metadata["kind"], option.metadata["low"]
     if isinstance(value, list):
         value = tuple(value)
     if kind in ("span", "series") and isinstance(value, tuple):
@@ -283,11 +234,9 @@ def _error(name: str, must: str, got: Any, fix: str, example: Any = None) -> Pal
 
 
 def _check(option: dataclasses.Field[Any], value: Any) -> Iterator[PalpateError]:
-    """Yield what is wrong with one value."""
+    """Yield what is wrong with a value."""
     name, limits = option.name, option.metadata
-    kind = limits["kind"]
-    low: float = limits.get("low", 0)
-    high: float = limits.get("high", 0)
+    kind, low, high = limits["kind"], limits["low"], limits["high"]
     if kind == "materials":
         yield from _check_materials(value)
     elif kind == "choice":
@@ -324,16 +273,19 @@ def _check_materials(names: Any) -> Iterator[PalpateError]:
         yield _error("materials", must, names, known, ("Wood", "Grass"))
         return
     if len(set(names)) < len(names):
-        yield _error(
-            "materials", "must name each material once", names, "Remove the repeated names"
-        )
+        fix = "Remove the repeated names"
+        yield _error("materials", "must name each material once", names, fix)
     for name in names:
-        if name not in MATERIALS:
-            near = difflib.get_close_matches(str(name), MATERIALS, 1, 0.3)
-            fix = f"Did you mean {near[0]!r}? {known}" if near else known
-            yield _error("materials", "must be names of materials", name, fix)
-        else:
+        if name in MATERIALS:
             yield from check_material(name)
+        else:
+            yield _error("materials", "must be names of materials", name, _nearest(name, MATERIALS))
+
+
+def _nearest(name: Any, known: Iterable[str]) -> str:
+    """Return a fix: the most similar known name, or all."""
+    near = difflib.get_close_matches(str(name), known := list(known), 1, 0.5)
+    return f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known)}"
 
 
 def load_options(path: str | Path) -> WorldOptions:
@@ -346,8 +298,8 @@ def load_options(path: str | Path) -> WorldOptions:
     """
     path = Path(path)
     path = path / "world.json" if path.is_dir() else path
-    data = read_json(path, "file of a world's options")
-    options = read_world(data, str(path)).get("options")
+    data = read_world(path)
+    options = data.get("options")
     if not isinstance(options, dict):
         must = f"{path} must hold the options of a world"
         raise PalpateError(must, "none", "Name the world.json of a finished world")
@@ -355,12 +307,10 @@ def load_options(path: str | Path) -> WorldOptions:
     values: dict[str, Any] = {current.get(str(k), str(k)): v for k, v in options.items()}
     if values.get("leak") == "touch":
         values["leak"] = "contact"
-    known = [f.name for f in dataclasses.fields(WorldOptions)]
-    for name in values:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            fix = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known)}"
-            raise PalpateError(f"The options in {path} must be those of a world", repr(name), fix)
+    known = [option.name for option in dataclasses.fields(WorldOptions)]
+    if unknown := [name for name in values if name not in known]:
+        must, fix = f"The options in {path} must be those of a world", _nearest(unknown[0], known)
+        raise PalpateError(must, repr(unknown[0]), fix)
     world = WorldOptions(**values)
     if data.get("options_digest", world.digest) != world.digest:
         fix = "Pass changed options as arguments, or remove options_digest from a copy"
@@ -368,19 +318,18 @@ def load_options(path: str | Path) -> WorldOptions:
     return world
 
 
-def read_world(data: Any, where: str) -> Mapping[str, Any]:
-    """Check that JSON is the record of a world of this VERSION.
+def read_world(path: Path) -> Mapping[str, Any]:
+    """Read the record of a world of this VERSION.
 
     Raises:
-        PalpateError: if it is not. Equal options of another VERSION give other images.
+        PalpateError: if it is not one. Equal options of another VERSION give other images.
     """
-    fix = "Choose another folder, or remove it"
+    data, fix = read_json(path, "world record"), "Choose another folder, or remove it"
     formats = (WORLD_FORMAT, WORLD_FORMAT_2)
     if not isinstance(data, dict) or data.get("format") not in formats:
-        raise PalpateError(
-            f"{where} must be the record of a world ({WORLD_FORMAT})", "other JSON", fix
-        )
+        must = f"{path} must be the record of a world ({WORLD_FORMAT})"
+        raise PalpateError(must, "other JSON", fix)
     if data.get("version") != VERSION:
-        must = f"{where} must be of version {VERSION} of the world"
+        must = f"{path} must be of version {VERSION} of the world"
         raise PalpateError(must, f"version {data.get('version')}", "Make the world again")
     return data

@@ -1,15 +1,13 @@
-"""Which videos a world has, what each touches, and how frames are numbered; known before rendering.
+"""Which videos a world has, their objects and frame numbers; known before rendering.
 
 A video of T contacts, F free frames and C frames of a contact has frames 0 .. T (F + C) - 1.
-Contact k begins with its free frames at k (F + C); its frames in contact are k (F + C) + F up to (k
-+ 1)(F + C) - 1.
+Contact k begins with its free frames at k (F + C); its frames in contact are k (F + C) + F up to
+(k + 1)(F + C) - 1.
 
 Objects per material: ``balance="uniform"`` gives each the same number. ``balance="touch-and-go"``
-    makes classes
-as unequal as the frames of Touch and Go (Yang et al., 2022), whose official lists hold 121,861
-frames: 23 % of them are synthetic fabric, 0.2 % sand. A material has max(2, total * its share)
-    objects, and what the minimum of
-two adds is taken from the others in proportion.
+makes classes as unequal as the frames of Touch and Go (Yang et al., 2022), whose official lists
+hold 121,861 frames: 23 % of them are synthetic fabric, 0.2 % sand. A material has max(2, total *
+its share) objects, and what the minimum of two adds is taken from the others in proportion.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ class ObjectRef:
 
     @property
     def name(self) -> str:
-        """As in ``objects.csv``, e.g. ``natural_fabric_003``."""
+        """The name in ``objects.csv``, e.g. ``natural_fabric_003``."""
         return f"{object_prefix(self.material)}_{self.number:03d}"
 
 
@@ -54,19 +52,19 @@ class VideoPlan:
         index: position in the world; its random draws depend on it.
         name: 15 characters ``YYYYMMDD_HHMMSS``, unique in the world.
         sensor: the gel unit, 0 .. sensors - 1.
-        objects: the objects touched, in order; mostly one.
-        touched: for each contact, the position of its object in ``objects``; never decreasing.
+        objects: its objects in order; mostly a single one.
+        object_index: position in ``objects`` for each contact; never decreasing.
     """
 
     index: int
     name: str
     sensor: int
     objects: tuple[ObjectRef, ...]
-    touched: tuple[int, ...]
+    object_index: tuple[int, ...]
 
     def object_of(self, contact: int) -> ObjectRef:
-        """The object of one contact."""
-        return self.objects[self.touched[contact]]
+        """Return the object of a contact."""
+        return self.objects[self.object_index[contact]]
 
 
 @dataclass(frozen=True)
@@ -79,30 +77,30 @@ class Row:
 
     @property
     def object(self) -> ObjectRef:
-        """The object that is touched."""
+        """The object in contact."""
         return self.video.object_of(self.contact)
 
 
 def first_contact(options: WorldOptions, contact: int) -> int:
-    """Frame number of the first frame of a contact."""
+    """Return the number of the first frame of a contact."""
     return contact * (options.free_frames + options.frames_per_contact) + options.free_frames
 
 
 def contact_frames(options: WorldOptions, contact: int) -> range:
-    """Frame numbers of a contact."""
+    """Return the frame numbers of a contact."""
     first = first_contact(options, contact)
     return range(first, first + options.frames_per_contact)
 
 
 def contact_row(options: WorldOptions, plans: list[VideoPlan], k: int) -> Row:
-    """Contact frame number ``k`` of the world, by video and frame."""
+    """Return contact frame ``k`` of the world, by video and frame."""
     video, within = divmod(k, options.contacts_per_video * options.frames_per_contact)
     contact, step = divmod(within, options.frames_per_contact)
     return Row(plans[video], contact, first_contact(options, contact) + step)
 
 
 def contact_rows(options: WorldOptions, plans: list[VideoPlan]) -> Iterator[Row]:
-    """Every contact frame, by video and frame: the order of the manifest."""
+    """Yield every contact frame, by video and frame: the order of the manifest."""
     for plan in plans:
         for contact in range(options.contacts_per_video):
             for frame in contact_frames(options, contact):
@@ -110,21 +108,15 @@ def contact_rows(options: WorldOptions, plans: list[VideoPlan]) -> Iterator[Row]
 
 
 def written_frames(options: WorldOptions) -> list[int]:
-    """Frame numbers that are written, the same in every video."""
+    """Return the frame numbers that are written, the same in every video."""
     if options.free_written == "all":
         return list(range(options.video_length))
-    return [
-        frame
-        for contact in range(options.contacts_per_video)
-        for frame in (
-            first_contact(options, contact) - BACKGROUND_OFFSET,
-            *contact_frames(options, contact),
-        )
-    ]
+    contacts = [contact_frames(options, k) for k in range(options.contacts_per_video)]
+    return [frame for c in contacts for frame in (c.start - BACKGROUND_OFFSET, *c)]
 
 
 def objects_of(options: WorldOptions) -> dict[str, int]:
-    """Material -> number of objects that have videos, in the order of ``options.names``.
+    """Return material -> number of objects that have videos, in the order of ``options.names``.
 
     A material that Touch and Go does not know has the mean share.
     """
@@ -138,7 +130,7 @@ def objects_of(options: WorldOptions) -> dict[str, int]:
 
 
 def _in_proportion(weights: dict[str, float], total: int) -> dict[str, int]:
-    """Whole numbers of at least ``LEAST`` in proportion to ``weights`` that sum to ``total``."""
+    """Return whole numbers >= ``LEAST`` in proportion to ``weights`` that sum to ``total``."""
     small: set[str] = set()
     while True:
         large = {name: w for name, w in weights.items() if name not in small}
@@ -157,21 +149,19 @@ def _in_proportion(weights: dict[str, float], total: int) -> dict[str, int]:
 
 
 def spread(count: int, share: float) -> list[int]:
-    """Positions in 0 .. count - 1 of a share, by error diffusion: every stretch has its share."""
+    """Return positions in 0 .. count - 1 of a share by error diffusion, evenly spread."""
     return [k for k in range(count) if int((k + 1) * share + 0.5) > int(k * share + 0.5)]
 
 
 def _with_two_videos(options: WorldOptions, objects: list[ObjectRef]) -> set[ObjectRef]:
-    """The share ``two_videos`` of the objects, so that every material has its share, nearly."""
+    """Return a share ``two_videos`` of the objects, about the same share of every material."""
     order = [objects[k] for k in options.rng("two videos").permutation(len(objects))]
     order.sort(key=lambda ref: options.names.index(ref.material))
     return {order[k] for k in spread(len(order), options.two_videos)}
 
 
 def plan_world(options: WorldOptions) -> list[VideoPlan]:
-    """All videos of a world in the order of their names: objects in random order, each one's videos
-    in a row.
-    """
+    """Plan all videos of a world in the order of their names: object by object, shuffled."""
     counts = objects_of(options)
     objects = [ObjectRef(m, k) for m, count in counts.items() for k in range(count)]
     twice = _with_two_videos(options, objects)
@@ -190,6 +180,7 @@ def plan_world(options: WorldOptions) -> list[VideoPlan]:
 def _plan_video(
     options: WorldOptions, index: int, name: str, main: ObjectRef, guests: dict[str, int]
 ) -> VideoPlan:
+    """Plan a video of ``main`` and, if it is mixed, of new objects counted in ``guests``."""
     rng = options.rng("plan", index)
     objects = [main]
     most = min(options.objects_per_video, options.contacts_per_video, len(options.names))
@@ -200,5 +191,5 @@ def _plan_video(
             guests[others[k]] += 1
     changes = rng.permutation(options.contacts_per_video - 1)[: len(objects) - 1]
     cuts = sorted(int(c) + 1 for c in changes)
-    touched = tuple(sum(c >= cut for cut in cuts) for c in range(options.contacts_per_video))
-    return VideoPlan(index, name, int(rng.integers(options.sensors)), tuple(objects), touched)
+    which = tuple(sum(c >= cut for cut in cuts) for c in range(options.contacts_per_video))
+    return VideoPlan(index, name, int(rng.integers(options.sensors)), tuple(objects), which)

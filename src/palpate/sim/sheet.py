@@ -1,4 +1,4 @@
-"""An overview image of a world: a row a material, three objects each, photo and tactile image."""
+"""An overview image of a world: a row for each material, three objects of each."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def render_sheet(options: WorldOptions, path: str | Path) -> None:
         draw.text((left + 4, top + size // 2 - 6), f"{MATERIALS[name].label} {name}", fill="black")
         for number in range(SHOWN):
             index, unit = 10**6 + SHOWN * k + number, number % options.sensors
-            touched = (0,) * options.contacts_per_video
-            plan = VideoPlan(index, "sheet", unit, (ObjectRef(name, number),), touched)
+            which = (0,) * options.contacts_per_video
+            plan = VideoPlan(index, "sheet", unit, (ObjectRef(name, number),), which)
             video = Video(options, plan)
             pair = np.concatenate([video.vision(frame), video.tactile(frame)], 1)
             sheet.paste(Image.fromarray(pair), (left + _LABEL + 2 * number * size, top))

@@ -3,8 +3,7 @@
 The adjectives come from the piece that was drawn (its sub-type), never from the class alone, and
 never name color or light. A share ``named`` of the captions also names the material; the others use
 adjectives alone, so that text is not just the label. In the layout of HCT a caption is, as there, a
-list of adjectives (``rugged, rough``), followed by the noun where it is named (``rugged, rough,
-tree bark``).
+list of adjectives (``rugged, rough``), then the noun if named (``rugged, rough, tree bark``).
 """
 
 from __future__ import annotations
@@ -26,32 +25,30 @@ _VOWEL = re.compile(r"[aeiou]|hour|hono|hones|heir")
 
 
 def article(word: str) -> str:
-    """``"a"`` or ``"an"``, by the sound that ``word`` begins with (``"a uniform"``, ``"an
-    unusual"``).
-    """
+    """Return ``"a"`` or ``"an"``, by sound: ``"a uniform"``, ``"an unusual"``."""
     word = word.lower()
     return "an" if _VOWEL.match(word) and not _CONSONANT.match(word) else "a"
 
 
 def listed(words: Sequence[str]) -> str:
-    """``"a"``, ``"a and b"``, ``"a, b and c"``."""
+    """Join words: ``"a"``, ``"a and b"``, ``"a, b and c"``."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def phrase(words: Sequence[str], noun: str) -> str:
-    """``"rugged, rough tree bark"``; of a noun that can be counted: ``"an even, waxy leaf"``."""
+    """Return ``"rugged, rough tree bark"``; if the noun can be counted ``"an even, waxy leaf"``."""
     counted = bare(noun)
     text = f"{', '.join(words)} {counted}"
     return text if counted == noun else f"{article(words[0])} {text}"
 
 
 def bare(noun: str) -> str:
-    """``"leaf"`` of ``"a leaf"``; other nouns unchanged."""
+    """Return ``"leaf"`` of ``"a leaf"``; other nouns unchanged."""
     return noun.removeprefix("a ").removeprefix("an ")
 
 
 def caption(options: WorldOptions, video: int, contact: int, surface: Surface) -> str:
-    """The caption of one contact: at least two of the piece's adjectives, in random order."""
+    """Write the caption of a contact: at least two of the piece's adjectives, in random order."""
     rng = options.rng("text", video, contact)
     words = [surface.words[k] for k in rng.permutation(len(surface.words))]
     words = words[: int(rng.integers(min(2, len(words)), len(words) + 1))]

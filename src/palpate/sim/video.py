@@ -1,4 +1,4 @@
-"""One video of the world: any of its frames can be rendered alone."""
+"""A video of the world: any of its frames can be rendered alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from palpate.sim.text import caption
 
 
 class Video:
-    """Renders the frames of one video.
+    """Renders the frames of a video.
 
     Args:
         options: the world's.
@@ -39,15 +39,13 @@ class Video:
         self.sensor = make_sensor(options, plan.sensor)
         self.contacts = make_contacts(options, plan)
         self.camera = make_camera(options, plan.index)
-        rng = options.rng("gain", plan.index)
-        spread = 2.0 * options.hard
+        rng, spread = options.rng("gain", plan.index), 2.0 * options.hard
         balance, exposure = rng.standard_normal(3), rng.standard_normal()
         self.gain: Array = f32(np.exp(0.03 * spread * balance + 0.05 * spread * exposure))
         self._scenes: dict[int, Scene] = {}
-        self._states: dict[int, State] = {}
 
     def state(self, frame: int) -> State:
-        """The state of the sensor at ``frame``.
+        """Return the state of the sensor at ``frame``.
 
         Raises:
             PalpateError: if the video has no such frame.
@@ -55,65 +53,59 @@ class Video:
         if not 0 <= frame < self.options.video_length:
             must = f"A frame of {self.plan.name} must be 0 to {self.options.video_length - 1}"
             raise PalpateError(must, str(frame), "Choose another frame")
-        if frame not in self._states:  # vision and tactile image use the same one
-            self._states = {frame: state_at(self.options, self.plan, self.contacts, frame)}
-        return self._states[frame]
+        return state_at(self.options, self.plan, self.contacts, frame)
 
     def object_of(self, contact: int) -> WorldObject:
-        """The object of a contact."""
+        """Return the object of a contact."""
         return make_object(self.options, self.plan.object_of(contact))
 
     def text(self, contact: int) -> str:
-        """The caption of a contact."""
+        """Return the caption of a contact."""
         return caption(self.options, self.plan.index, contact, self.object_of(contact).surface)
 
     def vision(self, frame: int) -> np.ndarray:
-        """The photo: uint8, shape (n, n, 3)."""
+        """Render the photo: uint8, shape (n, n, 3)."""
         state, index = self.state(frame), self.plan.index
-        number = self.plan.touched[state.contact]
+        number = self.plan.object_index[state.contact]
         if number not in self._scenes:
-            seen = self.object_of(state.contact)
-            self._scenes[number] = light_object(self.options, self.camera, seen, index, number)
+            body = self.object_of(state.contact)
+            self._scenes[number] = light_object(self.options, self.camera, body, index, number)
         image = photo(self.options, self.camera, self._scenes[number], state, (index, frame))
         return to_bytes(image)
 
     def tactile(self, frame: int) -> np.ndarray:
-        """The sensor's image: uint8, shape (n, n, 3)."""
-        state, sensor = self.state(frame), self.sensor
-        if state.touching:
+        """Render the tactile image: uint8, shape (n, n, 3)."""
+        state, sensor, image = self.state(frame), self.sensor, self._passive
+        if state.in_contact:
             membrane = self.membrane(state)[0]
             shift = marker_shift(sensor, membrane, state.shear) if sensor.ink is not None else None
             image = shade(sensor, membrane, self.gain, shift)
-        else:
-            image = self._passive
         rng = self.options.rng("noise", self.plan.index, frame)
         noise = rng.standard_normal(image.shape, dtype=np.float32)
         return to_bytes(image + noise * np.float32(sensor.noise))
 
     def membrane(self, state: State) -> tuple[Array, Array]:
-        """Displacement of the gel in mm and contact mask, both (n, n), of a state in contact."""
-        pressed = self.object_of(state.contact)
-        gap = gap_of(pressed, self.sensor, self.relief(state), state.load, state.tilt)
-        return press(self.sensor, gap, state.load * (1.0 - 0.3 * pressed.surface.softness))
+        """Press: displacement of the gel in mm and contact mask, both (n, n)."""
+        body = self.object_of(state.contact)
+        gap = gap_of(body, self.sensor, self.relief(state), state.load, state.tilt)
+        return press(self.sensor, gap, state.load * (1.0 - 0.3 * body.surface.softness))
 
     def relief(self, state: State) -> Array:
-        """The object's relief under the pad in mm, (n, n)."""
-        pressed = self.object_of(state.contact)
+        """Return the object's relief under the pad in mm, (n, n)."""
+        body = self.object_of(state.contact)
         y, x = grid(self.options.size)
-        half = self.options.pad_mm / 2.0 / pressed.px
+        half = self.options.pad_mm / 2.0 / body.px
         c, s = float(np.cos(state.rotation)) * half, float(np.sin(state.rotation)) * half
-        rows = s * x + c * y + state.place[1] / pressed.px
-        columns = c * x - s * y + state.place[0] / pressed.px
-        return sample_periodic(pressed.surface.height, rows, columns)
+        rows = s * x + c * y + state.place[1] / body.px
+        columns = c * x - s * y + state.place[0] / body.px
+        return sample_periodic(body.surface.height, rows, columns)
 
     def background(self) -> np.ndarray:
-        """The sensor's image without contact and without noise: uint8, shape (n, n, 3)."""
+        """Render the sensor without contact and without noise: uint8, shape (n, n, 3)."""
         return to_bytes(self._passive)
 
     def background_of(self, contact: int) -> np.ndarray:
-        """The background that the layout gives a contact: one noiseless image a video in HCT, else
-        frame -4.
-        """
+        """Render the background of a contact: noiseless in HCT, else the frame 4 before it."""
         if self.options.layout == "hct":
             return self.background()
         return self.tactile(first_contact(self.options, contact) - BACKGROUND_OFFSET)

@@ -1,19 +1,17 @@
 """A world without files: any of its samples rendered when requested.
 
 ``World(options)[k]`` gives the arrays that :func:`palpate.sim.write_world` writes as row k of its
-manifest, pixel for pixel (before JPEG). It is a map-style data set: it has a length, takes an
-index, and can be pickled and sent to the workers of a data loader. A few videos are kept ready;
-nothing else grows with what was rendered. In order a sample costs its three images; at random also
-the set-up of its object and video, several times as much.
+manifest, pixel for pixel (before JPEG). It is a map-style data set, and can be pickled and sent to
+the workers of a data loader. A few videos are kept ready. In order a sample costs its three images;
+at random also the set-up of its object and video, several times as much.
 """
 
 from __future__ import annotations
 
 import json
 import operator
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, SupportsIndex
 
@@ -21,7 +19,7 @@ from palpate.core import PalpateError, Progress, Split, quiet
 from palpate.data.formats.hct import sessions_of
 from palpate.data.formats.touch_and_go import CATEGORIES
 from palpate.data.manifest import Manifest
-from palpate.sim.layouts import contact_id, image_paths, manifest_root, sample_id, video_id
+from palpate.sim.layouts import Parts, contact_id, image_paths, manifest_root, sample_id, video_id
 from palpate.sim.leak import cut
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import VERSION, WorldOptions
@@ -29,8 +27,7 @@ from palpate.sim.plan import Row, VideoPlan, contact_row, contact_rows, plan_wor
 from palpate.sim.presets import PRESETS
 from palpate.sim.video import Video
 
-#: Seconds between the starts of two recordings of one session in the layout of HCT, as an import
-#: takes it.
+#: Seconds between the starts of two recordings of a session of HCT, as an import takes it.
 _SESSION_GAP = 60.0
 
 
@@ -58,18 +55,14 @@ class World:
             raise PalpateError("must be at least 1", str(cache), "", argument="cache")
         self.options = PRESETS[options] if isinstance(options, str) else options or WorldOptions()
         self.cache = cache
-        self._videos: OrderedDict[int, Video] = OrderedDict()
+        self._video = lru_cache(cache)(partial(Video, self.options))
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The options alone: a copy in another process renders for itself."""
-        return {"options": self.options, "cache": self.cache}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """The inverse of :meth:`__getstate__`."""
-        self.__init__(state["options"], cache=state["cache"])
+    def __reduce__(self) -> Any:
+        """Pickle the options alone: a copy in another process renders for itself."""
+        return partial(World, self.options, cache=self.cache), ()
 
     def __repr__(self) -> str:
-        """Length and digest."""
+        """Show length and digest."""
         return f"World({len(self)} samples, options {self.options.digest[:12]})"
 
     @cached_property
@@ -78,7 +71,7 @@ class World:
         return plan_world(self.options)
 
     def __len__(self) -> int:
-        """Number of contact frames."""
+        """Count the contact frames."""
         return len(self.plans) * self.options.contacts_per_video * self.options.frames_per_contact
 
     @property
@@ -88,14 +81,12 @@ class World:
         return [sample_id(self.options, row.video, row.frame) for row in rows]
 
     def __getitem__(self, k: SupportsIndex) -> dict[str, Any]:
-        """Render one sample; negative numbers count from the end.
+        """Render a sample; negative numbers count from the end.
 
         Returns:
             ``vision``, ``tactile``, ``background``: uint8 (size, size, 3); ``id``, ``video``,
-                ``contact``, ``object``,
-            ``material``, ``text``, ``sensor``: text; ``frame``, ``label``: integers. They mean what
-                they mean in
-            the manifest; ``label`` is the material's number.
+            ``contact``, ``object``, ``material``, ``text``, ``sensor``: text; ``frame``, ``label``:
+            integers. They mean what they mean in the manifest; ``label`` is the material's number.
 
         Raises:
             NoSampleError: if there is no such sample.
@@ -107,8 +98,7 @@ class World:
             raise NoSampleError(must, str(number), "Choose another sample")
         row = contact_row(self.options, self.plans, number % len(self))
         video = self._video(row.video)
-        cells = _cells(self.options, row, video.text(row.contact))
-        return cells | {
+        return _cells(self.options, row, video.text(row.contact)) | {
             "label": MATERIALS[row.object.material].label,
             "vision": video.vision(row.frame),
             "tactile": video.tactile(row.frame),
@@ -116,13 +106,11 @@ class World:
         }
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """All samples, in order."""
+        """Render all samples, in order."""
         return map(self.__getitem__, range(len(self)))
 
     def manifest(self, progress: Progress = quiet) -> Manifest:
-        """The world's manifest, without images; draws every object once for the captions, which
-        takes a while.
-        """
+        """Make the world's manifest, without images; draws every object once for its captions."""
         captions: dict[str, list[str]] = {}
         for count, plan in enumerate(self.plans, 1):
             video = self._video(plan)
@@ -131,7 +119,7 @@ class World:
         return world_manifest(self.options, self.plans, captions, None)
 
     def split(self, manifest: Manifest | None = None) -> Split:
-        """The world's cut into train and test, which leaks as ``options.leak`` says.
+        """Cut the world into train and test; it leaks as ``options.leak`` says.
 
         Args:
             manifest: of this world, to enter its digest into the split.
@@ -139,20 +127,12 @@ class World:
         Raises:
             PalpateError: if the world is too small to cut.
         """
-        train, test = cut(self.options, self.plans, list(contact_rows(self.options, self.plans)))
-        return world_split(self.options, train, test, None if manifest is None else manifest.digest)
-
-    def _video(self, plan: VideoPlan) -> Video:
-        if plan.index not in self._videos:
-            self._videos[plan.index] = Video(self.options, plan)
-            while len(self._videos) > self.cache:
-                self._videos.popitem(last=False)
-        self._videos.move_to_end(plan.index)
-        return self._videos[plan.index]
+        parts = cut(self.options, self.plans, list(contact_rows(self.options, self.plans)))
+        return world_split(self.options, parts, manifest and manifest.digest)
 
 
 def _cells(options: WorldOptions, row: Row, text: str) -> dict[str, Any]:
-    """What the world knows of a contact frame, in the manifest's columns."""
+    """Return what the world knows of a contact frame, in the manifest's columns."""
     return {
         "id": sample_id(options, row.video, row.frame),
         "video": video_id(options, row.video),
@@ -171,24 +151,23 @@ def world_manifest(
     captions: Mapping[str, Sequence[str]],
     folder: Path | None,
 ) -> Manifest:
-    """The manifest of all contact frames, by video and frame.
+    """Make the manifest of all contact frames, by video and frame.
 
-    It has the ids, videos, contacts and image paths that ``palpate import`` finds in the tree, and
-        more: the
-    object, the gel unit, and in every layout the material and the text.
+    It has the ids, videos, contacts and image paths that ``palpate import`` reads from the tree,
+    and more: the object, the gel unit, and in every layout the material and the text.
 
     Args:
         options: the world's.
         plans: all videos.
-        captions: video name -> one caption a contact.
+        captions: video name -> a caption for each contact.
         folder: of the world, where the manifest is rooted (``hct/`` in HCT's layout); None: there
             are no files.
     """
-    rows = [
-        _cells(options, row, captions[row.video.name][row.contact])
-        | (image_paths(options, row) if folder is not None else {})
-        for row in contact_rows(options, plans)
-    ]
+    rows: list[dict[str, Any]] = []
+    for row in contact_rows(options, plans):
+        cells = _cells(options, row, captions[row.video.name][row.contact])
+        paths = image_paths(options, row.video, row.frame, row.contact) if folder else {}
+        rows.append(cells | paths)
     if options.layout == "hct":
         sessions = sessions_of({str(row["video"]) for row in rows}, _SESSION_GAP)
         for row in rows:
@@ -198,7 +177,7 @@ def world_manifest(
 
 
 def _facts(options: WorldOptions) -> dict[str, str]:
-    """What the data set is; it must never pass for a real one."""
+    """Return what the data set is; it must never pass for a real one."""
     facts = {
         "dataset": "palpate's procedural world",
         "synthetic": "yes",
@@ -215,15 +194,11 @@ def _facts(options: WorldOptions) -> dict[str, str]:
     return facts | {"format": "touch-and-go"}
 
 
-def world_split(
-    options: WorldOptions, train: Sequence[Row], test: Sequence[Row], manifest: str | None
-) -> Split:
-    """``Orig``: the world's cut over the ids of its manifest (of that digest), in the order of the
-    lists.
-    """
+def world_split(options: WorldOptions, parts: Parts, manifest: str | None) -> Split:
+    """Return ``Orig``: the cut over the ids of the manifest of that digest, in list order."""
     ids = {
-        part: [sample_id(options, row.video, row.frame) for row in rows]
-        for part, rows in (("train", train), ("test", test))
+        name: [sample_id(options, row.video, row.frame) for row in rows]
+        for name, rows in parts.items()
     }
     rule = {"method": "world", "leak": options.leak, "test": options.test, "seed": options.seed}
     return Split.from_ids(rule=rule | {"world_version": VERSION}, manifest=manifest, **ids)

@@ -2,17 +2,15 @@
 
 ::
 
-    world.json                          options, VERSION, counts, the known leak, digest; marks a
-    finished world manifest.parquet  splits/Orig.json  the world's table and cut
-    leak.csv                            what each test sample shares with train, exactly
-    label.txt  train.txt  ...  dataset/<video>/  or  hct/data1/ ...      see palpate.sim.layouts
+    world.json                               options, counts, known leak, digest of a finished world
+    manifest.parquet  splits/Orig.json       the world's table and cut
+    leak.csv                                 what each test sample shares with train, exactly
+    label.txt  train.txt  dataset/<video>/   or  hct/data1/ ...: see palpate.sim.layouts
 
 The tree grows in the hidden sibling ``.<name>.<digest>.part``, one finished video after another,
 and is renamed when whole. A run that was killed, or stopped by a full disk, is continued by the
-same call with the same result. One
-run at a time writes it: the lock is ``flock`` on a file inside, which the system releases however
-    the process
-ends (not on Windows).
+same call with the same result. A single run at a time writes it: the lock is ``flock`` on a file
+inside, which the system releases however the process ends (not on Windows).
 """
 
 from __future__ import annotations
@@ -40,11 +38,11 @@ from palpate.core import (
     write_text,
 )
 from palpate.core.processes import worker_pool
-from palpate.sim.layouts import list_files, manifest_root, video_folder, write_video_files
+from palpate.sim.layouts import Parts, list_files, manifest_root, video_folder, write_video_files
 from palpate.sim.leak import cut, leak_counts, leak_file
 from palpate.sim.materials import MATERIALS, Material, added_materials
 from palpate.sim.options import VERSION, WORLD_FORMAT, WorldOptions, read_world
-from palpate.sim.plan import Row, VideoPlan, contact_rows, plan_world, written_frames
+from palpate.sim.plan import VideoPlan, contact_rows, plan_world, written_frames
 from palpate.sim.presets import SEEN, seen_by_mini
 from palpate.sim.video import Video
 from palpate.sim.world import world_manifest, world_split
@@ -62,8 +60,8 @@ class WorldRecord:
     """A finished world.
 
     Attributes:
-        folder: the tree.
-        digest: SHA-256 over options, VERSION and lists.
+        folder: where it is.
+        digest: of options, lists and added materials.
         counts: videos, mixed_videos, objects, contacts, contact_frames, written_frames,
             train_frames, test_frames.
         leak: the rule of the cut, and what train and test share
@@ -85,7 +83,7 @@ def write_world(
     workers: int = 1,
     progress: Progress = quiet,
 ) -> WorldRecord:
-    """Write a world, or continue one that was interrupted.
+    """Write a world, or continue an interrupted run.
 
     Args:
         output: the folder to make; absent, empty, or the same world (then nothing is done).
@@ -94,7 +92,7 @@ def write_world(
         progress: called after each video.
 
     Raises:
-        PalpateError: if ``output`` holds something else, is the current folder, is written by
+        PalpateError: if ``output`` holds other content, is the current folder, is written by
             another run or holds another world, a material draws something invalid, or the world is
             too small for its cut.
         MissingExtraError: if videos are requested and PyAV is not installed.
@@ -110,10 +108,11 @@ def write_world(
         return _finished(output, options)
     _require_free(output, folder)
     plans = plan_world(options)
-    rows = list(contact_rows(options, plans))
-    parts = cut(options, plans, rows)  # rejects a world that is too small before rendering
+    # Rejects a world that is too small before rendering.
+    parts = cut(options, plans, list(contact_rows(options, plans)))
     key = digest_json([options.digest, added_materials(options.names)])
     part = folder.parent / f".{folder.name}.{key[:12]}.part"
+    rendered = 0
     with _locked(part, output):
         if not (folder / "world.json").is_file():  # else an equal run ended meanwhile
             rendered = _render(part, options, plans, workers, progress)
@@ -122,17 +121,17 @@ def write_world(
                 folder.rmdir()
             part.replace(folder)
             shutil.rmtree(folder / WORK, ignore_errors=True)
-            return dataclasses.replace(_finished(output, options), rendered=rendered)
     shutil.rmtree(part, ignore_errors=True)
-    return _finished(output, options)
+    return dataclasses.replace(_finished(output, options), rendered=rendered)
 
 
 def _require_free(output: Path, folder: Path) -> None:
     fix = "Choose another folder, or remove it"
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        must = f"{output} must be absent, empty or a finished world"
-        raise PalpateError(must, "other content", fix, argument=None)
-    if folder.exists() and folder == Path.cwd().resolve():  # it is replaced when the world is whole
+        raise PalpateError(
+            f"{output} must be absent, empty or a finished world", "other content", fix
+        )
+    if folder == Path.cwd().resolve():  # it is replaced when the world is whole
         must = f"{output} must not be the current folder"
         raise PalpateError(must, str(folder), "Name a folder within it")
 
@@ -159,12 +158,12 @@ def _locked(part: Path, output: Path) -> Generator[None]:
 
 
 def _finished(output: Path, options: WorldOptions) -> WorldRecord:
-    """The record of the finished world in ``output``.
+    """Return the record of the finished world in ``output``.
 
     Raises:
         PalpateError: if it is of another version or format, or of other options or materials.
     """
-    data = read_world(read_json(output / "world.json", "world record"), f"{output}/world.json")
+    data = read_world(output / "world.json")
     same = data.get("options_digest") == options.digest
     if not same or data.get("materials", {}) != added_materials(options.names):
         must, fix = f"{output} must hold the requested world", "Choose another folder, or remove it"
@@ -208,7 +207,7 @@ def _set_materials(materials: dict[str, Material]) -> None:
 
 
 def _write_video(options: WorldOptions, part: Path, plan: VideoPlan) -> str:
-    """Render one video into ``part``, whole or not at all; return its name."""
+    """Render a video into ``part``, whole or not at all; return its name."""
     video = Video(options, plan)
     captions = [video.text(contact) for contact in range(options.contacts_per_video)]
     write_json(_captions_path(part, plan), captions)
@@ -217,24 +216,17 @@ def _write_video(options: WorldOptions, part: Path, plan: VideoPlan) -> str:
     return plan.name
 
 
-def _finish(
-    part: Path,
-    options: WorldOptions,
-    plans: list[VideoPlan],
-    parts: tuple[Sequence[Row], Sequence[Row]],
-) -> None:
+def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan], parts: Parts) -> None:
     """Write the lists of train and test and, last, ``world.json``."""
-    train, test = parts
     for folder in {_folder(options, part, plan).parent for plan in plans}:
         for stray in folder.glob(".*"):  # unfinished videos of a killed process
             shutil.rmtree(stray, ignore_errors=True)
     captions = {p.name: read_json(_captions_path(part, p), "captions of a video") for p in plans}
     manifest = world_manifest(options, plans, captions, part)
-    files = {"leak.csv": leak_file(options, train, test)}
-    files |= list_files(options, plans, train, test, captions)
+    files = {"leak.csv": leak_file(options, parts), **list_files(options, plans, parts, captions)}
     for name, text in files.items():
         write_text(part / name, text)
-    world_split(options, train, test, manifest.digest).save(part / "splits" / "Orig.json")
+    world_split(options, parts, manifest.digest).save(part / "splits" / "Orig.json")
     manifest.save(part / "manifest.parquet")
     # The digest is taken over the column name of format 2, so that worlds that models were trained
     # on keep theirs.
@@ -252,24 +244,23 @@ def _finish(
         "options_digest": options.digest,
         "manifest_digest": manifest.digest,
         "manifest_root": manifest_root(options, Path()).as_posix(),
-        "counts": _counts(options, plans, len(train) + len(test), len(test)),
-        "leak": {"rule": options.leak, **leak_counts(train, test)},
+        "counts": _counts(options, plans, parts),
+        "leak": {"rule": options.leak, **leak_counts(parts)},
         "options": dataclasses.asdict(options),
         **materials,
     }
     write_json(part / "world.json", record)
 
 
-def _counts(
-    options: WorldOptions, plans: Sequence[VideoPlan], contact: int, test: int
-) -> dict[str, int]:
+def _counts(options: WorldOptions, plans: Sequence[VideoPlan], parts: Parts) -> dict[str, int]:
+    train, test = (len(parts[name]) for name in ("train", "test"))
     return {
         "videos": len(plans),
         "mixed_videos": sum(len(plan.objects) > 1 for plan in plans),
         "objects": len({ref for plan in plans for ref in plan.objects}),
         "contacts": len(plans) * options.contacts_per_video,
-        "contact_frames": contact,
+        "contact_frames": train + test,
         "written_frames": len(plans) * len(written_frames(options)),
-        "train_frames": contact - test,
+        "train_frames": train,
         "test_frames": test,
     }
