@@ -8,7 +8,7 @@ The real clips are found under ``PALPATE_SHARED_DATA`` or ``../shared/data`` (``
 square is taken and averaged down; the pad is taken to be 14 mm high, so that a pixel is 14 / n mm. A run is a stretch of labeled frames; its background
 is the frame 4 before its first. Of the world, one frame at random of two contacts a video, against the frame 4 before the contact.
 
-The statistics are those of :mod:`palpate.sim.fidelity`. A statistic is ``inside`` if the world's median lies between the smallest and the largest median
+The statistics are those of `benchmarks/world_statistics.py`. A statistic is ``inside`` if the world's median lies between the smallest and the largest median
 of a real clip, otherwise ``outside`` with the distance; ``share`` says how many of the world's frames lie within 5 .. 95 % of the real frames.
 """
 
@@ -20,9 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-from palpate.sim import PRESETS, VERSION, Video, plan_world
-from palpate.sim.fidelity import (
+from world_statistics import (
     BANDS,
     change,
     color_grid,
@@ -33,6 +31,8 @@ from palpate.sim.fidelity import (
     spectrum,
     to_size,
 )
+
+from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.gel import make_sensor, shade
 from palpate.sim.options import BACKGROUND_OFFSET
 from palpate.sim.plan import contact_frames, first_contact
@@ -347,7 +347,7 @@ def main():
         "# The simulated GelSight beside real touches",
         "",
         f"Written by `{command} {options}`, world VERSION {VERSION}, {datetime.datetime.now(tz=datetime.UTC).date()}. What is measured, and how, "
-        "stands in that script and in `palpate.sim.fidelity`.",
+        "stands in that script and in `benchmarks/world_statistics.py`.",
         "",
         "Read it with care: the real side is five short clips, which look like one or two pads of one product, and their materials are five of the "
         "world's twenty. `inside` means no more than that the world's median frame could have come from one of them.",

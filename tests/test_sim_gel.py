@@ -109,9 +109,9 @@ def test_the_frame_four_before_a_contact_is_free():
     video = Video(SMALL, 0)
     for touch in range(SMALL.contacts_per_video):
         first = first_contact(SMALL, touch)
-        assert not video.state(first - 4).touching
-        assert not video.state(first - 1).touching
-        assert all(video.state(f).touching for f in contact_frames(SMALL, touch))
+        assert not video.state(first - 4).in_contact
+        assert not video.state(first - 1).in_contact
+        assert all(video.state(f).in_contact for f in contact_frames(SMALL, touch))
 
 
 def test_shading_is_the_photometric_formula():

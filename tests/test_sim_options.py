@@ -261,8 +261,8 @@ def test_plans_are_unique_sorted_and_complete():
     assert 0.3 < len(mixed) / len(plans) < 0.7
     for plan in plans:
         assert len({ref.material for ref in plan.objects}) == len(plan.objects) <= 3
-        assert list(plan.touched) == sorted(plan.touched)
-        assert set(plan.touched) == set(range(len(plan.objects)))
+        assert list(plan.object_index) == sorted(plan.object_index)
+        assert set(plan.object_index) == set(range(len(plan.objects)))
     guests = [ref for plan in mixed for ref in plan.objects[1:]]
     assert len(set(guests)) == len(guests)  # in no other video
     assert min(ref.number for ref in guests) >= options.objects_per_material

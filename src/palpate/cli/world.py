@@ -21,25 +21,21 @@ from palpate.sim import (
     seen_by_mini,
     write_world,
 )
+from palpate.sim.options import option_groups
 
-_TYPES: dict[str, Any] = {
-    "span": tuple[float, float],
-    "series": tuple[float, ...],
-    "materials": tuple[str, ...],
-}
+_TYPES: dict[str, Any] = {"span": tuple[float, float], "series": tuple[float, ...]}
+_TYPES |= {"materials": tuple[str, ...]}
 _METAVARS = {"span": "LOW HIGH", "series": "X ...", "materials": "NAME ..."}
 
 
 def _group(name: str) -> Any:
-    """Options of one group of :class:`WorldOptions`, each None unless given."""
+    """Return the class of a group of options, each None unless given."""
     fields: list[tuple[str, Any, Any]] = []
-    for option in dataclasses.fields(WorldOptions):
+    for option in option_groups()[name]:
         limits = option.metadata
-        if limits["group"] != name:
-            continue
         kind, text = limits["kind"], f"{limits['help'][0].upper()}{limits['help'][1:]}."
         metavar = _METAVARS.get(kind) or "|".join(limits.get("choices", ("X",)))
-        number = int if isinstance(limits.get("low"), int) else float
+        number = int if isinstance(limits["low"], int) else float
         of = Literal[limits["choices"]] if kind == "choice" else _TYPES.get(kind, number)
         default = f"(default: the preset's; WorldOptions: {option.default})"
         argument = tyro.conf.arg(help=text, metavar=metavar, help_behavior_hint=default)
@@ -78,7 +74,7 @@ class Options(Common):
     physics: _Physics = field(default_factory=_Physics)  # pyright: ignore[reportInvalidTypeForm]
     """The objects, the gel and how it is pressed; lengths in mm."""
     photos: _Photos = field(default_factory=_Photos)  # pyright: ignore[reportInvalidTypeForm]
-    """The camera, and everything in the photos that is irrelevant to touch."""
+    """The camera, and everything in the photos that is irrelevant to contact."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -98,7 +94,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
 
 
 def world_options(options: Options) -> WorldOptions:
-    """The world that the options name.
+    """Return the world that the options name.
 
     Raises:
         PalpateError: if an option is out of range, or both a preset and a file are given.
