@@ -101,7 +101,7 @@ def test_batches_agree():
     assert model.decode(torch.zeros(0, 3, 4, 4)).shape == (0, 16, 16, 3)
 
 
-def test_odd_sizes_are_refused():
+def test_odd_sizes_are_rejected():
     with pytest.raises(PalpateError, match="multiples of 4"):
         random_model().encode(np.zeros((1, 18, 16, 3), np.uint8))
 
@@ -175,7 +175,7 @@ def test_other_options_in_the_same_folder_train_anew(tmp_path):
     assert second.digest == train_autoencoder(train, short, tmp_path / "b").digest
 
 
-def test_folders_that_are_none_are_refused(tmp_path):
+def test_folders_that_are_none_are_rejected(tmp_path):
     with pytest.raises(PalpateError, match="diffusers VQModel"):
         Autoencoder.load(tmp_path)
 
@@ -241,7 +241,7 @@ def test_latents_are_encoded_once(tmp_path):
     assert len(calls) > n
 
 
-def test_a_card_that_cannot_be_used_is_told(tmp_path):
+def test_a_card_that_cannot_be_used_is_reported(tmp_path):
     random_model().save(tmp_path / "ae")
     file = tmp_path / "ae" / "palpate.json"
     about = json.loads(file.read_text())

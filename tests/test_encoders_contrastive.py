@@ -41,10 +41,8 @@ def make_world(root, videos=8, frames=3, size=16):
             rng = rng_for(0, material, v, k)
             wave = np.sin(np.arange(size) * (1 + v % 4))[:, None, None] * 60 + 128
             for suffix in ("v", "t"):
-                picture = np.clip(wave + rng.normal(0, 20, (size, size, 3)), 0, 255).astype(
-                    np.uint8
-                )
-                Image.fromarray(picture).save(root / f"{v}_{k}_{suffix}.png")
+                image = np.clip(wave + rng.normal(0, 20, (size, size, 3)), 0, 255).astype(np.uint8)
+                Image.fromarray(image).save(root / f"{v}_{k}_{suffix}.png")
             rows.append(
                 {
                     "id": f"v{v}/{k}",
@@ -105,7 +103,7 @@ def test_loss_equals_the_slow_loop():
     assert float(info_nce(a, b, 7.0, soft_targets(words))) == pytest.approx(
         slow_nce(a, b, 7.0, soft), abs=1e-5
     )
-    # arguments in the order touch, text, vision
+    # arguments in the order tactile, text, vision
     parts = {
         "tactile_text": slow_nce(a, b, 7.0, soft),
         "vision_text": slow_nce(c, b, 7.0, soft),
@@ -320,9 +318,9 @@ def test_paper_preset_is_the_paper():
         1.5e-4,
     )
     with torch.device("meta"):
-        touch = contrastive.CLIPVisionModelWithProjection(paper.tactile_config(768))
+        tactile = contrastive.CLIPVisionModelWithProjection(paper.tactile_config(768))
     assert (
-        sum(p.numel() for p in touch.parameters()) == 303_966_208
+        sum(p.numel() for p in tactile.parameters()) == 303_966_208
     )  # ViT-L/14 at 224 px with a 768-wide projection
     with pytest.raises(PalpateError, match="tiny, mini, paper"):
         preset("huge")

@@ -49,34 +49,32 @@ def count(encoders, monkeypatch):
 
 @pytest.mark.parametrize("encoder", ["tactile", "vision", "text"])
 @pytest.mark.parametrize("cached", [True, False])
-def test_embedding_equals_the_encoder_picture_by_picture(
-    world, encoders, encoder, cached, tmp_path
-):
-    found = embed(world, encoders, encoder, cache=tmp_path / "cache" if cached else None, batch=5)
+def test_embedding_equals_the_encoder_image_by_image(world, encoders, encoder, cached, tmp_path):
+    result = embed(world, encoders, encoder, cache=tmp_path / "cache" if cached else None, batch=5)
     column = {"tactile": "tactile", "vision": "vision"}.get(encoder)
     with torch.no_grad():
         for k in range(len(world)):
             if encoder == "text":
                 expect = encoders.clip.encode_text([world.column("text")[k]])[0]
             else:
-                picture = np.asarray(Image.open(world.paths(column)[k]))
+                image = np.asarray(Image.open(world.paths(column)[k]))
                 pre = encoders.preprocess(encoder)
                 pixels = (
-                    torch.tensor(picture).permute(2, 0, 1)[None] / 255
+                    torch.tensor(image).permute(2, 0, 1)[None] / 255
                     - torch.tensor(pre.mean).view(3, 1, 1)
                 ) / torch.tensor(pre.std).view(3, 1, 1)
                 model = encoders.clip.model if encoder == "vision" else encoders.tactile
                 states = model.vision_model(pixel_values=pixels).pooler_output
                 expect = torch.nn.functional.normalize(model.visual_projection(states), dim=-1)[0]
-            assert np.allclose(found.features[k], expect, atol=1e-5)
-    assert found.features.dtype == np.float32
-    assert np.allclose(np.linalg.norm(found.features, axis=1), 1, atol=1e-5)
-    assert (list(found.ids), list(found.labels), list(found.groups)) == (
+            assert np.allclose(result.features[k], expect, atol=1e-5)
+    assert result.features.dtype == np.float32
+    assert np.allclose(np.linalg.norm(result.features, axis=1), 1, atol=1e-5)
+    assert (list(result.ids), list(result.labels), list(result.groups)) == (
         world.ids,
         world.column("material"),
         world.column("video"),
     )
-    assert found.encoder == encoders.digest(encoder)
+    assert result.encoder == encoders.digest(encoder)
 
 
 @pytest.mark.parametrize("encoder", ["tactile", "vision", "text"])
@@ -152,15 +150,15 @@ def test_same_data_elsewhere_and_broken_cache(world, encoders, tmp_path, count):
 
 
 def test_arrays_and_files_agree_also_when_resized(world, encoders):
-    pictures = np.random.default_rng(0).integers(0, 256, (3, 24, 40, 3), dtype=np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (3, 24, 40, 3), dtype=np.uint8)
     rows = []
-    for k, picture in enumerate(pictures):
-        Image.fromarray(picture).save(world.root / f"wide{k}.png")
+    for k, image in enumerate(images):
+        Image.fromarray(image).save(world.root / f"wide{k}.png")
         rows.append({"id": str(k), "tactile": f"wide{k}.png"})
-    found = embed(Manifest.from_rows(rows, world.root), encoders, "tactile")
-    assert np.allclose(found.features, embed_images(pictures, encoders, "tactile"), atol=1e-6)
-    assert found.labels is None
-    assert found.groups is None
+    result = embed(Manifest.from_rows(rows, world.root), encoders, "tactile")
+    assert np.allclose(result.features, embed_images(images, encoders, "tactile"), atol=1e-6)
+    assert result.labels is None
+    assert result.groups is None
 
 
 def test_other_columns(world, encoders):
@@ -179,7 +177,7 @@ def test_other_columns(world, encoders):
 
 
 @pytest.mark.parametrize("cached", [True, False])
-def test_refusals(world, encoders, tmp_path, cached):
+def test_mistakes_are_explained(world, encoders, tmp_path, cached):
     cache = tmp_path / "cache" if cached else None
     with pytest.raises(PalpateError, match="vision, text, tactile"):
         embed(world, encoders, "smell", cache=cache)
@@ -190,7 +188,7 @@ def test_refusals(world, encoders, tmp_path, cached):
     with pytest.raises(PalpateError, match="tactile encoder"):
         embed(world, EncoderSet(encoders.clip), "tactile", cache=cache)
     for k in (1, 8):  # in two batches: both are named
-        world.paths("tactile")[k].write_bytes(b"no picture")
+        world.paths("tactile")[k].write_bytes(b"no image")
     with pytest.raises(ProblemsError) as caught:
         embed(world, encoders, "tactile", batch=3, cache=cache)
     assert [p.where for p in caught.value.problems] == [
@@ -216,6 +214,6 @@ def test_texts_come_from_the_manifest_or_from_the_material(world):
 
 def test_embed_texts_in_any_order(encoders):
     texts = ["soft", "rough and hard", "soft", "a"]
-    found = embed_texts(texts, encoders, batch=2)
-    assert np.array_equal(found[0], found[2])
-    assert np.abs(found[[1]] - embed_texts(["rough and hard"], encoders)).max() < 1e-5
+    result = embed_texts(texts, encoders, batch=2)
+    assert np.array_equal(result[0], result[2])
+    assert np.abs(result[[1]] - embed_texts(["rough and hard"], encoders)).max() < 1e-5

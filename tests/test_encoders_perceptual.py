@@ -36,7 +36,7 @@ def pairs(n=3, height=40, width=33, channels=3):
 def written_out(state, image):
     """The five stages of one image (3, h, w) in [-1, 1], by windows in float64."""
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    x, found = (image - shift[:, None, None]) / scale[:, None, None], []
+    x, result = (image - shift[:, None, None]) / scale[:, None, None], []
     for place, (stride, pad) in STEPS.items():
         if place in (3, 6):
             x = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(1, 2))[:, ::2, ::2].max(
@@ -52,15 +52,15 @@ def written_out(state, image):
         x = np.maximum(
             np.einsum("chwij,ocij->ohw", windows, weight, optimize=True) + bias[:, None, None], 0
         )
-        found.append(x / (np.sqrt((x**2).sum(axis=0)) + 1e-10))
-    return found
+        result.append(x / (np.sqrt((x**2).sum(axis=0)) + 1e-10))
+    return result
 
 
 @pytest.mark.parametrize("size", [(32, 32), (40, 33)])
 def test_the_distance_is_the_published_formula(states, network, size):
     first, second = pairs(2, *size)
-    found = lpips_per_image(first, second, network)
-    assert found.dtype == np.float64
+    result = lpips_per_image(first, second, network)
+    assert result.dtype == np.float64
     for k in range(2):
         stages = [
             written_out(states[0], v[k].transpose(2, 0, 1) / 127.5 - 1) for v in (first, second)
@@ -69,7 +69,7 @@ def test_the_distance_is_the_published_formula(states, network, size):
         expect = sum(
             (w * (a - b) ** 2).sum(axis=0).mean() for a, b, w in zip(*stages, weights, strict=True)
         )
-        assert found[k] == pytest.approx(expect, rel=1e-5)
+        assert result[k] == pytest.approx(expect, rel=1e-5)
 
 
 @pytest.mark.parametrize("size", [(32, 32), (64, 48)])
@@ -78,9 +78,9 @@ def test_a_mask_weighs_the_places_of_every_stage(states, network, size):
     mask = np.zeros((3, *size), bool)
     mask[0, 5:20, 9:30] = True
     mask[1] = True
-    found = lpips_per_image(first, second, network, mask=mask, batch=2)
-    assert found[1] == pytest.approx(lpips_per_image(first, second, network)[1], rel=1e-6)
-    assert np.isnan(found[2])
+    result = lpips_per_image(first, second, network, mask=mask, batch=2)
+    assert result[1] == pytest.approx(lpips_per_image(first, second, network)[1], rel=1e-6)
+    assert np.isnan(result[2])
     stages = [written_out(states[0], v[0].transpose(2, 0, 1) / 127.5 - 1) for v in (first, second)]
     expect = 0.0
     for i, (a, b) in enumerate(zip(*stages, strict=True)):
@@ -102,7 +102,7 @@ def test_a_mask_weighs_the_places_of_every_stage(states, network, size):
             axis=0
         )
         expect += (weight * places).sum() / weight.sum()
-    assert found[0] == pytest.approx(expect, rel=1e-5)
+    assert result[0] == pytest.approx(expect, rel=1e-5)
     for bad in (mask[:2], mask[:, :-1], mask.astype(float)):
         with pytest.raises(PalpateError, match="`mask` must be boolean of shape"):
             lpips_per_image(first, second, network, mask=bad)
@@ -120,20 +120,20 @@ def test_identical_images_are_at_0_and_the_distance_is_symmetric_and_grows(netwo
 
 def test_values_do_not_depend_on_batches_or_on_how_pixels_are_written(network):
     first, second = pairs(5)
-    found = lpips_per_image(first, second, network)
-    np.testing.assert_allclose(lpips_per_image(first, second, network, batch=2), found, rtol=1e-5)
-    np.testing.assert_allclose(lpips_per_image(first / 255, second, network), found, rtol=1e-5)
+    result = lpips_per_image(first, second, network)
+    np.testing.assert_allclose(lpips_per_image(first, second, network, batch=2), result, rtol=1e-5)
+    np.testing.assert_allclose(lpips_per_image(first / 255, second, network), result, rtol=1e-5)
     gray = [v[..., :1] for v in (first, second)]
     np.testing.assert_allclose(
         lpips_per_image(*gray, network),
         lpips_per_image(*(v.repeat(3, axis=3) for v in gray), network),
         rtol=1e-6,
     )
-    told = []
+    calls = []
     lpips_per_image(
-        first[::-1], second[::-1], network, batch=2, progress=lambda *a, **_: told.append(a[1:3])
+        first[::-1], second[::-1], network, batch=2, progress=lambda *a, **_: calls.append(a[1:3])
     )
-    assert told == [(2, 5), (4, 5), (5, 5)]
+    assert calls == [(2, 5), (4, 5), (5, 5)]
 
 
 def test_the_network_can_be_trained_through(network):
@@ -163,7 +163,7 @@ class Bomb:
         return (pytest.fail, ("unpickled",))
 
 
-def test_files_are_refused_by_name_and_never_unpickled(files, states, tmp_path):
+def test_files_are_rejected_by_name_and_never_unpickled(files, states, tmp_path):
     both = "alexnet-owt-7be5be79.pth.*alex.pth"
     with pytest.raises(PalpateError, match=f"Got no .*nothing.pth, no .*none.pth. .*{both}"):
         load_lpips(tmp_path / "nothing.pth", tmp_path / "none.pth")
@@ -211,13 +211,13 @@ def test_files_are_refused_by_name_and_never_unpickled(files, states, tmp_path):
         (lambda x: x[:2], "must have the shape of the generated"),
     ],
 )
-def test_bad_images_are_refused(network, change, match):
+def test_bad_images_are_rejected(network, change, match):
     first, second = pairs()
     with pytest.raises(PalpateError, match=match):
         lpips_per_image(first, change(second), network)
 
 
-def test_small_images_and_bad_batches_are_refused(network):
+def test_small_images_and_bad_batches_are_rejected(network):
     first, second = pairs(2, 32, 31)
     with pytest.raises(PalpateError, match=r"at least 32 x 32 for LPIPS\. Got 32 x 31"):
         lpips_per_image(first, second, network)

@@ -53,7 +53,7 @@ def encoders(clip):
     )
 
 
-def pictures(n=5, side=16):
+def make_images(n=5, side=16):
     return np.random.default_rng(0).integers(0, 256, (n, side, side, 3), dtype=np.uint8)
 
 
@@ -93,7 +93,7 @@ def test_saved_clip_is_a_standard_folder_with_equal_embeddings(clip, tmp_path):
     clip.save(tmp_path / "clip")
     plain = CLIPModel.from_pretrained(tmp_path / "clip").eval()
     tokenizer = AutoTokenizer.from_pretrained(tmp_path / "clip")
-    pixels = clip.preprocess.normalize(to_unit(pictures()))
+    pixels = clip.preprocess.normalize(to_unit(make_images()))
     tokens = tokenizer(TEXTS, padding=True, truncation=True, max_length=16, return_tensors="pt")
     with torch.no_grad():
         out = plain(
@@ -130,7 +130,8 @@ def test_encoders_survive_a_folder(encoders, tmp_path):
     assert again.tactile_preprocess == encoders.tactile_preprocess
     for encoder in ("vision", "tactile"):
         assert np.array_equal(
-            embed_images(pictures(), again, encoder), embed_images(pictures(), encoders, encoder)
+            embed_images(make_images(), again, encoder),
+            embed_images(make_images(), encoders, encoder),
         )
     assert np.array_equal(embed_texts(TEXTS, again), embed_texts(TEXTS, encoders))
     assert not [p for p in (tmp_path / "set").rglob("*") if p.suffix in (".bin", ".pt", ".pkl")]
@@ -211,13 +212,13 @@ def test_folders_that_are_no_clip(clip, tmp_path, monkeypatch):
 def test_unknown_and_missing_encoders(clip, encoders):
     for encoder in ("taste", "", "touch"):
         with pytest.raises(PalpateError, match="vision, text, tactile"):
-            embed_images(pictures(), encoders, encoder)
+            embed_images(make_images(), encoders, encoder)
     with pytest.raises(PalpateError, match="must be vision or tactile for images"):
-        embed_images(pictures(), encoders, "text")
+        embed_images(make_images(), encoders, "text")
     with pytest.raises(PalpateError, match="include a tactile encoder"):
-        embed_images(pictures(), EncoderSet(clip), "tactile")
+        embed_images(make_images(), EncoderSet(clip), "tactile")
     with pytest.raises(PalpateError, match="uint8"):
-        embed_images(pictures().astype(np.float32), encoders, "tactile")
+        embed_images(make_images().astype(np.float32), encoders, "tactile")
     with pytest.raises(PalpateError, match="device"):
         pick_device("cuda:99")
     assert pick_device("cpu").type == "cpu"
@@ -241,9 +242,9 @@ def test_preprocess_equals_transformers_processor():
     ours = Preprocess(16, 20, (0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
     config = {k: v for k, v in ours.to_config().items() if k != "image_processor_type"}
     theirs = CLIPImageProcessorPil(**config)(
-        Image.fromarray(pictures(1, 40)[0]), return_tensors="pt"
+        Image.fromarray(make_images(1, 40)[0]), return_tensors="pt"
     )["pixel_values"]
-    mine = ours(to_unit(ours.fit(pictures(1, 40))))
+    mine = ours(to_unit(ours.fit(make_images(1, 40))))
     assert torch.allclose(mine, theirs, atol=1e-5)
 
 
@@ -255,20 +256,20 @@ def test_augmentation():
     some = Augment()
     assert torch.equal(some(images, seeded(1)), some(images, seeded(1)))
     assert not torch.equal(some(images, seeded(1)), some(images, seeded(2)))
-    # only mirrors and turns: each result is one of the eight symmetries of its picture
+    # only mirrors and turns: each result is one of the eight symmetries of its image
     turned = Augment(crop=0, gain=0, offset=0, flips=True, quarter_turns=True)(images, seeded(3))
     seen = set()
-    for picture, result in zip(images, turned, strict=True):
-        ways = [torch.rot90(p, k, (1, 2)) for p in (picture, picture.flip(2)) for k in range(4)]
+    for image, result in zip(images, turned, strict=True):
+        ways = [torch.rot90(p, k, (1, 2)) for p in (image, image.flip(2)) for k in range(4)]
         match = [k for k, way in enumerate(ways) if torch.allclose(way, result, atol=1e-4)]
         assert len(match) == 1
         seen.update(match)
     assert len(seen) > 1
     lit = Augment(crop=0, gain=0.3, offset=0.2)(images, seeded(4))
-    for picture, result in zip(images, lit, strict=True):  # one straight line through all pixels
-        line = np.polyfit(picture.flatten().numpy(), result.flatten().numpy(), 1)
+    for image, result in zip(images, lit, strict=True):  # one straight line through all pixels
+        line = np.polyfit(image.flatten().numpy(), result.flatten().numpy(), 1)
         assert np.allclose(
-            np.polyval(line, picture.flatten().numpy()), result.flatten().numpy(), atol=1e-4
+            np.polyval(line, image.flatten().numpy()), result.flatten().numpy(), atol=1e-4
         )
 
 

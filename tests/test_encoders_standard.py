@@ -61,11 +61,11 @@ def images():
     return np.random.default_rng(0).integers(0, 256, (7, 20, 24, 3)).astype(np.uint8)
 
 
-def test_inception_features_are_those_of_the_module_asked_for_features(tmp_path, images):
+def test_inception_features_are_those_of_the_module_called_for_features(tmp_path, images):
     torch.manual_seed(1)
     module = Pooled().eval()
     path = script(module, tmp_path / "inception.pt")
-    found, digest = embed_standard(images, path, batch=3)
+    result, digest = embed_standard(images, path, batch=3)
     # An independent convolution: windows and sums in float64.
     weight, bias = (
         p.detach().numpy().astype(np.float64) for p in (module.conv.weight, module.conv.bias)
@@ -74,19 +74,19 @@ def test_inception_features_are_those_of_the_module_asked_for_features(tmp_path,
     expect = np.maximum(
         np.einsum("nhwcij,ocij->nohw", windows, weight) + bias[:, None, None], 0
     ).mean(axis=(2, 3))
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, expect, atol=1e-6)
-    np.testing.assert_allclose(embed_standard(images, path, batch=64)[0], found, atol=1e-6)
+    assert result.dtype == np.float32
+    np.testing.assert_allclose(result, expect, atol=1e-6)
+    np.testing.assert_allclose(embed_standard(images, path, batch=64)[0], result, atol=1e-6)
     assert len(digest) == 64
-    FeatureSet([str(i) for i in range(7)], found, encoder=digest)
+    FeatureSet([str(i) for i in range(7)], result, encoder=digest)
 
 
 def test_a_module_without_the_keyword_and_with_maps_of_one_pixel_is_taken(tmp_path, images):
-    found, _ = embed_standard(images, script(Plain(), tmp_path / "plain.pt"))
-    np.testing.assert_allclose(found, images.mean(axis=(1, 2)), rtol=1e-6)
+    result, _ = embed_standard(images, script(Plain(), tmp_path / "plain.pt"))
+    np.testing.assert_allclose(result, images.mean(axis=(1, 2)), rtol=1e-6)
     traced = tmp_path / "traced.pt"
     torch.jit.trace(Plain(), torch.zeros(2, 3, 8, 8, dtype=torch.uint8)).save(str(traced))
-    np.testing.assert_allclose(embed_standard(images, traced)[0], found, rtol=1e-6)
+    np.testing.assert_allclose(embed_standard(images, traced)[0], result, rtol=1e-6)
 
 
 def test_the_digest_is_that_of_the_weights(tmp_path, images):
@@ -117,7 +117,7 @@ class Bomb:
         return (pytest.fail, ("unpickled",))
 
 
-def test_files_that_are_no_torchscript_are_refused_and_never_unpickled(tmp_path):
+def test_files_that_are_no_torchscript_are_rejected_and_never_unpickled(tmp_path):
     with pytest.raises(
         PalpateError, match=r"absent\.pt must be a file.*inception-2015-12-05\.pt .*https://nvlabs"
     ):
@@ -134,7 +134,7 @@ def test_files_that_are_no_torchscript_are_refused_and_never_unpickled(tmp_path)
             load_standard(tmp_path / name)
 
 
-def test_modules_that_give_no_features_are_refused(tmp_path, images):
+def test_modules_that_give_no_features_are_rejected(tmp_path, images):
     with pytest.raises(
         PalpateError, match=r"must map 7 uint8 images to floats \(7, d\). Got Tensor of shape \(\)"
     ):
@@ -159,12 +159,12 @@ def clip(tmp_path):
 def test_clip_is_the_same_encoder_as_ours_with_the_same_digest(clip, images):
     folder, ours = clip
     for source in (folder, str(folder)):
-        found, digest = embed_standard(images, source, kind="clip", batch=2)
+        result, digest = embed_standard(images, source, kind="clip", batch=2)
         np.testing.assert_allclose(
-            found, embed_images(images, EncoderSet(ours), "vision"), atol=1e-6
+            result, embed_images(images, EncoderSet(ours), "vision"), atol=1e-6
         )
         assert digest == ours.digest("vision")
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(result, axis=1), 1, atol=1e-6)
 
 
 def test_clip_sees_the_center_square_by_the_bicubic_filter(clip):
@@ -204,7 +204,7 @@ def test_a_folder_of_the_vision_encoder_alone_and_the_shipped_name(tmp_path, ima
     (tmp_path / "vision" / "preprocessor_config.json").write_text(
         json.dumps(Preprocess(16, 16).to_config())
     )
-    found, _ = embed_standard(images, tmp_path / "vision", kind="clip")
+    result, _ = embed_standard(images, tmp_path / "vision", kind="clip")
     pre = Preprocess(16, 16)
     pixels = torch.tensor(pre.fit(images)).permute(0, 3, 1, 2) / 255
     pixels = (pixels - torch.tensor(pre.mean).view(3, 1, 1)) / torch.tensor(pre.std).view(3, 1, 1)
@@ -213,14 +213,14 @@ def test_a_folder_of_the_vision_encoder_alone_and_the_shipped_name(tmp_path, ima
             model.vision_model(pixel_values=pixels).pooler_output
         ).numpy()
     np.testing.assert_allclose(
-        found, states / np.linalg.norm(states, axis=1, keepdims=True), atol=1e-6
+        result, states / np.linalg.norm(states, axis=1, keepdims=True), atol=1e-6
     )
     mini, digest = embed_standard(images, "palpate/mini", kind="clip")
     assert mini.shape[0] == 7
     assert digest == EncoderSet.load("palpate/mini").digest("vision")
 
 
-def test_clip_folders_that_lack_files_are_refused_by_name(tmp_path, clip, images):
+def test_clip_folders_that_lack_files_are_rejected_by_name(tmp_path, clip, images):
     with pytest.raises(
         PalpateError, match=r"no folder .*nowhere\. .*hf download openai/clip-vit-large"
     ):
@@ -245,7 +245,7 @@ def test_clip_folders_that_lack_files_are_refused_by_name(tmp_path, clip, images
         load_standard(folder, kind="clip")
 
 
-def test_bad_arguments_are_refused(tmp_path, images):
+def test_bad_arguments_are_rejected(tmp_path, images):
     path = script(Plain(), tmp_path / "plain.pt")
     with pytest.raises(PalpateError, match="must be one of inception, clip"):
         embed_standard(images, path, kind="vgg")
@@ -260,9 +260,9 @@ def test_bad_arguments_are_refused(tmp_path, images):
 
 def test_progress_and_mapped_files(tmp_path, images):
     np.save(tmp_path / "images.npy", images)
-    told = []
+    calls = []
     mapped = np.load(tmp_path / "images.npy", mmap_mode="r")
     path = script(Plain(), tmp_path / "plain.pt")
-    found, _ = embed_standard(mapped, path, batch=3, progress=lambda *a, **_: told.append(a[1:3]))
-    np.testing.assert_allclose(found, images.mean(axis=(1, 2)), rtol=1e-6)
-    assert told == [(3, 7), (6, 7), (7, 7)]
+    result, _ = embed_standard(mapped, path, batch=3, progress=lambda *a, **_: calls.append(a[1:3]))
+    np.testing.assert_allclose(result, images.mean(axis=(1, 2)), rtol=1e-6)
+    assert calls == [(3, 7), (6, 7), (7, 7)]

@@ -73,7 +73,7 @@ def test_images_that_are_their_text_are_all_named(encoders):
         (None, PROMPTS, "label for every image"),
     ],
 )
-def test_what_cannot_be_named_is_refused(encoders, labels, prompts, message):
+def test_what_cannot_be_named_is_rejected(encoders, labels, prompts, message):
     images = features(labels or ["x", "y"])
     if labels is None:
         images = FeatureSet(images.ids, images.features, None, None, "encoder")

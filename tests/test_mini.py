@@ -40,19 +40,19 @@ def no_network(monkeypatch):
     """Counts attempts to reach anything; each fails."""
     attempts: list[object] = []
 
-    def refuse(*args, **kwargs):
+    def block(*args, **kwargs):
         attempts.append(args)
         raise OSError("no network here")
 
     for name in ("getaddrinfo", "create_connection"):
-        monkeypatch.setattr(socket, name, refuse)
-    monkeypatch.setattr(socket.socket, "connect", refuse)
+        monkeypatch.setattr(socket, name, block)
+    monkeypatch.setattr(socket.socket, "connect", block)
     return attempts
 
 
 @pytest.fixture
 def mini(tmp_path, monkeypatch):
-    """``palpate/mini`` as tests write it, and the working directory beside it."""
+    """``palpate/mini`` as tests write it, and the working directory next to it."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     return write_shipped(tmp_path / "root", monkeypatch)
@@ -124,14 +124,14 @@ def test_what_may_be_asked_of_the_hub(tmp_path, monkeypatch):
 
 
 def test_a_hub_id_works_like_a_folder(mini, tmp_path, monkeypatch):
-    asked = []
+    requested = []
     places = {
         "o/encoders": shipped_folder("palpate/mini", "encoders"),
         "o/generator": shipped_folder("palpate/mini", "generator"),
     }
 
     def snapshot(name, allow_patterns):
-        asked.append((name, tuple(allow_patterns)))
+        requested.append((name, tuple(allow_patterns)))
         return str(places[name])
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
@@ -139,8 +139,8 @@ def test_a_hub_id_works_like_a_folder(mini, tmp_path, monkeypatch):
         "palpate/mini"
     ).digest("tactile")
     assert TactilePipeline.from_pretrained("o/generator").digest == mini.digest
-    assert [name for name, _ in asked] == ["o/encoders", "o/generator"]
-    assert not any(".bin" in p or p == "*" for _, patterns in asked for p in patterns)
+    assert [name for name, _ in requested] == ["o/encoders", "o/generator"]
+    assert not any(".bin" in p or p == "*" for _, patterns in requested for p in patterns)
 
 
 def test_a_hub_out_of_reach_is_a_mistake_in_one_line(monkeypatch, no_network):
@@ -364,7 +364,7 @@ def test_the_cards_of_what_ships_are_whole_and_current(place):
 def test_a_fresh_process_with_the_hub_switched_off(tmp_path):
     code = (
         "import socket\n"
-        "def no(*a, **k): raise SystemExit('the network was asked')\n"
+        "def no(*a, **k): raise SystemExit('the network was requested')\n"
         "socket.getaddrinfo = socket.create_connection = socket.socket.connect = no\n"
         "import palpate as pp\n"
         "pp.TactilePipeline.from_pretrained('palpate/mini')\n"

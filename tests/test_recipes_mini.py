@@ -53,7 +53,7 @@ def small(mini, monkeypatch, tmp_path):
     return mini
 
 
-def test_the_page_tells_the_scores_of_the_cards(mini):
+def test_the_page_has_the_scores_of_the_cards(mini):
     target = shipped_module.shipped_root() / "mini"
     assert sys.modules["mini_cards"].scores_table(target) in (
         RECIPES.parent / "docs" / "concepts" / "mini.md"
@@ -118,14 +118,14 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
     capsys.readouterr()
     again = small.Recipe(tmp_path / "work", 1.0)
     again.make("scores")
-    said = capsys.readouterr().out
-    assert "already done" in said
-    assert "training" not in said
+    printed = capsys.readouterr().out
+    assert "already done" in printed
+    assert "training" not in printed
     shutil.rmtree(target)
     again.ship()
     assert digest_folder(target) == first
     assert again.verify() == 0
-    # A card that promises more than the weights keep is told.
+    # A card that promises more than the weights keep is calls.
     about = read_json(target / "autoencoder" / "palpate.json", "card")
     about["card"]["scores"][0]["value"] += 1.0
     from palpate.core import write_json
@@ -137,7 +137,7 @@ def test_every_part_is_made_shipped_and_verified(small, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_stop_between_saving_and_the_end_of_a_part_is_mended(small, tmp_path, monkeypatch):
+def test_a_stop_between_saving_and_the_end_of_a_part_is_repaired(small, tmp_path, monkeypatch):
     from palpate.encoders.encoder_set import ClipEncoders
 
     save = ClipEncoders.save

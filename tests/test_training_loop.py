@@ -256,7 +256,7 @@ def test_loss_that_is_not_finite_is_told_and_not_kept(tmp_path):
 
 
 @pytest.mark.parametrize("clip", [None, 1.0])
-def test_finite_loss_with_infinite_gradient_is_told(tmp_path, clip):
+def test_finite_loss_with_infinite_gradient_is_reported(tmp_path, clip):
     def bad(module, rows, generator, step):
         value, logs = loss(module, rows, generator, step)
         return value + (torch.sqrt(module.a.weight[0, 0] * 0) if step == 2 else 0), logs
@@ -291,7 +291,7 @@ def test_no_rows_no_parameters_bad_options(tmp_path):
             options(**change)
 
 
-def test_broken_checkpoint_is_told(tmp_path):
+def test_broken_checkpoint_is_reported(tmp_path):
     fit(Net(), loss, N, options(), tmp_path)
     file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:50])
