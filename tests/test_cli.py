@@ -1,14 +1,16 @@
 """The command line: statuses, JSON, one-line errors, old spellings, help, and how verbs connect."""
 
+import dataclasses
 import json
 import re
 import subprocess
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from palpate.cli import VERBS, main
-from palpate.cli.terminal import RENAMED, error_line
+from palpate.cli.terminal import RENAMED, error_line, join_help_lines
 from palpate.core import PalpateError, Split
 
 
@@ -119,6 +121,20 @@ def test_completion_knows_every_verb(capsys, shell):
         assert all(word in script for word in verb.split())
     if shell == "bash":
         subprocess.run(["bash", "-n"], input=script, text=True, check=True)
+
+
+def test_help_is_wrapped_by_the_terminal_and_not_by_the_source(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "generator", "--help"])
+    text = " ".join(re.sub("[│╭╰─╮╯]", "", capsys.readouterr().out).split())
+    assert "hub id, or palpate/mini." in text
+    sources = [
+        m.Options for m in (import_module(f"palpate.cli.{v.module}") for v in VERBS.values())
+    ]
+    for options in sources:
+        join_help_lines(options)
+        helps = [f.metadata.get("help", "") for f in dataclasses.fields(options)]
+        assert not any("\n" in text for text in helps)
 
 
 def test_a_group_of_verbs_lists_them(capsys):

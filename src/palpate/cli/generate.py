@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class Options(Common):
     """Sampling steps (default: the model's)."""
     batch: int | None = None
     """Images at a time; the images do not depend on it."""
-    skip_bad: bool = False
+    skip_bad: Switch = False
     """Skip unreadable photos and list them."""
     device: str = "auto"
     """auto, cpu, cuda, mps."""

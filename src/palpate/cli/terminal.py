@@ -8,11 +8,14 @@ options in the help; its option names stay flat.
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import dataclasses
 import difflib
 import errno
 import importlib
 import importlib.util
+import inspect
 import io
 import json
 import os
@@ -20,11 +23,13 @@ import re
 import shlex
 import sys
 import tempfile
+import textwrap
 import time
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -210,6 +215,7 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
     Raises:
         PalpateError: in one line what tyro would draw a box around.
     """
+    join_help_lines(options)
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -229,6 +235,20 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
         must = f"The options of palpate {name} must be as its help says"
         raise PalpateError(must, got, f"See: palpate {name} --help") from None
+
+
+def join_help_lines(options: type[Any]) -> None:
+    """Make the help of each option one paragraph: tyro keeps the line breaks of its docstring."""
+    for cls in filter(dataclasses.is_dataclass, options.__mro__):
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # type: ignore[attr-defined]
+        for statement, doc in pairwise(body):
+            match statement, doc:
+                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                    field = cls.__dataclass_fields__[name]
+                    field.metadata = {**field.metadata, "help": " ".join(text.split())}
+    for field in dataclasses.fields(options):
+        if dataclasses.is_dataclass(field.default):
+            join_help_lines(type(field.default))
 
 
 def _answer_renamed(name: str, args: Sequence[str]) -> None:

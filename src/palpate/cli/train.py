@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class Options(Common):
     source: Literal["text", "vision", "mixed"] | None = None
     """What training conditions on; `vision` is the baseline without text (GVST). Default: the
     preset's."""
-    background: bool = False
+    background: Switch = False
     """The variant that also sees the no-contact image."""
     steps: int | None = None
     """Optimizer steps. Default: the preset's."""
