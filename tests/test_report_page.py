@@ -247,7 +247,8 @@ def test_headline_facts():
     audits = [small_audit(), small_audit(name="NoLeak", **shared)]
     scores = [score(value=None, interval=None), score(subject="GVST")]
     assert summary_lines(Results("t", audits=audits, scores=scores)) == [
-        "Orig: 80.0 % of the test samples leak; 80 of 100 come from a video that train has as well.",
+        "Orig: 80.0 % of the test samples leak; 80 of 100 come from a video that train has as "
+        "well.",
         "NoLeak: no video is shared; none of the 100 test samples leaks.",
         "TMMD (lower is better): GVST 1.374 [1.010, 1.750]; floor 0.042.",
     ]
@@ -295,7 +296,7 @@ def test_the_histogram_of_gaps_has_a_bar_a_bin_and_the_median():
 
 def test_the_histograms_of_scores_have_the_threshold_and_join_fine_bins():
     signal = full_audit().signals[-1]
-    edges, unrelated, matches = bins_of(signal)
+    _, unrelated, matches = bins_of(signal)
     assert len(matches) <= MAX_BARS
     assert (sum(unrelated), sum(matches)) == (sum(signal.unrelated), sum(signal.matches))
     svg = score_histogram(signal, "in words")

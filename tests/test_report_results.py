@@ -1,4 +1,4 @@
-"""Results and audits as objects: indexing, frames, files, formats of earlier versions, the command."""
+"""Results and audits as objects: indexing, frames, files, earlier formats, the command."""
 
 import json
 import shutil

@@ -57,7 +57,6 @@ class Score:
         settings: further settings that must agree for a comparison.
         details: anything else worth keeping (values by class, matrices as lists); not compared.
         notes: what a reader must know.
-        note: superseded by ``notes``; '' or a sentence.
     """
 
     metric: str
@@ -81,7 +80,6 @@ class Score:
     settings: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[Note] = ()
-    note: str = ""
 
     def __float__(self) -> float:
         """Return the value; NaN where it is undefined."""

@@ -224,21 +224,33 @@ LEAKAGE: dict[str, Sentence] = {
         f"{p['count']} background images cannot be read{_few(p['files'])}; medians replace them"
     ),
     "blank-images": _blank_images,
-    "copies-across-videos": "{count} of {of} are so similar that they are taken for copies across videos and do not set the threshold",
+    "copies-across-videos": (
+        "{count} of {of} are so similar that they are taken for copies across videos and do "
+        "not set the threshold"
+    ),
     "empty-files": "{count} files are empty (0 bytes) and were not compared",
-    "group-few": "There are fewer than {parts} {group}s: whole contacts are kept together instead, and train and test share a {group}",
+    "group-few": (
+        "There are fewer than {parts} {group}s: whole contacts are kept together instead, and"
+        " train and test share a {group}"
+    ),
     "group-instead": "The manifest knows no videos: the {group} is kept whole",
     "group-materials": (
-        "Only {enough} of {materials} materials occur in {parts} or more {group}s, too few for the {group} to be the group: whole contacts are"
-        " kept together instead. Train and test then share {group}s, so scores are optimistic for new places"
+        "Only {enough} of {materials} materials occur in {parts} or more {group}s, too few "
+        "for the {group} to be the group: whole contacts are"
+        " kept together instead. Train and test then share {group}s, so scores are optimistic"
+        " for new places"
     ),
     "group-near-only": "The manifest knows no videos: near-duplicates alone are kept together",
-    "group-nulls": "{count} {part} samples have no {group}: they cannot be audited by group and count as not shared",
+    "group-nulls": (
+        "{count} {part} samples have no {group}: they cannot be audited by group and count as"
+        " not shared"
+    ),
     "group-of-data-set": "The data set says so: the {group} is kept whole",
     "images-absent": "{count} of {of} samples have no {modality} image and were not compared",
     "images-of-one-part": "Only one part has {modality} images: they were not compared",
     "images-unreadable": lambda p, _: (
-        f"{p['count']} {p['modality']} images cannot be read and were not compared{_few(p['files'])}"
+        f"{p['count']} {p['modality']} images cannot be read and were not "
+        f"compared{_few(p['files'])}"
     ),
     "impact-failed": "What leaking costs could not be measured: {reason}",
     "median-backgrounds": _median_backgrounds,
@@ -246,28 +258,42 @@ LEAKAGE: dict[str, Sentence] = {
         "Could be in every part, but not together with the others: {materials}"
     ),
     "near-frames": _near_frames,
-    "no-group": "Neither videos nor objects, sessions or contacts are known: only samples and images were compared",
+    "no-group": (
+        "Neither videos nor objects, sessions or contacts are known: only samples and images "
+        "were compared"
+    ),
     "no-materials": "No sample has a material: only the sizes of the parts are balanced",
     "rare-materials": _listed("In fewer than {parts} groups, so not in every part: {materials}"),
     "rows-skipped": _rows_skipped,
     "samples-in-no-part": "{count} of {of} samples of the manifest are in no part of the split",
     "signal-not-counted": "Reported, but not counted as a leak: the audit is not by {group}",
     "signal-nulls": "{count} {part} samples have no {group}: nothing is known of them",
-    "single-groups": "{count} samples have no {group}: each is a group by itself unless another column or a near-duplicate joins it",
+    "single-groups": (
+        "{count} samples have no {group}: each is a group by itself unless another column or "
+        "a near-duplicate joins it"
+    ),
     "split-of-other-manifest": "The split was made for another manifest (the digests differ)",
     "threshold-default": lambda p, _: (
-        f"Fewer than {p['fewest']} pairs are known to be unrelated: the threshold {p['threshold']} is a default, not calibrated to {p['rate']:.2%}"
+        f"Fewer than {p['fewest']} pairs are known to be unrelated: the threshold "
+        f"{p['threshold']} is a default, not calibrated to {p['rate']:.2%}"
     ),
-    "threshold-few-videos": "Train has too few samples of two known videos to measure how similar unrelated images are",
+    "threshold-few-videos": (
+        "Train has too few samples of two known videos to measure how similar unrelated images are"
+    ),
     "threshold-other-videos": _threshold_other_videos,
     "threshold-random-pairs": _threshold_random_pairs,
     "threshold-untrusted": (
-        "Best matches in other videos would set the threshold to {threshold:.3f}: many recordings of train are copies of one another, or these"
+        "Best matches in other videos would set the threshold to {threshold:.3f}: many "
+        "recordings of train are copies of one another, or these"
         " features cannot separate images. Random pairs set it instead"
     ),
-    "validation-leaks": "{count} {group} groups of the validation part occur in train or test as well: choosing a checkpoint on it leaks",
+    "validation-leaks": (
+        "{count} {group} groups of the validation part occur in train or test as well: "
+        "choosing a checkpoint on it leaks"
+    ),
     "videos-without-samples": lambda p, _: (
-        f"{len(p['videos'])} of the record's {p['of']} videos have no sample here, first {p['videos'][0]}"
+        f"{len(p['videos'])} of the record's {p['of']} videos have no sample here, first "
+        f"{p['videos'][0]}"
     ),
 }
 
@@ -305,7 +331,8 @@ EVALUATION: dict[str, Sentence] = {
         "them are in test"
     ),
     "repeated-splits": (
-        "{repeated} of {n} seeds gave a leak-free split that another gave: there are too few {group} "
+        "{repeated} of {n} seeds gave a leak-free split that another gave: there are too few "
+        "{group} "
         "groups for more"
     ),
     "shared-videos": (
@@ -338,8 +365,12 @@ EVALUATION: dict[str, Sentence] = {
     "generator-of-other-split": (
         "The generator was not trained on this split: it may have seen test samples"
     ),
-    "kid-interval": "The spread over random subsets that others print with KID is no interval; this one is",
-    "no-differences": "No differences between generators: their rows have no ids, and differ in number",
+    "kid-interval": (
+        "The spread over random subsets that others print with KID is no interval; this one is"
+    ),
+    "no-differences": (
+        "No differences between generators: their rows have no ids, and differ in number"
+    ),
     "no-interval-streamed": "No interval: neither groups nor repeats are known",
     "no-pairs": "Scores of pairs of images skipped: generated and reference share no id",
     "outside-test-part": (
