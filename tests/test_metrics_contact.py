@@ -12,6 +12,7 @@ from scipy import ndimage, stats
 from palpate.core import Note, PalpateError, require_comparable
 from palpate.metrics import (
     background_digest,
+    contact,
     contact_images,
     contact_iou,
     contact_mask,
@@ -20,10 +21,9 @@ from palpate.metrics import (
     contact_residual,
     contact_scores,
     contact_ssim,
-    masks,
     measure_contacts,
 )
-from palpate.metrics.masks import LEAST
+from palpate.metrics.contact import LEAST
 from palpate.sim import Video, World, WorldOptions
 from palpate.sim.plan import first_contact, plan_world
 
@@ -113,12 +113,12 @@ def test_noise_is_estimated_away_from_the_markers():
     slope = np.linspace(0.3, 0.6, 64)[:, None, None] + np.zeros((64, 64, 3))
     for deviation in (0.01, 0.05):
         noisy, keep = slope + rng.normal(size=slope.shape) * deviation, np.ones((64, 64), bool)
-        assert masks._noise(noisy, keep) == pytest.approx(deviation, rel=0.05)
+        assert contact._noise(noisy, keep) == pytest.approx(deviation, rel=0.05)
         keep[::5] = False
         noisy[::5] = rng.random((13, 64, 3))
-        assert masks._noise(noisy, keep) == pytest.approx(deviation, rel=0.08)
+        assert contact._noise(noisy, keep) == pytest.approx(deviation, rel=0.08)
         keep[::2] = False
-        assert masks._noise(noisy, keep) == 0
+        assert contact._noise(noisy, keep) == 0
 
 
 def test_the_digest_of_backgrounds_ignores_order_and_dtype():

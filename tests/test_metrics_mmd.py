@@ -11,11 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core import FeatureSet, PalpateError, PalpateWarning
-from palpate.metrics import Gaussian, Linear, Polynomial, distance, i_tmmd, mmd2, pairs, tmmd
-from palpate.metrics.halves import random_halves_sd
-from palpate.metrics.kernels import Kernel, gaussian, median_distance
+from palpate.metrics import Gaussian, Linear, Polynomial, distance, i_tmmd, kernels, mmd2, tmmd
+from palpate.metrics.kernels import (
+    Kernel,
+    blocked_sums,
+    centered_squares,
+    gaussian,
+    median_distance,
+)
+from palpate.metrics.mmd import random_halves_sd
 from palpate.metrics.moments import WIDEST, Moments, center_of, remainder_factor
-from palpate.metrics.pairs import blocked_sums, centered_squares
 
 
 def unit_rows(seed, n, d, spread=1.0):
@@ -110,7 +115,7 @@ KERNELS = {
 @pytest.mark.parametrize("most_items", [0, 2048])
 def test_sums_by_segment_and_unit_equal_the_double_loop(name, library, most_items, monkeypatch):
     xp = pytest.importorskip(library)
-    monkeypatch.setattr(pairs, "MOST_ITEMS", most_items)
+    monkeypatch.setattr(kernels, "MOST_ITEMS", most_items)
     kernel, k = KERNELS[name]
     for seed, n, units, block in [(0, 1, 3, 7), (1, 24, 3, 7), (2, 24, 30, 1024), (3, 50, 5, 16)]:
         x, (segment, unit) = unit_rows(seed, n, 4), layout(seed, n, units=units)
@@ -144,7 +149,7 @@ def test_the_result_does_not_depend_on_threads(monkeypatch):
     x, (segment, unit) = unit_rows(1, 700, 16), layout(1, 700, units=9)
     blocks = []
     for threads in (1, 5):
-        monkeypatch.setattr("palpate.metrics.arrays.blas_threads", lambda n=threads: n)
+        monkeypatch.setattr("palpate.metrics.inputs.blas_threads", lambda n=threads: n)
         swept = blocked_sums(x, segment, unit, segments=3, kernel=Gaussian(), block=64)
         blocks.append(swept.sums.block)
     np.testing.assert_array_equal(*blocks)
@@ -299,7 +304,7 @@ def test_moments_add_up_over_batches_and_devices():
 
 @pytest.fixture
 def small_moments(monkeypatch):
-    monkeypatch.setattr(pairs, "LEAST_ROWS", 100)
+    monkeypatch.setattr(kernels, "LEAST_ROWS", 100)
 
 
 def test_auto_takes_moments_where_they_are_cheaper_and_good_enough(small_moments, monkeypatch):
@@ -310,7 +315,7 @@ def test_auto_takes_moments_where_they_are_cheaper_and_good_enough(small_moments
     for options in ({"tolerance": 0}, {"sigma": (5.0, 10.0)}, {"kernel": Polynomial()}):
         assert distance(x, y, **options).backend == "blocked"
     assert distance(x[:30], y[:30]).backend == "blocked"
-    monkeypatch.setattr(pairs, "LONG", 100)
+    monkeypatch.setattr(kernels, "LONG", 100)
     with pytest.warns(PalpateWarning, match="takes long. Moments were not taken: their bound"):
         distance(x, y, tolerance=0)
 
@@ -332,7 +337,7 @@ def test_a_bound_that_overflows_is_no_bound(small_moments, sigma, scale):
 
 
 def test_arrays_on_disk_are_streamed(tmp_path, monkeypatch, small_moments):
-    monkeypatch.setattr(pairs, "STREAM", 64)
+    monkeypatch.setattr(kernels, "STREAM", 64)
     monkeypatch.setattr("palpate.metrics.inputs.SLAB", 70)
     x, y = spread_rows(0, 300, 8).astype(np.float32), spread_rows(1, 200, 8).astype(np.float32)
     for name, rows in (("x", x), ("y", y)):

@@ -10,10 +10,9 @@ from scipy import stats
 from palpate.core import Note, PalpateError, Score
 from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, mmd2, tmmd
 from palpate.metrics.intervals import permutation_test
-from palpate.metrics.kernels import Gaussian
+from palpate.metrics.kernels import Gaussian, blocked_sums
 from palpate.metrics.paired import difference, holm
-from palpate.metrics.pairs import blocked_sums
-from palpate.metrics.scored import Scored, excess_of
+from palpate.metrics.tactile import Scored, excess_of
 from test_metrics_mmd import loop_mmd, unit_rows
 from test_metrics_tactile import change, codes, keep, share, world
 
@@ -78,7 +77,7 @@ def test_the_test_sees_a_shift_and_keeps_quiet_without_one(monkeypatch):
     assert tmmd(g, r, permutations=0).details["p_value"] is None
     assert tmmd(g, r, permutations=0).null is None
     assert tmmd(g, r, seed=1).details["p_value"] != quiet.details["p_value"]
-    monkeypatch.setattr("palpate.metrics.pairs.MOST_ITEMS", 20)
+    monkeypatch.setattr("palpate.metrics.kernels.MOST_ITEMS", 20)
     assert tmmd(g, r).details["p_value"] is None  # sums of items with items were not kept
 
 

@@ -12,7 +12,7 @@ from scipy import stats
 
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, mmd2, tmmd
-from palpate.metrics.halves import half_of
+from palpate.metrics.mmd import half_of
 from palpate.report.notes import sentence
 from test_metrics_mmd import loop_mmd, unit_rows
 
@@ -310,7 +310,7 @@ def test_many_samples_are_left_out_in_blocks(monkeypatch):
         without_groups(world(8, classes=1, videos=8, frames=10, prefix="r")),
     )
     exact = tmmd(g, r)
-    monkeypatch.setattr("palpate.metrics.halves.BLOCKS", 40)
+    monkeypatch.setattr("palpate.metrics.mmd.BLOCKS", 40)
     blocks = tmmd(g, r)
     assert blocks.value == pytest.approx(exact.value, rel=1e-12)
     assert "leave-one-random-block-out" in blocks.interval_method

@@ -43,7 +43,7 @@ from palpate.metrics import (
     ssim,
     ssim_per_image,
 )
-from palpate.metrics.masks import LEAST
+from palpate.metrics.contact import LEAST
 from palpate.metrics.neighbors import prdc_rows
 from palpate.metrics.paired import mean_differences
 

@@ -5,8 +5,10 @@ On pairs of images: SSIM, PSNR and MS-SSIM, of whole images and of the contact a
 """
 
 from palpate.metrics.contact import (
+    background_digest,
     contact_images,
     contact_iou,
+    contact_mask,
     contact_ms_ssim,
     contact_psnr,
     contact_residual,
@@ -26,14 +28,11 @@ from palpate.metrics.images import (
     ssim_per_image,
 )
 from palpate.metrics.kernels import Gaussian, Linear, Polynomial
-from palpate.metrics.masks import background_digest, contact_mask
-from palpate.metrics.mmd import Distance, distance, mmd2
+from palpate.metrics.mmd import PRESETS, Distance, Options, distance, mmd2
 from palpate.metrics.neighbors import prdc, precision_recall
 from palpate.metrics.paired import Comparison, compare, compare_tmmd
-from palpate.metrics.presets import PRESETS, Options
-from palpate.metrics.published import cmmd, kid
 from palpate.metrics.streaming import CITMMD, DTMMD, ITMMD, TMMD
-from palpate.metrics.tactile import ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
+from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, four_scores, i_tmmd, kid, tmmd
 
 __all__ = [
     "CITMMD",

@@ -39,7 +39,7 @@ from palpate.metrics.inputs import (
 )
 from palpate.metrics.intervals import jackknife_errors, t_interval
 from palpate.metrics.paired import Comparison, difference, holm, same_samples
-from palpate.metrics.scored import Scored
+from palpate.metrics.tactile import Scored
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

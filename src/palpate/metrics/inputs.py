@@ -1,20 +1,28 @@
-"""What the metrics take, and what they reject: every input is checked once, at the public function.
+"""What the metrics take and reject: every input is checked once, at the public function.
 
 Features are finite floating-point rows ``(n, d)``: a NumPy array (also one on disk), a torch tensor
 on any device, a list of rows, or a :class:`palpate.core.FeatureSet`. Integers are rejected, since
 the distance of wrapped integers has no meaning; half precision is widened, since ``exp`` of a small
 exponent rounds to 1 there (a perfect score for anything).
+
+NumPy works on blocks in as many threads as BLAS would use; a library of the array-API standard
+(torch on CPU or CUDA, CuPy) runs the same blocks on its device, and only sums come back.
 """
 
 from __future__ import annotations
 
 import mmap
+import os
+import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, PalpateError, PalpateWarning
@@ -226,8 +234,6 @@ def checked_pair(
 
 def _like(x: Any, other: Any) -> Any:
     """``x`` in the type, library and device of ``other``."""
-    from array_api_compat import array_namespace, device
-
     return array_namespace(other).asarray(x, dtype=other.dtype, device=device(other))
 
 
@@ -235,8 +241,6 @@ def _at_least_float32(x: Any) -> Any:
     """As float32 or float64, in native byte order."""
     if isinstance(x, np.ndarray):
         return x.astype(np.float32 if x.dtype.itemsize <= 4 else np.float64, copy=False)
-    from array_api_compat import array_namespace
-
     xp = array_namespace(x)
     return x if x.dtype == xp.float64 else xp.astype(x, xp.float32)
 
@@ -249,8 +253,6 @@ def row_norms(x: Any) -> Array:
         if isinstance(x, np.ndarray):
             squares = np.einsum("ij,ij->i", slab, slab, dtype=np.float64)
         else:
-            from array_api_compat import array_namespace
-
             xp = array_namespace(x)
             squares = np.asarray(to_host(xp.sum(xp.astype(slab, xp.float64) ** 2, axis=1)))
         norms[k : k + SLAB] = np.sqrt(squares)
@@ -350,3 +352,76 @@ def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:
         must = f"Generated and {what} features must come from one encoder"
         got = f"digests {a.encoder[:12]} and {b.encoder[:12]}"
         raise PalpateError(must, got, "Embed both with the same encoder")
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def host(x: Any) -> Array:
+    """As a float64 NumPy array."""
+    return np.asarray(to_host(x), dtype=np.float64)
+
+
+def like(values: Any, x: Any) -> Any:
+    """NumPy ``values`` in the type, library and device of ``x``."""
+    return array_namespace(x).asarray(np.asarray(values), dtype=x.dtype, device=device(x))
+
+
+def rows_at(x: Any, index: Index) -> Any:
+    """``x[index]``, a copy; contiguous rows of an array on disk are read in one piece."""
+    if isinstance(x, np.ndarray):
+        return x[index]
+    xp = array_namespace(x)
+    return xp.take(x, xp.asarray(index, device=device(x)), axis=0)
+
+
+def blas_threads() -> int:
+    """Threads that BLAS may use: what ``threadpoolctl`` reports, at most the cores there are."""
+    from threadpoolctl import threadpool_info
+
+    allowed = [int(pool["num_threads"]) for pool in threadpool_info() if pool["user_api"] == "blas"]
+    usable = getattr(os, "sched_getaffinity", None)
+    cores = len(usable(0)) if usable else os.cpu_count() or 1
+    return max(1, min([cores, *allowed]))
+
+
+def in_threads(job: Callable[[T], R], items: Iterable[T], x: Any) -> Iterator[R]:
+    """``map(job, items)`` in the same order; for NumPy in threads with one BLAS thread each.
+
+    A block is a product and several passes over its result; BLAS threads would speed up the product
+    alone.
+    """
+    from threadpoolctl import threadpool_limits
+
+    if not isinstance(x, np.ndarray):
+        with full_precision():
+            yield from map(job, items)
+        return
+    workers = blas_threads()
+    if workers < 2:
+        yield from map(job, items)
+        return
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
+        waiting: list[Any] = []
+        for item in items:  # a few ahead: finished blocks must not pile up
+            waiting.append(pool.submit(job, item))
+            if len(waiting) > 2 * workers:
+                yield waiting.pop(0).result()
+        while waiting:
+            yield waiting.pop(0).result()
+
+
+@contextmanager
+def full_precision() -> Generator[None]:
+    """No TensorFloat-32 in torch's products: its ten bits are too few."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

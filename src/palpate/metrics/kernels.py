@@ -1,4 +1,4 @@
-"""Kernels: what is summed over pairs, and how wide it is.
+"""Kernels, and one pass over all pairs of samples by the cheaper of two back ends.
 
 Every kernel is a function of one matrix product, so that a block of values costs one product and
 little more. A constant that is added to a kernel cancels in every MMD estimator; the Gaussian is
@@ -10,20 +10,44 @@ sigma = 10, k lies in [0.98, 1], and sums of k itself in float32 lose what matte
   that.
 * :class:`Polynomial`: ``(gamma x.y + coef0)^degree``; degree 3, gamma 1/d, coef0 1 is KID's.
 * :class:`Linear`: ``x.y``; its MMD^2 is ``||mean x - mean y||^2``.
+
+The back ends give the same sums:
+
+* ``moments`` (:mod:`palpate.metrics.moments`): O(N d^2) time, for one Gaussian that is wide against
+  the spread of the features. Its remainder is bounded, and the bound is part of the result.
+* ``blocked``: O(N^2 d) time, any kernel, exact to rounding. The N x N matrix never exists: samples
+  are sorted by item, each block on or above the diagonal is one product, one ``expm1`` in place,
+  and sums by item in float64. Blocks run in threads and are added in a fixed order.
+
+``auto`` takes moments where they are cheaper and their bound stays within the tolerance, else
+blocks; the result records which.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from array_api_compat import array_namespace
 
-from palpate.core import PalpateError, rng_for
-from palpate.metrics.arrays import host, rows_at
-from palpate.metrics.inputs import Index, invalid, release
+from palpate.core import PalpateError, PalpateWarning, rng_for
+from palpate.metrics.inputs import (
+    Array,
+    Index,
+    host,
+    in_threads,
+    invalid,
+    like,
+    release,
+    row_norms,
+    rows_at,
+)
+from palpate.metrics.intervals import PairSums, one_hot, split_by
+from palpate.metrics.moments import Moments, center_of
 
 #: Factors on the median distance that make the bandwidths of ``"multi"``: two octaves around it.
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -210,3 +234,288 @@ def median_distance(
         must = "The median distance needs rows that differ"
         raise PalpateError(must, got, "Choose a bandwidth", example={"sigma": 10})
     return middle
+
+
+Backend = Literal["auto", "blocked", "moments"]
+BACKENDS = ("auto", "blocked", "moments")
+#: ``auto`` tries moments from so many rows on, in units of the width and in all.
+ROWS_A_WIDTH, LEAST_ROWS = 8, 4096
+#: Bytes of the moments of all items: at most, and four times that where pairs would take hours; up
+#: to the second number in any case, beyond it no more than the features.
+MOMENT_BYTES, STATE_BYTES = 512 << 20, 64 << 20
+#: From so many rows on a fall back to blocks warns: it takes hours.
+LONG = 300_000
+#: Rows of an array on disk that are added to moments together.
+STREAM = 1 << 15
+#: Up to this many rows float64 costs nothing.
+FLOAT64_BELOW = 1024
+#: Largest ``||z||^2`` in float32: an exponent is then rounded by less than 1e-7, so that MMD^2 at
+#: scale 1000 keeps 1e-4 even where all errors have one direction.
+FLOAT32_RADIUS = 0.25
+#: Blocks are not made smaller than this for speed; the caller may request less.
+SMALL_BLOCK = 256
+#: Up to this many items their sums with one another are kept (34 MB).
+MOST_ITEMS = 2048
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What one pass over the pairs gives.
+
+    Attributes:
+        sums: by item and segment.
+        spread: (K, 3) of the doubly centered kernel of each set of segments that was requested, see
+            :func:`centered_squares`.
+    """
+
+    sums: PairSums
+    spread: Array
+
+
+def kernel_sums(
+    parts: Sequence[Any],
+    segment: Index,
+    unit: Index,
+    *,
+    segments: int,
+    kernel: Kernel,
+    bound: Callable[[PairSums], float],
+    backend: Backend = "auto",
+    tolerance: float = 1e-4,
+    block: int = 1024,
+    spread: Sequence[Index] = (),
+) -> Sweep:
+    """Sums of k by item and segment.
+
+    Args:
+        parts: feature arrays (n_k, d), checked, of one type and library; arrays on disk
+            (``np.memmap``) are streamed by moments.
+        segment: (N,) in [0, segments) over all parts, one after the other.
+        unit: (N,).
+        segments: S.
+        kernel: what is summed.
+        bound: what the remainders of moments can change in the statistic that matters.
+        backend: see the module.
+        tolerance: largest ``bound`` that ``auto`` takes moments with.
+        block: most rows of a block.
+        spread: sets of segments whose centered squares are wanted.
+
+    Raises:
+        PalpateError: if moments are requested for another kernel, or for too many items.
+    """
+    width, rows = int(parts[0].shape[1]), len(segment)
+    items, number = np.unique(np.stack([segment, unit]), axis=1, return_inverse=True)
+    size = items.shape[1] * width**2 * 4
+    room = MOMENT_BYTES if rows <= LONG else 4 * MOMENT_BYTES
+    reason = ""
+    if not isinstance(kernel, Gaussian) or kernel.bandwidth is None:
+        reason = f"the kernel is {kernel.settings()}, not one Gaussian"
+    elif size > room:
+        cells = f"{items.shape[1]} (unit, segment) cells of width {width}"
+        reason = f"second moments of {cells} take more than {room >> 20} MiB"
+    if backend == "moments" and reason:
+        must = "The moments back end needs one Gaussian bandwidth and few groups"
+        raise PalpateError(must, reason, "Sum blocks", example={"backend": "blocked"})
+    cheap = size <= max(STATE_BYTES, rows * width * 4)
+    many = rows >= max(LEAST_ROWS, ROWS_A_WIDTH * width)
+    if backend == "moments" or (backend == "auto" and not reason and cheap and many):
+        sweep = _moments(
+            parts,
+            items,
+            number.reshape(-1),
+            segments=segments,
+            sigma=float(kernel.bandwidth or 0),
+            spread=spread,
+        )
+        remainder = bound(sweep.sums)
+        if backend == "moments" or remainder <= tolerance:
+            return sweep
+        reason = f"their bound {remainder:.2g} exceeds the tolerance {tolerance:.2g}"
+    if rows > LONG:
+        why = f" Moments were not taken: {reason}." if backend == "auto" and reason else ""
+        text = f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{why}"
+        warnings.warn(text, PalpateWarning, stacklevel=4)
+    x = parts[0] if len(parts) == 1 else array_namespace(parts[0]).concat(list(parts), axis=0)
+    return blocked_sums(
+        x, segment, unit, segments=segments, kernel=kernel, block=block, spread=spread
+    )
+
+
+def _moments(
+    parts: Sequence[Any],
+    items: Index,
+    number: Index,
+    *,
+    segments: int,
+    sigma: float,
+    spread: Sequence[Index],
+) -> Sweep:
+    moments, first = Moments.empty(center_of(parts), sigma, items.shape[1]), 0
+    for part in parts:
+        for k in range(0, len(part), STREAM):
+            slab = part[k : k + STREAM]
+            moments.add(slab, number[first : first + len(slab)])
+            release(part)
+            first += len(slab)
+    squares = [moments.spread(np.flatnonzero(np.isin(items[0], s))) for s in spread]
+    return Sweep(moments.sums(items[0], items[1], segments), np.array(squares).reshape(-1, 3))
+
+
+def blocked_sums(
+    x: Any,
+    segment: Index,
+    unit: Index,
+    *,
+    segments: int,
+    kernel: Kernel,
+    block: int = 1024,
+    spread: Sequence[Index] = (),
+) -> Sweep:
+    """Kernel sums of all samples of ``x`` (N, d) with all segments, block by block."""
+    order = np.lexsort((unit, segment))
+    segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
+    new = (np.diff(segment, prepend=-1) != 0) | (np.diff(unit, prepend=unit[:1]) != 0)
+    item, first, n = np.cumsum(new) - 1, np.flatnonzero(new), len(order)
+    pairs, joined = _Pairs(x, order, kernel), len(first) <= MOST_ITEMS
+    blocks = _slices(n, max(1, min(block, max(SMALL_BLOCK, -(-n // 8)))))
+    by_item = _Cells(item, len(first), blocks, pairs.z) if joined else None
+    by_segment = _Cells(segment, segments, blocks, pairs.z) if spread or not joined else None
+    rows = np.zeros((n if by_segment else 0, segments))
+
+    def sums_of(pair: tuple[int, int]) -> tuple[Any, ...]:
+        i, j = pair
+        k = pairs.block(blocks[i], blocks[j], diagonal=0 if i == j else None)
+        items = by_item.sums(k, i, j) if by_item else None
+        if by_segment is None:
+            return items, None, None, None
+        marks = by_segment.marks
+        across, down = host(k @ marks[j]), host(k.T @ marks[i])
+        return items, across, down, by_segment.sums(k * k, i, j)
+
+    todo = [(i, j) for i in range(len(blocks)) for j in range(i, len(blocks))]
+    for (i, j), sums in zip(todo, in_threads(sums_of, todo, x), strict=True):
+        if by_item:
+            by_item.add(sums[0], i, j)
+        if by_segment:
+            rows[blocks[i], by_segment.present[j]] += sums[1]
+            if i != j:
+                rows[blocks[j], by_segment.present[i]] += sums[2]
+            by_segment.add(sums[3], i, j)
+    squares = by_segment.total if by_segment else np.zeros((0, 0))
+    centered = [
+        centered_squares(
+            float(squares[np.ix_(s, s)].sum()), rows[np.isin(segment, s)][:, s].sum(axis=1)
+        )
+        for s in spread
+    ]
+    if by_item:
+        weights = (np.ones(n), pairs.diagonal())
+        size, diagonal = (np.bincount(item, w, len(first)).astype(np.float64) for w in weights)
+        of_items = PairSums.from_block(
+            by_item.total, size, diagonal, segment[first], unit[first], segments=segments
+        )
+    else:
+        same = _same_unit(pairs, segment, unit, np.zeros_like(rows), block)
+        of_items = PairSums(np.ones(n), rows, same, pairs.diagonal(), segment, unit)
+    return Sweep(of_items, np.array(centered).reshape(-1, 3))
+
+
+def _same_unit(pairs: _Pairs, segment: Index, unit: Index, same: Array, block: int) -> Array:
+    """(N, S) sums of each sample with those of its unit, into ``same``."""
+    for at in split_by(unit):
+        for part in _slices(len(at), block if len(at) > 1 else 0):
+            k = pairs.block(at[part], at, diagonal=part.start)
+            same[at[part]] = host(k @ like(one_hot(segment[at], same.shape[1]), k))
+    return same
+
+
+class _Pairs:
+    """Kernel values of blocks of pairs of the rows of ``x`` in this order.
+
+    Rows of a stationary kernel are centered, which changes no value but the rounding, and all are
+    in units of the kernel. Norms are those of the same rounded rows as the products.
+    """
+
+    def __init__(self, x: Any, order: Index, kernel: Kernel) -> None:
+        self.kernel, self.xp = kernel, array_namespace(x)
+        xp, z, single = self.xp, rows_at(x, order), False
+        if kernel.stationary and len(order):
+            z = z - xp.mean(z, axis=0)  # any center is right: float32 is near enough
+        z = z / kernel.unit(x.shape[1])
+        if z.dtype != xp.float64 and kernel.stationary and len(order) > FLOAT64_BELOW:
+            single = float(row_norms(z).max()) ** 2 <= FLOAT32_RADIUS
+        if z.dtype != xp.float64 and not single:
+            wide = xp.astype(rows_at(x, order), xp.float64)
+            wide = wide - like(host(xp.mean(wide, axis=0)), wide) if kernel.stationary else wide
+            z = wide / kernel.unit(x.shape[1])
+        self.z = z
+        self.half = row_norms(z) ** 2 / 2
+        self.shift = like(self.half, z)
+
+    def block(self, rows: Any, columns: Any, diagonal: int | None = None) -> Any:
+        """(n, m) float64 values, 0 at i = j; ``diagonal``: the column of the first row, if any."""
+        k = self._rows(self.z, rows) @ self._rows(self.z, columns).T
+        if self.kernel.stationary:
+            k -= self._rows(self.shift, rows)[:, None]
+            k -= self._rows(self.shift, columns)
+        k = self.xp.astype(self.kernel.values(k, self.xp), self.xp.float64, copy=False)
+        if diagonal is not None:
+            at = np.arange(k.shape[0])
+            k[at, at + diagonal] = 0
+        return k
+
+    def diagonal(self) -> Array:
+        """(n,) k(x_i, x_i), shifted by the same constant as :meth:`block`."""
+        return host(self.kernel.values(2 * self.half * (not self.kernel.stationary), np))
+
+    def _rows(self, x: Any, at: Any) -> Any:
+        return x[at] if isinstance(at, slice) else rows_at(x, at)
+
+
+def _slices(n: int, step: int) -> list[slice]:
+    return [slice(i, min(i + step, n)) for i in range(0, n, step)] if step else []
+
+
+class _Cells:
+    """Sums over blocks by pair of cells (items, or segments).
+
+    Attributes:
+        present: of each block the cells that occur, ascending.
+        marks: of each block (n, R) indicators of these, in float64 on the device of the rows.
+        total: (C, C) sums so far.
+    """
+
+    def __init__(self, cell: Index, cells: int, blocks: Sequence[slice], z: Any) -> None:
+        self.present = [np.unique(cell[b]) for b in blocks]
+        wide = array_namespace(z).astype(z[:0], array_namespace(z).float64)
+        marks = (cell[b][:, None] == p for b, p in zip(blocks, self.present, strict=True))
+        self.marks = [like(m.astype(np.float64), wide) for m in marks]
+        self.total = np.zeros((cells, cells))
+
+    def sums(self, k: Any, i: int, j: int) -> Array:
+        """The sums of a block of values."""
+        return host(self.marks[i].T @ k @ self.marks[j])
+
+    def add(self, sums: Array, i: int, j: int) -> None:
+        """Add the sums of block (i, j), and of its mirror image."""
+        self.total[np.ix_(self.present[i], self.present[j])] += sums
+        if i != j:
+            self.total[np.ix_(self.present[j], self.present[i])] += sums.T
+
+
+def centered_squares(squares: float, row_sums: Array) -> tuple[float, float, float]:
+    """Of the doubly centered kernel: the sum of squares over i != j, the trace, the squared
+    diagonal.
+
+    From sum_ij k^2 and row sums of a matrix whose diagonal is 0:
+    ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means, and ``Kc_ii = r - 2 r_i``.
+    """
+    n = len(row_sums)
+    if n < 2:
+        return np.nan, np.nan, np.nan
+    r = row_sums / n
+    mean = r.mean()
+    diagonal = mean - 2 * r
+    inner = float((diagonal**2).sum())
+    every = float(squares - 2 * n * (r**2).sum() + n**2 * mean**2)
+    return max(every - inner, 0.0), float(diagonal.sum()), inner

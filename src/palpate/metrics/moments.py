@@ -28,9 +28,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from palpate.metrics.arrays import host, in_threads, like, rows_at
-from palpate.metrics.inputs import Array, Index, release, row_norms
-from palpate.metrics.sums import PairSums
+from palpate.metrics.inputs import Array, Index, host, in_threads, like, release, row_norms, rows_at
+from palpate.metrics.intervals import PairSums
 
 #: Rows that are multiplied together.
 CHUNK = 2048
@@ -146,7 +145,7 @@ class Moments:
         return PairSums.from_block(block, n, none, segment, unit, **fixed, bound=bound)
 
     def spread(self, items: Index) -> tuple[float, float, float]:
-        """As :func:`palpate.metrics.pairs.centered_squares`, to leading order in 1 / sigma^2.
+        """As :func:`palpate.metrics.kernels.centered_squares`, to leading order in 1 / sigma^2.
 
         ``Kc_ij = z_i . z_j`` with z centered on the mean of the samples of these items.
         """

@@ -31,9 +31,17 @@ from scipy import special
 from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
 from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
-from palpate.metrics.presets import Options
-from palpate.metrics.scored import Scored, excess_of, not_comparable, same_units, with_floor
-from palpate.metrics.tactile import floors_of, four_of, tmmd_scored
+from palpate.metrics.mmd import Options
+from palpate.metrics.tactile import (
+    Scored,
+    excess_of,
+    floors_of,
+    four_of,
+    not_comparable,
+    same_units,
+    tmmd_scored,
+    with_floor,
+)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from palpate.metrics.inputs import (
     invalid,
     to_host,
 )
-from palpate.metrics.presets import Options, plan_for
+from palpate.metrics.mmd import Options, plan_for
 from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, reference_free, tmmd_scored
 
 COLUMNS = ("ids", "labels", "groups")

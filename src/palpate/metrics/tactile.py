@@ -9,37 +9,517 @@ better for all four.
 * **D-TMMD** ``= 1/C sum_c D_cc / sum_c' D_cc'`` (Eq. 7) with ``D_cc = dist^2(G^c_1, G^c_2)`` (Eq.
   5), ``D_cc' = dist^2(G^c, G^c')`` (Eq. 6).
 
-All come from one table of kernel sums (:mod:`palpate.metrics.tables`). Read the last three next to
-the same metric on real samples (``Score.floor``) and next to TMMD: a generator that collapses to
-one image has a perfect I- and CI-TMMD. A score that is not defined has value None and a note;
-classes that are excluded are in ``details``.
+One pass over the pairs fills a :class:`Table` of kernel sums; a metric merges its segments and
+computes a statistic of the totals, and the jackknife the same statistic without each unit.
+
+Read the last three next to the same metric on real samples (``Score.floor``) and next to TMMD: a
+generator that collapses to one image has a perfect I- and CI-TMMD. A score that is not defined has
+value None and a note; classes that are excluded are in ``details``.
+
+KID and CMMD are TMMD with other settings, over all pairs instead of random subsets. KID (Binkowski
+et al., arXiv 1801.01401): the unbiased MMD^2 with the kernel ``(x.y / d + 1)^3`` on features of
+Inception. CMMD (Jayasumana et al., arXiv 2401.09603): the biased one with a Gaussian of bandwidth
+10 on embeddings of CLIP.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
 import numpy as np
 
+from palpate import __version__
 from palpate.core import FeatureSet, Note, PalpateError, Score
-from palpate.metrics.halves import (
+from palpate.core.features import is_missing
+from palpate.core.plain import plain
+from palpate.metrics.inputs import (
+    Array,
+    Index,
+    checked_features,
+    checked_names,
+    checked_pair,
+    copies_across,
+    feature_set,
+    require_one_encoder,
+)
+from palpate.metrics.intervals import (
+    Interval,
+    PairSums,
+    Totals,
+    jackknife_errors,
+    permutation_test,
+    t_interval,
+)
+from palpate.metrics.kernels import Kernel, Polynomial, gaussian, kernel_sums
+from palpate.metrics.mmd import (
+    AGGREGATES,
+    DENOMINATORS,
     Design,
+    Options,
+    Plan,
     design_of,
     dispersion_of,
+    half_of,
     halves_bound,
     halves_of,
+    largest_bound,
+    mmd_bound,
+    mmd_matrix,
+    plan_for,
     random_halves_sd,
+    sample_units,
     self_distances,
+    unit_index,
     whole_sets,
+    without_set,
 )
-from palpate.metrics.inputs import Array, Index, feature_set, require_one_encoder
-from palpate.metrics.intervals import permutation_test
-from palpate.metrics.mmd import largest_bound, mmd_bound, mmd_matrix
-from palpate.metrics.presets import AGGREGATES, DENOMINATORS, Options, Plan, plan_for
-from palpate.metrics.scored import UNBOUNDED, Scored, scored, with_floor
-from palpate.metrics.sums import PairSums, Totals
-from palpate.metrics.tables import Table, build_table, class_estimate, estimate
+
+
+@dataclass(frozen=True)
+class Table:
+    """Kernel sums of one generated set (and its reference): all that the four metrics need.
+
+    Attributes:
+        sums: segment ``4 c + 2 (half of the class) + (half of the set)`` for class number c; the
+            last segment is the reference.
+        classes: label of each class number; ``""`` holds samples without a label.
+        unit: what the jackknife leaves out: ``"group"``, ``"sample"`` or ``"random-block"``.
+        names: the name of each unit number.
+        kernel: what was summed.
+        spread: (1 + C, 3) :func:`palpate.metrics.kernels.centered_squares` of the generated set
+            and of each class.
+        copies: generated rows that are bit for bit rows of the reference.
+    """
+
+    sums: PairSums
+    classes: Sequence[str]
+    unit: str
+    names: Sequence[str]
+    kernel: Kernel
+    spread: Array
+    copies: int | None = 0
+
+    @property
+    def grouped(self) -> bool:
+        """Whether units are groups."""
+        return self.unit == "group"
+
+    def tmmd(self) -> PairSums:
+        """Segments 0: generated, 1: reference."""
+        return self.sums.merge(np.repeat([0, 1], [self.sums.segments - 1, 1]), 2)
+
+    def set_halves(self) -> PairSums:
+        """Segments 0, 1: the halves of the generated set."""
+        return self.sums.merge(np.append(np.arange(self.sums.segments - 1) % 2, -1), 2)
+
+    def class_halves(self, kept: Index) -> PairSums:
+        """Segments 2k, 2k + 1: the halves of class number ``kept[k]``."""
+        to = np.full(self.sums.segments, -1, dtype=np.intp)
+        for k, c in enumerate(kept):
+            to[4 * c : 4 * c + 4] = [2 * k, 2 * k, 2 * k + 1, 2 * k + 1]
+        return self.sums.merge(to, 2 * len(kept))
+
+    def whole_classes(self) -> PairSums:
+        """Segment c: class number c, whole."""
+        classes = len(self.classes)
+        return self.sums.merge(np.append(np.repeat(np.arange(classes), 4), -1), classes)
+
+
+def build_table(
+    generated: FeatureSet,
+    reference: FeatureSet | None,
+    plan: Plan,
+    *,
+    grouped: bool,
+    median_of: FeatureSet | None = None,
+    further: Callable[[Table, Plan], float] | None = None,
+) -> Table:
+    """Check the sets and pass once over all their pairs.
+
+    Args:
+        generated: the set that is halved and divided into classes.
+        reference: real samples, or None where no metric needs them.
+        plan: halves, seed, bandwidth, back end, normalization.
+        grouped: whether the groups of the sets are the jackknife's units; else samples are.
+        median_of: the set whose median distance ``sigma="median"`` takes; else the reference, or
+            the generated set without one.
+        further: the bound of a statistic without scale, which moments must keep within the
+            tolerance as well: D-TMMD is a ratio.
+
+    Raises:
+        PalpateError: on features or groups that are rejected.
+    """
+    name = "generated" if plan.subject == "generated" else f"The features of {plan.subject!r}"
+    if reference is None:
+        sets = [generated]
+        parts = [checked_features(name, generated.features, normalize=plan.normalize)]
+    else:
+        sets, features = [generated, reference], (generated.features, reference.features)
+        names = (name, "reference")
+        parts = [*checked_pair(*features, normalize=plan.normalize, least=1, names=names)]
+    if grouped:
+        groups = [checked_names("groups", s.groups, len(s.ids)) or [] for s in sets]
+        units, unit = unit_index(*groups), "group"
+        unit_names = sorted({name for group in groups for name in group})
+    else:
+        ids = [str(i) for s in sets for i in s.ids]
+        units, unit, unit_names = sample_units(ids, plan.seed)
+    classes, segment = _segments(generated, plan)
+    reference_segment = 4 * len(classes)
+    segment = np.append(segment, np.full(len(units) - len(segment), reference_segment))
+    kernel = plan.kernel
+    if kernel is None and isinstance(plan.sigma, str) and median_of is not None:
+        kernel = gaussian(plan.sigma, _rows_of_median(median_of, plan), median_of.groups)
+    if kernel is None:
+        kernel = gaussian(plan.sigma, parts[-1], sets[-1].groups)
+
+    def bound(sums: PairSums) -> float:
+        table = Table(sums, classes, unit, unit_names, kernel, np.zeros((0, 3)))
+        ratio = further(table, plan) * plan.scale / 1000 if further else 0.0
+        return max(_bound(table, plan), ratio)
+
+    of_class = [np.arange(4 * c, 4 * c + 4) for c in range(len(classes))]
+    sweep = kernel_sums(
+        parts,
+        segment,
+        units,
+        segments=reference_segment + 1,
+        kernel=kernel,
+        backend=plan.backend,
+        tolerance=plan.tolerance * plan.scale / 1000,
+        bound=bound,
+        block=plan.block,
+        spread=[np.arange(reference_segment), *of_class],
+    )
+    copies = copies_across(*parts) if reference is not None else 0
+    return Table(sweep.sums, classes, unit, unit_names, kernel, sweep.spread, copies)
+
+
+def _segments(generated: FeatureSet, plan: Plan) -> tuple[list[str], Index]:
+    """The classes, and (n,) the segment of each sample."""
+    ids = [str(i) for i in generated.ids]
+    labels = [""] * len(ids)
+    if generated.labels is not None:
+        labels = ["" if is_missing(v) else str(v) for v in generated.labels]
+    classes = sorted(set(labels))
+    label = np.searchsorted(classes, labels) if labels else np.zeros(0, dtype=np.intp)
+    whole = np.zeros_like(label)
+    return classes, 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, whole, plan)
+
+
+def _rows_of_median(median_of: FeatureSet, plan: Plan) -> Array:
+    name = "The features that the median distance is taken over"
+    return checked_features(name, median_of.features, normalize=plan.normalize)
+
+
+def _bound(table: Table, plan: Plan) -> float:
+    """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most."""
+    halves, reference = table.set_halves(), table.sums.segment == table.sums.segments - 1
+    bounds = [largest_bound(table.whole_classes(), plan.estimator, plan.scale)]
+    if reference.any():
+        bounds.append(largest_bound(table.tmmd(), plan.estimator, plan.scale))
+    if halves.bound is not None and np.isfinite(self_distances(halves.totals, plan)[0][0]):
+        bounds.append(float(halves_bound(halves.bound.totals, plan)[0]))
+    return max(b if np.isfinite(b) else np.inf for b in bounds)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A statistic with its jackknife.
+
+    Attributes:
+        values: (K,).
+        errors: (K,) standard errors.
+        df: their degrees of freedom.
+        method: in words.
+        replicates: (G, K) values without each unit.
+        units: (G,) units.
+        without_class: (C, 4) the first four values without each class; empty with fewer than three.
+        of_classes: whether the errors are those over classes.
+    """
+
+    values: Array
+    errors: Array
+    df: int
+    method: str
+    replicates: Array = field(repr=False)
+    units: Index = field(repr=False)
+    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
+    of_classes: bool = False
+
+    def interval(self, k: int, level: float) -> Interval | None:
+        """Interval of value k, or None where it has none."""
+        value, error = float(self.values[k]), float(self.errors[k])
+        if not (np.isfinite(value) and np.isfinite(error) and error > 0):
+            return None  # no variation between units is no evidence of certainty
+        return t_interval(value, error, self.df, level)
+
+
+def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
+    """The statistic on all samples, with its leave-one-unit-out jackknife."""
+    replicates = np.array([statistic(t) for t in sums.leave_one_out()], dtype=np.float64)
+    df = len(sums.units) - 1
+    tail = "" if unit == "group" else ", samples taken as independent"
+    method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
+    errors = jackknife_errors(replicates)
+    return Estimate(statistic(sums.totals), errors, df, method, replicates, sums.units)
+
+
+def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
+    """As :func:`estimate`, for 2C segments; over classes where one cannot spare a unit (two
+    groups).
+
+    The interval over classes also holds the differences between classes, so it errs on the wide
+    side. The first four values of the statistic must be defined for fewer classes; only they get
+    errors then.
+    """
+    over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
+    if classes < 3:
+        return over_units
+    without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
+    if np.isfinite(over_units.errors[0]):
+        return replace(over_units, without_class=without)
+    errors = np.full(len(over_units.values), np.nan)
+    errors[: without.shape[1]] = jackknife_errors(without)
+    reason = f"(a class has too few {unit}s to leave one out)"
+    method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
+    return replace(
+        over_units,
+        errors=errors,
+        df=classes - 1,
+        method=method,
+        without_class=without,
+        of_classes=True,
+    )
+
+
+#: A bound at scale 1000 from which a note reports it.
+LOOSE_BOUND = 1e-4
+#: Designs that differ by less have one floor: the change is far below the noise of any floor.
+SAME_DESIGN = 0.01
+UNBOUNDED = Note("undefined", {"reason": "moments"})
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A score and how it moves.
+
+    Attributes:
+        score: the score.
+        replicates: (G,) the value without each unit.
+        units: (G,) names of the units; see :func:`over_classes` for the other choice.
+        excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
+        design: what the value depends on besides the features: of halves of whole groups how their
+            sizes turn E into dist^2 (:class:`palpate.metrics.mmd.Design`), of other biased
+            values 1/m + 1/m' of the halves; empty where it depends on neither.
+        groups: names of all units that the set has.
+        without_class: (C, 2 or more) the value without each class, and what ``excess`` has; empty
+            with fewer than three classes.
+    """
+
+    score: Score
+    replicates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    units: Sequence[str] = ()
+    excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    design: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    groups: Sequence[str] = ()
+    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
+
+
+def scored(  # noqa: PLR0913
+    metric: str,
+    table: Table,
+    generated: FeatureSet,
+    plan: Plan,
+    settings: Sequence[str],
+    *,
+    estimate: Estimate | None = None,
+    design: Array | None = None,
+    bound: float = 0.0,
+    limit: float | None = None,
+    details: dict[str, Any],
+    notes: Sequence[Note] = (),
+    **fields: Any,
+) -> Scored:
+    """A score with everything that the plan and the set fix.
+
+    NaN becomes None, and an undefined value loses its interval.
+
+    Args:
+        metric: its name.
+        table: for kernel, back end, units.
+        generated: for sizes and digests.
+        plan: for subject, split, level, scale, and the options named in ``settings``.
+        settings: options that bear on this metric.
+        estimate: its first value is the score's; None for an undefined one.
+        design: as :class:`Scored`; default empty.
+        bound: the value is within this of the exact one, rounding aside.
+        limit: the largest bound that leaves a value; default: as much as a distance can be.
+        details: kept with the score.
+        notes: an undefined score has one of code ``undefined``.
+        **fields: further fields of the score.
+    """
+    value = plain(estimate.values[0]) if estimate else None
+    notes = list(notes)
+    if value is not None and not bound <= (2 * plan.scale if limit is None else limit):
+        value, notes = None, [UNBOUNDED]
+    elif value is not None and bound > LOOSE_BOUND * (plan.scale / 1000 if limit is None else 1):
+        notes.insert(0, Note("within-bound", {"bound": float(bound)}))
+    interval = estimate.interval(0, plan.level) if estimate and value is not None else None
+    if value is None:
+        fields["null"] = None
+        details |= {name: None for name in ("p_value", "z") if name in details}
+        notes = notes or [Note("undefined", {"reason": "no-pairs"})]
+    elif interval is None:
+        notes.append(Note("no-interval", {"reason": "too-few"}))
+    score = Score(
+        metric,
+        plan.subject,
+        value,
+        interval,
+        plan.level,
+        estimate.method if estimate and interval else "",
+        bandwidth=table.kernel.bandwidth,
+        scale=plan.scale,
+        n=len(generated.ids),
+        encoder=generated.encoder,
+        split=plan.split,
+        details={
+            **plain(details),
+            "unit": table.unit,
+            "backend": table.sums.backend,
+            "bound": plain(float(bound)) if value is not None else None,
+            "version": __version__,
+        },
+        notes=tuple(notes),
+        settings={
+            **table.kernel.settings(),
+            **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)},
+        },
+        **fields,
+    )
+    design = np.zeros(0) if design is None else design
+    if estimate is None or not len(estimate.units):
+        return Scored(score, design=design)
+    names = [table.names[int(u)] for u in estimate.units]
+    excess = estimate.replicates[:, 1] if "E" in details else np.zeros(0)
+    replicates, without = estimate.replicates[:, 0], estimate.without_class
+    result = Scored(score, replicates, names, excess, design, names, without)
+    return over_classes(result) if estimate.of_classes else result
+
+
+def over_classes(one: Scored) -> Scored:
+    """The same with classes left out in turn instead of units; ``details["left_out"]`` records it.
+
+    For classes that cannot spare a unit, and for comparisons with a set that has such classes.
+    """
+    if not len(one.without_class):
+        return one
+    details = {**one.score.details, "left_out": "class"}
+    return replace(
+        one,
+        score=replace(one.score, details=details),
+        replicates=one.without_class[:, 0],
+        units=details["classes"],
+        excess=one.without_class[:, 1] if "E" in details else np.zeros(0),
+    )
+
+
+def same_units(*sets: Scored) -> Sequence[Scored]:
+    """The sets with the same units left out, or the same classes; unchanged where neither works."""
+    by_class = [over_classes(s) for s in sets]
+    for choice in (sets, by_class):
+        if all(list(s.units) == list(choice[0].units) for s in choice):
+            return choice
+    return sets
+
+
+def excess_of(one: Scored) -> Scored | None:
+    """The between-group excess E of an I- or CI-TMMD as its own score; None where there is none.
+
+    It does not depend on the number of groups, and its floor is that of the same classes: it is
+    what to report. Where moments do not bound it, it is undefined.
+    """
+    score, d = one.score, one.score.details
+    if d.get("E") is None or score.settings.get("halves") != "group":
+        return None
+    bound = np.inf if d.get("E_bound") is None else float(d["E_bound"])  # JSON has no infinity
+    known = bound <= 2 * score.scale
+    interval = d.get("E_interval") if known else None
+    notes = [] if known else [UNBOUNDED]
+    if known and bound > LOOSE_BOUND * score.scale / 1000:
+        notes = [Note("within-bound", {"bound": bound})]
+    kept = ("unit", "left_out", "units", "backend", "version", "classes", "excluded")
+    of_excess = replace(
+        score,
+        metric=f"{score.metric} E",
+        value=d["E"] if known else None,
+        interval=tuple(interval) if interval else None,
+        null=None,
+        interval_method=score.interval_method if interval else "",
+        floor=d.get("E_floor"),
+        estimator="unbiased",
+        seed=None,
+        notes=tuple(notes),
+        details={k: d[k] for k in kept if k in d} | {"bound": bound if known else None},
+    )
+    units = one.units if len(one.excess) else ()
+    without = one.without_class[:, 1:]
+    return Scored(of_excess, one.excess, units, groups=one.groups, without_class=without)
+
+
+def not_comparable(one: Scored, floor: Scored) -> str:
+    """Why real samples like these give another value of this metric; '' if they do not.
+
+    Halves of whole groups grow with the share of pairs inside groups, which falls with the number
+    of groups and rises with the samples in each; a biased value falls as 1 / n; a mean over classes
+    has a floor over the same classes alone.
+
+    Returns:
+        ``"classes"``, ``"groups"``, ``"group-sizes"``, ``"sizes"`` or ``""``.
+    """
+    if one.score.details.get("classes") != floor.score.details.get("classes"):
+        return "classes"
+    by_group = one.score.settings.get("halves") == "group"
+    if by_group and list(one.groups) != list(floor.groups):
+        return "groups"
+    same = one.design.shape == floor.design.shape
+    if not same or not np.allclose(one.design, floor.design, rtol=SAME_DESIGN, atol=0):
+        return "group-sizes" if by_group else "sizes"
+    return ""
+
+
+def with_floor(one: Scored, floor: Scored) -> Scored:
+    """The score with that of real samples as its floor, where the two are comparable.
+
+    E of CI-TMMD has as its floor that of the real samples of the generator's classes, E_ratio of
+    D-TMMD none where the classes differ.
+    """
+    details, real = one.score.details, floor.score.details
+    reason = not_comparable(one, floor)
+    classes = details.get("classes")
+    more: dict[str, Any] = {}
+    if "E" in details:
+        same = classes == real.get("classes")
+        more["E_floor"] = real.get("E") if same else _mean_excess(floor.score, classes or [])
+    if "E_ratio" in details:
+        more["E_ratio_floor"] = real.get("E_ratio") if classes == real.get("classes") else None
+    notes = list(one.score.notes)
+    if reason and one.score.value is not None:
+        notes.append(Note("no-floor", {"reason": reason}))
+    value = None if reason else floor.score.value
+    score = replace(one.score, floor=value, details={**details, **more}, notes=tuple(notes))
+    return replace(one, score=score)
+
+
+def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:
+    """The mean E of some classes, None unless all are known."""
+    per_class = score.details.get("per_class", {})
+    each = [per_class.get(name, {}).get("E") for name in classes]
+    return sum(each) / len(each) if each and None not in each else None
+
 
 INDEPENDENT = Note("independent-samples")
 
@@ -152,7 +632,7 @@ def i_tmmd(
     """I-TMMD: dist^2 between two halves of the generated samples (paper, Eq. 3).
 
     With ``halves="group"`` the value is the average over halvings by whole groups, in closed form
-    (:mod:`palpate.metrics.halves`).
+    (:mod:`palpate.metrics.mmd`).
 
     Args:
         generated: (n, d) features: an array, a tensor, a list of rows, or a FeatureSet.
@@ -566,3 +1046,40 @@ def _require_same_groups(generated: FeatureSet, floor: FeatureSet) -> None:
     if (floor.groups is None) != (generated.groups is None):
         must = "The floor must be scored like the generated samples"
         raise PalpateError(must, "groups in one of the two", "Give groups to both, or to none")
+
+
+def kid(generated: Any, reference: Any, **options: Any) -> Score:
+    """KID between generated and real features, times 1000; lower is better.
+
+    Args:
+        generated: (n, d) features; as published, the 2048 pool features of Inception.
+        reference: (m, d) features of real images.
+        **options: of :func:`palpate.metrics.tmmd`, e.g. ``groups`` and ``reference_groups`` for an
+            interval over whole groups, or ``scale=1`` for the plain value.
+
+    Raises:
+        PalpateError: as :func:`palpate.metrics.tmmd`.
+    """
+    settings: dict[str, Any] = {"normalize": False, "permutations": 0} | options
+    score = tmmd(generated, reference, kernel=Polynomial(), preset="paper", **settings)
+    return _named("KID", score)
+
+
+def cmmd(generated: Any, reference: Any, **options: Any) -> Score:
+    """CMMD between generated and real embeddings, times 1000; lower is better.
+
+    Args:
+        generated: (n, d) L2-normalized features; as published, image embeddings of CLIP.
+        reference: (m, d) features of real images.
+        **options: of :func:`palpate.metrics.tmmd`.
+
+    Raises:
+        PalpateError: as :func:`palpate.metrics.tmmd`.
+    """
+    settings: dict[str, Any] = {"permutations": 0} | options
+    return _named("CMMD", tmmd(generated, reference, preset="cmmd", **settings))
+
+
+def _named(name: str, score: Score) -> Score:
+    settings = {k: v for k, v in score.settings.items() if k != "preset"}
+    return replace(score, metric=name, settings=settings)
