@@ -1,12 +1,15 @@
 """Precision and recall of every kind of planted leak, over 20 seeds.
 
     python benchmarks/leakage_planted.py --seeds 20
-    python benchmarks/leakage_planted.py --seeds 20 --flat        # with Glass: prints without any texture among the unrelated touches
+    python benchmarks/leakage_planted.py --seeds 20 --flat        # with Glass: prints without any
+    texture among the unrelated touches
 
-Each seed makes a train and a test part (tests/leakage_fixtures.py: 60 videos of 9 kinds of surface, 128 px, 4 samples each) and plants near-duplicates (brightness
-+-5 %, JPEG quality 60, shifts up to 4 px, and combinations) across videos, the same sample, the same bytes, shared videos and frames 3 apart. Near-duplicates are
-judged twice: with videos known, and with all metadata dropped. Rows that are near-duplicates by nature (same bytes, same sample) count as such; frames 3
-apart, which may or may not be, are left out of that judgment. Peak memory is the process's.
+Each seed makes a train and a test part (tests/leakage_fixtures.py: 60 videos of 9 kinds of surface,
+128 px, 4 samples each) and plants near-duplicates (brightness +-5 %, JPEG quality 60, shifts up to
+4 px, and combinations) across videos, the same sample, the same bytes, shared videos and frames 3
+apart. Near-duplicates are judged twice: with videos known, and with all metadata dropped. The same
+bytes and the same sample count as near-duplicates; frames 3 apart, which may or may not be, are
+excluded from that judgment. Peak memory is that of the process.
 """
 
 import argparse
@@ -22,7 +25,7 @@ import polars as pl
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from leakage_fixtures import MATERIALS, forge
+from leakage_fixtures import MATERIALS, make_leaky
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit
 from palpate.leakage.near import near_duplicates
@@ -87,7 +90,7 @@ def main():
     total, missed, samples, seconds = {}, Counter(), 0, 0.0
     for seed in range(options.first, options.first + options.seeds):
         with tempfile.TemporaryDirectory() as folder:
-            leaky = forge(
+            leaky = make_leaky(
                 Path(folder), seed, size=options.size, look=options.look, materials=materials
             )
             samples += len(leaky.test)
@@ -97,16 +100,15 @@ def main():
         missed.update(lost)
         for kind, row in found.items():
             total[kind] = total.get(kind, np.zeros(3, int)) + row
-    print(
-        f"{options.seeds} seeds from {options.first}, {samples} test samples, {options.size} px, {options.look}, {seconds:.0f} s of audits"
-    )
-    print(
-        f"{'planted kind':44s} {'planted':>8s} {'found':>6s} {'wrong':>6s} {'precision':>10s} {'recall':>8s}"
-    )
+    look = f"{options.size} px, {options.look}"
+    print(f"{options.seeds} seeds from {options.first}, {samples} test samples, {look}")
+    print(f"{seconds:.0f} s of audits")
+    names = ("planted", "found", "wrong", "precision", "recall")
+    print(f"{'planted kind':40s}", *(f"{name:>10s}" for name in names))
     for kind, (right, wrong, lost) in total.items():
-        print(
-            f"{kind:44s} {right + lost:8d} {right:6d} {wrong:6d} {right / max(1, right + wrong):10.4f} {right / max(1, right + lost):8.4f}"
-        )
+        precision, recall = right / max(1, right + wrong), right / max(1, right + lost)
+        counts = f"{right + lost:10d} {right:10d} {wrong:10d}"
+        print(f"{kind:40s} {counts} {precision:10.4f} {recall:10.4f}")
     for (modality, how, change), n in sorted(missed.items()):
         print(f"  missed in {modality} ({how}): {n} of {change}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")

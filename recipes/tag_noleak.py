@@ -22,7 +22,10 @@ from palpate.data.manifest import Manifest
 from palpate.leakage import split, verify
 from palpate.leakage.noleak import FORMAT, RATIOS, SEEDS, load_record, record_split
 
-CITE = "Videos of Touch and Go (Yang et al., NeurIPS 2022 Datasets and Benchmarks; CC BY 4.0), ids alone."
+CITE = (
+    "Videos of Touch and Go (Yang et al., NeurIPS 2022 Datasets and Benchmarks; CC BY 4.0),"
+    " ids alone."
+)
 METHOD = "whole videos, smallest largest deviation of any class's share of frames"
 
 

@@ -1,7 +1,8 @@
-"""A forged train and test part with planted leaks of every kind among unrelated samples.
+"""A made-up train and test part with planted leaks of every kind among unrelated samples.
 
-Pictures come from the procedural world (many videos of few materials, so that unrelated ones can be much alike) and, for a fifth of the videos, from smooth random
-fields. They are rendered with a margin of 4 pixels and cropped, so that a shifted copy shows what lay beside the crop.
+Pictures come from the procedural world (many videos of few materials, so that unrelated ones can
+be much alike) and, for a fifth of the videos, from smooth random fields. They are rendered with a
+margin of 4 pixels and cropped, so that a shifted copy shows what lay beside the crop.
 """
 
 from dataclasses import dataclass, field
@@ -15,7 +16,8 @@ from palpate.data.manifest import Manifest
 from palpate.sim import Video, WorldOptions, plan_world
 
 MARGIN = 4
-#: Without Glass: the print of a flat thing is the rim of the pad and nothing else, the same wherever it was taken.
+#: Without Glass: the print of a flat thing is the rim of the pad and nothing else, the same
+#: wherever it was taken.
 MATERIALS = ("Wood", "Brick", "Concrete", "Leather", "Rubber", "Synthetic Fabric", "Tree", "Gravel")
 #: What is done to a planted copy: one of these by turns.
 CHANGES = ("brightness", "jpeg", "shift", "brightness+jpeg", "jpeg+shift", "brightness+jpeg+shift")
@@ -24,7 +26,7 @@ KINDS = ("near-duplicate", "identical sample", "identical bytes", "shared video"
 
 @dataclass
 class Leaky:
-    """Both parts, and which test ids were planted as what (id -> the train id that it leaks from)."""
+    """Both parts, and the planted test ids by kind (id -> the train id that it leaks from)."""
 
     train: Manifest
     test: Manifest
@@ -36,7 +38,7 @@ class Leaky:
 
 
 def changed(picture: np.ndarray, how: str, rng: np.random.Generator) -> np.ndarray:
-    """A crop of a picture with margin: brightness times 0.95 to 1.05, moved by up to 4 pixels along each axis."""
+    """A crop of an image with margin: brightness times 0.95 to 1.05, moved by up to 4 pixels."""
     moves = [
         (y, x) for y in range(-MARGIN, MARGIN + 1) for x in range(-MARGIN, MARGIN + 1) if y or x
     ]
@@ -60,7 +62,7 @@ def save(path: Path, picture: np.ndarray, quality: int = 95) -> None:
 
 
 class NoiseVideo:
-    """Smooth random fields: a photo of them, and their relief lit from three sides on a gel of smooth colors."""
+    """Smooth random fields: a photo of them, and their relief lit from three sides on a gel."""
 
     def __init__(self, rng: np.random.Generator, size: int):
         self.rng, self.size = rng, size
@@ -100,7 +102,7 @@ class NoiseVideo:
         return np.clip(x + self.rng.normal(0, 1, x.shape) + 0.5, 0, 255).astype(np.uint8)
 
 
-def forge(
+def make_leaky(
     root: Path,
     seed: int,
     *,
@@ -111,7 +113,11 @@ def forge(
     planted: float = 0.25,
     kinds: tuple[str, ...] = KINDS,
 ) -> Leaky:
-    """Writes pictures below ``root``: ``objects`` videos of each material of the world and a quarter as many of noise, 4 touches each, 40 % of the videos in test."""
+    """Write images below ``root``.
+
+    ``objects`` videos of each material of the world and a quarter as many of noise, 4 contacts
+    each; 40 % of the videos are test.
+    """
     rng = np.random.default_rng([seed, 7])
     options = WorldOptions(
         seed=seed,

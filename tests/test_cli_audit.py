@@ -1,4 +1,4 @@
-"""``palpate audit`` from the outside: every kind of input, every output, and bad input answered in a line."""
+"""``palpate audit`` from the outside: every kind of input, every output, bad input in a line."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ def texture(seed, size=96):
 
 @pytest.fixture
 def folders(tmp_path):
-    """Two folders of pairs without metadata: 30 pictures each, test 3 is train 5 brighter, moved and saved again."""
+    """Two folders of 30 pairs without metadata: test 3 is train 5 brighter and moved."""
     for part, first in (("a", 0), ("b", 1000)):
         for k in range(30):
             for side, shift in (("vision", 0), ("tactile", 5000)):

@@ -1,4 +1,4 @@
-"""The audit and its exact signals: against double loops, the published facts, and files planted by hand."""
+"""The audit and its exact signals: against double loops, the published facts, planted files."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Near-duplicates in vision and touch: the similarity against a slow one, the calibration, causes, groups, and rubbish files."""
+"""Near-duplicates: the similarity against a slow one, calibration, causes, groups, bad files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
-from leakage_fixtures import MATERIALS, NoiseVideo, changed, crop, forge, save
+from leakage_fixtures import MATERIALS, NoiseVideo, crop, make_leaky, save
 from palpate.core import PalpateError, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibration, near
@@ -43,8 +43,8 @@ def fields(n, seed=0, sigma=2.0):
 def test_similarity_is_the_best_overlap_at_whole_offsets_and_more_between():
     x = quantized(band_pass(fields(6)[:, :, :SIDE, :SIDE]))
     i, j = np.array([0, 0, 1, 2, 4]), np.array([0, 1, 2, 3, 5])
-    found = similarities(x, i, j)
-    for s, a, b in zip(found, i, j, strict=True):
+    flags = similarities(x, i, j)
+    for s, a, b in zip(flags, i, j, strict=True):
         t = x[a, :, REACH:-REACH, REACH:-REACH].astype(float)
         t -= t.mean((1, 2), keepdims=True)
         best = -1.0
@@ -54,9 +54,9 @@ def test_similarity_is_the_best_overlap_at_whole_offsets_and_more_between():
                 w = w - w.mean((1, 2), keepdims=True)
                 best = max(best, float((t * w).sum() / np.sqrt((t**2).sum() * (w**2).sum())))
         assert best - 1e-3 <= s <= best + 0.12
-    assert found[0] == pytest.approx(1, abs=1e-3)
+    assert flags[0] == pytest.approx(1, abs=1e-3)
     grid = similarity_grid(x, i, np.arange(6))
-    assert grid[np.arange(5), j] == pytest.approx(found, abs=1e-5)
+    assert grid[np.arange(5), j] == pytest.approx(flags, abs=1e-5)
 
 
 def test_similarity_survives_gain_offset_and_shift_and_tells_others_apart():
@@ -91,7 +91,7 @@ def test_background_leaves_contact_alone_and_takes_shifted_markers_off():
 
 
 def gel_with_markers(size=136):
-    """A gel of soft colors with 8 x 8 printed dots, each about a pixel of the thumbnail wide, (size, size, 3)."""
+    """(size, size, 3): a gel of soft colors with 8 x 8 dots, about a thumbnail pixel wide."""
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:size, :size].astype(float)
     gel = np.stack([120 + 0.2 * x, 110 + 0.1 * y, 125 - 0.15 * x], -1)
@@ -137,10 +137,10 @@ def test_candidates_find_what_comparing_all_finds(monkeypatch):
     queries, base = np.arange(300, 600), np.arange(300)
     exact, s = best_matches(comparer, queries, base)
     monkeypatch.setattr("palpate.leakage.similarity.EXHAUSTIVE", 0)
-    found, t = best_matches(comparer, queries, base)
+    flags, t = best_matches(comparer, queries, base)
     assert (exact == base).mean() > 0.995
-    assert (found == exact).mean() > 0.995
-    assert t[found == exact] == pytest.approx(s[found == exact], abs=1e-5)
+    assert (flags == exact).mean() > 0.995
+    assert t[flags == exact] == pytest.approx(s[flags == exact], abs=1e-5)
 
 
 def test_copies_across_videos_do_not_move_the_threshold():
@@ -157,14 +157,14 @@ def test_copies_across_videos_do_not_move_the_threshold():
 def test_random_pairs_are_carried_over_to_the_whole_train_part():
     rng = np.random.default_rng(0)
     z = rng.gumbel(0.1, 0.09, (1500, 64)).astype(np.float32)
-    found = calibration.random_pairs(z, 5000, 0.001)
+    flags = calibration.random_pairs(z, 5000, 0.001)
     exact = 0.1 + 0.09 * (np.log(5000) - np.log(-np.log1p(-0.001)))
-    assert np.arctanh(found.threshold) == pytest.approx(exact, rel=0.12)
+    assert np.arctanh(flags.threshold) == pytest.approx(exact, rel=0.12)
 
 
 @pytest.fixture(scope="module")
 def leaky(tmp_path_factory):
-    return forge(
+    return make_leaky(
         tmp_path_factory.mktemp("leaky"),
         5,
         objects=3,
@@ -179,22 +179,23 @@ def test_planted_copies_are_found_and_others_are_not(leaky, modality, known):
     train, test = (
         (leaky.train, leaky.test) if known else (anonymous(leaky.train), anonymous(leaky.test))
     )
-    found = near_duplicates(train, test, modality)
+    flags = near_duplicates(train, test, modality)
     truth = leaky.truth("near-duplicate")
-    missed = [leaky.change[i] for i, t in zip(test.ids, truth & ~found.flag, strict=True) if t]
-    # A print of half a gray level is no more than what JPEG 60 changes in it, so without videos some copies stay below any safe threshold.
+    missed = [leaky.change[i] for i, t in zip(test.ids, truth & ~flags.flag, strict=True) if t]
+    # A print of half a gray level is no more than what JPEG 60 changes in it, so without videos
+    # some copies stay below any safe threshold.
     assert len(missed) <= (0.25 if modality == "tactile" and not known else 0.1) * truth.sum()
     assert all("jpeg" in how for how in missed)
-    assert found.flag[~truth].mean() <= 0.03
+    assert flags.flag[~truth].mean() <= 0.03
     source = [
         leaky.planted["near-duplicate"][i]
-        for i, t in zip(test.ids, truth & found.flag, strict=True)
+        for i, t in zip(test.ids, truth & flags.flag, strict=True)
         if t
     ]
-    assert [train.ids[k] for k in found.nearest[truth & found.flag]] == source
-    assert set(found.cause) <= {"", "content", "nothing touched", "sensor drift"}
-    assert sum(found.matches) == np.isfinite(found.score).sum() == len(test)
-    assert len(found.edges) == len(found.unrelated) + 1
+    assert [train.ids[k] for k in flags.nearest[truth & flags.flag]] == source
+    assert set(flags.cause) <= {"", "content", "nothing touched", "sensor drift"}
+    assert sum(flags.matches) == np.isfinite(flags.score).sum() == len(test)
+    assert len(flags.edges) == len(flags.unrelated) + 1
 
 
 def test_groups_join_copies_and_nothing_else(leaky):
@@ -217,7 +218,7 @@ def test_groups_join_copies_and_nothing_else(leaky):
 
 
 def test_groups_join_faint_touches_that_the_slow_part_finds_too(tmp_path, monkeypatch):
-    leaky = forge(tmp_path, 12, objects=3, materials=MATERIALS[:6], kinds=("near-duplicate",))
+    leaky = make_leaky(tmp_path, 12, objects=3, materials=MATERIALS[:6], kinds=("near-duplicate",))
     both = Manifest.join(leaky.train, leaky.test)
     label = dict(zip(both.ids, near_groups(both, "tactile").tolist(), strict=True))
     pairs = leaky.planted["near-duplicate"].items()
@@ -235,10 +236,10 @@ def test_groups_join_faint_touches_that_the_slow_part_finds_too(tmp_path, monkey
     assert sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 2
 
 
-def rows(root, name, pictures, background=None):
+def rows(root, name, images, background=None):
     out = []
-    for k, picture in enumerate(pictures):
-        save(root / f"{name}{k}.jpg", picture)
+    for k, image in enumerate(images):
+        save(root / f"{name}{k}.jpg", image)
         out.append(
             {
                 "id": f"{name}/{k}",
@@ -253,7 +254,7 @@ def rows(root, name, pictures, background=None):
 
 
 def gels(root, count=6):
-    """Videos of noise touches, each with backgrounds of its own, and their makers."""
+    """Videos of noise tactile images, each with backgrounds of its own, and their makers."""
     made, samples = [], []
     for v in range(count):
         video = NoiseVideo(np.random.default_rng([9, v]), 104)
@@ -289,11 +290,11 @@ def test_untouched_gel_is_named_and_is_no_leak(tmp_path):
     ]
     train = Manifest.from_rows([*samples[:24], blank[0]], tmp_path)
     test = Manifest.from_rows([*samples[24:], blank[1]], tmp_path)
-    found = near_duplicates(train, test, "tactile")
-    assert found.cause[-1] == "nothing touched"
-    assert not found.flag.any()
-    assert found.nearest[-1] == 24
-    assert "blank-images" in [note.code for note in found.notes]
+    flags = near_duplicates(train, test, "tactile")
+    assert flags.cause[-1] == "nothing touched"
+    assert not flags.flag.any()
+    assert flags.nearest[-1] == 24
+    assert "blank-images" in [note.code for note in flags.notes]
 
 
 def test_drift_of_the_gel_is_named_and_is_no_leak(tmp_path):
@@ -321,13 +322,13 @@ def test_drift_of_the_gel_is_named_and_is_no_leak(tmp_path):
         "tactile": "v0t7.jpg",
         "background": "worn.jpg",
     }
-    found = near_duplicates(
+    flags = near_duplicates(
         Manifest.from_rows([*samples[:24], later[0], other], tmp_path),
         Manifest.from_rows([*samples[24:], later[1]], tmp_path),
         "tactile",
     )
-    assert found.cause[-1] == "sensor drift"
-    assert not found.flag.any()
+    assert flags.cause[-1] == "sensor drift"
+    assert not flags.flag.any()
 
 
 def test_a_score_near_the_threshold_counts_where_the_slow_part_matches_the_same_image(monkeypatch):
@@ -369,14 +370,14 @@ def test_black_photos_show_nothing(tmp_path):
     test = Manifest.from_rows(
         [*black[2:], *(row for rows_ in others[6:] for row in rows_)], tmp_path
     )
-    found = near_duplicates(train, test, "vision")
-    assert list(found.cause[:2]) == ["nothing touched"] * 2
-    assert not found.flag.any()
+    flags = near_duplicates(train, test, "vision")
+    assert list(flags.cause[:2]) == ["nothing touched"] * 2
+    assert not flags.flag.any()
 
 
 def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
-    picture = crop(NoiseVideo(np.random.default_rng(3), 72).photo(0))
-    image = Image.fromarray(picture)
+    image = crop(NoiseVideo(np.random.default_rng(3), 72).photo(0))
+    image = Image.fromarray(image)
     image.save(tmp_path / "a.jpg", quality=95)
     for mode, name in (
         ("L", "gray.png"),
@@ -402,11 +403,11 @@ def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
     manifest = Manifest.from_rows(
         [*({"id": n, "vision": n} for n in [*names, "absent.jpg"]), {"id": "none"}], tmp_path
     )
-    found = near_duplicates(manifest, manifest, "vision")
+    flags = near_duplicates(manifest, manifest, "vision")
     bad = [i in ("empty.jpg", "cut.jpg", "text.jpg", "absent.jpg", "none") for i in manifest.ids]
-    assert np.array_equal(np.isnan(found.score), bad)
-    assert not found.flag[bad].any()
-    assert "images-unreadable" in [note.code for note in found.notes]
+    assert np.array_equal(np.isnan(flags.score), bad)
+    assert not flags.flag[bad].any()
+    assert "images-unreadable" in [note.code for note in flags.notes]
 
 
 def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
@@ -426,7 +427,7 @@ def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
         3,
         4,
         0,
-    ]  # the last file is the first one's picture again
+    ]  # the last file is the first one's image again
     assert len(plain.pixels) == 5
     monkeypatch.setattr("palpate.leakage.thumbnails.PIECE", 2)
     cached = thumbnails(order, cache=tmp_path / "cache", threads=2)
@@ -435,8 +436,8 @@ def test_cache_and_processes_change_nothing(tmp_path, monkeypatch):
     assert len(pieces) == 3
     pieces[0].unlink()  # as after a stop: what is there is used, the rest decoded
     pieces[1].write_bytes(b"half")
-    mended = thumbnails(order, cache=tmp_path / "cache")
-    for other in (cached, again, mended):
+    repaired = thumbnails(order, cache=tmp_path / "cache")
+    for other in (cached, again, repaired):
         assert np.array_equal(other.row, plain.row)
         assert np.array_equal(other.pixels, plain.pixels)
 
@@ -449,28 +450,28 @@ def test_embeddings_and_their_mistakes(tmp_path):
         Manifest.from_rows([{"id": f"{p}{k}", "video": f"{p}{k // 4}"} for k in range(n)], tmp_path)
         for p, n in (("a", 200), ("b", 80))
     ]
-    found = near_duplicates(parts[0], parts[1], "vision", features=(train, test))
-    assert list(np.flatnonzero(found.flag)) == list(range(20))
-    assert list(found.nearest[:20]) == list(range(20))
+    flags = near_duplicates(parts[0], parts[1], "vision", features=(train, test))
+    assert list(np.flatnonzero(flags.flag)) == list(range(20))
+    assert list(flags.nearest[:20]) == list(range(20))
     for wrong in ((train[1:], test), (train, test[:, :3]), (np.full_like(train, np.nan), test)):
         with pytest.raises(PalpateError):
             near_duplicates(parts[0], parts[1], "vision", features=wrong)
 
 
-def test_a_million_rows_of_one_picture_and_tiny_sets_are_answered(tmp_path):
+def test_many_rows_of_one_image_and_tiny_sets_are_answered(tmp_path):
     save(tmp_path / "a.jpg", crop(NoiseVideo(np.random.default_rng(0), 72).photo(0)))
-    table = pl.DataFrame({"id": [str(k) for k in range(100_000)]}).with_columns(
+    table = pl.DataFrame({"id": [str(k) for k in range(20_000)]}).with_columns(
         vision=pl.lit("a.jpg"), video=pl.lit("v")
     )
     many = Manifest(
         Manifest.from_rows([], tmp_path)
-        .table.clear(100_000)
+        .table.clear(20_000)
         .with_columns(id=table["id"], vision=table["vision"], video=table["video"]),
         tmp_path,
     )
-    found = near_duplicates(many, many, "vision")
-    assert found.flag.all()
-    assert "threshold-default" in [note.code for note in found.notes]
+    flags = near_duplicates(many, many, "vision")
+    assert flags.flag.all()
+    assert "threshold-default" in [note.code for note in flags.notes]
     empty = Manifest(many.table.clear(), tmp_path)
     assert len(near_duplicates(many, empty, "vision").score) == 0
     assert np.isnan(
@@ -488,9 +489,9 @@ def test_real_clips_without_metadata(real_data, tmp_path):
     part = lambda keep: Manifest(hidden.table.filter(pl.Series(keep)), hidden.root)  # noqa: E731
     videos = np.array(manifest.column("video"))
     for modality, least in (("vision", 0.99), ("tactile", 0.9)):
-        found = near_duplicates(part(~odd), part(odd), modality)
-        assert found.flag.mean() >= least
-        same = videos[~odd][found.nearest[found.flag]] == videos[odd][found.flag]
+        flags = near_duplicates(part(~odd), part(odd), modality)
+        assert flags.flag.mean() >= least
+        same = videos[~odd][flags.nearest[flags.flag]] == videos[odd][flags.flag]
         assert same.all()
         for clip in np.unique(videos):
             assert not near_duplicates(
@@ -498,47 +499,39 @@ def test_real_clips_without_metadata(real_data, tmp_path):
             ).flag.any()
 
 
-def test_changed_crops_stay_within_the_margin():
-    picture = NoiseVideo(np.random.default_rng(0), 72).photo(0)
-    out = changed(picture, "brightness+shift", np.random.default_rng(0))
-    assert out.shape == (64, 64, 3)
-    assert abs(out.mean() / crop(picture).mean() - 1) < 0.12
-
-
 def uploads(
     folder: Path, seeds: range, name: str, count: int, *, copied: bool = False
 ) -> list[dict[str, str]]:
-    """``count`` pictures of each video, copies brighter and saved again at quality 60."""
+    """``count`` images of each video, copies brighter and saved again at quality 60."""
     rows: list[dict[str, str]] = []
     for seed in seeds:
         video = NoiseVideo(np.random.default_rng(seed), 72)
         for k in range(count):
             path = folder / f"{name}{seed}-{k}.{'jpg' if copied else 'png'}"
-            picture = crop(video.photo(40 * k))
+            image = crop(video.photo(40 * k))
             if copied:
-                Image.fromarray(np.clip(picture * 1.05, 0, 255).astype(np.uint8)).save(
+                Image.fromarray(np.clip(image * 1.05, 0, 255).astype(np.uint8)).save(
                     path, quality=60
                 )
             else:
-                save(path, picture)
+                save(path, image)
             rows.append({"id": path.stem, "video": f"{name}{seed}", "vision": path.name})
     return rows
 
 
 @pytest.mark.parametrize(
-    "case", ["eleven videos", "two videos", "one video", "train twice", "most of train twice"]
+    "case", ["eleven videos", "one video", "train twice", "most of train twice"]
 )
 def test_copies_are_found_however_many_they_are(tmp_path, case):
-    if case == "eleven videos":  # fewer than a hundred train pictures, and all of test copies
+    if case == "eleven videos":  # fewer than a hundred train images, and all of test copies
         train, test = (
             uploads(tmp_path, range(11), "a", 4),
             uploads(tmp_path, range(11), "b", 4, copied=True),
         )
-    elif case in ("two videos", "one video"):
-        n = 2 if case == "two videos" else 1
+    elif case == "one video":
         train, test = (
-            uploads(tmp_path, range(n), "a", 20),
-            uploads(tmp_path, range(n), "b", 20, copied=True),
+            uploads(tmp_path, range(1), "a", 20),
+            uploads(tmp_path, range(1), "b", 20, copied=True),
         )
     elif case == "train twice":  # what test copies stands in train under two names
         train = uploads(tmp_path, range(8), "a", 5) + uploads(
@@ -550,10 +543,10 @@ def test_copies_are_found_however_many_they_are(tmp_path, case):
             tmp_path, range(4, 12), "c", 4, copied=True
         )
         test = uploads(tmp_path, range(4), "b", 4, copied=True)
-    found = near_duplicates(
+    flags = near_duplicates(
         Manifest.from_rows(train, tmp_path), Manifest.from_rows(test, tmp_path), "vision"
     )
-    assert found.flag.mean() >= 0.95, found.notes
+    assert flags.flag.mean() >= 0.95, flags.notes
 
 
 def test_equal_pictures_score_one_however_many_there_are(tmp_path):
@@ -565,9 +558,9 @@ def test_equal_pictures_score_one_however_many_there_are(tmp_path):
     ]
     whole = Manifest.from_rows(rows, tmp_path)
     train, test = (Manifest(whole.table[a:b], tmp_path) for a, b in ((0, 16_000), (16_000, 20_000)))
-    found = near_duplicates(train, test, "vision")
-    assert found.flag.all()
-    assert set(found.score.tolist()) == {1.0}
+    flags = near_duplicates(train, test, "vision")
+    assert flags.flag.all()
+    assert set(flags.score.tolist()) == {1.0}
 
 
 def test_a_changed_file_is_decoded_again_and_cameras_may_be_held_upright(tmp_path):
@@ -578,11 +571,11 @@ def test_a_changed_file_is_decoded_again_and_cameras_may_be_held_upright(tmp_pat
     assert (
         np.abs(thumbnails([path], cache=tmp_path / "cache").pixels.astype(int) - before).mean() > 5
     )
-    picture = Image.open(path).convert("RGB")
+    image = Image.open(path).convert("RGB")
     exif = Image.Exif()
     exif[0x0112] = 6  # the camera was turned: shown rotated by a quarter, clockwise
-    picture.save(tmp_path / "turned.png", exif=exif)
-    picture.transpose(Image.Transpose.ROTATE_270).save(tmp_path / "upright.png")
+    image.save(tmp_path / "turned.png", exif=exif)
+    image.transpose(Image.Transpose.ROTATE_270).save(tmp_path / "upright.png")
     turned, upright = thumbnail(tmp_path / "turned.png"), thumbnail(tmp_path / "upright.png")
     assert np.array_equal(turned, upright)
     assert not np.array_equal(turned, thumbnail(path))

@@ -1,4 +1,4 @@
-"""Leak-free splits: against brute force over all assignments, on the published lists, folds, groups, records, errors."""
+"""Leak-free splits: against brute force, on the published lists, folds, groups, errors."""
 
 import itertools
 import json
@@ -56,7 +56,7 @@ def published(real_data):
 
 
 def brute(counts, target):
-    """(fewest missing, smallest largest deviation among those) over all assignments, by the definition."""
+    """(fewest missing, smallest largest deviation among those) over all assignments."""
     totals, parts = counts.sum(0), len(target)
     last = counts.shape[1] - 1
     used = [m for m in range(last) if (counts[:, m] > 0).sum() >= parts] + [last]
@@ -77,7 +77,7 @@ MATRICES = st.lists(
 TARGETS = st.sampled_from([(0.8, 0.2), (0.7, 0.3), (0.5, 0.5), (0.6, 0.2, 0.2), (1 / 3,) * 3])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(MATRICES, TARGETS, st.integers(0, 5))
 def test_the_optimum_is_that_of_brute_force_and_every_seed_reaches_it(rows, target, seed):
     rows = rows[:6] if len(target) == 3 else rows
@@ -96,6 +96,12 @@ def test_the_optimum_is_that_of_brute_force_and_every_seed_reaches_it(rows, targ
         assert problem.missing(drawn).sum() == missing
         limit = max(best.deviation, RESOLUTION) + tolerance
         assert problem.deviations(drawn).max() <= limit + EXACT
+
+
+def test_a_program_that_highs_cannot_presolve_is_solved():
+    counts = np.array([[0, 3, 9, 12], [3, 9, 0, 12], [1, 5, 3, 9], [5, 9, 20, 34]])
+    best = optimize(Problem(counts, np.array([0.6, 0.2, 0.2])))
+    assert best.deviation == pytest.approx(brute(counts, (0.6, 0.2, 0.2))[1], abs=EXACT)
 
 
 @pytest.mark.parametrize(("groups", "worst"), [(600, 0.004), (3000, 0.002)])
@@ -406,7 +412,7 @@ def call(capsys, *args):
 
 @pytest.fixture
 def lists(tmp_path):
-    """Two lists of eight videos that share some, one with Windows line ends and a byte-order mark; names with commas and spaces."""
+    """Two lists of eight videos, one with Windows line ends and a byte-order mark."""
     names = ["a, b", "Straße", "c", "d", "e", "f", "g", "h"]
     rows = [f"{v}/{f:010d}.jpg,{k % 2 + 3}" for k, v in enumerate(names) for f in range(10)]
     (tmp_path / "train.txt").write_bytes(b"\xef\xbb\xbf" + "\r\n".join(rows[::2]).encode())

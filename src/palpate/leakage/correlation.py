@@ -86,7 +86,7 @@ def band_pass(images: Floats) -> Floats:
 
 def smooth(images: Floats) -> Floats:
     """The same with what varies slowly, but without each channel's mean."""
-    blurred: Floats = _FINE @ images @ _FINE.T
+    blurred = np.asarray(_FINE @ images @ _FINE.T, np.float32)
     return blurred - blurred.mean(axis=(2, 3), keepdims=True)
 
 

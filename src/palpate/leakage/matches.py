@@ -7,6 +7,7 @@ are one entry.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ class Entries:
     def __len__(self) -> int:
         return len(self.item)
 
-    def only(self, rows: NDArray[np.generic]) -> Entries:
+    def only(self, rows: Any) -> Entries:
         """Some of the entries, by mask or row numbers; ``back`` no longer holds."""
         return replace(
             self, item=self.item[rows], videos=self.videos[rows], sample=self.sample[rows]

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -121,7 +122,7 @@ def pool(
     key = np.stack([row, np.zeros_like(row)], axis=1)
     if modality == "tactile":
         gel = backgrounds(row, recorded, thumbs.pixels, videos, codes(parts, "sensor"))
-        levels = dict(zip(("video", "sensor", "all"), gel.medians, strict=True))
+        levels: dict[str, Any] = dict(zip(("video", "sensor", "all"), gel.medians, strict=True))
         if any(gel.medians):
             notes.append(Note("median-backgrounds", levels))
         key[:, 1] = gel.row

@@ -42,6 +42,8 @@ EXACT = 2e-6
 WHOLE, ROUNDS, FREE = 1000, 12, (60, 40)
 #: Branch-and-bound nodes for the optimum, and of a draw: this many divided by groups x parts.
 NODES, DRAW_NODES = 600_000, 6000
+#: Status of :func:`scipy.optimize.milp` for a program without a solution.
+INFEASIBLE = 2
 #: How far from the best objective a draw may stop.
 DRAW_GAP = 0.15
 #: Weight of the random cost beside the mean deviation; of a material that a part lacks.
@@ -107,7 +109,7 @@ def optimize(problem: Problem) -> Optimum:
     Args:
         problem: at least as many groups as parts.
     """
-    program = _Program(problem, limit=0.0)
+    program = _Program(problem)
     objective = program.objective(excess=1.0)
     assignment, value = program.solve(objective, (RESOLUTION, 1.0), NODES)
     if assignment is None:  # the node limit came first
@@ -154,37 +156,48 @@ def _greedy(problem: Problem) -> Ints:
 
 
 class _Program:
-    """Variables x (group by group), d, the excess of the largest d over ``limit``, u."""
+    """Variables x (group by group), d, the excess of the largest d over ``limit``, u.
 
-    def __init__(self, problem: Problem, limit: float) -> None:
-        self.problem, self.limit = problem, limit
+    Without a limit there is no d: the excess is the largest deviation itself. (HiGHS 1.12 proves
+    wrong optima of small programs in which d takes part in the minimum.)
+    """
+
+    def __init__(self, problem: Problem, limit: float | None = None) -> None:
+        self.problem, self.limit = problem, limit or 0.0
         groups, parts = len(problem.counts), len(problem.target)
         eye = sparse.identity(parts)
         shares: Any = sparse.kron(problem.share[:, problem.used].T, eye)
         presence: Any = sparse.kron((problem.counts > 0)[:, problem.possible].T.astype(float), eye)
         wanted = np.tile(problem.target, int(problem.used.sum()))
-        self.x, self.d, self.u = groups * parts, len(wanted), presence.shape[0]
+        count = len(wanted)
+        self.x, self.d, self.u = groups * parts, 0 if limit is None else count, presence.shape[0]
         self.whole = self.x <= WHOLE
         once = sparse.kron(sparse.identity(groups), np.ones((1, parts)))
-        unit, below = sparse.identity(self.d), np.full((self.d, 1), -1.0)
+        d, excess = sparse.identity(count), np.ones((count, 1))
         rows: list[list[Any]] = [
             [once, None, None, None],
-            [shares, -unit, None, None],
-            [shares, unit, None, None],
-            [None, unit, below, None],
+            [shares, -d, None, None],
+            [shares, d, None, None],
+            [None, d, -excess, None],
             [presence, None, None, sparse.identity(self.u)],
         ]
-        low = [np.ones(groups), np.full(self.d, -np.inf), wanted, np.full(self.d, -np.inf)]
-        high = [np.ones(groups), wanted, np.full(self.d, np.inf), np.full(self.d, limit)]
-        low, high = [*low, np.ones(self.u)], [*high, np.full(self.u, np.inf)]
+        if limit is None:
+            rows[1:4] = [[shares, -excess, None], [shares, excess, None]]
+            rows[0], rows[-1] = [once, None, None], [presence, None, sparse.identity(self.u)]
+        least, most = np.full(count, -np.inf), np.full(count, np.inf)
+        caps = [] if limit is None else [(least, np.full(count, limit))]
+        one = (np.ones(groups), np.ones(groups))
+        present = (np.ones(self.u), np.full(self.u, np.inf))
+        limits = [one, (least, wanted), (wanted, most), *caps, present]
+        low, high = (np.concatenate(side) for side in zip(*limits, strict=True))
         matrix: Any = sparse.block_array(rows, format="csr")
-        self.constraints = LinearConstraint(matrix, np.concatenate(low), np.concatenate(high))
+        self.constraints = LinearConstraint(matrix, low, high)
 
     def objective(self, *, excess: float, mean: float = 0.0, cost: Floats | float = 0.0) -> Floats:
         """Weights of the excess, of the mean deviation, and of each x."""
         x = np.broadcast_to(cost, (len(self.problem.counts), len(self.problem.target))).ravel()
         return np.concatenate(
-            [x, np.full(self.d, mean / self.d), [excess], np.full(self.u, MISSING)]
+            [x, np.full(self.d, mean / max(self.d, 1)), [excess], np.full(self.u, MISSING)]
         )
 
     def solve(
@@ -220,13 +233,13 @@ class _Program:
             return None, bound
         fixed = relaxed.reshape(-1, parts) > 1 - EXACT
         fixed[rng.permutation(len(fixed))[: FREE[1]]] = False
-        assignment: Ints | None = None
+        best: Ints | None = None
         for _ in range(ROUNDS):
             low[: self.x] = fixed.ravel()
             x, _ = self._highs(objective, (low, high), nodes)
             if x is None:
                 break
-            assignment = x.reshape(-1, parts).argmax(1)
+            best = assignment = x.reshape(-1, parts).argmax(1)
             worst = self.problem.deviations(assignment).max(0)
             if worst.max() <= self.limit + excess[0] + EXACT:
                 break
@@ -234,7 +247,7 @@ class _Program:
             fixed = np.eye(parts, dtype=bool)[assignment]
             fixed[rng.permutation(hot)[: FREE[0]]] = False
             fixed[rng.permutation(len(fixed))[: FREE[1]]] = False
-        return assignment, bound
+        return best, bound
 
     def _highs(
         self, objective: Floats, limits: tuple[Floats, Floats], nodes: int = 0, gap: float = 0.0
@@ -243,13 +256,17 @@ class _Program:
         integrality = np.zeros(len(objective))
         integrality[: self.x] = nodes > 0
         options: dict[str, Any] = {"node_limit": nodes, "mip_rel_gap": gap} if nodes else {}
-        result = milp(
-            objective,
-            constraints=self.constraints,
-            bounds=Bounds(*limits),  # pyright: ignore[reportArgumentType]
-            integrality=integrality,
-            options=options,
-        )
+        result: Any = None
+        for presolve in (True, False):  # HiGHS ends some small programs in "Solve error"
+            result = milp(
+                objective,
+                constraints=self.constraints,
+                bounds=Bounds(*limits),  # pyright: ignore[reportArgumentType]
+                integrality=integrality,
+                options=options | {"presolve": presolve},
+            )
+            if result.x is not None or result.status == INFEASIBLE:
+                break
         bound = result.mip_dual_bound if nodes else result.fun
         x = None if result.x is None else result.x[: self.x]
         return x, -np.inf if bound is None else float(bound)

@@ -29,7 +29,9 @@ LEAST_FILL = 0.25
 
 
 @overload
-def split(data: Data, *, seed: int = 0, folds: None = None, **options: Any) -> Split: ...
+def split(  # pyright: ignore[reportOverlappingOverload]
+    data: Data, *, seed: int = 0, folds: None = None, **options: Any
+) -> Split: ...
 @overload
 def split(
     data: Data, *, seed: int | Sequence[int] = 0, folds: int | None = None, **options: Any
