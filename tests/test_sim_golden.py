@@ -1,4 +1,4 @@
-"""Pictures of every material as they were when VERSION was last raised; within 2/255 on any CPU.
+"""Images of every material as they were when VERSION was last raised; within 2/255 on any CPU.
 
 ``PALPATE_GOLDEN=write pytest tests/test_sim_golden.py`` draws them anew: raise VERSION in the same
 commit.
@@ -15,9 +15,8 @@ from palpate.sim.plan import ObjectRef, VideoPlan
 GOLDEN = Path(__file__).parent / "golden" / "sim_world.npz"
 
 
-def pictures():
-    """Photo and touch of one object of each material, the two looks in turn: uint8 (20, 2, 20, 20,
-    3)."""
+def draw():
+    """Render photo and tactile image of an object of each material: uint8 (20, 2, 20, 20, 3)."""
     images = []
     for k, name in enumerate(MATERIALS):
         options = WorldOptions(size=20, look=("gelsight", "digit")[k % 2])
@@ -26,8 +25,8 @@ def pictures():
     return np.array(images)
 
 
-def test_pictures_have_not_changed():
-    images = pictures()
+def test_images_have_not_changed():
+    images = draw()
     if os.environ.get("PALPATE_GOLDEN") == "write":
         GOLDEN.parent.mkdir(exist_ok=True)
         np.savez_compressed(GOLDEN, images=images, version=VERSION)
@@ -35,5 +34,5 @@ def test_pictures_have_not_changed():
         assert int(data["version"]) == VERSION
         difference = np.abs(images.astype(int) - data["images"])
     names = [name for name, d in zip(MATERIALS, difference, strict=True) if d.max() > 2]
-    assert not names, f"changed pictures: {names}"
+    assert not names, f"changed images: {names}"
     assert GOLDEN.stat().st_size < 60_000

@@ -7,37 +7,11 @@ import pytest
 from palpate.sim import MATERIALS, Video, WorldOptions, plan_world
 from palpate.sim.text import NAMED, UNNAMED, article, listed, phrase
 
-LIGHT = {
-    "red",
-    "orange",
-    "yellow",
-    "green",
-    "blue",
-    "purple",
-    "violet",
-    "pink",
-    "brown",
-    "black",
-    "white",
-    "gray",
-    "golden",
-    "silver",
-    "beige",
-    "colored",
-    "color",
-    "bright",
-    "dark",
-    "pale",
-    "light",
-    "shiny",
-    "glossy",
-    "matt",
-    "matte",
-    "shaded",
-    "glazed",
-    "transparent",
-    "clear",
-}
+COLORS = (
+    "red orange yellow green blue purple violet pink brown black white gray golden silver beige"
+)
+LIGHT = set(f"{COLORS} colored color bright dark pale light shiny glossy matt matte".split())
+LIGHT |= {"shaded", "glazed", "transparent", "clear"}
 FIXED = {
     w for t in (*NAMED, *UNNAMED) for w in re.findall(r"[a-z]+", re.sub(r"\{.*?\}", "", t))
 } | {"a", "an", "and"}
@@ -52,8 +26,8 @@ def test_captions_use_the_words_of_the_piece_and_the_template_alone():
     named = total = 0
     for plan in plan_world(options):
         video = Video(options, plan)
-        for touch in range(options.contacts_per_video):
-            text, surface = video.text(touch), video.object_of(touch).surface
+        for contact in range(options.contacts_per_video):
+            text, surface = video.text(contact), video.object_of(contact).surface
             allowed = FIXED | set(words(" ".join(surface.words))) | set(words(surface.noun))
             assert set(words(text)) <= allowed, text
             assert sum(w in text.lower() for w in surface.words) >= 2
@@ -81,20 +55,9 @@ def test_no_material_has_words_of_color_or_light():
 @pytest.mark.parametrize(
     ("word", "expected"),
     [
-        ("unusual", "an"),
-        ("uniform", "a"),
-        ("even", "an"),
-        ("hard", "a"),
-        ("Elastic", "an"),
-        ("usual", "a"),
-        ("uninterrupted", "an"),
-        ("unilateral", "a"),
-        ("one-sided", "a"),
-        ("onerous", "an"),
-        ("honest", "an"),
-        ("honeycombed", "a"),
-        ("hourly", "an"),
-        ("Umbral", "an"),
+        *((word, "a") for word in ("uniform", "hard", "usual", "unilateral", "one-sided")),
+        *((word, "an") for word in ("unusual", "even", "Elastic", "uninterrupted", "onerous")),
+        *(("honest", "an"), ("honeycombed", "a"), ("hourly", "an"), ("Umbral", "an")),
     ],
 )
 def test_articles(word, expected):
@@ -108,9 +71,7 @@ def test_phrases():
     assert listed(("a", "b", "c")) == "a, b and c"
 
 
-def test_no_caption_has_the_prototypes_faults():
-    """ "A unusual" for "an unusual", "tree surface" for bark, words of another sub-type than the
-    one drawn."""
+def test_words_and_nouns_belong_to_the_subtype_that_was_drawn():
     options = WorldOptions(
         tile=64,
         size=16,
@@ -119,30 +80,19 @@ def test_no_caption_has_the_prototypes_faults():
         contacts_per_video=3,
         materials=("Tree", "Others", "Plants", "Metal"),
     )
-    texts = {}
+    words_of, nouns = {}, {}
     for plan in plan_world(options):
         video = Video(options, plan)
-        for touch in range(3):
-            texts.setdefault(plan.object_of(touch).material, []).append(
-                (video.text(touch), video.object_of(touch).surface)
-            )
-    for found in texts.values():
-        for text, surface in found:
-            assert not re.search(
-                r"\ba (?:a|e|i|o|unu|une)|\ban (?:[^aeiou]|uni[^nm])", text.lower()
-            ), text
-            assert "surface" not in text
-            assert "material" not in text
+        for contact in range(3):
+            text, surface = video.text(contact), video.object_of(contact).surface
+            wrong = r"\ba (?:a|e|i|o|unu|une)|\ban (?:[^aeiou]|uni[^nm])|surface|material"
+            assert not re.search(wrong, text.lower()), text
             assert surface.noun.removeprefix("a ") in text
-    assert all("tree bark" in text for text, _ in texts["Tree"])
-    assert {surface.noun for _, surface in texts["Others"]} >= {"a sponge", "a rope"}
-    words_of = {}
-    for found in texts.values():
-        for _, surface in found:
             words_of.setdefault(surface.subtype, set()).add(frozenset(surface.words))
-    assert all(
-        len(sets) == 1 for sets in words_of.values()
-    )  # the words belong to the sub-type that was drawn
+            nouns.setdefault(plan.object_of(contact).material, set()).add(surface.noun)
+    assert nouns["Tree"] == {"tree bark"}
+    assert nouns["Others"] >= {"a sponge", "a rope"}
+    assert all(len(sets) == 1 for sets in words_of.values())
     assert len({words for sets in words_of.values() for words in sets}) == len(words_of)
 
 
@@ -152,9 +102,9 @@ def test_captions_of_hct_are_lists_of_adjectives():
     )
     ends = set()
     for plan in plan_world(options):
-        for touch in range(options.contacts_per_video):
+        for contact in range(options.contacts_per_video):
             video = Video(options, plan)
-            surface, parts = video.object_of(touch).surface, video.text(touch).split(", ")
+            surface, parts = video.object_of(contact).surface, video.text(contact).split(", ")
             noun = surface.noun.removeprefix("a ")
             assert set(parts) <= {*surface.words, noun}
             assert len(parts) == len(set(parts)) >= 2

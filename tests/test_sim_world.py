@@ -42,9 +42,8 @@ def hct(tmp_path_factory):
 
 
 def read_list(path):
-    return [
-        (p, int(label)) for p, label in (x.split(",") for x in path.read_text().split("\n") if x)
-    ]
+    rows = (line.split(",") for line in path.read_text().split("\n") if line)
+    return [(path, int(label)) for path, label in rows]
 
 
 def test_the_tree_has_the_layout_of_touch_and_go(frames):
@@ -80,16 +79,12 @@ def test_hct_has_the_layout_of_the_archive(hct):
         numbers = sorted(int(re.fullmatch(r"(\d+)-0\.\d{4}\.jpg", n)[1]) for n in names["vision"])
         assert numbers == list(range(HCT.video_length))
     for rig in {p.parent for p in trajectories}:
-        contact, free = (
-            json.loads((rig / f"{name}.json").read_text()) for name in ("contact", "not_contact")
-        )
+        lists = (rig / "contact.json", rig / "not_contact.json")
+        contact, free = (json.loads(path.read_text()) for path in lists)
         pairs = list(zip(contact["vision"], contact["tactile"], strict=True))
         assert len(pairs) + len(free["vision"]) == sum(1 for _ in rig.glob("*/vision/*"))
-        rows = [
-            row
-            for path in rig.glob("t*.csv")
-            for row in csv.DictReader(path.read_text().splitlines())
-        ]
+        lists = (csv.DictReader(path.read_text().splitlines()) for path in rig.glob("t*.csv"))
+        rows = list(itertools.chain(*lists))
         assert {(row["url"], row["tactile"]) for row in rows} == set(pairs)
         assert all((rig / row["tactile_background"]).is_file() for row in rows)
         assert all(re.fullmatch(r"[a-z, -]+", row["caption"]) for row in rows)
@@ -125,7 +120,7 @@ def test_the_manifest_is_that_of_an_import_and_more(layout, tmp_path):
 
 @pytest.mark.parametrize(("layout", "look"), [("frames", "gelsight"), ("hct", "digit")])
 @pytest.mark.parametrize("leak", ["frame", "contact", "none"])
-def test_an_audit_finds_exactly_the_leak_that_the_world_reports(layout, look, leak, tmp_path):
+def test_an_audit_reports_exactly_the_leak_of_the_world(layout, look, leak, tmp_path):
     options = dataclasses.replace(LEAKY, layout=layout, look=look, leak=leak)
     counts = write_world(tmp_path / "w", options).leak
     imported = import_dataset(tmp_path / "w", tmp_path / "i")
@@ -143,9 +138,7 @@ def test_an_audit_finds_exactly_the_leak_that_the_world_reports(layout, look, le
     shortest = {"frame": 1, "contact": 6, "none": None}[leak]
     assert counts["gap_min"] == shortest
     assert (counts["contacts_shared"] > 0) is (leak == "frame")
-    assert (
-        counts["objects_shared"] > 0
-    )  # some objects have two videos, so a cut by video shares them
+    assert counts["objects_shared"] > 0  # some objects have two videos
     train = [(i.rsplit("/", 1)[0], int(i.rsplit("/", 1)[1])) for i in split.ids("train")]
     for name, row in truth.items():
         video, frame = name.rsplit("/", 1)
@@ -234,7 +227,7 @@ def test_a_world_is_a_data_set_for_loaders():
     world = World(dataclasses.replace(PRESETS["tiny"], size=16, tile=64), cache=2)
     empty = len(pickle.dumps(world))
     first = world[0]
-    assert len(pickle.dumps(world)) == empty < 3000  # without what it rendered
+    assert len(pickle.dumps(world)) == empty < 3000  # without rendered videos
     copy = pickle.loads(pickle.dumps(world))
     np.testing.assert_array_equal(copy[0]["vision"], first["vision"])
     data = pytest.importorskip("torch.utils.data")
@@ -244,7 +237,7 @@ def test_a_world_is_a_data_set_for_loaders():
     assert world._video.cache_info().currsize == 2
 
 
-def test_what_a_world_does_not_have_is_rejected():
+def test_missing_samples_and_presets_are_rejected():
     world = World("tiny")
     for k in (32, -33, 10**9):
         with pytest.raises(PalpateError, match="must be 0 to 31"):

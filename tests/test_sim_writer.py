@@ -81,16 +81,13 @@ def test_folders_that_cannot_become_a_world_are_rejected_before_rendering(tmp_pa
     (tmp_path / "notes" / "mine.txt").write_text("mine")
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    for output, message in (
-        (tmp_path / "notes", "absent, empty"),
-        (Path(), "current folder"),
-        (Path("../here"), "current folder"),
-    ):
+    here = [(Path(), "current folder"), (Path("../here"), "current folder")]
+    for output, message in ((tmp_path / "notes", "absent, empty"), *here):
         with pytest.raises(PalpateError, match=message):
             write_world(output, TINY, progress=never)
-    one = WorldOptions(materials=1, objects_per_material=1, leak="none", size=16, tile=64)
+    single = WorldOptions(materials=1, objects_per_material=1, leak="none", size=16, tile=64)
     with pytest.raises(PalpateError, match="at least two videos"):
-        write_world(tmp_path / "w", one, progress=never)
+        write_world(tmp_path / "w", single, progress=never)
     with pytest.raises(PalpateError, match="`workers` must be at least 1"):
         write_world(tmp_path / "w", TINY, workers=0)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["here", "notes"]
@@ -137,12 +134,9 @@ def test_workers_end_with_a_killed_parent_and_the_lock_is_free(tmp_path):
     while workers & {pid for pid, _ in processes()}:
         assert time.monotonic() < until
         time.sleep(0.1)
+    videos = len(list(tmp_path.glob(".w.*.part/dataset/2*")))
     with pytest.raises(KeyboardInterrupt):  # past the lock
-        write_world(
-            tmp_path / "w",
-            PRESETS["small"],
-            progress=kill_after(len(list(tmp_path.glob(".w.*.part/dataset/2*")))),
-        )
+        write_world(tmp_path / "w", PRESETS["small"], progress=kill_after(videos))
 
 
 @pytest.fixture

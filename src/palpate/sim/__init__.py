@@ -1,9 +1,10 @@
 """The procedural visuo-tactile world: videos of a gel sensor pressed on and sliding over materials.
 
 Synthetic: it shows mechanisms (leakage, background reward, guidance); its numbers are never
-    compared with real data.
+compared with real data.
+
 ``write_world(folder, PRESETS["demo"])`` writes a tree in the layout of Touch and Go;
-``World("demo")[7]`` renders one sample without files.
+``World("demo")[7]`` renders a sample without files.
 """
 
 from palpate.sim.materials import MATERIALS, Material, Surface

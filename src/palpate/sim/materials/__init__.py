@@ -51,12 +51,12 @@ MATERIALS: dict[str, Material] = {
     "Others": Material(19, "material", other, ("sponge", "carpet", "stud mat", "rope")),
 }
 _BUILT_IN = dict(MATERIALS)
-#: What a material may be called: names stand in lists and ids.
+#: What a material may be called: names are parts of lists and ids.
 _NAME = re.compile(r"[A-Za-z0-9_()-]+(?: [A-Za-z0-9_()-]+)*")
 
 
 def object_prefix(name: str) -> str:
-    """The beginning of the ids of a material's objects, e.g. ``natural_fabric``."""
+    """Return the beginning of the ids of a material's objects, e.g. ``natural_fabric``."""
     return name.lower().replace(" ", "_")
 
 
@@ -81,19 +81,15 @@ def check_material(name: str) -> Iterator[PalpateError]:
 
 
 def added_materials(names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Of the materials that are not built in: name -> label, noun, subtypes and SHA-256 of the
-    function's source.
-    """
-    added = {name: MATERIALS[name] for name in names if _BUILT_IN.get(name) != MATERIALS[name]}
-    return {
-        name: {
-            "label": m.label,
-            "noun": m.noun,
-            "subtypes": list(m.subtypes),
-            "function": digest_lines(_source(m.draw).splitlines()),
-        }
-        for name, m in added.items()
-    }
+    """Return name -> label, noun, subtypes and source digest of materials that are not built in."""
+    added: dict[str, dict[str, Any]] = {}
+    for name in names:
+        material = MATERIALS[name]
+        if _BUILT_IN.get(name) != material:
+            facts = {"label": material.label, "noun": material.noun}
+            source = digest_lines(_source(material.draw).splitlines())
+            added[name] = {**facts, "subtypes": list(material.subtypes), "function": source}
+    return added
 
 
 def _source(function: Any) -> str:

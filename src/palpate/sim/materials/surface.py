@@ -19,7 +19,7 @@ HIGHEST_MM = 50.0
 
 @dataclass(frozen=True)
 class Surface:
-    """One piece of a material, as a periodic tile.
+    """A piece of a material, as a periodic tile.
 
     Attributes:
         height: relief in mm, shape (n, n), float32.
@@ -42,8 +42,7 @@ class Surface:
     noun: str = ""
 
 
-#: Draws one piece of a material on a tile; all randomness comes from the generator (also the tile's
-#: own).
+#: Draws a piece of a material on a tile; all randomness comes from the generator, also the tile's.
 Draw: TypeAlias = Callable[[Tile, np.random.Generator], Surface]
 
 
@@ -54,7 +53,7 @@ class Material:
     Attributes:
         label: id in ``label.txt``.
         noun: for captions, ``"tree bark"`` or, where it can be counted, ``"a leaf"``.
-        draw: the function that draws one piece.
+        draw: the function that draws a piece.
         subtypes: the kinds that ``draw`` chooses from.
     """
 
@@ -81,16 +80,15 @@ def rising(height: Array) -> Array:
 
 
 def plain(tile: Tile, color: Array) -> Array:
-    """An albedo of one color."""
+    """Return an albedo of a single color."""
     return np.broadcast_to(color, (tile.n, tile.n, 3))
 
 
 def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator) -> Surface:
-    """Draw and check one piece.
+    """Draw and check a piece.
 
     Returns:
-        The surface with median height 0, albedo clipped to [0.01, 1], arrays in float32 and C
-        order.
+        The surface with median height 0, albedo clipped to [0.01, 1], arrays in float32, C order.
 
     Raises:
         PalpateError: naming the material, if its function failed, or returned a wrong shape,
@@ -110,8 +108,7 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
     except Exception as error:  # whatever a user's function raises
         require(False, "draw a Surface without an error", f"{type(error).__name__}: {error}")
         raise
-    shapes = (height.shape, albedo.shape)
-    wanted = ((n, n), (n, n, 3))
+    shapes, wanted = (height.shape, albedo.shape), ((n, n), (n, n, 3))
     require(shapes == wanted, f"return a height and an albedo of shapes {wanted}", shapes)
     finite = bool(np.isfinite(height).all() and np.isfinite(albedo).all())
     require(finite, "return finite numbers", "NaN or infinity")
@@ -137,5 +134,5 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
 
 
 def is_line(value: object) -> bool:
-    """Whether ``value`` is text of one line that is not blank."""
+    """Return whether ``value`` is a single line of text that is not blank."""
     return isinstance(value, str) and bool(value.strip()) and value.isprintable()
