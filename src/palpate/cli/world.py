@@ -23,8 +23,11 @@ from palpate.sim import (
 )
 from palpate.sim.options import option_groups
 
-_TYPES: dict[str, Any] = {"span": tuple[float, float], "series": tuple[float, ...]}
-_TYPES |= {"materials": tuple[str, ...]}
+_TYPES: dict[str, Any] = {
+    "span": tuple[float, float],
+    "series": tuple[float, ...],
+    "materials": tuple[str, ...],
+}
 _METAVARS = {"span": "LOW HIGH", "series": "X ...", "materials": "NAME ..."}
 
 

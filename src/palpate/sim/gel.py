@@ -115,8 +115,10 @@ class Sensor:
 
 
 #: The options that a unit depends on.
-_UNIT_OPTIONS = ("look", "seed", "size", "pad_mm", "gel_mm", "relax_mm", "optical_mm")
-_UNIT_OPTIONS += ("dome_mm", "markers", "dirt", "vignette", "sensor_noise")
+_UNIT_OPTIONS = (
+    *("look", "seed", "size", "pad_mm", "gel_mm", "relax_mm", "optical_mm"),
+    *("dome_mm", "markers", "dirt", "vignette", "sensor_noise"),
+)
 
 
 def make_sensor(options: WorldOptions, unit: int) -> Sensor:

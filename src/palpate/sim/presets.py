@@ -13,8 +13,8 @@ MINI_SEEDS = range(900_000, 900_100)
 SEEN = "Shipped mini models may have been trained on this world: their scores on it mean nothing."
 
 _SPARSE: dict[str, Any] = {"free_written": "background"}
-_TINY: dict[str, Any] = {"materials": ("Wood", "Brick", "Leather", "Grass")}
-_TINY |= {"objects_per_material": 2, "contacts_per_video": 2, "frames_per_contact": 2}
+_FEW = ("Wood", "Brick", "Leather", "Grass")
+_TINY: dict[str, Any] = {"materials": _FEW, "contacts_per_video": 2, "frames_per_contact": 2}
 _PRETRAIN: dict[str, Any] = {"contacts_per_video": 5, "frames_per_contact": 2, **_SPARSE}
 _SMALL: dict[str, Any] = {"two_videos": 0.25, "frames_per_contact": 4, **_SPARSE}
 
@@ -22,7 +22,7 @@ _SMALL: dict[str, Any] = {"two_videos": 0.25, "frames_per_contact": 4, **_SPARSE
 #: 2026-11-21: tiny 32 contact frames, 1 s, 1 MB; demo 1,200, 9 s, 24 MB; pretrain 4,000, 23 s, 49
 #: MB; small 8,000, 34 s, 80 MB; full 36,000, 430 s, 870 MB (ten times a tenth of it).
 PRESETS: dict[str, WorldOptions] = {
-    "tiny": WorldOptions(**_TINY),
+    "tiny": WorldOptions(objects_per_material=2, **_TINY),
     "demo": WorldOptions(),
     "pretrain": WorldOptions(seed=1000, objects_per_material=20, **_PRETRAIN),
     "small": WorldOptions(objects_per_material=20, **_SMALL),

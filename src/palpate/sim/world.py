@@ -128,7 +128,7 @@ class World:
             PalpateError: if the world is too small to cut.
         """
         parts = cut(self.options, self.plans, list(contact_rows(self.options, self.plans)))
-        return world_split(self.options, parts, manifest and manifest.digest)
+        return world_split(self.options, parts, manifest.digest if manifest is not None else None)
 
 
 def _cells(options: WorldOptions, row: Row, text: str) -> dict[str, Any]:

@@ -51,8 +51,13 @@ def _weave(tile: Tile, rng: np.random.Generator, kind: str, step: float, wobble:
     return smoothstep(np.cos(u) + np.cos(v), 0.9, -0.3)  # mesh
 
 
-_SYNTHETIC = {"twill": "woven", "knit": "knitted", "mesh": "meshed", "rib": "ribbed"}
-_SYNTHETIC |= {"plain": "woven"}
+_SYNTHETIC = {
+    "twill": "woven",
+    "knit": "knitted",
+    "mesh": "meshed",
+    "rib": "ribbed",
+    "plain": "woven",
+}
 
 
 def synthetic_fabric(tile: Tile, rng: np.random.Generator) -> Surface:
