@@ -21,12 +21,8 @@ def picture(k: int, size: int = SIZE) -> np.ndarray:
 
 def number(array: np.ndarray) -> int:
     """The number drawn by :func:`picture`."""
-    size = array.shape[1]
-    return sum(
-        1 << bit
-        for bit in range(8)
-        if array[:, bit * size // 8 + 2 : (bit + 1) * size // 8 - 2].mean() > 115
-    )
+    bars = np.split(array, 8, axis=1)
+    return sum(1 << bit for bit, bar in enumerate(bars) if bar[:, 2:-2].mean() > 115)
 
 
 def write_video(
@@ -72,9 +68,7 @@ def write_frames(folder: Path, count: int) -> None:
 
 def tree(folder: Path) -> set[str]:
     """All files and folders below ``folder``."""
-    return (
-        {p.relative_to(folder).as_posix() for p in folder.rglob("*")} if folder.exists() else set()
-    )
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*")}
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,6 @@ def test_tarf_pairs_tactile_images_with_the_view_of_their_number(tmp_path):
     assert drawn(result, "tactile") == list(range(1, 11))
     assert drawn(result, "vision") == list(range(33, 43))
     assert result.splits["Orig"].counts() == {"train": 4, "val": 1, "test": 5}
-    assert result.facts["depth"] == "1 folders of .npy files, not imported"
     assert result.suspicious == []
     (path,) = write_lists(result.manifest, result.splits["Orig"], tmp_path / "lists")
     published = tmp_path / "data" / "tarf" / "split_interval.json"
@@ -157,7 +156,7 @@ def test_tarf_broken_lists_and_empty_trees(tmp_path):
         (root / "split_interval.json").write_text(text)
         assert kinds(validate(root).invalid) == {"bad-json": 1}, text
     (tmp_path / "bare" / "touch").mkdir(parents=True)
-    with pytest.raises(PalpateError, match="Got none"):
+    with pytest.raises(PalpateError, match="must hold vision/ and touch/"):
         import_dataset(tmp_path / "bare", tmp_path / "out", format="tarf")
     with pytest.raises(PalpateError, match="must be a folder"):
         import_dataset(root / "split_interval.json", tmp_path / "out", format="tarf")

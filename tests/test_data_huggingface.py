@@ -11,11 +11,14 @@ from format_trees import hf_kinds as kinds
 from format_trees import hf_rows, save_hf
 from palpate.core import MissingExtraError, PalpateError, ProblemsError, Split
 from palpate.data.exporting import export_dataset
-from palpate.data.formats.huggingface_source import open_source
 from palpate.data.importing import import_dataset, validate
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 datasets = pytest.importorskip("datasets", reason="the extra hf is not installed")
+
+
+#: As ``MAPS``, with the frame from the path of the row.
+BY_PATH = MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"}
 
 
 @pytest.fixture
@@ -54,26 +57,13 @@ def test_a_foreign_set_keeps_its_bytes_parts_and_labels(source, tmp_path, form):
 
 @pytest.mark.parametrize("parted", [False, True])
 def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
-    table = small_manifest.table.sample(
-        fraction=1, shuffle=True, seed=3
-    )  # an order of its own, which the parts tear apart
-    facts = {
-        "dataset": "ours",
-        "license": "CC0",
-        "citation": "nobody, 2024",
-        "url": "https://example.org",
-        "format": "touch-and-go",
-        "text_source": "none",
-    }
+    # in another order, which the parts tear apart
+    table = small_manifest.table.sample(fraction=1, shuffle=True, seed=3)
+    facts = {"dataset": "ours", "license": "CC0", "citation": "nobody, 2024"}
+    facts |= {"url": "https://example.org", "format": "touch-and-go", "text_source": "none"}
     manifest = Manifest(table, small_manifest.root, facts)
-    split = (
-        Split(
-            {i: ("train", "val", "test")[k % 3] for k, i in enumerate(manifest.ids) if k % 7},
-            {"method": "mine"},
-        )
-        if parted
-        else None
-    )
+    parts = {i: ("train", "val", "test")[k % 3] for k, i in enumerate(manifest.ids) if k % 7}
+    split = Split(parts, {"method": "mine"}) if parted else None
     files = export_dataset(manifest, tmp_path / "hf", to="hf", split=split).files
     assert all(f.is_file() for f in files)
     loaded = datasets.load_from_disk(str(tmp_path / "hf"))
@@ -87,11 +77,9 @@ def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
     assert again.manifest.digest == manifest.digest
     assert dict(again.facts) == facts
     assert same_bytes(manifest, again.manifest)
-    if split is None:
-        assert again.splits == {}
-    else:
-        assert again.splits["Orig"].digest == split.digest
-        assert again.splits["Orig"].rule == {"method": "mine"}
+    assert {n: (s.digest, s.rule) for n, s in again.splits.items()} == (
+        {"Orig": (split.digest, {"method": "mine"})} if split else {}
+    )
 
 
 @pytest.mark.parametrize(
@@ -99,17 +87,12 @@ def test_what_was_exported_comes_back_whole(small_manifest, tmp_path, parted):
     [("csv", "manifest.csv"), ("jsonl", "manifest.jsonl"), ("parquet", "samples.parquet")],
 )
 def test_tables_come_back_with_their_split(small_manifest, tmp_path, to, name):
-    table = small_manifest.table.with_columns(
-        text=small_manifest.table["id"] + ', "so\n called" 5"'
-    )
-    manifest = Manifest(table, small_manifest.root, {})
+    text = small_manifest.table["id"] + ', "so\n called" 5"'
+    manifest = Manifest(small_manifest.table.with_columns(text=text), small_manifest.root, {})
     split = Split({i: ("train", "test")[k % 2] for k, i in enumerate(manifest.ids) if k % 5})
     files = export_dataset(manifest, tmp_path / "o", to=to, split=split).files
-    assert {f.relative_to(tmp_path / "o").as_posix() for f in files} == {
-        name,
-        "lists/train.csv",
-        "lists/test.csv",
-    }
+    names = {f.relative_to(tmp_path / "o").as_posix() for f in files}
+    assert names == {name, "lists/train.csv", "lists/test.csv"}
     again = import_dataset(tmp_path / "o" / name, tmp_path / "out", root=manifest.root)
     assert again.manifest.digest == manifest.digest
     assert again.splits["Orig"].digest == split.digest
@@ -132,131 +115,87 @@ def test_equal_images_are_written_once_and_paths_of_exports_stay_inside(small_ma
     rows = hf_rows()
     for row in rows:
         row["gel"] = rows[0]["gel"]
-    result = import_dataset(
-        save_hf(tmp_path / "mine", rows, **kinds()),
-        tmp_path / "out",
-        columns=MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"},
-    )
+    source = save_hf(tmp_path / "mine", rows, **kinds())
+    result = import_dataset(source, tmp_path / "out", columns=BY_PATH)
     assert set(result.manifest.column("tactile")) == {"train/tactile/00000000.jpg"}
     export_dataset(small_manifest, tmp_path / "hf", to="hf")
-    loaded = datasets.load_from_disk(str(tmp_path / "hf"))
-    outside = {"tactile_path": [f"../../{k}.png" for k in range(len(small_manifest))]}
-    evil = (
-        loaded["all"]
-        .remove_columns("tactile_path")
-        .add_column("tactile_path", outside["tactile_path"])
-    )
+    loaded = datasets.load_from_disk(str(tmp_path / "hf"))["all"]
+    outside = [f"../../{k}.png" for k in range(len(small_manifest))]
+    evil = loaded.remove_columns("tactile_path").add_column("tactile_path", outside)
     evil.save_to_disk(str(tmp_path / "evil"))
     again = import_dataset(tmp_path / "evil", tmp_path / "out2")
     assert all(p.startswith("all/tactile/") for p in again.manifest.column("tactile"))
     assert not [*tmp_path.glob("*.png"), *(tmp_path / "out2").glob("*.png")]
 
 
-def test_bad_rows_are_reported_with_their_place_and_images_outside_are_rejected(tmp_path):
+def test_bad_rows_are_reported_with_their_place(tmp_path):
     rows = hf_rows()
-    secret = tmp_path / "secret.jpg"
-    secret.write_bytes(rows[0]["gel"]["bytes"])
     rows[1]["gel"] = None
     rows[2]["gel"] = {"bytes": b"", "path": "x.jpg"}
     rows[3]["rgb"] = {"bytes": rows[3]["rgb"]["bytes"][:-200], "path": "x.png"}
     rows[4]["path"] = "a/b"
-    source = tmp_path / "mine"
-    table = [
-        {
-            **{k: v for k, v in row.items() if k not in ("rgb", "gel")},
-            "rgb": row["rgb"],
-            "gel": row["gel"],
-        }
-        for row in rows
-    ]
-    save_hf(source, table, **kinds())
-    maps = MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"}
+    source = save_hf(tmp_path / "mine", rows, **kinds())
     with pytest.raises(ProblemsError) as caught:
-        import_dataset(source, tmp_path / "out", columns=maps)
+        import_dataset(source, tmp_path / "out", columns=BY_PATH)
     reported = sorted((p.where, p.kind) for p in caught.value.problems)
-    assert reported == [
-        ("mine/train:1", "missing-image"),
-        ("mine/train:2", "bad-image"),
-        ("mine/train:3", "bad-image"),
-        ("mine/train:4", "bad-frame"),
-    ]
+    expected = ["missing-image", "bad-image", "bad-image", "bad-frame"]
+    assert reported == [(f"mine/train:{k}", kind) for k, kind in enumerate(expected, 1)]
     assert not (tmp_path / "out").exists()
-    report = validate(source, columns=maps)
+    report = validate(source, columns=BY_PATH)
     assert sorted((p.where, p.kind) for p in [*report.missing, *report.invalid]) == reported
-    assert len(import_dataset(source, tmp_path / "out", columns=maps, skip_bad=True).manifest) == 4
-    texts = [
-        {"part": "all", "image": str(secret)},
-        {"part": "all", "image": "in.jpg"},
-        {"part": "all", "image": "https://example.org/x.jpg"},
-    ]
-    save_hf(tmp_path / "texts", texts)
-    (tmp_path / "texts" / "in.jpg").write_bytes(secret.read_bytes())
-    result = import_dataset(
-        tmp_path / "texts", tmp_path / "out2", columns={"tactile": "image"}, skip_bad=True
-    )
-    assert [(p.where, p.kind) for p in result.skipped] == [
-        ("texts/all:0", "outside-root"),
-        ("texts/all:2", "missing-file"),
-    ]
+    result = import_dataset(source, tmp_path / "out", columns=BY_PATH, skip_bad=True)
+    assert len(result.manifest) == 4
+
+
+def test_named_images_must_be_inside_the_source(tmp_path):
+    secret = tmp_path / "secret.jpg"
+    secret.write_bytes(hf_rows()[0]["gel"]["bytes"])
+    names = (str(secret), "in.jpg", "https://example.org/x.jpg")
+    source = save_hf(tmp_path / "texts", [{"part": "all", "image": name} for name in names])
+    (source / "in.jpg").write_bytes(secret.read_bytes())
+    maps = {"tactile": "image"}
+    result = import_dataset(source, tmp_path / "out", columns=maps, skip_bad=True)
+    expected = [("texts/all:0", "outside-root"), ("texts/all:2", "missing-file")]
+    assert [(p.where, p.kind) for p in result.skipped] == expected
     assert result.manifest.ids == ["all/00000001"]
 
 
 def test_what_cannot_be_opened_is_reported(source, tmp_path, monkeypatch):
-    with pytest.raises(
-        PalpateError, match="no vision and no tactile among part, path, kind, rgb, gel"
-    ):
-        import_dataset(source, tmp_path / "out")
+    def fails(word, source, **options):
+        with pytest.raises(PalpateError, match=word):
+            import_dataset(source, tmp_path / "out", format="hf", **options)
+
+    fails("no vision and no tactile among part, path, kind, rgb, gel", source)
     next(source.glob("train/*.arrow")).write_bytes(b"x")
-    with pytest.raises(PalpateError, match="mine must be whole and readable"):
-        import_dataset(source, tmp_path / "out", columns=MAPS)
+    fails("mine must be whole and readable", source, columns=MAPS)
     (tmp_path / "csvs").mkdir()
     (tmp_path / "csvs" / "train.csv").write_text("a\n1\n")
-    with pytest.raises(PalpateError, match="must be made of parquet or arrow"):
-        open_source(tmp_path / "csvs")
+    fails("must be made of parquet or arrow", tmp_path / "csvs")
     (tmp_path / "script").mkdir()
     (tmp_path / "script" / "script.py").write_text("raise SystemExit('ran')")
-    with pytest.raises(PalpateError):
-        open_source(tmp_path / "script")
-    with pytest.raises(PalpateError, match="a name on the hub like user/name"):
-        import_dataset(tmp_path / "none" / "such" / "place", tmp_path / "out", format="hf")
+    fails("script", tmp_path / "script")
+    fails("a name on the hub like user/name", tmp_path / "none" / "such" / "place")
+
+    def offline(*_, **__):
+        raise ConnectionError("offline\nmode")
+
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    monkeypatch.setattr(
-        "palpate.data.formats.huggingface_source._streamed",
-        lambda *_: (_ for _ in ()).throw(ConnectionError("offline\nmode")),
-    )
-    with pytest.raises(
-        PalpateError, match=r"user/name must be whole and readable. Got offline\. Check the name"
-    ):
-        import_dataset("user/name", tmp_path / "out", format="hf")
+    monkeypatch.setattr("palpate.data.formats.huggingface_source._streamed", offline)
+    fails(r"user/name must be whole and readable. Got offline\. Check the name", "user/name")
+    monkeypatch.delenv("HF_HUB_OFFLINE")  # a hub out of reach is reported at once
+    monkeypatch.setattr("huggingface_hub.HfApi.dataset_info", offline)
+    fails("hub must be within reach.*hf download --repo-type dataset user/name", "user/name")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_hub_out_of_reach_is_reported_at_once_with_what_to_do(tmp_path, monkeypatch):
-    def unreachable(*_, **__):
-        raise OSError("Name or service not known")
-
-    monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
-    monkeypatch.setattr("huggingface_hub.HfApi.dataset_info", unreachable)
-    with pytest.raises(
-        PalpateError, match=r"hub must be within reach.*hf download --repo-type dataset user/name"
-    ):
-        import_dataset("user/name", tmp_path / "out", format="hf")
 
 
 def test_an_id_of_two_parts_is_in_neither_and_parts_follow_the_kept_row(tmp_path):
     rows = hf_rows()
     rows[5]["path"] = rows[1]["path"]  # of validation: the id of a row of train
     rows[2]["path"] = rows[1]["path"]  # twice in train
-    result = import_dataset(
-        save_hf(tmp_path / "mine", rows, **kinds()),
-        tmp_path / "out",
-        columns=MAPS | {"frame": "split_part(split_part(path, '/', -1), '.', 1)"},
-        skip_bad=True,
-    )
-    assert [(p.where, p.kind) for p in result.skipped] == [
-        ("mine/train:2", "duplicate-id"),
-        ("mine/validation:0", "two-parts"),
-    ]
+    source = save_hf(tmp_path / "mine", rows, **kinds())
+    result = import_dataset(source, tmp_path / "out", columns=BY_PATH, skip_bad=True)
+    expected = [("mine/train:2", "duplicate-id"), ("mine/validation:0", "two-parts")]
+    assert [(p.where, p.kind) for p in result.skipped] == expected
     assert result.splits["Orig"].counts() == {"train": 3, "val": 2}
     assert "data1/0-17.0/1" in result.manifest.ids
 
@@ -265,9 +204,8 @@ def test_numbers_that_are_no_class_are_reported_and_minus_one_is_inconclusive(tm
     rows = hf_rows()
     rows[1]["kind"], rows[2]["kind"], rows[6]["kind"] = 7, -1, -2
     source = save_hf(tmp_path / "mine", rows, **kinds() | {"kind": datasets.Value("int64")})
-    for path in source.glob(
-        "*/dataset_info.json"
-    ):  # a number that the library refuses to write, though not to read
+    # a number that the library refuses to write, though not to read
+    for path in source.glob("*/dataset_info.json"):
         info = json.loads(path.read_text())
         info["features"]["kind"] = {"names": ["Wood", "Rock"], "_type": "ClassLabel"}
         path.write_text(json.dumps(info))

@@ -16,10 +16,12 @@ from palpate.data.manifest import Manifest
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
 
-#: Contacts of every made recording of 40 frames: label 3 from 10 to 15, label 15 from 17 to 19.
-LINES = [f"{{}}/{k:010d}.jpg,3" for k in range(10, 16)] + [
-    f"{{}}/{k:010d}.jpg,15" for k in range(17, 20)
-]
+#: Contacts of every recording of 40 frames: label 3 from 10 to 15, label 15 from 17 to 19.
+LABELS = {**dict.fromkeys(range(10, 16), 3), **dict.fromkeys(range(17, 20), 15)}
+
+
+def lines_of(video, frames, label=3):
+    return [f"{video}/{k:010d}.jpg,{label}" for k in frames]
 
 
 def make_recordings(root, *, raw=(), extracted=(), place="dataset", lines=None):
@@ -30,12 +32,11 @@ def make_recordings(root, *, raw=(), extracted=(), place="dataset", lines=None):
     for name in extracted:
         write_frames(root / place / name / "video_frame", 40)
         write_frames(root / place / name / "gelsight_frame", 40)
-    text = (
-        lines
-        if lines is not None
-        else [line.format(name) for name in (*raw, *extracted) for line in LINES]
-    )
-    (root / "label.txt").write_text("\n".join(text))
+    if lines is None:
+        lines = [
+            row for v in (*raw, *extracted) for k in LABELS for row in lines_of(v, [k], LABELS[k])
+        ]
+    (root / "label.txt").write_text("\n".join(lines))
     return root
 
 
@@ -82,6 +83,30 @@ def test_extracted_frames_go_before_the_raw_video(tmp_path):
     assert import_touch_and_go(root, tmp_path / "out").facts["layout"] == "extracted"
 
 
+#: Lines of ``label.txt`` in the tree of ``spoil``, what is wrong with each, and a word of its text.
+BAD_LINES = [
+    ("good/0000000010.jpg,3", "", ""),
+    ("good/0000000041.jpg,3", "beyond-end", "40 frames"),  # of the sensor's video
+    ("cut/0000000010.jpg,3", "bad-video", "gelsight.mp4"),
+    ("cut/0000000011.jpg,3", "", ""),
+    ("nomoov/0000000010.jpg,3", "bad-video", "video.mp4"),
+    ("gone/0000000010.jpg,3", "missing-video", "3 rows"),
+    ("gone/0000000011.jpg,3", "", ""),
+    ("gone/0000000012.jpg,3", "", ""),
+    ("ext/0000000011.jpg,3", "missing-file", "frame 11"),
+    ("ext/0000000012.jpg,3", "bad-image", "0000000012.jpg"),
+    ("ext/0000000013.jpg,3", "bad-image", "0000000013.jpg"),
+    ("ext/0000000014.jpg,3", "", ""),
+    ("ext/0000000090.jpg,3", "beyond-end", "90"),
+    ("good/0000000012.jpg,77", "unknown-label", "77"),
+    ("good/0000000013.jpg,-1", "", ""),
+    ("oneside/0000000001.jpg,3", "missing-video", "no tactile frames"),
+    ("good,3", "bad-path", "good"),
+    ("good/0000000039.jpg,3", "", ""),  # the last frame of the sensor's video
+    ("good/0000000040.jpg,3", "beyond-end", "frame 40"),
+]
+
+
 def spoil(root):
     """One of each kind of bad input; returns the expected problems."""
     make_recordings(root, raw=("good", "cut", "nomoov"), extracted=("ext",))
@@ -94,67 +119,22 @@ def spoil(root):
     jpeg.write_bytes(jpeg.read_bytes()[:-300])
     (root / "dataset" / "ext" / "gelsight_frame" / "0000000013.jpg").write_bytes(b"")
     write_video(root / "dataset" / "oneside" / "video.mp4", 5)
-    (root / "label.txt").write_text(
-        "\n".join(
-            [
-                "good/0000000010.jpg,3",  # 1
-                "good/0000000041.jpg,3",  # 2: beyond the 40 tactile frames
-                "cut/0000000010.jpg,3",  # 3
-                "cut/0000000011.jpg,3",  # 4
-                "nomoov/0000000010.jpg,3",  # 5
-                "gone/0000000010.jpg,3",  # 6
-                "gone/0000000011.jpg,3",  # 7
-                "gone/0000000012.jpg,3",  # 8
-                "ext/0000000011.jpg,3",  # 9
-                "ext/0000000012.jpg,3",  # 10
-                "ext/0000000013.jpg,3",  # 11
-                "ext/0000000014.jpg,3",  # 12
-                "ext/0000000090.jpg,3",  # 13
-                "good/0000000012.jpg,77",  # 14
-                "good/0000000013.jpg,-1",  # 15
-                "oneside/0000000001.jpg,3",  # 16
-                "good,3",  # 17
-                "good/0000000039.jpg,3",  # 18: the last frame of the touch video
-                "good/0000000040.jpg,3",  # 19: the first behind it
-            ]
-        )
-    )
+    (root / "label.txt").write_text("\n".join(line for line, _, _ in BAD_LINES))
     (root / "captions.csv").write_text("frame,text\ngood/0000000010.jpg,hard\nnonsense,hard\n")
-    return [
-        (root / "captions.csv", 3, "bad-path", "nonsense"),
-        (root / "label.txt", 2, "beyond-end", "40 frames"),
-        (root / "label.txt", 3, "bad-video", "gelsight.mp4"),
-        (root / "label.txt", 5, "bad-video", "video.mp4"),
-        (root / "label.txt", 6, "missing-video", "3 rows"),
-        (root / "label.txt", 9, "missing-file", "frame 11"),
-        (root / "label.txt", 10, "bad-image", "0000000012.jpg"),
-        (root / "label.txt", 11, "bad-image", "0000000013.jpg"),
-        (root / "label.txt", 13, "beyond-end", "90"),
-        (root / "label.txt", 14, "unknown-label", "77"),
-        (root / "label.txt", 16, "missing-video", "no tactile frames"),
-        (root / "label.txt", 17, "bad-path", "good"),
-        (root / "label.txt", 19, "beyond-end", "frame 40"),
-    ]
+    bad = [(f"{root}/label.txt:{n}", *p) for n, (_, *p) in enumerate(BAD_LINES, 1) if p[0]]
+    return [(f"{root}/captions.csv:3", "bad-path", "nonsense"), *bad]
 
 
-def test_everything_bad_is_reported_at_once_and_nothing_remains(tmp_path):
+def test_everything_bad_is_reported_at_once_or_skipped_alone(tmp_path):
     expected = spoil(tmp_path / "tag")
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(tmp_path / "tag", tmp_path / "out")
-    assert [(p.where, p.kind) for p in caught.value.problems] == [
-        (f"{f}:{n}", kind) for f, n, kind, _ in expected
-    ]
-    for problem, (_, _, _, word) in zip(caught.value.problems, expected, strict=True):
+    for problem, (where, kind, word) in zip(caught.value.problems, expected, strict=True):
+        assert (problem.where, problem.kind) == (where, kind)
         assert word in problem.text
     assert not (tmp_path / "out").exists()
-
-
-def test_skip_bad_imports_the_others_and_lists_the_same(tmp_path):
-    expected = spoil(tmp_path / "tag")
     result = import_touch_and_go(tmp_path / "tag", tmp_path / "out", skip_bad=True)
-    assert [(p.where, p.kind) for p in result.skipped] == [
-        (f"{f}:{n}", kind) for f, n, kind, _ in expected
-    ]
+    assert [(p.where, p.kind) for p in result.skipped] == [(w, kind) for w, kind, _ in expected]
     assert result.manifest.ids == ["ext/0000000014", "good/0000000010", "good/0000000039"]
     assert result.manifest.column("text") == [None, "hard", None]
     assert result.inconclusive == 1
@@ -223,21 +203,18 @@ def test_cached_frames_of_other_settings_are_rejected(tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["raw", "extracted"])
-def test_background_is_a_typical_frame_where_the_recording_begins_with_a_contact_else_null(
-    tmp_path, layout
-):
-    lines = [f"a/{k:010d}.jpg,3" for k in range(0, 8)] + [f"b/{k:010d}.jpg,3" for k in range(40)]
+def test_without_a_frame_before_the_contact_a_typical_one_is_the_background(tmp_path, layout):
+    lines = [*lines_of("a", range(8)), *lines_of("b", range(40))]
     root = make_recordings(tmp_path / "tag", **{layout: ("a", "b")}, lines=lines)
     result = import_touch_and_go(root, tmp_path / "out")
     manifest = result.manifest.require_valid()
     assert result.facts["backgrounds"] == "none 1, typical 1"
     assert manifest.column("background")[8:] == [None] * 40
-    frames = [
-        round(x) for x in np.linspace(12, 39, 15)
-    ]  # from 5 behind the touch's last frame to the end
+    # from 5 behind the last frame of the contact to the end
+    frames = [round(x) for x in np.linspace(12, 39, 15)]
     median = np.median([[k >> b & 1 for b in range(8)] for k in frames], axis=0)
-    distance = [sum(abs((k >> b & 1) - median[b]) for b in range(8)) for k in frames]
-    nearest = {k for k, d in zip(frames, distance, strict=True) if d == min(distance)}
+    distance = {k: sum(abs((k >> b & 1) - median[b]) for b in range(8)) for k in frames}
+    nearest = {k for k, d in distance.items() if d == min(distance.values())}
     assert set(shown(Manifest(manifest.table[:8], manifest.root), "background")) <= nearest
     assert len(nearest) < 5
 
@@ -265,9 +242,8 @@ def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):
 
 def test_official_split_captions_and_objects(tmp_path):
     root = make_recordings(tmp_path / "tag", extracted=("a", "b"))
-    (root / "train.txt").write_text(
-        "\n".join(f"a/{k:010d}.jpg,3" for k in range(10, 16)) + "\nelsewhere/0000000001.jpg,3"
-    )
+    train = [*lines_of("a", range(10, 16)), "elsewhere/0000000001.jpg,3"]
+    (root / "train.txt").write_text("\n".join(train))
     (root / "test.txt").write_text("b/17.jpg,15\nb/0000000018.jpg,15")
     (root / "captions.csv").write_text("a/0000000010.jpg,hard, cold\n")
     (root / "objects.csv").write_text("frame,object\nb/0000000019.jpg,wall\n")
@@ -277,29 +253,22 @@ def test_official_split_captions_and_objects(tmp_path):
     assert orig.ids("test") == ["b/0000000017", "b/0000000018"]
     assert orig.manifest == result.manifest.digest
     assert Split.load(tmp_path / "out" / "splits" / "Orig.json").digest == orig.digest
-    rows = {r["id"]: r for r in result.manifest.table.iter_rows(named=True)}
-    assert rows["a/0000000010"]["text"] == "hard, cold"
-    assert rows["a/0000000011"]["text"] is None
-    assert rows["b/0000000019"]["object"] == "wall"
+    some = result.manifest.take(["a/0000000010", "a/0000000011", "b/0000000019"])
+    assert some.column("text") == ["hard, cold", None, None]
+    assert some.column("object") == [None, None, "wall"]
     assert result.facts["text_source"] == "captions.csv"
     (root / "label.txt").unlink()
+    # each problem once, although the lists are labels and split in one
     (root / "train.txt").write_text("a/0000000010.jpg,3\nx,3\na/0000000011.jpg,-2")
-    with pytest.raises(
-        ProblemsError
-    ) as caught:  # each once, although the lists are labels and split in one
-        import_touch_and_go(root, tmp_path / "out2")
-    assert [(p.where, p.kind) for p in caught.value.problems] == [
-        (f"{root / 'train.txt'}:2", "bad-path"),
-        (f"{root / 'train.txt'}:3", "unknown-label"),
-    ]
-    (root / "train.txt").write_text("a/0000000010.jpg,3")
-    result = import_touch_and_go(root, tmp_path / "out2")
+    result = import_touch_and_go(root, tmp_path / "out2", skip_bad=True)
+    places = [(f"{root}/train.txt:2", "bad-path"), (f"{root}/train.txt:3", "unknown-label")]
+    assert [(p.where, p.kind) for p in result.skipped] == places
     assert result.manifest.ids == ["a/0000000010", "b/17", "b/0000000018"]
     assert result.splits["Orig"].counts() == {"train": 1, "test": 2}
 
 
 def test_max_per_contact_takes_evenly_spaced_frames(tmp_path):
-    lines = [f"a/{k:010d}.jpg,3" for k in range(10, 30)] + ["a/0000000035.jpg,3"]
+    lines = lines_of("a", [*range(10, 30), 35])
     root = make_recordings(tmp_path / "tag", extracted=("a",), lines=lines)
     take = lambda **kw: import_touch_and_go(root, tmp_path / "out", **kw).manifest.column("frame")  # noqa: E731
     assert take(max_per_contact=1) == [20, 35]
@@ -327,30 +296,16 @@ def test_missing_root_list_and_recordings_are_named(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_link_out_of_the_data_set_is_reported(tmp_path):
-    make_recordings(tmp_path / "real", extracted=("a",))
-    root = tmp_path / "tag"
-    (root / "dataset").mkdir(parents=True)
-    shutil.copy(tmp_path / "real" / "label.txt", root)
-    (root / "dataset" / "a").symlink_to(tmp_path / "real" / "dataset" / "a")
+@pytest.mark.parametrize("what", ["recording", "frame"])
+def test_links_out_of_the_data_set_are_reported(tmp_path, what):
+    root = make_recordings(tmp_path / "tag", extracted=("a",))
+    path = root / "dataset" / "a"
+    path = path / "gelsight_frame" / "0000000010.jpg" if what == "frame" else path
+    path.rename(tmp_path / "outside")
+    path.symlink_to(tmp_path / "outside")
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(root, tmp_path / "out")
     assert [p.kind for p in caught.value.problems] == ["outside-root"]
-
-
-def test_one_frame_that_links_out_of_the_data_set_is_reported_or_skipped(tmp_path):
-    make_recordings(tmp_path, extracted=("a",))
-    frames = tmp_path / "dataset" / "a" / "gelsight_frame"
-    listed = (tmp_path / "label.txt").read_text().split(",")[0].split("/")[1]
-    (tmp_path.parent / f"{tmp_path.name}-outside.jpg").write_bytes((frames / listed).read_bytes())
-    (frames / listed).unlink()
-    (frames / listed).symlink_to(tmp_path.parent / f"{tmp_path.name}-outside.jpg")
-    with pytest.raises(ProblemsError) as caught:
-        import_touch_and_go(tmp_path, tmp_path / "out")
-    assert [p.kind for p in caught.value.problems] == ["outside-root"]
-    done = import_touch_and_go(tmp_path, tmp_path / "out", skip_bad=True)
-    assert [p.kind for p in done.skipped] == ["outside-root"]
-    assert done.manifest.problems() == []
 
 
 @pytest.mark.slow

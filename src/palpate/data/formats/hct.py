@@ -34,9 +34,10 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -104,10 +105,10 @@ class Lists:
         files: the lists read.
     """
 
-    samples: list[Frame] = field(default_factory=list)
-    contact: set[tuple[str, int]] = field(default_factory=set)
-    untouched: dict[str, list[Frame]] = field(default_factory=lambda: defaultdict(list))
-    files: list[str] = field(default_factory=list)
+    samples: list[Frame]
+    contact: set[tuple[str, int]]
+    untouched: dict[str, list[Frame]]
+    files: list[str]
 
 
 def detect(source: Path) -> bool:
@@ -151,9 +152,8 @@ def scan(
     if swap not in ("report", "fix"):
         raise PalpateError("must be report or fix", repr(swap), "", argument="swap")
     if session_gap < 0:
-        raise PalpateError(
-            "must be 0 seconds or more", f"{session_gap}", "", argument="session_gap"
-        )
+        got = f"{session_gap}"
+        raise PalpateError("must be 0 seconds or more", got, "", argument="session_gap")
     root, rigs = find(Path(source))
     if not rigs:
         must = f"{source} must be HCT: {LOOKS_FOR}"
@@ -264,54 +264,55 @@ def _in_time(video: str) -> tuple[str, float, str]:
 
 def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: bool) -> Lists:
     """The samples of all lists, and what the two JSON files add."""
-    read, unlisted = Lists(), list[Frame]()
-    resting: set[tuple[str, int]] = set()
+    samples, unlisted, untouched = list[Frame](), list[Frame](), list[Frame]()
+    files: list[str] = []
     for rig in rigs:
-        for part, path in tvl.part_lists((result.base if lists is None else lists) / rig).items():
-            read.files.append(f"{rig}/{path.name}")
-            read.samples += _frames(result, tvl.read_list(result, path), rig, part)
-        for frame in _frames(result, _json_rows(result, rig, "not_contact"), rig, None):
-            read.untouched[frame.video].append(frame)
-            resting.add(frame.key)
+        for part, path in tvl.part_lists((lists or result.base) / rig).items():
+            files.append(f"{rig}/{path.name}")
+            samples += _frames(result, tvl.read_list(result, path), rig, part)
+        untouched += _frames(result, _json_rows(result, rig, "not_contact"), rig, None)
         unlisted += _frames(result, _json_rows(result, rig, "contact"), rig, None)
-    if lists is not None and not read.samples:
-        raise PalpateError(
-            "must hold lists such as data1/train.csv", str(lists), "", argument="lists"
-        )
-    known = {frame.key for frame in read.samples}
-    read.contact = known | {frame.key for frame in unlisted if frame.key not in resting}
+    if lists is not None and not samples:
+        must = "must hold lists such as data1/train.csv"
+        raise PalpateError(must, str(lists), "", argument="lists")
+    known, resting = {frame.key for frame in samples}, {frame.key for frame in untouched}
+    in_contact = known | {frame.key for frame in unlisted if frame.key not in resting}
     unlisted = [frame for frame in unlisted if frame.key not in known]
-    both = [frame.where for frame in [*read.samples, *unlisted] if frame.key in resting]
+    both = [frame.where for frame in [*samples, *unlisted] if frame.key in resting]
     text = "not_contact.json calls them untouched; samples only where a list has them"
     tvl.suspect_rows(result, both, "contact-and-not", text)
     unlisted = [frame for frame in unlisted if frame.key not in resting]
     if contact:
-        read.samples += unlisted
+        samples += unlisted
     else:
         text = "in contact.json but in no list, so no samples; contact=True includes them"
         tvl.suspect_rows(result, [f.where for f in unlisted], "unlisted-contact", text)
-    odd = [
-        f.where for f in read.samples if f.tactile != f"{f.video}/tactile/{f.vision.split('/')[-1]}"
-    ]
+    pairs = [(f, f"{f.video}/tactile/{PurePosixPath(f.vision).name}") for f in samples]
+    odd = [frame.where for frame, tactile in pairs if frame.tactile != tactile]
     text = "photo and tactile image differ in trajectory or file name"
     tvl.suspect_rows(result, odd, "unequal-names", text)
     result.facts["not_contact"] = f"{len(resting)} frames, no samples"
-    read.samples.sort(key=lambda frame: (_in_time(frame.video), frame.number))
-    return read
+    samples.sort(key=lambda frame: (_in_time(frame.video), frame.number))
+    return Lists(samples, in_contact, _by_video(untouched), files)
+
+
+def _by_video(frames: Iterable[Frame]) -> dict[str, list[Frame]]:
+    by_video: dict[str, list[Frame]] = defaultdict(list)
+    for frame in frames:
+        by_video[frame.video].append(frame)
+    return by_video
 
 
 def _json_rows(result: Scan, rig: str, name: str) -> list[Row]:
     """The rows of ``contact.json`` or ``not_contact.json``, with cells named as in the lists."""
     path = result.base / rig / f"{name}.json"
-    data = read_json_file(result, path) if path.is_file() else None
+    data = read_json_file(result, path) if path.is_file() else {"vision": [], "tactile": []}
     if data is None:
         return []
     names = {"vision": "url", "tactile": "tactile", "background": "tactile_background"}
-    lists: dict[str, Any] = {}
-    if isinstance(data, dict):
-        lists = {names[key]: data[key] for key in names if key in data}
-    is_list = {isinstance(v, list) and all(isinstance(p, str) for p in v) for v in lists.values()}
-    if not {"url", "tactile"} <= set(lists) or is_list != {True}:
+    lists = {names[k]: v for k, v in data.items() if k in names} if isinstance(data, dict) else {}
+    is_list = [isinstance(v, list) and all(isinstance(p, str) for p in v) for v in lists.values()]
+    if not {"url", "tactile"} <= set(lists) or not all(is_list):
         text = "not an object with lists of paths under vision and tactile"
         result.problem(path, "bad-json", text)
         return []
@@ -368,14 +369,11 @@ def _swap(
     Returns:
         The frames, and the videos that were fixed.
     """
-    by_video: dict[str, list[Frame]] = defaultdict(list)
-    for frame in frames:
-        by_video[frame.video].append(frame)
     files: dict[str, tuple[list[Path], list[Path]]] = {}
-    for video, group in by_video.items():
-        few = [group[k] for k in sorted({0, len(group) // 2, len(group) - 1})]
-        sides = ([result.base / getattr(f, side) for f in few] for side in ("vision", "tactile"))
-        files[video] = next(sides), next(sides)
+    for video, group in _by_video(frames).items():
+        some = [group[k] for k in sorted({0, len(group) // 2, len(group) - 1})]
+        sides = [[result.base / getattr(f, side) for f in some] for side in ("vision", "tactile")]
+        files[video] = sides[0], sides[1]
     seen = looks(files, progress)
     evidence: dict[str, str] = {}
     for rig in sorted({frame.rig for frame in frames}):
@@ -387,10 +385,8 @@ def _swap(
     fixed = set(evidence) if swap == "fix" else set[str]()
     state = "fixed" if fixed else "as they are"
     result.facts["swapped_folders"] = f"{len(evidence)}, {state}" if evidence else "none"
-    back = [
-        replace(f, vision=f.tactile, tactile=f.vision) if f.video in fixed else f for f in frames
-    ]
-    return back, fixed
+    back = {f.where: replace(f, vision=f.tactile, tactile=f.vision) for f in frames}
+    return [back[f.where] if f.video in fixed else f for f in frames], fixed
 
 
 def _backgrounds(
@@ -403,48 +399,43 @@ def _backgrounds(
 
     The listed image of a fixed trajectory does not count: it was made of its vision.
     """
-    exists: dict[str, bool] = {}
-    typical: dict[str, str | None] = {}
 
-    def first(*names: str | None) -> str | None:
-        is_file = (n for n in names if n and exists.setdefault(n, (result.base / n).is_file()))
-        return next(is_file, None)
+    @cache
+    def is_file(name: str) -> bool:
+        return (result.base / name).is_file()
 
-    kinds: Counter[str] = Counter()
-    chosen: list[str | None] = []
-    bare: dict[str, list[str]] = defaultdict(list)
-    for frame in frames:
+    @cache
+    def typical(video: str) -> str | None:
+        side = "vision" if video in fixed else "tactile"
+        return _typical(result.base, [getattr(f, side) for f in untouched.get(video, [])])
+
+    def choose(frame: Frame) -> tuple[str, str | None]:
         listed = frame.background if frame.video not in fixed else None
-        kind, name = "as listed", first(_located(listed, frame.rig), listed) if listed else None
-        if name is None:
-            kind, name = FALLBACK, first(f"{frame.rig}/{FALLBACK}", FALLBACK)
-        if name is None:
-            if frame.video not in typical:
-                side = "vision" if frame.video in fixed else "tactile"
-                paths = [getattr(f, side) for f in untouched.get(frame.video, [])]
-                typical[frame.video] = _typical(result.base, paths)
-            kind, name = "untouched frame", typical[frame.video]
-        if name is None:
-            kind = "none"
-            bare[frame.rig].append(frame.where)
-        kinds[kind] += 1
-        chosen.append(name)
-    for places in bare.values():
+        sources = [("as listed", name) for name in (listed and _located(listed, frame.rig), listed)]
+        sources += [(FALLBACK, name) for name in (f"{frame.rig}/{FALLBACK}", FALLBACK)]
+        for kind, name in sources:
+            if name and is_file(name):
+                return kind, name
+        return ("untouched frame" if typical(frame.video) else "none"), typical(frame.video)
+
+    chosen = [choose(frame) for frame in frames]
+    for rig in sorted({frame.rig for frame in frames}):
+        pairs = zip(frames, chosen, strict=True)
+        bare = [frame.where for frame, (_, name) in pairs if frame.rig == rig and name is None]
         text = f"no image of the untouched gel, as none is listed and there is no {FALLBACK}"
-        tvl.suspect_rows(result, places, "no-background", text)
-    result.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
-    return chosen
+        tvl.suspect_rows(result, bare, "no-background", text)
+    kinds = sorted(Counter(kind for kind, _ in chosen).items())
+    result.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in kinds)
+    return [name for _, name in chosen]
 
 
 def _typical(root: Path, names: Sequence[str]) -> str | None:
     """Of up to 15 evenly spaced whole images the one nearest to their median, or None."""
     whole = [name for name in names if inside(root, name) and check_image(root / name) is None]
-    if not whole:
-        return None
     places = np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round().astype(int)
     some = [whole[k] for k in np.unique(places)]
     images = [np.asarray(read_image(root / name)) for name in some]
-    if len({image.shape for image in images}) > 1:
+    if len({image.shape for image in images}) != 1:
         return None
     median = np.median(images, axis=0).astype(np.float32)
     return some[int(np.argmin([np.abs(image - median).mean() for image in images]))]

@@ -31,7 +31,7 @@ import polars as pl
 from PIL import Image
 
 from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
-from palpate.data.formats.base import Facts, Format, Row, Scan, import_scanned
+from palpate.data.formats.base import Cells, Facts, Format, Scan, import_scanned
 from palpate.data.formats.huggingface_source import ROW, Source, first_line, open_source
 from palpate.data.images import BROKEN, Check
 from palpate.data.imported import Imported, removing_on_error
@@ -136,8 +136,8 @@ class _Store:
     folder: Path | None
     created: list[Path]
     how: Check
+    checked: dict[bytes, tuple[str, str | None]] = field(default_factory=dict)
     paths: dict[bytes, str] = field(default_factory=dict)
-    reasons: dict[bytes, str] = field(default_factory=dict)
     taken: dict[str, bytes] = field(default_factory=dict)
 
     def put(self, data: bytes, path: str | None, default: str) -> str | tuple[str, str]:
@@ -147,16 +147,13 @@ class _Store:
             Its path below the folder, or what is wrong as (kind, text).
         """
         digest = hashlib.blake2b(data, digest_size=16).digest()
-        if digest not in self.paths and digest not in self.reasons:
-            kind, reason = _checked(data, self.how)
-            if reason:
-                self.reasons[digest] = reason
-            else:
-                suffix = SUFFIXES.get(kind, f".{kind.lower()}")
-                self.paths[digest] = path or default + suffix
-        if digest in self.reasons:
-            return "bad-image", self.reasons[digest]
-        path = path or self.paths[digest]
+        if digest not in self.checked:
+            self.checked[digest] = _checked(data, self.how)
+        kind, reason = self.checked[digest]
+        if reason:
+            return "bad-image", reason
+        suffix = SUFFIXES.get(kind, f".{kind.lower()}")
+        path = path or self.paths.setdefault(digest, default + suffix)
         if (before := self.taken.setdefault(path, digest)) != digest:
             return "duplicate-path", f"another image of the data set has the path {path!r}"
         if self.folder is not None and before is digest:
@@ -197,31 +194,29 @@ def _scan(
 ) -> Scan:
     """Read all rows; ``store`` takes their images."""
     maps = compile_maps(columns, source.names, list(SCHEMA))
-    if not any(side in maps.expressions for side in IMAGE_COLUMNS[:2]):
+    if not {"vision", "tactile"} & set(maps.expressions):
         got = f"no vision and no tactile among {', '.join(source.names) or 'no columns'}"
         must, example = f"{source.name} must have a column for the images", {"vision": "COLUMN"}
         raise PalpateError(must, got, "Map your columns", example={"columns": example})
-    label = source.labels.get(maps.source("material") or "")
-    names = dict(enumerate(label)) if label else None
+    names = dict(enumerate(source.labels.get(maps.source("material") or "", ()))) or None
     names = names if classes is None else read_classes(Path(classes))
     result = Scan(store.folder or source.folder or Path(), dict(source.facts))
     places: list[int] = []
-    parts: set[str] = set()
     total = sum(len(data) for data in source.splits.values() if hasattr(data, "__len__"))
     for split, first, batch in _batches(source):
+        count = len(next(iter(batch.values())))
         reader = _BatchReader(source, maps, split, first, batch, result, store)
-        for k, row in reader.rows(names):
+        for k, row in reader.rows(count, names):
             places += [int(batch[ROW][k])] if ROW in batch else []
-            if part := PART_NAMES.get(split):
-                row[1]["split"] = part
-                parts.add(split)
-            result.rows.append(row)
-        progress("reading rows", first + reader.count, total)
+            row["split"] = PART_NAMES.get(split)
+            result.rows.append((reader.where(k), row))
+        progress("reading rows", first + count, total)
     if places:  # an export of palpate: the order of its manifest
         order = sorted(range(len(places)), key=places.__getitem__)
         result.rows = [result.rows[k] for k in order]
+    parts = sorted(split for split in source.splits if split in PART_NAMES)
     if len(parts) > 1:
-        rule = source.description.get("rule") or {"method": "official", "parts": sorted(parts)}
+        rule = source.description.get("rule") or {"method": "official", "parts": parts}
         result.split_name, result.split_rule = "Orig", dict(rule)
     worded = any("text" in row for _, row in result.rows)
     text_source = f"column {columns.get('text', 'text')}" if worded else "none"
@@ -248,7 +243,7 @@ def _batches(source: Source) -> Iterator[tuple[str, int, Batch]]:
 
 @dataclass
 class _BatchReader:
-    """Rows of one batch: the rows ``first`` to ``first + count - 1`` of the part ``split``."""
+    """Rows of one batch, of which the first is row ``first`` of the part ``split``."""
 
     source: Source
     maps: ColumnMaps
@@ -258,47 +253,40 @@ class _BatchReader:
     result: Scan
     store: _Store
 
-    @property
-    def count(self) -> int:
-        """Number of rows."""
-        return len(next(iter(self.batch.values())))
-
-    def rows(self, classes: Mapping[int, str] | None) -> Iterator[tuple[int, Row]]:
+    def rows(self, count: int, classes: Mapping[int, str] | None) -> Iterator[tuple[int, Cells]]:
         """The usable rows by their number in the batch."""
         sources = {target: self.maps.source(target) for target in IMAGE_COLUMNS}
         stored = {t: c for t, c in sources.items() if c and c in self.source.images}
         plain = self.maps.without(list(stored))
         texts = {n: pl.Series(self._texts(n), dtype=pl.String) for n in plain.columns}
-        table = pl.DataFrame({ROW: range(self.count)}).with_columns(**texts)
-        usable, inconclusive = manifest_rows(
-            plain.apply(table), self.count, self._where, classes, self.result.problems
-        )
+        cells = plain.apply(pl.DataFrame({ROW: range(count)}).with_columns(**texts))
+        problems = self.result.problems
+        usable, inconclusive = manifest_rows(cells, count, self.where, classes, problems)
         self.result.inconclusive += inconclusive
         for k, row in usable:
-            row.setdefault("id", self._default_id(k, row))
-            problems: list[tuple[str, str]] = []
+            by_frame = "video" in row and "frame" in row
+            default = f"{row['video']}/{row['frame']}" if by_frame else self._place(k, "")
+            row.setdefault("id", default)
+            good = True
             for target in (t for t in IMAGE_COLUMNS if t in self.maps.expressions):
                 column = stored.get(target)
                 cell = self.batch[column][k] if column else row.get(target)
                 path = self._stored(target, k, cell)
+                if path is None and target != "background":
+                    path = "missing-image", "no image"
                 if isinstance(path, tuple):
-                    problems.append((path[0], f"{target}: {path[1]}"))
-                elif path is not None or target == "background":
-                    row[target] = path
-                else:
-                    problems.append(("missing-image", f"no {target} image"))
-            for kind, text in problems:
-                self.result.problem(self._where(k), kind, text)
-            if not problems:
-                yield k, (self._where(k), row)
+                    self.result.problem(self.where(k), path[0], f"{target}: {path[1]}")
+                    good = False
+                row[target] = path
+            if good:
+                yield k, row
 
-    def _where(self, k: int) -> str:
+    def where(self, k: int) -> str:
+        """Data set, part and row."""
         return f"{self.source.name}/{self.split}:{self.first + k}".replace("/:", ":")
 
-    def _default_id(self, k: int, row: Mapping[str, Any]) -> str:
-        if "video" in row and "frame" in row:
-            return f"{row['video']}/{row['frame']}"
-        return f"{self.split}/{self.first + k:08d}".lstrip("/")
+    def _place(self, k: int, folder: str) -> str:
+        return Path(self.split, folder, f"{self.first + k:08d}").as_posix()
 
     def _texts(self, name: str) -> Sequence[str | None]:
         """Cells as texts: an image is its file name, a class label its name.
@@ -322,11 +310,10 @@ class _BatchReader:
         data = _bytes(self.source, cell)
         if not isinstance(data, bytes):
             return data
-        path: str | None = None
-        if self.source.description and f"{target}_path" in self.batch:
-            path = self.batch[f"{target}_path"][k]
+        is_export = self.source.description and f"{target}_path" in self.batch
+        path = self.batch[f"{target}_path"][k] if is_export else None
         safe = path if path and not re.search(CLIMBS, path) else None
-        default = f"{self.split or 'all'}/{target}/{self.first + k:08d}"
+        default = self._place(k, target) if self.split else f"all/{self._place(k, target)}"
         return self.store.put(data, safe, default)
 
 

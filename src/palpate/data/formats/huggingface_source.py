@@ -114,7 +114,7 @@ def _loaded(source: Path, name: str, config: str | None, revision: str | None) -
 
 
 def _require_hub(name: str, revision: str | None) -> None:
-    """Ask the hub once, without the library's half minute of retries."""
+    """Query the hub once, without the library's half minute of retries."""
     if os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "TRUE", "YES", "ON"):
         return
     from huggingface_hub import HfApi
@@ -122,14 +122,13 @@ def _require_hub(name: str, revision: str | None) -> None:
 
     try:
         HfApi().dataset_info(name, revision=revision, timeout=20)
-    except HfHubHTTPError as error:
-        must = f"The Hugging Face hub must have the data set {name}"
-        fix = "Check the name; for a private one log in: hf auth login"
-        raise PalpateError(must, f"the answer {first_line(error)}", fix) from None
     except Exception as error:  # of the network library
         must = f"{name} is no folder here, so the Hugging Face hub must be within reach"
         fix = f"Where there is a network: hf download --repo-type dataset {name} --local-dir DIR, "
         fix += "and import DIR; with HF_HUB_OFFLINE=1 a cached copy is taken"
+        if isinstance(error, HfHubHTTPError):
+            must = f"The Hugging Face hub must have the data set {name}"
+            fix = "Check the name; for a private one log in: hf auth login"
         raise PalpateError(must, first_line(error), fix) from None
 
 
@@ -144,9 +143,8 @@ def _streamed(place: str, config: str | None, revision: str | None, local: bool)
     kinds = LOCAL if local else REMOTE
     if builder.name not in kinds:
         must = f"{place} must be made of {' or '.join(kinds)} files"
-        if local:
-            raise PalpateError(must, str(builder.name), "Convert it to Parquet")
-        fix, example = "The hub keeps a copy in Parquet", {"revision": "refs/convert/parquet"}
+        fix = "Convert it to Parquet" if local else "The hub keeps a copy in Parquet"
+        example = None if local else {"revision": "refs/convert/parquet"}
         raise PalpateError(must, str(builder.name), fix, example=example)
     return builder.as_streaming_dataset()
 

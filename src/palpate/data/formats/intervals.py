@@ -10,19 +10,19 @@
 The columns may have other names (``NAMES``), or map expressions (:mod:`palpate.data.mapping`) name
 them; without a header the order is video, start, end, label. ``start`` and ``end`` are frame
 numbers from 0 that **both belong to the contact**; with ``half_open`` the end is the first frame
-after it. ``object``, ``text``, ``session`` and ``background`` (the frame that shows the gel before
-the contact) are optional. A label of -1 marks contact of unclear material: no samples, but no
-background is taken from there either.
+after it. ``object``, ``text`` and ``session`` are optional. A label of -1 marks contact of unclear
+material: no samples, but no background is taken from there either.
 
 Each interval is a contact ``video#000k`` in the order of frames; each of its frames is a sample
-(``every`` thins). Backgrounds follow the rule of Touch and Go where the list names none. Intervals
-that overlap are all skipped: which is true is unknown.
+(``every`` thins). Backgrounds follow the rule of Touch and Go. Intervals that overlap are all
+skipped: which is true is unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import polars as pl
@@ -34,6 +34,7 @@ from palpate.data.formats.touch_and_go import (
     require_frame_options,
     require_videos,
     scan_rows,
+    usable,
 )
 from palpate.data.frames import FolderFrames, ImageFormat
 from palpate.data.images import Check
@@ -59,7 +60,6 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "object": ("object",),
     "text": ("text", "caption", "description"),
     "session": ("session",),
-    "background": ("background", "background_frame"),
 }
 NEEDED = ("video", "start", "end")
 ORDER = ("video", "start", "end", "label")
@@ -69,16 +69,14 @@ LOOKS_FOR = f"a table with the columns {', '.join(ORDER)}, next to folders of re
 
 @dataclass(frozen=True)
 class Interval:
-    """A contact: frames ``first`` to ``last``, both included; ``contact`` will be its name."""
+    """A contact: frames ``first`` to ``last``, both included."""
 
     where: str
     video: str
     first: int
     last: int
     words: Mapping[str, str]
-    background: int | None
     inconclusive: bool
-    contact: str = ""
 
 
 class _Whole(Recordings):
@@ -128,10 +126,8 @@ def scan(
     listed = _read(work, source, columns, classes, half_open)
     rows, contacts = _prepared(work, listed, every, check, progress)
     rows = work.decode(rows, progress, videos=check == "decode")
-    result = Scan(base, {"dataset": source.stem}, scan_rows(work, rows, check))
-    for row, (_, cells) in zip(rows, result.rows, strict=True):
-        cells |= {"material": None, **contacts[row.contact].words}
-    result.facts["text_source"] = _text_source(columns, contacts)
+    words = _words(rows, contacts)
+    result = Scan(base, _facts(source, columns, words), scan_rows(work, rows, check, None, words))
     result.problems, result.suspicious = work.problems, work.suspicious
     result.inconclusive = sum(i.inconclusive for i in listed)
     return result
@@ -171,9 +167,9 @@ def run(  # noqa: PLR0913 (a public verb)
         listed = _read(work, source, columns, classes, half_open)
         rows, contacts = _prepared(work, listed, every, check, progress)
         rows = extracted(work, rows, source, skip_bad=skip_bad, progress=progress)
-        facts = {**FACTS.of_manifest(), "format": "intervals", "dataset": source.stem}
-        facts["text_source"] = _text_source(columns, contacts)
-        manifest = work.manifest(rows, facts, "", _words(rows, contacts))
+        words = _words(rows, contacts)
+        facts = {**FACTS.of_manifest(), "format": "intervals", **_facts(source, columns, words)}
+        manifest = work.manifest(rows, facts, "", words)
         table = manifest.table.with_columns(sensor=pl.lit(sensor, dtype=pl.String))
         manifest = Manifest(table, manifest.root, manifest.facts)
         inconclusive = sum(i.inconclusive for i in listed)
@@ -228,9 +224,13 @@ def _root(source: Path, root: Path | None) -> Path:
     return base
 
 
-def _text_source(columns: Mapping[str, str] | None, contacts: Mapping[str, Interval]) -> str:
-    worded = any("text" in contact.words for contact in contacts.values())
-    return f"column {(columns or {}).get('text', 'text')}" if worded else "none"
+def _facts(
+    source: Path, columns: Mapping[str, str] | None, words: Mapping[str, FrameTable]
+) -> dict[str, str]:
+    text_source = (
+        f"column {(columns or {}).get('text', 'text')}" if words["text"].values else "none"
+    )
+    return {"dataset": source.stem, "text_source": text_source}
 
 
 def _words(rows: Sequence[Row], contacts: Mapping[str, Interval]) -> dict[str, FrameTable]:
@@ -289,11 +289,9 @@ def _interval(
     video, start, end = (row[name] for name in NEEDED)
     assert isinstance(start, int)
     assert isinstance(end, int)
-    last, background, label = end - half_open, row.get("background"), row.get("material")
+    last, label = end - half_open, row.get("material")
     if last < start:
         return "bad-interval", f"the contact ends at frame {last} before it starts at {start}"
-    if background is not None and not str(background).isdecimal():
-        return "bad-frame", f"the background {background!r} is not a whole number from 0"
     if labels is not None and label not in (None, "-1", *labels.values()):
         number = int(str(label)) if str(label).isdecimal() else -1
         if number not in labels:
@@ -301,8 +299,7 @@ def _interval(
         label = labels[number]
     words = {name: str(row[name]) for name in WORDS if row.get(name)}
     words |= {"material": str(label)} if label else {}
-    frame = None if background is None else int(str(background))
-    return Interval(where, str(video), start, last, words, frame, label == "-1")
+    return Interval(where, str(video), start, last, words, label == "-1")
 
 
 def _prepared(
@@ -314,43 +311,37 @@ def _prepared(
     rows = [Row(i.where, i.video, i.video, i.first, i.where, "") for i in listed]
     opened = {row.where for row in work.open(rows, progress)}
     listed = [i for i in listed if i.where in opened and _within(work, i)]
-    in_contact: dict[str, set[int]] = {}
+    in_contact: dict[str, set[int]] = {i.video: set() for i in listed}
     for i in listed:
-        in_contact.setdefault(i.video, set()).update(range(i.first, i.last + 1))
+        in_contact[i.video].update(range(i.first, i.last + 1))
     work.in_contact = in_contact
-    contacts = {i.contact: i for i in _named(_apart(listed, work.problems))}
-    rows = [row for i in contacts.values() for row in _frames(work, i, every)]
-    work.choose_backgrounds(rows, {i.contact: i.first for i in contacts.values()})
-    for name in {row.contact for row in rows}:
-        _take_listed_background(work, contacts[name])
-    rows = work.check(rows, check, progress)
-    for name in sorted(set(work.videos) - {i.video for i in contacts.values()}):
-        text = f"the recording {name!r} has no usable interval"
-        work.suspicious.append(Problem(str(work.root), "unlisted-video", text))
-    without = {r.contact for r in rows} - set(work.background_frames) - set(work.typical_of)
-    for i in (contacts[name] for name in sorted(without)):
-        text = f"no frame of {i.video!r} shows the untouched gel"
-        work.suspicious.append(Problem(i.where, "no-background", text))
+    contacts: dict[str, Interval] = {}
+    count: Counter[str] = Counter()
+    for i in _apart(listed, work.problems):
+        if not i.inconclusive:
+            count[i.video] += 1
+            contacts[f"{i.video}#{count[i.video]:04d}"] = i
+    rows = [row for name in contacts for row in _frames(work, name, contacts[name], every)]
+    starts = {name: i.first for name, i in contacts.items()}
+    rows = usable(work, rows, starts, set(count), check=check, progress=progress)
     return rows, contacts
 
 
 def _within(work: Recordings, interval: Interval) -> bool:
-    """Whether an interval and its background are within the recording; if not, it is a problem."""
+    """Whether an interval is within the recording; if not, it is a problem."""
     length = min(map(len, work.frames[interval.video].values()))
-    furthest = max(interval.last, interval.background or 0)
-    if furthest >= length:
-        what = "the contact" if interval.last >= length else "its background"
-        text = f"{what} reaches frame {furthest} of {interval.video!r}: both modalities have "
-        text += f"{length} frames, counted from 0"
+    if interval.last >= length:
+        text = f"the contact reaches frame {interval.last} of {interval.video!r}: both modalities "
+        text += f"have {length} frames, counted from 0"
         work.problems.append(Problem(interval.where, "beyond-end", text))
-    return furthest < length
+    return interval.last < length
 
 
 def _apart(listed: list[Interval], problems: list[Problem]) -> list[Interval]:
     """The intervals that share no frame with another, sorted by video and frame."""
     first: dict[object, Interval] = {}
     for i in listed:
-        key = (i.video, i.first, i.last, tuple(i.words.items()))
+        key = (i.video, i.first, i.last, *i.words.items())
         if (before := first.setdefault(key, i)) is not i:
             text = f"the same interval is at {before.where} already"
             problems.append(Problem(i.where, "duplicate-row", text))
@@ -358,12 +349,11 @@ def _apart(listed: list[Interval], problems: list[Problem]) -> list[Interval]:
     overlaps: dict[str, tuple[Interval, Interval]] = {}
     widest: Interval | None = None  # of those before, the one that reaches furthest
     for i in ordered:
-        if widest is None or widest.video != i.video:
-            widest = i
-        elif i.first <= widest.last:
-            overlaps[i.where] = i, widest
-            overlaps.setdefault(widest.where, (widest, i))
-        widest = i if i.last > widest.last else widest
+        same = widest if widest is not None and widest.video == i.video else None
+        if same is not None and i.first <= same.last:
+            overlaps[i.where] = i, same
+            overlaps.setdefault(same.where, (same, i))
+        widest = same if same is not None and same.last >= i.last else i
     for i, other in overlaps.values():
         text = f"frames {i.first} to {i.last} of {i.video!r} overlap with "
         text += f"{other.first} to {other.last} at {other.where}"
@@ -371,51 +361,19 @@ def _apart(listed: list[Interval], problems: list[Problem]) -> list[Interval]:
     return [i for i in ordered if i.where not in overlaps]
 
 
-def _named(listed: Sequence[Interval]) -> Iterator[Interval]:
-    """The conclusive intervals with the names of their contacts."""
-    count: dict[str, int] = {}
-    for i in listed:
-        if not i.inconclusive:
-            count[i.video] = count.get(i.video, 0) + 1
-            yield replace(i, contact=f"{i.video}#{count[i.video]:04d}")
-
-
-def _frames(work: Recordings, interval: Interval, every: int) -> list[Row]:
+def _frames(work: Recordings, contact: str, interval: Interval, every: int) -> list[Row]:
     """A row for each frame that both modalities have; one problem for those that one lacks."""
-    video, numbers = interval.video, range(interval.first, interval.last + 1, every)
+    video, where = interval.video, interval.where
+    numbers = range(interval.first, interval.last + 1, every)
     missing: set[int] = set()
     for modality, source in work.frames[video].items():
-        lacking = [k for k in numbers if not source.has(k)]
-        leaves = isinstance(source, FolderFrames) and not source.leaving.isdisjoint(lacking)
-        if lacking:
-            text = (
-                f"no {modality} image of {len(lacking)} of the frames of {interval.contact}, the "
-            )
-            text += f"first of them {lacking[0]}, in {source.source}"
+        if lacking := [k for k in numbers if not source.has(k)]:
+            leaves = isinstance(source, FolderFrames) and not source.leaving.isdisjoint(lacking)
+            text = f"no {modality} image of {len(lacking)} of the frames of {contact}, the first "
+            text += f"of them {lacking[0]}, in {source.source}"
             text += ": a link that leaves it" * leaves
             kind = "outside-root" if leaves else "missing-file"
-            work.problems.append(Problem(interval.where, kind, text))
-        missing.update(lacking)
-    return [
-        Row(interval.where, f"{video}/{k:010d}", video, k, interval.contact, "")
-        for k in numbers
-        if k not in missing
-    ]
-
-
-def _take_listed_background(work: Recordings, interval: Interval) -> None:
-    """Take the background that the list names, if it names one, instead of the rule's."""
-    frame, contact = interval.background, interval.contact
-    if frame is None:
-        return
-    source = work.frames[interval.video]["tactile"]
-    if not source.has(frame):
-        text = f"no image of the background, frame {frame}, in {source.source}"
-        work.problems.append(Problem(interval.where, "missing-file", text))
-        return
-    if frame in work.in_contact[interval.video]:
-        text = f"the listed background, frame {frame} of {interval.video!r}, is in a contact"
-        work.suspicious.append(Problem(interval.where, "background-in-touch", text))
-    work.background_frames[contact] = frame
-    work.backgrounds[contact] = source.path(frame)
-    work.typical_of.pop(contact, None)
+            work.problems.append(Problem(where, kind, text))
+            missing.update(lacking)
+    frames = (k for k in numbers if k not in missing)
+    return [Row(where, f"{video}/{k:010d}", video, k, contact, "") for k in frames]

@@ -11,14 +11,14 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Generic, TypeGuard, TypeVar
 
 from palpate.core import PARTS, PalpateError, Split, inside, write_json
-from palpate.data.formats.base import Row, Scan
+from palpate.data.formats.base import Facts, Row, Scan, few
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import CLIMBS, Manifest
 
@@ -26,6 +26,8 @@ from palpate.data.manifest import CLIMBS, Manifest
 DIGITS = 18
 NUMBER = r"([0-9]+)"
 K = TypeVar("K", int, str)
+#: (folder, name or number): what a JSON list calls a sample.
+Key = tuple[str, int] | tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -166,11 +168,7 @@ def natural(name: str) -> tuple[int, int, str]:
 
 
 def require_folder(source: Path, name: str) -> Path:
-    """The source, if it is a folder.
-
-    Raises:
-        PalpateError: if it is missing or a file.
-    """
+    """The source of a data set, which must be a folder."""
     source = Path(source)
     if not source.is_dir():
         got = f"the file {source}" if source.exists() else f"nothing at {source}"
@@ -178,14 +176,11 @@ def require_folder(source: Path, name: str) -> Path:
     return source
 
 
-@dataclass(frozen=True)
-class Pair:
-    """One entry of a JSON list: where it is, its part, and its two names."""
-
-    where: str
-    part: str
-    first: str
-    second: str
+def require_layout(root: Path, looks_for: str, facts: Facts, *, complete: object) -> None:
+    """Raise an error that lists the folders of a source, unless ``complete`` is true."""
+    if not complete:
+        fix = f"Fetch the data from {facts.url}"
+        raise PalpateError(f"{root} must hold {looks_for}", few(subfolders(root)), fix)
 
 
 def read_json_file(scan: Scan, path: Path) -> Any:
@@ -197,18 +192,62 @@ def read_json_file(scan: Scan, path: Path) -> Any:
         return None
 
 
-def is_pair_list(data: Any) -> TypeGuard[dict[str, list[Any]]]:
+def is_split(data: Any) -> TypeGuard[dict[str, list[Any]]]:
     """Whether JSON data is ``{"train": [..], "val": .., "test": ..}``."""
-    return (
-        isinstance(data, dict)
-        and not set(PARTS).isdisjoint(data)
-        and all(isinstance(rows, list) for rows in data.values())
-    )
+    if not isinstance(data, dict) or set(PARTS).isdisjoint(data):
+        return False
+    return all(isinstance(rows, list) for rows in data.values())
 
 
-def read_pairs(scan: Scan, path: Path, data: dict[str, list[Any]]) -> list[Pair]:
-    """The well-formed entries of ``{"train": [[folder, name], ..], ..}``; names may be integers."""
-    pairs: list[Pair] = []
+def read_split(
+    scan: Scan,
+    path: Path,
+    data: Mapping[str, list[Any]],
+    ids: Mapping[Any, str],
+    key: Callable[[str, str], Key | None],
+) -> Split:
+    """The split of ``{"train": [[folder, name], ..], ..}``; names may be integers.
+
+    Args:
+        scan: missing, duplicate and malformed entries are its problems. A sample in two parts is in
+            neither.
+        path: the list.
+        data: its content.
+        ids: (folder, name) -> id of every sample on disk, whether usable or not.
+        key: the key in ``ids`` of an entry, or None if its name is no frame number.
+    """
+    folders = {folder for folder, _ in ids}
+    lost: Counter[str] = Counter()
+    seen: dict[str, str] = {}
+    in_two: set[str] = set()
+    for where, part, folder, name in _pairs(scan, path, data):
+        sample = key(folder, name)
+        i = ids.get(sample)
+        if sample is None:
+            scan.problem(where, "bad-frame", f"the index {name!r} is not an integer")
+        elif sample[0] not in folders:
+            lost[folder] += 1
+        elif i is None:
+            scan.problem(where, "missing-file", f"{folder}/{name} is listed but not there")
+        elif i not in seen:
+            seen[i] = part
+        elif seen[i] == part:
+            scan.problem(where, "duplicate-row", f"{folder}/{name} is listed twice")
+        else:
+            in_two.add(i)
+            scan.problem(where, "two-parts", f"{folder}/{name} is in {seen[i]}, too")
+    for name, count in lost.items():
+        scan.problem(path, "missing-folder", f"no folder {name!r}, with {count} listed entries")
+    if unlisted := len(ids) - len(seen):
+        scan.suspect(path, "unlisted", f"{unlisted} of {len(ids)} samples are in no part")
+    parts = {i: part for i, part in seen.items() if i not in in_two}
+    return Split(parts, {"method": "official", "files": [path.name]})
+
+
+def _pairs(
+    scan: Scan, path: Path, data: Mapping[str, list[Any]]
+) -> Iterator[tuple[str, str, str, str]]:
+    """(place, part, folder, name) of the well-formed entries."""
     for part, rows in data.items():
         if part not in PARTS:
             text = f"the part {part!r} ({len(rows)} entries) is none of {', '.join(PARTS)}"
@@ -222,71 +261,16 @@ def read_pairs(scan: Scan, path: Path, data: dict[str, list[Any]]) -> list[Pair]
             elif any(re.search(rf"{CLIMBS}|[/\\]|^$", n) for n in names):
                 scan.problem(where, "outside-root", f"{names!r} are not plain names")
             else:
-                pairs.append(Pair(where, part, *names))
-    return pairs
+                yield where, part, names[0], names[1]
 
 
-def assign(
-    scan: Scan, path: Path, pairs: Iterable[tuple[Pair, Hashable]], ids: Mapping[Any, str]
-) -> Split:
-    """The split of a JSON list; missing, duplicate and ambiguous entries are problems.
-
-    Args:
-        scan: takes the problems. A sample in two parts is in neither.
-        path: the list.
-        pairs: each entry with the key of its sample, (folder, name).
-        ids: key -> id of every sample on disk, whether usable or not.
-    """
-    folders = {folder for folder, _ in ids}
-    lost: Counter[str] = Counter()
-    seen: dict[str, Pair] = {}
-    in_two: set[str] = set()
-    for pair, key in pairs:
-        name = f"{pair.first}/{pair.second}"
-        i = ids.get(key)
-        if i is None and isinstance(key, tuple) and key[0] not in folders:
-            lost[pair.first] += 1
-        elif i is None:
-            scan.problem(pair.where, "missing-file", f"{name} is listed but not there")
-        elif (before := seen.setdefault(i, pair)) is not pair and before.part == pair.part:
-            scan.problem(pair.where, "duplicate-row", f"{name} is listed twice")
-        elif before is not pair:
-            in_two.add(i)
-            scan.problem(pair.where, "two-parts", f"{name} is in {before.part}, too")
-    for name, count in lost.items():
-        scan.problem(path, "missing-folder", f"no folder {name!r}, with {count} listed entries")
-    if unlisted := len(ids) - len(seen):
-        scan.suspect(path, "unlisted", f"{unlisted} of {len(ids)} samples are in no part")
-    parts = {i: pair.part for i, pair in seen.items() if i not in in_two}
-    return Split(parts, {"method": "official", "files": [path.name]})
-
-
-def write_pairs(
-    manifest: Manifest,
-    split: Split,
-    file: Path,
-    pattern: str,
-    convert: Callable[[str], int | str] = str,
+def write_split(
+    manifest: Manifest, split: Split, file: Path, convert: Callable[[str], int | str] = str
 ) -> list[Path]:
-    """Write ``{"train": [[folder, name], ..], "val": .., "test": ..}`` of the tactile images.
-
-    Args:
-        manifest: of the samples.
-        split: their parts.
-        file: to write to.
-        pattern: of a tactile path, with two groups: folder and name.
-        convert: how a folder or name is written.
-
-    Raises:
-        PalpateError: if the path of a sample does not match.
-    """
+    """Write ``{"train": [[folder, name], ..], ..}`` with the folder and stem of tactile images."""
     lists: dict[str, list[list[int | str]]] = {part: [] for part in PARTS}
     for part in split.counts():
-        for path in manifest.part(split, part).column("tactile"):
-            match = re.fullmatch(pattern, path)
-            if match is None:
-                must = "The lists of this data set need tactile images in its folders"
-                raise PalpateError(must, path, "Write the split file alone")
-            lists[part].append([convert(name) for name in match.groups()])
+        paths = map(PurePosixPath, manifest.part(split, part).column("tactile"))
+        lists[part] = [[convert(path.parent.name), convert(path.stem)] for path in paths]
     write_json(file, lists)
     return [file]

@@ -18,8 +18,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from palpate.core import PalpateError, Progress, quiet
-from palpate.data.formats.base import Facts, Format, Scan, few
-from palpate.data.formats.layout import numbered, require_folder, subfolders
+from palpate.data.formats.base import Facts, Format, Scan
+from palpate.data.formats.layout import numbered, require_folder, require_layout, subfolders
 from palpate.data.tables import open_table
 
 CITATION = (
@@ -53,21 +53,9 @@ def detect(source: Path) -> bool:
 
 
 def scan(source: Path, *, metadata: Path | None = None, progress: Progress = quiet) -> Scan:
-    """List the images of all trials.
-
-    Args:
-        source: the folder of the objects.
-        metadata: table of materials; default: that in the source, if there is one.
-        progress: called with the number of objects read.
-
-    Raises:
-        PalpateError: if there is no object, or the named table is missing.
-    """
+    """List the images of all trials; ``metadata`` is a table of materials elsewhere."""
     root = require_folder(source, FACTS.name)
-    folders = subfolders(root)
-    if not detect(root):
-        must = f"{root} must hold {LOOKS_FOR}"
-        raise PalpateError(must, few(folders), f"Fetch the data from {FACTS.url}")
+    require_layout(root, LOOKS_FOR, FACTS, complete=detect(root))
     facts = {"background": "first image of the trial (inferred), which is no sample"}
     facts |= {"layout": "raw trials", "text_source": "none", "vision": "none in this layout"}
     result = Scan(root, facts)
@@ -76,8 +64,7 @@ def scan(source: Path, *, metadata: Path | None = None, progress: Progress = qui
     for done, name in enumerate(objects):
         progress("reading objects", done, len(objects))
         _object(result, name, materials.get(int(name)))
-    others = [name for name in folders if name not in objects]
-    result.suspect(root, "unknown-folder", "skipped, as not the number of an object", others)
+    _suspect_unnumbered(result, ".")
     unknown = [name for name in objects if not 1 <= int(name) <= OBJECTS]
     result.suspect(root, "unknown-object", f"objects outside 1 to {OBJECTS}", unknown)
     bare = [name for name in objects if materials and int(name) not in materials]
@@ -92,22 +79,25 @@ def _numbers(folder: Path) -> list[str]:
     return [name for name in subfolders(folder) if name.isdecimal()]
 
 
+def _suspect_unnumbered(result: Scan, place: str) -> None:
+    odd = [name for name in subfolders(result.base / place) if not name.isdecimal()]
+    result.suspect(place, "unknown-folder", "skipped, as not a number", odd)
+
+
 def _object(result: Scan, name: str, material: str | None) -> None:
     """Add the images of one object's trials."""
     place = f"{name}/tactile_data"
     trials = _numbers(result.base / place)
-    others = [trial for trial in subfolders(result.base / place) if trial not in trials]
-    result.suspect(place, "unknown-folder", "skipped, as not the number of a trial", others)
+    _suspect_unnumbered(result, place)
     if not trials:
         result.problem(place, "missing-folder", "the object has no trial")
     single: list[str] = []
     for trial in trials:
         folder = f"{place}/{trial}/0/gelsight"
         images = numbered(result, folder, steady=True, suffixes=(".png",))
-        images = images if images.files else numbered(result, folder, steady=True)
         if not images.files:
             kind = "frames" if (result.base / folder).is_dir() else "folder"
-            result.problem(folder, f"missing-{kind}", "the trial has no images")
+            result.problem(folder, f"missing-{kind}", "the trial has no PNG images")
             continue
         first, *others = images.files
         if not others:  # an image cannot be its own background
@@ -133,10 +123,8 @@ def _materials(result: Scan, given: Path | None) -> dict[int, str]:
     if not path.is_file():
         if given is None:
             return {}
-        fix = f"Fetch {METADATA} from github.com/alanzjl/t3"
-        raise PalpateError(
-            "must be a table of materials", f"no file {path}", fix, argument="metadata"
-        )
+        got, fix = f"no file {path}", f"Fetch {METADATA} from github.com/alanzjl/t3"
+        raise PalpateError("must be a table of materials", got, fix, argument="metadata")
     table = open_table(path)
     if not {"Index", "Material"} <= set(table.names):
         must = f"{path} must have the columns Index, Name, Material"
@@ -152,5 +140,4 @@ def _materials(result: Scan, given: Path | None) -> dict[int, str]:
     result.problems += table.problems
     unknown = sorted(set(materials.values()) - set(MATERIALS))
     result.suspect(path, "unknown-material", f"other than {', '.join(MATERIALS)}", unknown)
-    result.facts["materials"] = path.name
     return materials

@@ -16,21 +16,20 @@ one split each, named as the file. Cross-contact shares every object between tra
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.core import Progress, Split, quiet
 from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import (
-    assign,
-    is_pair_list,
+    is_split,
     named,
     natural,
     paired,
     read_json_file,
-    read_pairs,
+    read_split,
     require_folder,
+    require_layout,
     subfolders,
-    write_pairs,
+    write_split,
 )
 from palpate.data.formats.objectfolder import CITATION, LICENSE, SENSOR
 from palpate.data.formats.objectfolder import FACTS as OBJECTFOLDER
@@ -57,26 +56,16 @@ def detect(source: Path) -> bool:
 
 
 def scan(source: Path, *, progress: Progress = quiet) -> Scan:
-    """Pair the images of the benchmark.
-
-    Args:
-        source: the folder with ``touch/`` and ``vision/``.
-        progress: called with the number of objects read.
-
-    Raises:
-        PalpateError: if a side is missing.
-    """
+    """Pair the images of ``touch/`` and ``vision/``."""
     root = require_folder(source, FACTS.name)
-    sides = {side: subfolders(root / side) for side in ("touch", "vision")}
-    if empty := [side for side, objects in sides.items() if not objects]:
-        must = f"{root} must hold {LOOKS_FOR}"
-        raise PalpateError(must, f"no objects in {empty[0]}/", f"See {FACTS.url}")
+    sides = [subfolders(root / side) for side in ("touch", "vision")]
+    require_layout(root, LOOKS_FOR, FACTS, complete=all(sides))
     result = Scan(root, {"layout": "cross-generation benchmark", "text_source": "none"})
     background = BACKGROUND if (root / BACKGROUND).exists() else None
     if background is None:
         result.suspect("touch_ref", "no-background", "no touch_ref.png, so no backgrounds")
     ids: dict[tuple[str, str], str] = {}
-    objects = sorted({*sides["touch"], *sides["vision"]}, key=natural)
+    objects = sorted(set().union(*sides), key=natural)
     for done, name in enumerate(objects):
         progress("reading objects", done, len(objects))
         tactile, vision = (named(result, f"{side}/{name}") for side in ("touch", "vision"))
@@ -91,38 +80,26 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
                 "sensor": SENSOR,
             }
             result.rows.append((tactile.path(contact), row))
-    _read_lists(result, ids)
+    for path in sorted(root.glob("*.json")):
+        data = read_json_file(result, path)
+        if is_split(data):
+            key = lambda folder, name: (folder, name)  # noqa: E731
+            result.splits[path.stem] = read_split(result, path, data, ids, key)
+        elif data is not None:
+            text = 'skipped, as not {"train|val|test": [[object, contact], ..]}'
+            result.suspect(path, "unknown-file", text)
+    if len(result.splits) == 1:
+        result.splits = {"Orig": result.splits.popitem()[1]}
     return result
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Write ``split.json``, ``{"train": [[object, contact], ..], ..}``, integers as such.
-
-    Raises:
-        PalpateError: if a tactile image is not in ``touch/<object>/``.
-    """
+    """Write ``split.json``, ``{"train": [[object, contact], ..], ..}``, integers as such."""
 
     def convert(name: str) -> int | str:
         return int(name) if name.isdecimal() and str(int(name)) == name else name
 
-    pattern = r"touch/([^/]+)/([^/]+)\.\w+"
-    return write_pairs(manifest, split, Path(folder) / "split.json", pattern, convert)
+    return write_split(manifest, split, Path(folder) / "split.json", convert)
 
 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
-
-
-def _read_lists(result: Scan, ids: dict[tuple[str, str], str]) -> None:
-    """The parts of every JSON list at the root."""
-    lists: dict[Path, dict[str, list[Any]]] = {}
-    for path in sorted(result.base.glob("*.json")):
-        data = read_json_file(result, path)
-        if is_pair_list(data):
-            lists[path] = data
-        elif data is not None:
-            text = 'skipped, as not {"train|val|test": [[object, contact], ..]}'
-            result.suspect(path, "unknown-file", text)
-    for path, data in lists.items():
-        pairs = [(pair, (pair.first, pair.second)) for pair in read_pairs(result, path, data)]
-        name = "Orig" if len(lists) == 1 else path.stem
-        result.splits[name] = assign(result, path, pairs, ids)

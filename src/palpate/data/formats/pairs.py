@@ -32,7 +32,7 @@ import polars as pl
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.data.formats.base import Cells, Facts, Format, Scan
-from palpate.data.formats.layout import Images, paired
+from palpate.data.formats.layout import Images, paired, require_folder
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import SCHEMA
 from palpate.data.mapping import compile_maps
@@ -100,30 +100,32 @@ def scan(
     source = Path(source)
     maps = dict(columns or {})
     labels = None if classes is None else read_classes(Path(classes))
+    is_table = source.is_file()
+    if not is_table:
+        require_folder(source, FACTS.name)
+    foreign = {"side": side} if is_table else {"root": root, "names": names}
+    if given := [name for name, value in foreign.items() if value is not None]:
+        must = f"must come with a {'folder' if is_table else 'table'}"
+        raise PalpateError(must, str(source), "Leave it out", argument=given[0])
     progress("reading rows", 0, 1)
-    if source.is_file():
-        if side is not None:
-            fix = f"Leave it out; map a column to {side}"
-            raise PalpateError("must come with a folder", f"{source.name}", fix, argument="side")
-        layout = f"table {source.suffix.lower()[1:] or 'csv'}"
-        result = Scan(source.parent if root is None else Path(root), {"layout": layout})
+    layout = "folders" if side is None else f"folder of {side} images"
+    layout = f"table {source.suffix.lower()[1:] or 'csv'}" if is_table else layout
+    base = source.parent if is_table else source
+    result = Scan(base if root is None else Path(root), {"layout": layout})
+    if is_table:
         _read_table(result, source, maps, names, labels)
-    elif source.is_dir():
-        if root is not None or names is not None:
-            argument = "names" if root is None else "root"
-            got = f"the folder {source}"
-            raise PalpateError("must come with a table", got, "Leave it out", argument=argument)
-        layout = "folders" if side is None else f"folder of {side} images"
-        result = Scan(source, {"layout": layout})
-        files = _pairs(result) if side is None else _single(result, side)
-        _add_files(result, files, maps, labels)
     else:
-        raise PalpateError("The source must exist", f"nothing at {source}", "Check the path")
+        single = {} if side is None else {p: {side: p} for p in _images(result, ".").files.values()}
+        _add_files(result, _pairs(result) if side is None else single, maps, labels)
     progress("reading rows", 1, 1)
-    _look_over(result, source, one_side=side is not None)
-    result.facts["dataset"] = source.stem
+    result.suspicious += odd_groups(source, result.rows)
+    absent = [name for name in SIDES if result.rows and name not in result.rows[0][1]]
+    if absent and side is None:
+        text = f"no column {absent[0]}, so the samples have one image each; map one if there is one"
+        result.suspect(source, "one-sided", text)
     worded = any("text" in row for _, row in result.rows)
     result.facts["text_source"] = f"column {maps.get('text', 'text')}" if worded else "none"
+    result.facts["dataset"] = source.stem
     if any("split" in row for _, row in result.rows):
         result.split_name = "Orig"
         result.split_rule = {"method": "official", "column": maps.get("split", "split")}
@@ -131,15 +133,6 @@ def scan(
 
 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
-
-
-def _look_over(result: Scan, source: Path, *, one_side: bool) -> None:
-    """Report groups that only some rows have, and tables with one image column."""
-    result.suspicious += odd_groups(source, result.rows)
-    absent = [side for side in SIDES if result.rows and side not in result.rows[0][1]]
-    if absent and not one_side:
-        text = f"no column {absent[0]}, so the samples have one image each; map one if there is one"
-        result.suspect(source, "one-sided", text)
 
 
 def _read_table(
@@ -219,11 +212,6 @@ def _pairs(result: Scan) -> dict[str, Cells]:
         tactile.files[stem]: {"vision": vision.path(stem), "tactile": tactile.path(stem)}
         for stem in paired(result, tactile, vision)
     }
-
-
-def _single(result: Scan, side: Side) -> dict[str, Cells]:
-    """Path -> the same path in the column of its side."""
-    return {path: {side: path} for path in _images(result, ".").files.values()}
 
 
 def _folders(source: Path, side: str) -> list[str]:

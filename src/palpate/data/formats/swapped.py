@@ -48,10 +48,9 @@ def look(paths: Sequence[Path]) -> Look | None:
             with Image.open(path) as image:
                 size = image.size
                 image.draft("RGB", (max(THUMBNAIL, size[0] // 8), max(THUMBNAIL, size[1] // 8)))
-                small = image.convert("RGB")
+                small = image.convert("RGB").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
         except BROKEN:
             continue
-        small = small.resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
         sizes.append(size)
         thumbnails.append(np.asarray(small, np.float64) / 255)
     return Look(sizes[0], np.mean(thumbnails, axis=0)) if sizes else None
@@ -63,12 +62,7 @@ def looks(
     """Recording -> (vision, tactile) looks of the given frames, without unreadable recordings."""
     look_at = lambda name: (look(files[name][0]), look(files[name][1]))  # noqa: E731
     pairs = dict(in_threads(look_at, files, "looking for swapped folders", progress))
-    readable: dict[str, tuple[Look, Look]] = {}
-    for name in files:
-        vision, tactile = pairs[name]
-        if vision is not None and tactile is not None:
-            readable[name] = vision, tactile
-    return readable
+    return {name: (v, t) for name in files for v, t in [pairs[name]] if v and t}
 
 
 def swapped(sides: Mapping[str, tuple[Look, Look]], sensor_size: tuple[int, int]) -> dict[str, str]:

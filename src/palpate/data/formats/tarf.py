@@ -22,19 +22,18 @@ import re
 from pathlib import Path
 
 from palpate.core import PalpateError, Progress, Split, quiet
-from palpate.data.formats.base import Facts, Format, Scan, few
+from palpate.data.formats.base import Facts, Format, Scan
 from palpate.data.formats.layout import (
-    Pair,
-    assign,
-    is_pair_list,
+    is_split,
     natural,
     numbered,
     paired,
     read_json_file,
-    read_pairs,
+    read_split,
     require_folder,
+    require_layout,
     subfolders,
-    write_pairs,
+    write_split,
 )
 from palpate.data.manifest import Manifest
 
@@ -79,18 +78,15 @@ def scan(source: Path, *, scale: str | None = None, progress: Progress = quiet) 
 
     Args:
         source: the folder with ``vision/`` and ``touch/``.
-        scale: of the views, ``"40_30"``; default: that of the touch, else the only one there is.
+        scale: of the views, ``"80_60"``; default: that of the touch, else the only one there is.
         progress: called with the number of scenes read.
 
     Raises:
-        PalpateError: if a side is missing, or the scale of the views is ambiguous or absent.
+        PalpateError: if a folder is missing, or the scale of the views is ambiguous or absent.
     """
     root = require_folder(source, FACTS.name)
     tactile, vision = _scenes(root / "touch"), _scenes(root / "vision")
-    for side, scenes in (("touch", tactile), ("vision", vision)):
-        if not scenes:
-            must = f"{root / side} must hold folders named <scene>_40_30"
-            raise PalpateError(must, few(subfolders(root / side)), f"Fetch it from {FACTS.url}")
+    require_layout(root, LOOKS_FOR, FACTS, complete=tactile and vision)
     result = Scan(root, {"layout": "vision/, touch/, touch_bg/", "text_source": "none"})
     ids: dict[tuple[str, int], str] = {}
     used: set[str] = set()
@@ -105,22 +101,19 @@ def scan(source: Path, *, scale: str | None = None, progress: Progress = quiet) 
     names = [name for side in ("touch", "vision") for name in subfolders(root / side)]
     odd = [name for name in names if not re.fullmatch(SCALED, name)]
     result.suspect(root, "unknown-folder", "skipped, as not named <scene>_<scale>", odd)
-    if depth := subfolders(root / "depth"):
-        result.facts["depth"] = f"{len(depth)} folders of .npy files, not imported"
     result.facts["vision_scale"] = ", ".join(sorted(used))
-    if (root / LIST).is_file() and (data := read_json_file(result, root / LIST)) is not None:
-        _read_list(result, data, ids)
+    path = root / LIST
+    data = read_json_file(result, path) if path.is_file() else None
+    if is_split(data):
+        result.splits["Orig"] = read_split(result, path, data, ids, _key)
+    elif data is not None:
+        result.problem(path, "bad-json", 'not {"train|val|test": [[scene, index], ..]}')
     return result
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Write ``split_interval.json`` with all three parts, which the public loader expects.
-
-    Raises:
-        PalpateError: if a tactile image is not in ``touch/<scene>_<scale>/``.
-    """
-    pattern = r"touch/(.+_[0-9]+_[0-9]+)/([^/]+)\.\w+"
-    return write_pairs(manifest, split, Path(folder) / LIST, pattern)
+    """Write ``split_interval.json`` with all three parts, which the public loader expects."""
+    return write_split(manifest, split, Path(folder) / LIST)
 
 
 FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
@@ -173,17 +166,6 @@ def _scene(result: Scan, scene: str, view_scale: str, ids: dict[tuple[str, int],
         result.rows.append((tactile.path(k), row))
 
 
-def _read_list(result: Scan, data: object, ids: dict[tuple[str, int], str]) -> None:
-    """``Orig`` of the JSON list."""
-    path = result.base / LIST
-    if not is_pair_list(data):
-        result.problem(path, "bad-json", 'not {"train|val|test": [[scene, index], ..]}')
-        return
-    pairs: list[tuple[Pair, tuple[str, int]]] = []
-    for pair in read_pairs(result, path, data):
-        if pair.second.isdecimal():
-            scene = re.sub(r"_[0-9]+_[0-9]+$", "", pair.first)
-            pairs.append((pair, (scene, int(pair.second))))
-        else:
-            result.problem(pair.where, "bad-frame", f"the index {pair.second!r} is not an integer")
-    result.splits["Orig"] = assign(result, path, pairs, ids)
+def _key(scene: str, index: str) -> tuple[str, int] | None:
+    """Scene and number of an entry of the list."""
+    return (re.sub(r"_[0-9]+_[0-9]+$", "", scene), int(index)) if index.isdecimal() else None

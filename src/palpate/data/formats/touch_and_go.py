@@ -256,6 +256,37 @@ def extracted(
     return rows
 
 
+def usable(
+    work: Recordings,
+    rows: list[FrameRow],
+    starts: Mapping[str, int],
+    listed: set[str],
+    *,
+    check: Check,
+    progress: Progress,
+) -> list[FrameRow]:
+    """The rows whose images are whole, with a background chosen for each contact.
+
+    Args:
+        work: takes what is wrong.
+        rows: of opened recordings.
+        starts: contact -> its first frame.
+        listed: the recordings in use; others are reported.
+        check: how images are checked.
+        progress: progress callback.
+    """
+    work.choose_backgrounds(rows, starts)
+    rows = work.check(rows, check, progress)
+    for video in sorted(set(work.videos) - listed):
+        text = f"no usable contact of the recording {video!r} is listed"
+        work.suspicious.append(Problem(str(work.root), "unlisted-video", text))
+    with_background = {*work.background_frames, *work.typical_of}
+    for contact in sorted({row.contact for row in rows} - with_background):
+        text = "no frame of its recording shows the untouched gel"
+        work.suspicious.append(Problem(contact, "no-background", text))
+    return rows
+
+
 def scan_rows(
     work: Recordings,
     rows: Sequence[FrameRow],
@@ -344,17 +375,9 @@ def _prepared(
 ) -> list[FrameRow]:
     """The usable rows, up to extraction; what is wrong is added to ``work``."""
     work.problems += lists.problems
+    starts, videos = first_frames(rows_of(lists.listed)), set(lists.listed.contact["video"])
     rows = work.open(rows, progress)
-    work.choose_backgrounds(rows, first_frames(rows_of(lists.listed)))
-    rows = work.check(rows, check, progress)
-    for video in sorted(set(work.videos) - set(lists.listed.contact["video"])):
-        text = f"the recording {video!r} is in no list"
-        work.suspicious.append(Problem(str(work.root), "unlisted-video", text))
-    without = {r.contact for r in rows} - set(work.background_frames) - set(work.typical_of)
-    for contact in sorted(without):
-        text = "no frame of its recording shows the untouched gel"
-        work.suspicious.append(Problem(contact, "no-background", text))
-    return rows
+    return usable(work, rows, starts, videos, check=check, progress=progress)
 
 
 def _splits(manifest: Manifest, official: FrameList | None) -> dict[str, Split]:

@@ -1,9 +1,7 @@
 """What the two halves of Touch-Vision-Language (TVL), HCT and SSVTP, share: lists and captions.
 
-**Lists** are ``train.csv`` and ``test.csv`` (``val.csv`` too, as palpate writes one). Their readers
-disagree: one goes by position, one by name, one takes the first column for an index. So a first row
-without the name of an image is a header; columns that it does not name as expected are, in order,
-the missing columns of images, and the first other column that is not all numbers is the caption.
+**Lists** are ``train.csv`` and ``test.csv`` (``val.csv`` too, as palpate writes one). A first row
+without the name of an image is a header; without a header, columns go by position.
 
 **Captions** are adjectives between commas; they are trimmed, in lower case, without full stops.
 """
@@ -19,7 +17,7 @@ from palpate.core import PARTS, write_text
 from palpate.data.formats.base import Row, Scan
 from palpate.data.formats.layout import count_rows
 from palpate.data.images import SUFFIXES
-from palpate.data.tables import LINE, header_of, open_table
+from palpate.data.tables import header_of, open_table
 
 CITATION = (
     "L. Fu, G. Datta, H. Huang, W. C.-H. Panitch, J. Drake, J. Ortiz, M. Mukadam, M. Lambeta, "
@@ -53,40 +51,21 @@ def read_list(scan: Scan, path: Path, columns: Sequence[str] = COLUMNS) -> list[
     Returns:
         (``file:line``, cells by the names in ``columns``); empty cells are None.
     """
-    first = header_of(path)
+    first = [name.lower() for name in header_of(path)]
     if not first:
         scan.problem(path, "empty-list", "the list has no lines")
         return []
-    table = open_table(path, [str(k) for k in range(len(first))])
-    rows = table.read(table.names).drop(LINE).rows()
-    scan.problems += table.problems
-    start = 0 if any(map(is_image, first)) else 1
-    names = _columns([name.lower() for name in first] if start else [], rows[start:], columns)
-    if "url" not in names and rows[start:]:
-        text = f"no column of photos (url) among {', '.join(first)}"
-        scan.problem(path, "missing-column", text)
+    bare = any(map(is_image, first))
+    names = [*columns, *[""] * len(first)][: len(first)] if bare else first
+    if "url" not in names and names[0] == "":  # saved with the photo as index
+        names[0] = "url"
+    if "url" not in names:
+        scan.problem(path, "missing-column", f"no column url among {', '.join(first)}")
         return []
-    return [
-        (table.where(k), {n: cell for n, cell in zip(names, rows[k], strict=True) if n})
-        for k in range(start, len(rows))
-    ]
-
-
-def _columns(
-    header: Sequence[str], rows: Sequence[Sequence[str | None]], known: Sequence[str]
-) -> list[str | None]:
-    """What each column holds, or None where it holds nothing of use."""
-    names = [name if name in known else None for name in header] or [None] * len(rows[0])
-    paths = [name for name in known if name not in (*names, "caption")]
-    for k, name in enumerate(names):
-        cells = [row[k] for row in rows if row[k]]
-        if name is None and 2 * sum(is_image(cell or "") for cell in cells) > len(cells):
-            names[k] = paths.pop(0) if paths else None
-        elif (
-            name is None and "caption" not in names and not all(c and c.isdecimal() for c in cells)
-        ):
-            names[k] = "caption"
-    return names
+    table = open_table(path, names)
+    rows = table.read([name for name in columns if name in names]).rows(named=True)
+    scan.problems += table.problems
+    return [(table.where(k), row) for k, row in enumerate(rows) if k or bare]
 
 
 def write_list(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Path:

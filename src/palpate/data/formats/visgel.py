@@ -22,8 +22,7 @@ A recording is a video, the group. Its name is its path without the side, ``data
 
 Most frames touch nothing. The contact of a frame is the variance of the Laplacian of (frame -
 reference) in gray levels; T3 keeps contact > 18, which leaves 726,740 of 3,170,795 frames.
-``min_contact`` does so (on luma, while T3 swaps the weights of red and blue); by default all frames
-stay, and a few of them are measured to report whether most are flat.
+``min_contact`` does so (on luma, while T3 swaps the weights of red and blue); by default all stay.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.core import PalpateError, Progress, Split, inside, quiet, write_text
+from palpate.core import PalpateError, Progress, Split, inside, quiet
 from palpate.data.formats.base import Cells, Facts, Format, Row, Scan, few
 from palpate.data.formats.layout import (
     Images,
@@ -47,9 +46,7 @@ from palpate.data.formats.layout import (
     report_missing_folders,
     require_folder,
 )
-from palpate.data.images import Check, in_threads, read_image
-from palpate.data.listing import write_table
-from palpate.data.manifest import Manifest
+from palpate.data.images import in_threads, read_image
 
 FACTS = Facts(
     name="VisGel",
@@ -74,14 +71,12 @@ LOOKS_FOR = (
 LISTS = "data_lst"
 DIRECTIONS = ("vision2touch", "touch2vision")
 #: Part -> the word in the names of the lists.
-WORDS = {"train": "train", "val": "val", "test": "eval"}
+WORDS = {"train": "train", "test": "eval"}
 FIELDS = 8
 FRAME = r"frame([0-9]{1,18})"
 SIDES = ("touch", "vision")
 #: How deep recordings may be below the source, and how many folders ``detect`` opens.
 DEPTH, PEEKS = 6, 60
-#: T3's threshold for contact, and how many frames are measured by default.
-FLAT, MEASURED = 18.0, 64
 
 
 def detect(source: Path) -> bool:
@@ -98,7 +93,6 @@ def scan(
     root: Path | None = None,
     prefix: str = "",
     min_contact: float | None = None,
-    check: Check = "decode",
     progress: Progress = quiet,
 ) -> Scan:
     """Read the lists, or find the recordings where there are none.
@@ -108,66 +102,25 @@ def scan(
         root: where the paths of the lists start; default: the source.
         prefix: start of the listed paths to remove, where they were written for another disk.
         min_contact: skip frames of this contact or less; T3 takes 18. Reads every frame.
-        check: ``decode`` measures 64 frames to report whether most are flat.
         progress: called with the number of recordings or lists read.
 
     Raises:
         PalpateError: if the source is no folder, or has neither lists nor recordings.
     """
     source = require_folder(source, FACTS.name)
-    if lists := _lists(source):
-        result = Scan(source if root is None else Path(root), {"layout": "lists"})
-        folder = next(iter(lists.values())).parent.resolve()
-        result.facts["lists"] = os.path.relpath(folder, result.base.resolve())
-        result.facts["prefix"] = prefix
-        _read_lists(result, lists, progress)
+    lists = _lists(source)
+    result = Scan(Path(root) if root and lists else source, {"text_source": "none"})
+    result.facts["layout"] = "lists" if lists else "recordings"
+    if lists:
+        _read_lists(result, lists, prefix, progress)
     else:
-        result = Scan(source, {"layout": "recordings"})
         _read_recordings(result, progress)
-    result.facts["text_source"] = "none"
     if min_contact is not None:
         _skip_flat(result, min_contact, progress)
-    elif check == "decode" and result.rows:
-        step = -(-len(result.rows) // MEASURED)
-        measured = _contacts(result.base, result.rows[::step], quiet)
-        values = [value for value in measured if value is not None]
-        if (flat := sum(value <= FLAT for value in values)) * 2 > len(values):
-            text = f"{flat} of {len(values)} measured frames touch nothing (contact of {FLAT:g} or "
-            text += f"less); min_contact={FLAT:g} skips such frames"
-            result.suspect(result.base, "flat-frames", text)
     return result
 
 
-def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
-    """Write ``{train,val,eval}_{vision2touch,touch2vision}.txt`` with the data set's own lines.
-
-    Recordings without lists get a CSV of the manifest's rows a part.
-
-    Raises:
-        PalpateError: if the lists are gone, or lack a sample.
-    """
-    if "lists" not in manifest.facts:
-        parts = {part: manifest.part(split, part) for part in split.counts()}
-        return [write_table(Path(folder) / f"{part}.csv", rows) for part, rows in parts.items()]
-    manifest.take(list(split.parts))
-    place = manifest.root / manifest.facts["lists"]
-    lines: dict[tuple[str, str], dict[str, str]] = {}
-    for (_, way), path in _lists(place).items():
-        for _, text in _lines(path):
-            row = _row(text.split(), way, manifest.facts.get("prefix", ""))
-            if row and (part := split.parts.get(row["id"])):
-                lines.setdefault((part, way), {}).setdefault(row["id"], text + "\n")
-    if lost := set(split.parts).difference(*lines.values()):
-        must = f"Every sample must be in one of the lists in {place}"
-        raise PalpateError(must, few(sorted(lost)), "Put the lists back, or import again")
-    files: list[Path] = []
-    for (part, way), rows in lines.items():
-        files.append(Path(folder) / f"{WORDS[part]}_{way}.txt")
-        write_text(files[-1], "".join(rows.values()))
-    return files
-
-
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
 def contact(frame: np.ndarray, reference: np.ndarray) -> float:
@@ -181,7 +134,7 @@ def contact(frame: np.ndarray, reference: np.ndarray) -> float:
 def _lists(source: Path) -> dict[tuple[str, str], Path]:
     """(part, direction) -> list, from ``data_lst/`` or the folder itself."""
     for place in (source / LISTS, source):
-        keys = [(part, way) for part in ("train", "test") for way in DIRECTIONS]
+        keys = [(part, way) for part in WORDS for way in DIRECTIONS]
         paths = {(part, way): place / f"{WORDS[part]}_{way}.txt" for part, way in keys}
         if lists := {key: path for key, path in paths.items() if path.is_file()}:
             return lists
@@ -230,7 +183,9 @@ def _recording(folder: str) -> str:
     return "/".join(part for part in folder.split("/") if part.lower() not in SIDES) or "."
 
 
-def _read_lists(result: Scan, lists: dict[tuple[str, str], Path], progress: Progress) -> None:
+def _read_lists(
+    result: Scan, lists: dict[tuple[str, str], Path], prefix: str, progress: Progress
+) -> None:
     """Rows of all lists, each sample once; the parts by direction, as one split if they agree."""
     rows: dict[str, Row] = {}
     parts: dict[str, dict[str, str]] = {}
@@ -240,7 +195,7 @@ def _read_lists(result: Scan, lists: dict[tuple[str, str], Path], progress: Prog
         in_way = parts.setdefault(way, {})
         for number, text in _lines(path):
             where, fields = f"{path}:{number}", text.split()
-            row = _row(fields, way, result.facts["prefix"]) if len(fields) == FIELDS else None
+            row = _row(fields, way, prefix) if len(fields) == FIELDS else None
             if "\ufffd" in text:
                 result.problem(where, "bad-encoding", f"the line {text[:80]!r} is not UTF-8")
             elif len(fields) != FIELDS:
@@ -312,12 +267,13 @@ def _walk(root: Path) -> Iterator[tuple[str, list[str]]]:
         yield place.as_posix(), names
 
 
-def _contacts(base: Path, rows: Sequence[Row], progress: Progress) -> list[float | None]:
-    """The contact of each row; None without a reference, or where an image is unreadable."""
+def _skip_flat(result: Scan, least: float, progress: Progress) -> None:
+    """Drop the frames of little contact; those that cannot be measured stay."""
 
     def measure(k: int) -> float | None:
-        cells = rows[k][1]
-        paths = [inside(base, cells[name]) for name in ("tactile", "background") if cells[name]]
+        cells = result.rows[k][1]
+        names = [cells[name] for name in ("tactile", "background") if cells[name]]
+        paths = [inside(result.base, name) for name in names]
         try:
             images = [np.asarray(read_image(path).convert("L")) for path in paths if path]
         except PalpateError:
@@ -325,18 +281,11 @@ def _contacts(base: Path, rows: Sequence[Row], progress: Progress) -> list[float
         comparable = len(images) == 2 and images[0].shape == images[1].shape
         return contact(*images) if comparable else None
 
-    values = dict(in_threads(measure, range(len(rows)), "measuring contact", progress))
-    return [values[k] for k in range(len(rows))]
-
-
-def _skip_flat(result: Scan, least: float, progress: Progress) -> None:
-    """Drop the frames of little contact; those that cannot be measured stay."""
-    values = _contacts(result.base, result.rows, progress)
-    pairs = zip(result.rows, values, strict=True)
-    rows = [row for row, value in pairs if value is None or value > least]
-    skipped = f"{len(result.rows) - len(rows)} of {len(result.rows)} frames skipped"
-    result.facts["min_contact"] = f"{least:g}; {skipped}"
-    if unknown := values.count(None):
-        text = f"{unknown} frames could not be compared with a reference"
-        result.suspect(result.base, "contact-unknown", text)
-    result.rows = rows
+    count = len(result.rows)
+    values = dict(in_threads(measure, range(count), "measuring contact", progress))
+    unknown = [k for k, value in values.items() if value is None]
+    text = "frames that could not be compared with a reference"
+    result.suspect(result.base, "contact-unknown", text, unknown)
+    kept = [k for k in range(count) if (value := values[k]) is None or value > least]
+    result.facts["min_contact"] = f"{least:g}; {count - len(kept)} of {count} frames skipped"
+    result.rows = [result.rows[k] for k in kept]

@@ -27,8 +27,15 @@ from pathlib import Path
 from typing import Literal
 
 from palpate.core import PalpateError, Progress, quiet
-from palpate.data.formats.base import Facts, Format, Scan, few
-from palpate.data.formats.layout import Images, numbered, paired, require_folder, subfolders
+from palpate.data.formats.base import Facts, Format, Scan
+from palpate.data.formats.layout import (
+    Images,
+    numbered,
+    paired,
+    require_folder,
+    require_layout,
+    subfolders,
+)
 
 Part = Literal["real", "sim"]
 FACTS = Facts(
@@ -68,24 +75,13 @@ def detect(source: Path) -> bool:
 
 
 def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) -> Scan:
-    """List the frames of all logs, with the webcam's of the same number.
-
-    Args:
-        source: the folder with ``real/`` or ``sim/``.
-        part: which of the two; default: ``real`` if it is there.
-        progress: called with the number of logs read.
-
-    Raises:
-        PalpateError: if the part is unknown or not there.
-    """
+    """List the frames of ``part`` (default: ``real`` if it is there), with those of the webcam."""
     root = require_folder(source, FACTS.name)
     if part is not None and part not in LAYOUT:
         raise PalpateError("must be real or sim", repr(part), "", argument="part")
     part = part or ("real" if _logs(root / "real", "real") else "sim")
     logs = _logs(root / part, part)
-    if not logs:
-        must, fix = f"{root} must hold {LOOKS_FOR}", f"Fetch the data from {FACTS.url}"
-        raise PalpateError(must, few(subfolders(root)), fix)
+    require_layout(root, LOOKS_FOR, FACTS, complete=logs)
     result = Scan(root, {"layout": part, "text_source": "none"})
     if part == "sim":
         result.facts |= {"simulated": "yes", "vision": "none in this part"}
@@ -118,29 +114,26 @@ def _log(result: Scan, part: str, name: str, place: str, sparsh: str | None) -> 
     """Add the frames of one log."""
     _, folder, pattern = LAYOUT[part]
     tactile = numbered(result, f"{place}/{folder}", pattern, steady=True)
-    vision: Images[int] | None = None
     if not tactile.files:
-        video = result.base / place / f"{folder}.mp4"
-        fix = f"ffmpeg -i {folder}.mp4 -start_number 0 -qscale:v 2 {folder}/frame_%07d.jpg"
-        text = f"only {video.name}; extract it here: mkdir -p {folder} && {fix}"
-        text = text if video.is_file() else f"no images in {folder}/"
+        text = f"no images in {folder}/"
+        if (result.base / place / f"{folder}.mp4").is_file():
+            fix = f"ffmpeg -i {folder}.mp4 -start_number 0 -qscale:v 2 {folder}/frame_%07d.jpg"
+            text = f"only {folder}.mp4; extract it here: mkdir -p {folder} && {fix}"
         result.problem(place, "missing-frames", text)
         return
-    if part == "real":
-        vision = numbered(result, f"{place}/{WEBCAM}", pattern)
-        if not vision.files:
-            text = f"no frames in {WEBCAM}/: {len(tactile.files)} samples have no vision"
-            result.suspect(place, "no-vision", text)
-            vision = None
+    vision = numbered(result, f"{place}/{WEBCAM}", pattern) if part == "real" else Images[int]("")
+    if part == "real" and not vision.files:
+        text = f"no frames in {WEBCAM}/: {len(tactile.files)} samples have no vision"
+        result.suspect(place, "no-vision", text)
     video = place.partition("/")[2]
-    for k in paired(result, tactile, vision) if vision else tactile.files:
+    for k in paired(result, tactile, vision) if vision.files else tactile.files:
         row = {
             "id": f"{video}/{k}",
             "video": video,
             "frame": k,
             "object": name,
             "tactile": tactile.path(k),
-            "vision": vision.path(k) if vision else None,
+            "vision": vision.path(k) if vision.files else None,
             "sensor": FACTS.sensor,
             "domain": part,
             "split": sparsh,
