@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 
 from mini_fixtures import WORLD, write_shipped
-from palpate.core import PalpateError, read_json, shipped, write_json
-from palpate.encoders.models import shipped_folder
+from palpate.core import PalpateError, read_json, write_json
 from palpate.data.importing import import_dataset
 from palpate.diffusion.pipeline import TactilePipeline
+from palpate.encoders import models as shipped
 from palpate.encoders.encoder_set import EncoderSet
+from palpate.encoders.models import shipped_folder
 from palpate.evaluation import presets
 from palpate.sim import MINI_SEEDS, write_world
 from palpate.studies.inputs import require_unseen
