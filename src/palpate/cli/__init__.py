@@ -7,84 +7,8 @@ is imported when it is called.
 from __future__ import annotations
 
 import sys
-from typing import NamedTuple
 
-#: Exit statuses.
-OK, FAILED_CHECK, USER_ERROR, BUG, INTERRUPTED = 0, 1, 2, 70, 130
-
-
-class Verb(NamedTuple):
-    """A verb: its module, what it does, an example."""
-
-    module: str
-    help: str
-    example: str
-
-
-VERBS: dict[str, Verb] = {
-    "import": Verb(
-        "importing",
-        "Turn a data set on disk into a manifest",
-        "palpate import touch_and_go/ -o tag/",
-    ),
-    "validate": Verb(
-        "validate",
-        "List what is missing, invalid or suspicious in a data set",
-        "palpate validate touch_and_go/",
-    ),
-    "export": Verb(
-        "export",
-        "Write a manifest as a Hugging Face data set or a table",
-        "palpate export tag/ --to hf -o tag_hf/",
-    ),
-    "audit": Verb(
-        "audit",
-        "Check whether a train/test split leaks",
-        "palpate audit train.txt test.txt --fail-over 0.01",
-    ),
-    "split": Verb(
-        "split",
-        "Make a split that does not leak, stratified by material",
-        "palpate split tag/ -o noleak.json",
-    ),
-    "world": Verb(
-        "world", "Write the procedural world: a small synthetic data set", "palpate world -o world/"
-    ),
-    "train encoder": Verb(
-        "encoder",
-        "Train the tactile encoder against frozen vision and text encoders",
-        "palpate train encoder tag/ --split noleak.json -o encoders/",
-    ),
-    "train generator": Verb(
-        "train",
-        "Train a generator of tactile images",
-        "palpate train generator tag/ --split noleak.json --clip encoders/ -o model/",
-    ),
-    "generate": Verb(
-        "generate", "Make tactile images for photos", "palpate generate photo.jpg -o tactile.png"
-    ),
-    "score": Verb(
-        "score",
-        "Score generated tactile images",
-        "palpate score --generated generated/ --reference real/ --encoder palpate/mini",
-    ),
-    "probe": Verb(
-        "probe",
-        "Tell how well an encoder's embeddings name the material",
-        "palpate probe tag/ --split noleak.json --encoder encoders/",
-    ),
-    "report": Verb(
-        "report",
-        "Write the page: audit, gallery, scores, settings",
-        "palpate report audit.json scores.json -o page.html",
-    ),
-    "demo": Verb(
-        "demo", "Run everything once, from photos to a page", "palpate demo --data touch_and_go/"
-    ),
-    "completion": Verb(
-        "completion", "Print the completion script of a shell", 'eval "$(palpate completion bash)"'
-    ),
-}
+from palpate.cli.verbs import OK, USER_ERROR, VERBS
 
 
 def usage(group: str = "") -> str:

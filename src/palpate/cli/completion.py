@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli import VERBS
 from palpate.cli.terminal import CONFIG, Common, Terminal
+from palpate.cli.verbs import VERBS
 
 
 @dataclass(frozen=True, kw_only=True)

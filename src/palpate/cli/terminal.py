@@ -37,7 +37,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from palpate.cli import BUG, FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
+from palpate.cli.verbs import BUG, FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
 from palpate.core import (
     MissingExtraError,
     Note,

@@ -14,13 +14,13 @@ from functools import cache
 from importlib import resources
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, SampleRef, plain, quiet
+from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
 from palpate.report import audits, plots, sentences, text
 from palpate.report.notes import confidence, sentence
 from palpate.report.results import GalleryItem, LeakPair, Results
@@ -34,6 +34,53 @@ OPEN_PAIRS, MAX_PAIRS = 6, 24
 LONG_LIST = 24
 _DIGEST = re.compile(r"(?:sha256:)?[0-9a-f]{32,128}")
 _NUMBER = re.compile(r"(?<![\w.,])[−-]?\d[\d,]*(?:\.\d+)?(?:\s?%)?(?!\w|-[A-Za-z])")
+
+
+class ReportFiles(NamedTuple):
+    """What :func:`write_report` wrote."""
+
+    page: Path
+    json: Path
+    markdown: Path
+
+
+def write_report(
+    results: Results,
+    page: Path,
+    *,
+    base: Path | None = None,
+    max_bytes: int = 10_000_000,
+    progress: Progress = quiet,
+) -> ReportFiles:
+    """Write ``page`` (HTML) and, next to it, the same results as ``.json`` and ``.md``.
+
+    Args:
+        results: everything to show.
+        page: the HTML file; its name must end in ``.html``.
+        base: folder that relative image paths of ``results`` start from; by default that of
+            ``page``. The JSON counts them from its own folder.
+        max_bytes: largest size of the HTML file. Images shrink, then rows are skipped, and the page
+            says so.
+        progress: called while images are made.
+
+    Raises:
+        PalpateError: if ``page`` does not end in ``.html``, if scores of different settings would
+            share a column (nothing is written then), or if ``max_bytes`` cannot hold the text.
+    """
+    page = Path(page)
+    if page.suffix != ".html":
+        fix = "Name it e.g. report.html"
+        raise PalpateError("The page's file name must end in .html", f"{page.name!r}", fix)
+    folder = page.parent
+    results = results.relative_to(folder, base=base or folder)
+    files = ReportFiles(page, page.with_suffix(".json"), page.with_suffix(".md"))
+    names = (files.json.name, files.markdown.name)
+    markdown = results.to_markdown()
+    html = render_page(results, folder, max_bytes=max_bytes, names=names, progress=progress)
+    write_json(files.json, results.to_json())
+    write_text(files.markdown, markdown)
+    write_text(page, html)
+    return files
 
 
 def render_page(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -233,9 +234,7 @@ class Audit:
 
     def __str__(self) -> str:
         """The finding, the signals, and the notes: a few lines."""
-        from palpate.report.terminal import as_text
-
-        return as_text(self)
+        return _writer("terminal").as_text(self)
 
     def _repr_html_(self) -> str:
         """For notebooks: the same as :meth:`__str__`."""
@@ -356,9 +355,7 @@ class Results:
 
     def __str__(self) -> str:
         """The tables of scores, as in the terminal."""
-        from palpate.report.terminal import as_text
-
-        return as_text(self)
+        return _writer("terminal").as_text(self)
 
     def _repr_html_(self) -> str:
         """For notebooks: the tables of scores."""
@@ -371,21 +368,15 @@ class Results:
             PalpateError: if ``path`` does not end in ``.html``, or scores of different settings
                 would share a column.
         """
-        from palpate.report import write_report
-
-        write_report(self, Path(path), base=Path())
+        _writer("page").write_report(self, Path(path), base=Path())
 
     def to_markdown(self) -> str:
         """Everything as Markdown, with paths in place of images."""
-        from palpate.report.markdown import render_markdown
-
-        return render_markdown(self)
+        return _writer("markdown").render_markdown(self)
 
     def to_latex(self) -> str:
         """The scores as LaTeX tables (booktabs)."""
-        from palpate.report.latex import latex_tables
-
-        return latex_tables(self)
+        return _writer("latex").latex_tables(self)
 
     def to_frame(self) -> pl.DataFrame:
         """A polars frame, one row a score, with its interval, null and settings."""
@@ -487,6 +478,11 @@ class Results:
         path = Path(path)
         results = cls.from_json(read_record(path, "results file", form=RESULTS_FORMATS))
         return results.with_paths(lambda name: os.path.normpath(path.parent / name))
+
+
+def _writer(name: str) -> Any:
+    """Load a writer when it is used: writers import the results, and some are heavy."""
+    return import_module(f"palpate.report.{name}")
 
 
 def _key(score: Score) -> tuple[str, str, str]:
