@@ -242,10 +242,10 @@ def join_help_lines(options: type[Any]) -> None:
     for cls in filter(dataclasses.is_dataclass, options.__mro__):
         body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # type: ignore[attr-defined]
         for statement, doc in pairwise(body):
-            match statement, doc:
-                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                    field = cls.__dataclass_fields__[name]
-                    field.metadata = {**field.metadata, "help": " ".join(text.split())}
+            if isinstance(statement, ast.AnnAssign) and isinstance(doc, ast.Expr):
+                field: Any = cls.__dataclass_fields__[ast.unparse(statement.target)]
+                text = " ".join(str(ast.literal_eval(doc.value)).split())
+                field.metadata = {**field.metadata, "help": text}
     for field in dataclasses.fields(options):
         if dataclasses.is_dataclass(field.default):
             join_help_lines(type(field.default))
