@@ -38,7 +38,7 @@ import numpy as np
 from mini_cards import ship, write_page
 from mini_scores import score_all
 
-from palpate.core import PalpateError, Run, Split, digest_json, read_json, write_json
+from palpate.core import PalpateError, Split, digest_json, read_json, write_json
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder
@@ -51,7 +51,8 @@ from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import SHIPPED, shipped_root
 from palpate.encoders.presets import preset
 from palpate.sim import PRESETS, VERSION, WorldOptions, write_world
-from palpate.studies.inputs import fresh
+from palpate.studies.demo import fresh
+from palpate.studies.stages import Run
 
 NAME = "palpate/mini"
 #: Its table of scores is written from the cards.

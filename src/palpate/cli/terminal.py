@@ -66,6 +66,7 @@ RENAMED: dict[tuple[str, str], str] = {
     ("train generator", "--towers"): "--clip",
     ("train generator", "--encoder"): "--clip",
     ("split", "--group"): "--by",
+    ("demo", "--group"): "--by",
     ("generate", "--manifest"): "a positional argument: palpate generate tag/ --split noleak.json",
     ("audit", "--group"): "--by",
     ("audit", "--processes"): "--threads",

@@ -27,7 +27,6 @@ from palpate.core.random import rng_for, seed_for
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
-from palpate.core.stages import Run, Stage
 
 __all__ = [
     "PARTS",
@@ -39,11 +38,9 @@ __all__ = [
     "Problem",
     "ProblemsError",
     "Progress",
-    "Run",
     "SampleRef",
     "Score",
     "Split",
-    "Stage",
     "atomic_folder",
     "atomic_path",
     "columns",

@@ -1,4 +1,4 @@
-"""Presets of the whole pipeline, one row each: worlds, encoders, generator, and what a run costs."""
+"""Presets of the demo, one row each: worlds, encoders, generator, and what a run costs."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ from palpate.sim import WorldOptions
 
 
 @dataclass(frozen=True)
-class PipelinePreset:
+class DemoPreset:
     """A complete run.
 
     Attributes:
-        name: for ``--preset``.
+        name: of the preset.
         world: the embedded data set, used where no data is given.
-        pretraining: another world, of other objects, on which encoders and autoencoder are trained where no ready ones are taken.
+        pretraining: another world, of other objects, on which encoders and autoencoder are trained
+            where no ready ones are taken.
         encoder, diffusion: names of the presets of those rooms.
-        models: shipped models that stand for the pretrained ones: the frozen CLIP and autoencoder, and the tactile encoder that training
-            goes on from; None: all are trained in the run.
+        models: shipped models that stand for the pretrained ones: the frozen CLIP and autoencoder,
+            and the tactile encoder that training goes on from; None: all are trained in the run.
         start: whether the generator goes on from that of ``models`` instead of from random weights.
         train: share of the train part.
-        repeat: the train part's touches are repeated until they are this share of the autoencoder's training set.
-        touch_epochs: passes of the tactile encoder over the pretraining samples, then over the train part (the first are left out where
-            it goes on from a ready one).
+        repeat: the train part's tactile images are repeated until they are this share of the
+            autoencoder's training set.
+        tactile_epochs: passes of the tactile encoder over the pretraining samples, then over the
+            train part (the first are left out where it goes on from a ready one).
         cost: measured on two CPU cores.
     """
 
@@ -37,23 +39,13 @@ class PipelinePreset:
     start: bool = False
     train: float = 0.75
     repeat: float = 1 / 3
-    touch_epochs: tuple[float, float] = (5, 6)
+    tactile_epochs: tuple[float, float] = (5, 6)
     cost: str = ""
 
 
-#: Ten materials that differ in touch: with all twenty, minutes of training leave the encoders close to chance.
-_TEN = (
-    "Wood",
-    "Brick",
-    "Tile",
-    "Leather",
-    "Synthetic Fabric",
-    "Rubber",
-    "Tree",
-    "Grass",
-    "Gravel",
-    "Sand",
-)
+#: Materials that feel different: with all twenty, minutes of training stay close to chance.
+_TEN = ("Wood", "Brick", "Tile", "Leather", "Synthetic Fabric", "Rubber", "Tree", "Grass", "Gravel")
+_TEN = (*_TEN, "Sand")
 _TINY = replace(WORLDS["tiny"], objects_per_material=4, contacts_per_video=2, frames_per_contact=2)
 _MINI = replace(
     WORLDS["demo"],
@@ -70,7 +62,7 @@ PRESETS = {
     p.name: p
     for p in (
         #              name    world   pretraining                encoder diffusion
-        PipelinePreset(
+        DemoPreset(
             "tiny",
             _TINY,
             replace(_TINY, seed=1000),
@@ -79,7 +71,7 @@ PRESETS = {
             train=0.75,
             cost="for tests: under a minute",
         ),
-        PipelinePreset(
+        DemoPreset(
             "mini",
             _MINI,
             _MINI_BEFORE,
@@ -94,16 +86,13 @@ PRESETS = {
 }
 
 
-def preset(name: str) -> PipelinePreset:
+def preset(name: str) -> DemoPreset:
     """A preset by name.
 
     Raises:
         PalpateError: if there is none of that name.
     """
     if name not in PRESETS:
-        raise PalpateError(
-            f"A preset of the pipeline must be one of {', '.join(PRESETS)}",
-            repr(name),
-            "Choose one of these",
-        )
+        must = f"must be one of {', '.join(PRESETS)}"
+        raise PalpateError(must, repr(name), "Choose one of these", argument="preset")
     return PRESETS[name]

@@ -1,0 +1,141 @@
+"""From a finished run of the demo to the results of a page: facts, gallery, notes, commands."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from palpate.core import Note, Score, rng_for
+from palpate.data.manifest import Manifest
+from palpate.diffusion.generation import Generated
+from palpate.encoders.models import is_shipped
+from palpate.evaluation.controls import BACKGROUND
+from palpate.report.results import Audit, GalleryItem, Results
+from palpate.studies.demo import DemoRun
+
+#: Rows of the gallery; more would be folded away.
+GALLERY = 40
+#: Rows per contact: its frames look alike.
+PER_CONTACT = 2
+
+
+def results_of(run: DemoRun, command: str) -> Results:
+    """The results of a run; ``command`` is the command line that reproduces it."""
+    dataset = str(run.stages["data"].facts["dataset"])
+    return Results(
+        title=f"From photo to tactile image on {dataset}",
+        facts=[_leak_fact(run.audits), _distance_fact(run), _material_fact(run)],
+        audits=run.audits,
+        scores=run.scores,
+        gallery=gallery(run.manifest, run.generated, run.options.seed),
+        settings=run.settings(),
+        notes=_notes(run),
+        commands=[command, *_next_steps(run)],
+    )
+
+
+def _leak_fact(audits: Sequence[Audit]) -> str:
+    clean = next(a for a in audits if a.name.startswith("NoLeak"))
+    fact = f"NoLeak (whole {clean.group}s kept together) leaks {clean.leaked_fraction:.1%}"
+    own = next((a for a in audits if not a.name.startswith("NoLeak")), None)
+    by_video = next((a for a in audits if a.name.endswith("seen by video")), None)
+    if own is not None:
+        gap = ""
+        if own.gap_median is not None:
+            gap = f", a median of {own.gap_median:g} frames from the nearest train frame"
+        share = f"{own.leaked_fraction:.1%} of the test samples of the data set's own split"
+        return f"Leak: {share} share a video with train{gap}; {fact}."
+    if by_video is not None:
+        share = f"{by_video.leaked_fraction:.1%} of its test samples share a video with train"
+        return f"Leak: {fact} by {clean.group}, but {share}: there are too few videos."
+    return f"Leak: {fact}."
+
+
+def _score(run: DemoRun, metric: str, subject: str, preset: str | None = None) -> Score | None:
+    for s in run.scores:
+        if (s.metric, s.subject) == (metric, subject) and s.settings.get("preset") == preset:
+            return s
+    return None
+
+
+def _with_interval(score: Score | None) -> str:
+    if score is None or score.value is None:
+        return "undefined"
+    interval = " [{:.2f}, {:.2f}]".format(*score.interval) if score.interval else ""
+    return f"{score.value:.2f}{interval}"
+
+
+def _distance_fact(run: DemoRun) -> str:
+    source = "photos and no-contact images" if run.options.background else "photos alone"
+    gel = _score(run, "TMMD", BACKGROUND, "grouped")
+    versus = f", the empty gel {_with_interval(gel)}" if gel is not None else ""
+    value = _with_interval(_score(run, "TMMD", "generated", "grouped"))
+    start = f"Distance: {len(run.generated.ids)} tactile images generated from {source}"
+    return f"{start} have TMMD (grouped) {value} to the real ones{versus} (lower is better)."
+
+
+def _material_fact(run: DemoRun) -> str:
+    made, real, gel = (
+        _score(run, "material accuracy", name) for name in ("generated", "real", BACKGROUND)
+    )
+    if made is None or real is None:
+        materials = run.manifest.table["material"].drop_nulls().n_unique()
+        return f"Material: {materials} materials, too few for a probe."
+    more = f", of the empty gel {gel:.1%}" if gel is not None else ""
+    more += f"; chance is {made.details['chance']:.1%}"
+    start = "Material: a probe fitted to real train images is right on"
+    return f"{start} {real:.1%} of the real test images and {made:.1%} of the generated ones{more}."
+
+
+def gallery(manifest: Manifest, generated: Generated, seed: int) -> list[GalleryItem]:
+    """Test samples in turn from every material, one per contact first; chosen by seed alone."""
+    rows = {row["id"]: row for row in manifest.take(generated.ids).table.iter_rows(named=True)}
+    order = sorted(rows, key=lambda i: rng_for(seed, "gallery", i).random())
+    counts: Counter[tuple[str | int | None, ...]] = Counter()
+    rank: dict[str, tuple[int, int, str]] = {}
+    for i in order:
+        material, contact = rows[i]["material"], (rows[i]["video"], rows[i]["contact"])
+        counts[contact] += 1
+        counts[material, counts[contact]] += 1
+        rank[i] = (counts[contact], counts[material, counts[contact]], str(material))
+    order = [i for i in sorted(order, key=lambda i: rank[i]) if rank[i][0] <= PER_CONTACT]
+    items: list[GalleryItem] = []
+    for i in order[:GALLERY]:
+        background = rows[i]["background"]
+        gel = str(manifest.path(background).resolve()) if background else None
+        items.append(GalleryItem(manifest.ref(rows[i]), str(generated.path(i).resolve()), gel))
+    return items
+
+
+def _notes(run: DemoRun) -> list[Note]:
+    notes = [Note("synthetic-data")] if run.manifest.facts.get("synthetic") else []
+    roles = {"clip": "the frozen vision and text encoders", "autoencoder": "the frozen autoencoder"}
+    if trained := [what for role, what in roles.items() if run.models[role] is None]:
+        notes.append(Note("small-models", {"models": trained}))
+    for name in dict.fromkeys(n for n in run.models.values() if n and is_shipped(n)):
+        models = [what for role, what in roles.items() if run.models[role] == name]
+        if run.models["clip"] == name:
+            models.append("the tactile encoder's starting weights, then trained on the train part")
+        notes.append(Note("shipped-models", {"name": name, "models": models}))
+    notes += run.split.notes
+    if run.manifest.table["text"].null_count():
+        notes.append(Note("template-texts"))
+    gel = _score(run, "material accuracy", BACKGROUND)
+    if gel is not None and float(gel) > 2 * gel.details["chance"]:
+        notes.append(Note("gel-names-material", {"share": gel.value}))
+    if skipped := run.stages["data"].facts.get("skipped"):
+        notes.append(Note("skipped-inputs", {"count": len(skipped), "first": skipped[:5]}))
+    return notes
+
+
+def _next_steps(run: DemoRun) -> list[str]:
+    folder = Path(run.stages["data"].folder).parent
+    data, split = folder / "data" / "manifest", folder / "split" / "noleak.json"
+    model, encoders = folder / "generator" / "model", folder / "encoders" / "encoders"
+    return [
+        f"palpate audit {data} --split {split} --worst 50",
+        f"palpate generate YOUR_PHOTOS/ --model {model} -o YOUR_IMAGES/",
+        f"palpate score --generated YOUR_IMAGES/ --reference {data} --split {split} "
+        f"--encoder {encoders} -o scores.json",
+    ]
