@@ -66,28 +66,7 @@ def test_the_demo_ends_in_a_page_with_everything_on_it(whole):
     assert results.audits[0].leaked_fraction > 0
     assert results.audits[1].leaked_fraction == 0
     assert len(results.facts) == 3
-<<<<<<< HEAD
-    assert "synthetic-data" in {note.code for note in results.notes}
-    assert results.title == "From photo to touch on palpate's procedural world"
-    assert {s.metric for s in results.scores} >= {
-        "TMMD",
-        "I-TMMD",
-        "CI-TMMD",
-        "D-TMMD",
-        "SSIM",
-        "PSNR",
-    }
-    assert {s.subject for s in results.scores} >= {
-        "generated",
-        "background only",
-        "real, same material",
-    }
-    split, encoder = results.settings["digests"]["split"], results.settings["digests"]["encoders"]
-    for score in results.scores:
-        assert score.split == split
-        assert score.metric in ("SSIM", "PSNR") or score.encoder == encoder
-=======
-    assert {"synthetic-data", "small-models"} <= {note.code for note in results.notes}
+    assert {"synthetic-data", "models-of-this-run"} <= {note.code for note in results.notes}
     metrics = {"TMMD", "I-TMMD", "CI-TMMD", "D-TMMD", "SSIM", "PSNR", "material accuracy"}
     assert {s.metric for s in results} >= metrics
     assert {s.subject for s in results} >= {"generated", "background only", "real, same material"}
@@ -95,7 +74,6 @@ def test_the_demo_ends_in_a_page_with_everything_on_it(whole):
     for score in results:
         assert score.split == digests["split"]
         assert score.metric in ("SSIM", "PSNR") or score.encoder == digests["encoders"]
->>>>>>> d5e7920 (Demo as one graph of stages and one page; notes as data)
     page = (whole / "page.html").read_text()
     assert page.count("data:image/") >= 3 * len(results.gallery)
 
@@ -128,7 +106,7 @@ def test_a_demo_killed_between_the_last_file_of_a_stage_and_its_mark_resumes(who
     for name in stages:  # as each stage was just before it was marked as finished
         record = json.loads((run / name / "stage.json").read_text())
         inputs = {key: record[key] for key in ("digest", "inputs")}
-        (run / name / "inputs.json").write_text(json.dumps(inputs))
+        (run / f"{name}.partial.json").write_text(json.dumps(inputs))
         (run / name / "stage.json").unlink()
         (run / name).rename(run / f"{name}.partial")
     finished(run)
@@ -136,24 +114,6 @@ def test_a_demo_killed_between_the_last_file_of_a_stage_and_its_mark_resumes(who
     assert outcome(run) == outcome(whole)
 
 
-<<<<<<< HEAD
-def test_a_demo_killed_between_a_stages_last_file_and_its_mark_heals(whole, tmp_path):
-    out = tmp_path / "run"
-    assert demo(out)[0] == 0
-    for name in STAGES:  # the state of each stage just before it is marked as finished
-        mark = out / name / "stage.json"
-        record = json.loads(mark.read_text())
-        (out / f"{name}.partial.json").write_text(
-            json.dumps({"digest": record["digest"], "inputs": record["inputs"]})
-        )
-        mark.unlink()
-        (out / name).rename(out / f"{name}.partial")
-    # The data were read in place from the world's folder, which bears its name again before they are.
-    status, lines = demo(out)
-    assert status == 0, "\n".join(lines)
-    assert not list(out.glob("*.partial"))
-    assert outcome(out) == outcome(whole)
-=======
 def test_a_finished_demo_runs_nothing_again_and_another_seed_does(whole):
     assert not [line for line in finished(whole) if ": done in" in line]
     _, lines = demo(whole, "--seed", "1", kill_at="clip")
@@ -161,7 +121,6 @@ def test_a_finished_demo_runs_nothing_again_and_another_seed_does(whole):
     assert "split" in begun
     assert "world" not in begun
     finished(whole)  # as it was, for the tests that follow
->>>>>>> d5e7920 (Demo as one graph of stages and one page; notes as data)
 
 
 def test_images_that_change_in_place_rebuild_everything_that_read_them(tmp_path):
@@ -172,103 +131,11 @@ def test_images_that_change_in_place_rebuild_everything_that_read_them(tmp_path)
         with Image.open(path) as image:
             turned = image.rotate(180)
         turned.save(path)
-<<<<<<< HEAD
-    status, lines = demo(out, "--data", str(data))
-    assert status == 0, "\n".join(lines)
-    reused = {line.split(":")[0] for line in lines if "already done" in line}
-    assert reused <= {"split", "pretraining", "pretraining-data"}
-
-
-def test_a_users_copy_of_the_pretraining_world_is_welcome(tmp_path):
-    assert (
-        main(
-            [
-                "world",
-                "-o",
-                str(tmp_path / "w"),
-                "--preset",
-                "tiny",
-                "--seed",
-                "1000",
-                "--objects-per-material",
-                "4",
-                "-q",
-            ]
-        )
-        == 0
-    )
-    status, lines = demo(tmp_path / "run", "--data", str(tmp_path / "w"))
-    assert status == 0, "\n".join(lines)
-
-
-def test_encoders_and_generators_of_another_split_are_told(whole, tmp_path):
-    place = whole / "data"
-    assert (
-        main(
-            [
-                "split",
-                str(place),
-                "-o",
-                str(tmp_path / "s.json"),
-                "--seed",
-                "9",
-                "--train",
-                "0.5",
-                "-q",
-            ]
-        )
-        == 0
-    )
-    model, encoders, made = (
-        whole / "generator" / "model",
-        whole / "encoders" / "encoders",
-        tmp_path / "made",
-    )
-    assert (
-        main(
-            [
-                "generate",
-                "--model",
-                str(model),
-                "--manifest",
-                str(place),
-                "--split",
-                str(tmp_path / "s.json"),
-                "-o",
-                str(made),
-                "-q",
-            ]
-        )
-        == 0
-    )
-    args = [
-        "--generated",
-        str(made),
-        "--split",
-        str(tmp_path / "s.json"),
-        "--encoder",
-        str(encoders),
-        "-o",
-        str(tmp_path / "x.json"),
-        "-q",
-    ]
-    assert main(["score", "--reference", str(place), *args]) == 0
-    notes = {
-        s["metric"]: {note["code"] for note in s["notes"]}
-        for s in json.loads((tmp_path / "x.json").read_text())["scores"]
-        if s["subject"] == "made"
-    }
-    assert "encoder-of-other-split" in notes["TMMD"]
-    assert "generator-of-other-split" in notes["SSIM"]
-    notes = [n.code for s in Results.load(whole / "page.json").scores for n in s.notes]
-    assert "encoder-of-other-split" not in notes
-=======
     assert reused(finished(run, "--data", str(data))) <= {
         "split",
         "pretraining",
         "pretraining-data",
     }
->>>>>>> d5e7920 (Demo as one graph of stages and one page; notes as data)
 
 
 def test_a_copy_of_the_pretraining_world_may_be_the_data(tmp_path):
@@ -279,7 +146,7 @@ def test_a_copy_of_the_pretraining_world_may_be_the_data(tmp_path):
 
 def test_an_encoder_and_a_generator_of_another_split_are_noted(whole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    data, encoders = whole / "data" / "manifest", whole / "encoders" / "encoders"
+    data, encoders = whole / "data", whole / "encoders" / "encoders"
     for line in (
         f"split {data} -o s.json --seed 9 --train 0.5",
         f"generate {data} --model {whole / 'generator' / 'model'} --split s.json -o made",
@@ -304,12 +171,8 @@ def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
         "train encoder tag --split s.json -o encoders --preset tiny",
         "train generator tag --split s.json --clip encoders -o model --preset tiny --background",
         "generate tag --split s.json --model model -o made",
-<<<<<<< HEAD
-        "score --generated made --reference tag --split s.json --encoder encoders -o scores.json --json",
-=======
         "probe tag --split s.json --encoder encoders -o probe.json",
         "score --generated made --reference tag --split s.json --encoder encoders -o scores.json",
->>>>>>> d5e7920 (Demo as one graph of stages and one page; notes as data)
         "report audit.json scores.json -o page.html",
     ):
         assert main([*line.split(), "-q"]) == 0, (line, capsys.readouterr())
@@ -319,11 +182,7 @@ def test_every_verb_by_itself(tmp_path, monkeypatch, capsys):
     assert results.scores
     assert results.gallery
     assert results.settings["digests"]["split"] == results.audits[0].split
-<<<<<<< HEAD
-    assert any(command.startswith("palpate score --generated made") for command in results.commands)
-=======
     assert any(command.startswith("palpate score") for command in results.commands)
->>>>>>> d5e7920 (Demo as one graph of stages and one page; notes as data)
 
 
 def test_unreadable_photos_stop_generating_unless_skipped(whole, tmp_path):
@@ -346,11 +205,6 @@ def test_real_clips_become_a_page(real_data, tmp_path):
     assert results.settings["stages"]["data"]["samples"] == 436
     assert [a.group for a in results.audits] == ["contact", "video"]
     assert [a.leaked_fraction for a in results.audits] == [0.0, 1.0]
-<<<<<<< HEAD
-    codes = {note.code for note in results.notes}
-    assert "group-materials" in codes
-    assert "synthetic-data" not in codes
-=======
     assert "synthetic-data" not in {note.code for note in results.notes}
 
 
@@ -369,4 +223,3 @@ def test_the_page_of_the_demo_opens_cleanly_in_a_browser(whole, chromium):
         assert page.evaluate("document.images.length") > 20
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.close()
->>>>>>> d5e7920 (Demo as one graph of stages and one page; notes as data)

@@ -8,8 +8,8 @@ from mini_fixtures import WORLD, write_shipped
 from palpate.core import PalpateError, read_json, write_json
 from palpate.data.importing import import_dataset
 from palpate.diffusion.pipeline import TactilePipeline
-from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders import models
+from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.models import shipped_folder
 from palpate.sim import MINI_SEEDS, write_world
 from palpate.studies import presets
@@ -57,9 +57,9 @@ def test_shipped_models_replace_three_stages(mini, tmp_path):
     assert (ceiling["n"], ceiling["codes"]) == (len(demo.split.ids("test")), 64)
     results = results_of(demo, "palpate demo")
     notes = {note.code: note.params for note in results.notes}
-    assert notes["shipped-models"]["name"] == "palpate/mini"
-    assert len(notes["shipped-models"]["models"]) == 3
-    assert "small-models" not in notes
+    assert notes["models-shipped"]["name"] == "palpate/mini"
+    assert len(notes["models-shipped"]["models"]) == 3
+    assert "models-of-this-run" not in notes
     lines: list[str] = []
     run_demo(OPTIONS, tmp_path / "run", say=lines.append)
     assert all("already done" in line for line in lines)
@@ -80,7 +80,7 @@ def test_from_scratch_and_with_backgrounds_the_generator_starts_from_random_weig
     assert start_of(tmp_path / "a") is None
     encoders = EncoderSet.load(tmp_path / "a" / "encoders" / "encoders")
     assert encoders.card["start_card"].get("data") is None
-    assert "small-models" in {note.code for note in results_of(demo, "x").notes}
+    assert "models-of-this-run" in {note.code for note in results_of(demo, "x").notes}
     run_demo(replace(OPTIONS, background=True), tmp_path / "b")
     assert start_of(tmp_path / "b") is None
 

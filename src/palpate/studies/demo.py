@@ -240,7 +240,7 @@ class _Demo:
         def build(folder: Path) -> dict[str, Any]:
             options: dict[str, Any] = {"size": size, "progress": self.progress}
             options["skip_bad"] = self.options.skip_bad
-            imported = import_dataset(source, folder / "manifest", **options)
+            imported = import_dataset(source, folder, **options)
             texts_of(imported.manifest)  # raises for samples with neither text nor material
             return {
                 "digest": imported.manifest.digest,
@@ -255,14 +255,14 @@ class _Demo:
         inputs |= {"skip_bad": self.options.skip_bad}
         world = self.run.stages["world"].digest if "world" in self.run.stages else None
         stage = self.run.stage("data", {**inputs, "world": world}, build)
-        manifest = Manifest.load(stage.folder / "manifest")
+        manifest = Manifest.load(stage.folder)
         if judged:  # images may lie elsewhere than the source
             require_unseen(manifest.root, manifest.facts)
         return manifest
 
     def split(self, manifest: Manifest) -> tuple[Split, list[Audit]]:
         """The leak-free split, and the audits of it and of the data set's own splits."""
-        own = sorted((self.run.stages["data"].folder / "manifest" / "splits").glob("*.json"))
+        own = sorted((self.run.stages["data"].folder / "splits").glob("*.json"))
         options, preset = self.options, self.preset
 
         def build(folder: Path) -> dict[str, Any]:
@@ -294,12 +294,12 @@ class _Demo:
         tree = self.world("pretraining", self.preset.pretraining)
 
         def build(folder: Path) -> dict[str, Any]:
-            imported = import_dataset(tree, folder / "manifest", progress=self.progress)
+            imported = import_dataset(tree, folder, progress=self.progress)
             return {"digest": imported.manifest.digest, "samples": len(imported.manifest)}
 
         world = {"pretraining": self.run.stages["pretraining"].digest}
         stage = self.run.stage("pretraining-data", world, build)
-        other = Manifest.load(stage.folder / "manifest")
+        other = Manifest.load(stage.folder)
         # Prefixed, so that a user's copy of this world does not collide with it.
         return Manifest.join(other.prefixed("pretraining/"), manifest.part(split, "train"))
 

@@ -112,12 +112,12 @@ def _notes(run: DemoRun) -> list[Note]:
     notes = [Note("synthetic-data")] if run.manifest.facts.get("synthetic") else []
     roles = {"clip": "the frozen vision and text encoders", "autoencoder": "the frozen autoencoder"}
     if trained := [what for role, what in roles.items() if run.models[role] is None]:
-        notes.append(Note("small-models", {"models": trained}))
+        notes.append(Note("models-of-this-run", {"models": trained}))
     for name in dict.fromkeys(n for n in run.models.values() if n and is_shipped(n)):
         models = [what for role, what in roles.items() if run.models[role] == name]
         if run.models["clip"] == name:
-            models.append("the tactile encoder's starting weights, then trained on the train part")
-        notes.append(Note("shipped-models", {"name": name, "models": models}))
+            models.append("the starting weights of the tactile encoder")
+        notes.append(Note("models-shipped", {"name": name, "models": models}))
     notes += run.split.notes
     if run.manifest.table["text"].null_count():
         notes.append(Note("template-texts"))
@@ -125,13 +125,13 @@ def _notes(run: DemoRun) -> list[Note]:
     if gel is not None and float(gel) > 2 * gel.details["chance"]:
         notes.append(Note("gel-names-material", {"share": gel.value}))
     if skipped := run.stages["data"].facts.get("skipped"):
-        notes.append(Note("skipped-inputs", {"count": len(skipped), "first": skipped[:5]}))
+        notes.append(Note("files-skipped", {"problems": skipped}))
     return notes
 
 
 def _next_steps(run: DemoRun) -> list[str]:
     folder = Path(run.stages["data"].folder).parent
-    data, split = folder / "data" / "manifest", folder / "split" / "noleak.json"
+    data, split = folder / "data", folder / "split" / "noleak.json"
     model, encoders = folder / "generator" / "model", folder / "encoders" / "encoders"
     return [
         f"palpate audit {data} --split {split} --worst 50",
