@@ -15,7 +15,6 @@ from palpate.core import (
     PalpateError,
     Problem,
     ProblemsError,
-    Run,
     Score,
     Split,
     atomic_folder,
@@ -31,6 +30,7 @@ from palpate.core import (
     seed_for,
     to_numpy,
 )
+from palpate.studies.stages import Run
 
 PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]
 
