@@ -1,4 +1,4 @@
-"""The house: imports go one way and have no effects, help is quick, sources hold nothing personal."""
+"""The house: imports go one way, have no effects; help is quick; nothing personal in the sources."""
 
 import re
 import shutil
@@ -49,8 +49,8 @@ for verb in VERBS:
 assert "torch" not in sys.modules
 """
     output = python(code)
-    for verb in VERBS:
-        assert f"Example: palpate {verb}" in output
+    for verb in VERBS.values():
+        assert f"Example: {verb.example}" in output
     assert output.count("--json") >= len(VERBS)
 
 
