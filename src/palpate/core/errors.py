@@ -140,7 +140,7 @@ class MissingExtraError(PalpateError):
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         self._given = (package, extra, purpose)
         must, got = f"{purpose} needs the package {package}", "no such package in this environment"
-        super().__init__(must, got, f"Run: pip install 'palpate[{extra}]'")
+        super().__init__(must, got, f"In palpate's checkout run: pip install -e '.[{extra}]'")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), self._given, self.__dict__
