@@ -222,7 +222,7 @@ def test_numbers_that_are_no_class_are_reported_and_minus_one_is_inconclusive(tm
 
 def test_a_missing_extra_says_what_to_install(small_manifest, source, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "datasets", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'palpate\[hf\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install -e '\.\[hf\]'"):
         import_dataset(source, tmp_path / "out", columns=MAPS)
     with pytest.raises(MissingExtraError, match="datasets"):
         export_dataset(small_manifest, tmp_path / "hf", to="hf")

@@ -101,5 +101,5 @@ def test_media_overwritten_in_the_middle_is_told_while_decoding(tmp_path):
 
 def test_without_av_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(MissingExtraError, match=r"palpate\[video\]"):
+    with pytest.raises(MissingExtraError, match=r"\[video\]"):
         VideoReader(tmp_path / "v.mp4")
