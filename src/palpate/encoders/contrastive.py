@@ -385,8 +385,10 @@ def train_clip(
     place = pick_device(device)
     train = train_part(manifest, split)
     texts, text_source = texts_of(train)
-    preset.clip_config(0)  # rejects a preset that takes a pretrained CLIP
-    course = preset.clip_course or preset.tactile_course
+    course = preset.clip_course
+    if course is None:
+        must, got = "must describe a fresh CLIP", f"{preset.name}, which takes {preset.pretrained}"
+        raise PalpateError(must, got, "Pass a clip, or use the preset mini", argument="preset")
     images = cached_images(train, "vision", preset.image, cache, progress)
     clip = new_clip(preset, texts, seed, _preprocess(preset, images))
     move(clip.model, place)

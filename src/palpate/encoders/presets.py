@@ -147,14 +147,9 @@ class EncoderPreset:
         return _vision(self.tactile, self.image, self.patch, dim)
 
     def clip_config(self, vocabulary: int) -> CLIPConfig:
-        """Return the fresh CLIP's configuration; ids of special tokens as in ``tokenizer``.
-
-        Raises:
-            PalpateError: if the preset takes a pretrained CLIP.
-        """
-        if self.vision is None or self.text is None:
-            must, got = "must describe a fresh CLIP", f"{self.name}, which takes {self.pretrained}"
-            raise PalpateError(must, got, "Pass a clip, or use the preset mini", argument="preset")
+        """Return the fresh CLIP's configuration; ids of special tokens as in ``tokenizer``."""
+        assert self.vision is not None
+        assert self.text is not None
         vision = _vision(self.vision, self.image, self.patch, self.dim)
         text = {
             "hidden_size": self.text.width,
