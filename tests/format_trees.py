@@ -179,7 +179,7 @@ def hf_kinds() -> dict:
 
 
 def save_hf(folder: Path, rows: list[dict], **kinds) -> Path:
-    """Save rows by their cell ``part`` as a Hugging Face folder; columns not in ``kinds`` are texts."""
+    """Save rows by their cell ``part``; columns that are not in ``kinds`` are texts."""
     import datasets
 
     features = datasets.Features({n: kinds.get(n, datasets.Value("string")) for n in rows[0]})

@@ -12,13 +12,11 @@ from format_trees import (
     make_objectfolder,
     make_objectfolder_generation,
     make_tarf,
-    make_visgel,
-    make_visgel_recordings,
     make_ycb_slide,
     of_kind,
     row,
 )
-from palpate.core import PalpateError, ProblemsError, Split
+from palpate.core import PalpateError, Split
 from palpate.data.formats.base import Scan, few
 from palpate.data.formats.layout import natural, numbered
 from palpate.data.importing import import_dataset, validate, write_lists
@@ -30,54 +28,17 @@ BOM = b"\xef\xbb\xbf"
 
 
 def test_numbers_are_integers_and_nothing_is_skipped_silently(tmp_path):
-    for name in ("2.jpg", "10.jpg", "9.PNG", "009.jpg", "x.jpg", ".3.jpg", "4.txt"):
+    for name in ("2.jpg", "10.jpg", "9.PNG", "009.jpg", f"{10**19}.jpg", ".3.jpg", "4.txt"):
         (tmp_path / "a" / name).parent.mkdir(exist_ok=True)
         (tmp_path / "a" / name).write_bytes(b"")
     (tmp_path / "a" / "5.jpg").mkdir()
     scan = Scan(tmp_path)
     assert list(numbered(scan, "a").files.items()) == [(2, "2.jpg"), (9, "009.jpg"), (10, "10.jpg")]
     assert [(p.where, p.kind) for p in scan.problems] == [("a/9.PNG", "duplicate-frame")]
-    assert of_kind(scan.suspicious, "unknown-name").text.endswith("1: x.jpg")
+    assert of_kind(scan.suspicious, "unknown-name").text.endswith(f"1: {10**19}.jpg")
     assert numbered(scan, "none").files == {}
     assert sorted(["10", "b", "9", "009", "a"], key=natural) == ["009", "9", "10", "a", "b"]
     assert [few("abcd"), few([1]), few([])] == ["4: a, b, c ...", "1: 1", "none"]
-
-
-@pytest.mark.parametrize(
-    ("make", "name", "stray"),
-    [
-        (make_tarf, "tarf", "touch/bench_40_30/{}.jpg"),
-        (make_visgel_recordings, "visgel", "2/rec/frame{}.jpg"),
-        (make_objectfolder, "objectfolder", "2/tactile_data/1/0/gelsight/{}.png"),
-        (make_ycb_slide, "ycb-slide", "real/055_baseball/dataset_0/frames/frame_{}.jpg"),
-    ],
-)
-def test_numbers_too_long_for_a_frame_are_suspicious(tmp_path, make, name, stray):
-    made = make(tmp_path / "data")
-    path = write_image(made.source / stray.format("9" * 20), 3)
-    result = validate(made.source, format=name)
-    assert result.samples == made.samples
-    assert path.name in of_kind(result.suspicious, "unknown-name").text
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (make_tarf, "tarf"),
-        (make_visgel, "visgel"),
-        (make_objectfolder, "objectfolder"),
-        (make_objectfolder_generation, "objectfolder-generation"),
-        (make_ycb_slide, "ycb-slide"),
-    ],
-)
-def test_links_out_of_the_tree_are_rejected_whether_broken_or_not(tmp_path, make, name):
-    source = make(tmp_path / "data").source
-    path = import_dataset(source, tmp_path / "out", format=name).manifest.paths("tactile")[-1]
-    path.rename(tmp_path / "outside.jpg")
-    path.symlink_to(tmp_path / "outside.jpg")
-    assert kinds(validate(source, format=name).invalid) == {"outside-root": 1}
-    (tmp_path / "outside.jpg").unlink()
-    assert kinds(validate(source, format=name).invalid) == {"outside-root": 1}
 
 
 # --- TaRF
@@ -114,7 +75,7 @@ def test_tarf_views_of_another_scale(tmp_path):
     with pytest.raises(PalpateError, match="views of 'bench' have 40_30, 80_60"):
         import_dataset(root, tmp_path / "no", scale="1_1")
     (root / "vision" / "bench_40_30").rename(root / "vision" / "bench_160_120")
-    with pytest.raises(PalpateError, match="must name one of the scales of the views of 'bench'"):
+    with pytest.raises(PalpateError, match="views of 'bench' have 160_120, 80_60"):
         import_dataset(root, tmp_path / "no")
 
 
@@ -365,10 +326,3 @@ def test_ycb_slide_reports_everything_bad(tmp_path):
     assert result.manifest.ids == [*ids, "055_baseball/dataset_4/0", strange]
     assert result.manifest.column("vision").count(None) == 4
     assert strange not in result.splits["sparsh"].parts
-
-
-def test_a_failed_import_names_all_problems(tmp_path):
-    root = make_tarf(tmp_path / "data").source
-    (root / "vision" / "bench_40_30" / "1.jpg").unlink()
-    with pytest.raises(ProblemsError, match="unpaired"):
-        import_dataset(root, tmp_path / "out")

@@ -47,29 +47,22 @@ def shown(manifest, column):
 @pytest.mark.parametrize("place", ["dataset", "final_dataset", "."])
 @pytest.mark.parametrize("layout", ["raw", "extracted", "mixed"])
 def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
-    names = {
-        "raw": {"raw": ("a", "b")},
-        "extracted": {"extracted": ("a", "b")},
-        "mixed": {"raw": ("a",), "extracted": ("b",)},
-    }
-    root = make_recordings(tmp_path / "tag", place=place, **names[layout])
+    names = {"raw": ("a",), "extracted": ("b",)} if layout == "mixed" else {layout: ("a", "b")}
+    root = make_recordings(tmp_path / "tag", place=place, **names)
     result = import_touch_and_go(root, tmp_path / "out")
     manifest = result.manifest.require_valid()
-    frames = [*range(10, 16), *range(17, 20)] * 2
-    assert manifest.ids == [f"{v}/{k:010d}" for v, k in zip("a" * 9 + "b" * 9, frames, strict=True)]
+    frames = [*LABELS, *LABELS]
+    assert manifest.ids == [f"{v}/{k:010d}" for v in "ab" for k in LABELS]
     assert manifest.column("frame") == frames
     assert manifest.column("material") == (["Wood"] * 6 + ["Rock"] * 3) * 2
     assert manifest.column("contact") == [f"{v}#000{t}" for v in "ab" for t in [1] * 6 + [2] * 3]
-    assert shown(manifest, "vision") == frames
-    assert shown(manifest, "tactile") == frames
-    # 4 before 10 is 6; 4 before 17 is 13, in a touch, so back to 9
+    assert shown(manifest, "vision") == shown(manifest, "tactile") == frames
+    # 4 before 10 is 6; 4 before 17 is 13, in a contact, so back to 9
     assert shown(manifest, "background") == ([6] * 6 + [9] * 3) * 2
-    assert result.facts["layout"] == layout
-    assert result.facts["license"] == "CC BY 4.0"
-    assert result.facts["text_source"] == "none"
+    facts = {name: result.facts[name] for name in ("layout", "license", "text_source")}
+    assert facts == {"layout": layout, "license": "CC BY 4.0", "text_source": "none"}
     assert manifest.column("text") == [None] * 18
-    roots = {"raw": tmp_path / "out", "extracted": root, "mixed": tmp_path / "out"}
-    assert manifest.root == roots[layout].resolve()
+    assert manifest.root == (root if layout == "extracted" else tmp_path / "out").resolve()
     again = Manifest.load(tmp_path / "out")
     assert again.digest == manifest.digest
     assert again.require_valid().root == manifest.root
@@ -146,19 +139,17 @@ def test_failing_while_decoding_removes_what_this_run_wrote(tmp_path, monkeypatc
     original = recordings.VideoFrames.extract
 
     def fail(self, expected, created, stop):
-        original(self, {10, 11} if "b" in self.source.parts else expected, created, stop)
-        if "b" in self.source.parts:
-            raise PalpateError(
-                "the video must be whole", "frame 12 of 40 cannot be decoded", "fetch it"
-            )
+        broken = "b" in self.source.parts
+        original(self, {10, 11} if broken else expected, created, stop)
+        if broken:
+            raise PalpateError("the video must be whole", "frame 12 of 40 is broken", "fetch it")
 
     monkeypatch.setattr(recordings.VideoFrames, "extract", fail)
     (tmp_path / "out").mkdir()
     with pytest.raises(ProblemsError) as caught:
         import_touch_and_go(root, tmp_path / "out")
-    assert {(p.where, p.kind) for p in caught.value.problems} == {
-        (f"{root / 'label.txt'}:10", "bad-video")
-    }
+    places = {(p.where, p.kind) for p in caught.value.problems}
+    assert places == {(f"{root / 'label.txt'}:10", "bad-video")}
     assert tree(tmp_path / "out") == set()
     result = import_touch_and_go(root, tmp_path / "out", skip_bad=True)
     assert result.manifest.column("video") == ["a"] * 9 + ["b"] * 2
@@ -182,10 +173,8 @@ def test_interrupted_import_keeps_frames_and_goes_on(tmp_path):
     assert all(p.stat().st_mtime_ns == t for p, t in kept.items())
     assert resumed.manifest.digest == whole.manifest.digest
     for path in (tmp_path / "whole").rglob("*.jpg"):
-        assert (
-            path.read_bytes()
-            == (tmp_path / "out" / path.relative_to(tmp_path / "whole")).read_bytes()
-        )
+        same = tmp_path / "out" / path.relative_to(tmp_path / "whole")
+        assert path.read_bytes() == same.read_bytes()
 
 
 def test_cached_frames_of_other_settings_are_rejected(tmp_path):

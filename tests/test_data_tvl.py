@@ -13,7 +13,7 @@ import pytest
 from format_trees import TVL_COLUMNS as COLUMNS
 from format_trees import gel, kinds, make_hct, make_ssvtp, photo, put, write_csv
 from palpate.core import PalpateError, ProblemsError, Split
-from palpate.data.formats import hct, ssvtp, tvl
+from palpate.data.formats import ssvtp, tvl
 from palpate.data.formats.base import Scan
 from palpate.data.importing import import_dataset as read
 from palpate.data.importing import write_lists
@@ -206,12 +206,6 @@ def test_written_lists_read_back_as_the_same_split(tmp_path, make, seed):
     assert (after.suspicious, again.suspicious) == ([], [])
     with pytest.raises(PalpateError, match="must hold"):
         read(root, tmp_path / "out", lists=tmp_path / "nowhere")
-
-
-def test_lists_of_hct_need_rows_of_its_rigs(ssvtp_tree, tmp_path):
-    manifest = read(ssvtp_tree, tmp_path / "a").manifest
-    with pytest.raises(PalpateError, match="below the folder of its domain"):
-        hct.write_lists(manifest, Split(dict.fromkeys(manifest.ids, "train")), tmp_path / "lists")
 
 
 # --- SSVTP

@@ -284,11 +284,7 @@ def _unique(scan: Scan, rows: list[Row]) -> list[Row]:
     for where, row in rows:
         part, hint = row.pop("split", None), ""
         if row.get("id") is None:
-            of_video = row.get("video") is not None and row.get("frame") is not None
-            path = Path(row.get("tactile") or row.get("vision") or where)
-            of_path = path.with_suffix("").as_posix()
-            row["id"] = f"{row['video']}/{row['frame']}" if of_video else of_path
-            made_of = "video and frame" if of_video else "the path"
+            row["id"], made_of = _default_id(where, row)
             hint = f", made of {made_of} since there is none: map a column to id"
         i = row["id"]
         if i not in seen:
@@ -306,3 +302,11 @@ def _unique(scan: Scan, rows: list[Row]) -> list[Row]:
     if scan.split_name and parts:
         scan.splits[scan.split_name] = Split(parts, scan.split_rule)
     return good
+
+
+def _default_id(where: str, row: Cells) -> tuple[str, str]:
+    """The id of a row that has none, and what it is made of."""
+    if row.get("video") is not None and row.get("frame") is not None:
+        return f"{row['video']}/{row['frame']}", "video and frame"
+    path = Path(row.get("tactile") or row.get("vision") or where)
+    return path.with_suffix("").as_posix(), "the path"

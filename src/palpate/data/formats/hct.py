@@ -34,7 +34,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -74,40 +74,20 @@ FRAME = re.compile(r"(\d{1,18})(?:-.*)?")
 Swap = Literal["report", "fix"]
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One listed frame; paths are relative to the root, ``background`` is as listed."""
-
-    where: str
-    part: str | None
-    rig: str
-    video: str
-    number: int
-    vision: str
-    tactile: str
-    background: str | None
-    text: str | None
-
-    @property
-    def key(self) -> tuple[str, int]:
-        """Video and number."""
-        return self.video, self.number
-
-
 @dataclass
 class Lists:
-    """The lists of a tree.
+    """The lists of a tree; frames are rows with the paths and words as listed.
 
     Attributes:
         samples: the frames that are samples, by video (in order of time) and number.
-        contact: every frame known to be in contact.
+        contact: (video, number) of every frame known to be in contact.
         untouched: video -> its frames in ``not_contact.json``.
         files: the lists read.
     """
 
-    samples: list[Frame]
+    samples: list[Row]
     contact: set[tuple[str, int]]
-    untouched: dict[str, list[Frame]]
+    untouched: dict[str, list[Cells]]
     files: list[str]
 
 
@@ -163,35 +143,18 @@ def scan(
     keys = sorted(listed.contact)
     names = contact_names([video for video, _ in keys], [k for _, k in keys], None)
     contacts = dict(zip(keys, names, strict=True))
-    sessions = sessions_of({frame.video for frame in listed.samples}, session_gap)
-    result.rows = [(f.where, {"vision": f.vision, "tactile": f.tactile}) for f in listed.samples]
+    sessions = sessions_of({row["video"] for _, row in listed.samples}, session_gap)
+    result.rows = listed.samples
     report_missing_folders(result)
-    present = {where for where, _ in result.rows}
-    frames = [frame for frame in listed.samples if frame.where in present]
-    frames, fixed = _swap(result, frames, swap, progress)
-    backgrounds = _backgrounds(result, frames, listed.untouched, fixed)
+    fixed = _swap(result, swap, progress)
+    _choose_backgrounds(result, listed.untouched, fixed)
     sensor = WORLD.sensor if "synthetic" in result.facts else FACTS.sensor
-    result.rows = []
-    for frame, background in zip(frames, backgrounds, strict=True):
-        row: Cells = {
-            "id": f"{frame.video}/{frame.number}",
-            "video": frame.video,
-            "frame": frame.number,
-            "contact": contacts[frame.key],
-            "session": sessions[frame.video],
-            "text": frame.text,
-            "vision": frame.vision,
-            "tactile": frame.tactile,
-            "background": background,
-            "sensor": sensor,
-            "domain": frame.rig,
-            "split": frame.part,
-        }
-        result.rows.append((frame.where, row))
+    for _, row in result.rows:
+        row |= {"contact": contacts[_key(row)], "session": sessions[row["video"]], "sensor": sensor}
     result.split_name = "Orig" if lists is None else "Lists"
     method = "official" if lists is None else "lists"
     result.split_rule = {"method": method, "files": listed.files}
-    worded = sorted({f"{frame.part}.csv" for frame in frames if frame.text})
+    worded = sorted({f"{row['split']}.csv" for _, row in result.rows if row["text"]})
     result.facts["text_source"] = f"captions of {', '.join(worded)}" if worded else "none"
     result.facts["session_gap"] = f"{session_gap:g} s"
     if root == Path(source) / "hct" and (root.parent / "ssvtp").is_dir():
@@ -219,22 +182,14 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     """Write ``dataN/<part>.csv`` with ``url,tactile,tactile_background,caption``.
 
     Paths are relative to ``dataN``; a background outside ``dataN`` is relative to ``hct/``.
-
-    Raises:
-        PalpateError: if a sample's images are not below the folder of its domain.
     """
     files: list[Path] = []
+    columns = ("domain", "vision", "tactile", "background", "text")
     for part in split.counts():
         rows: dict[str, list[list[str | None]]] = defaultdict(list)
-        for row in manifest.part(split, part).table.iter_rows(named=True):
-            prefix = f"{row['domain']}/"
-            if not all(str(row[name]).startswith(prefix) for name in ("vision", "tactile")):
-                must = "HCT's lists need every image below the folder of its domain"
-                got = f"{row['id']!r} with domain {row['domain']!r} and photo {row['vision']!r}"
-                raise PalpateError(must, got, "Write the split file alone")
-            paths = [row[name] for name in ("vision", "tactile", "background")]
-            cells = [path and path.removeprefix(prefix) for path in paths]
-            rows[row["domain"]].append([*cells, row["text"]])
+        for domain, *paths, text in manifest.part(split, part).table.select(columns).iter_rows():
+            cells = [path and path.removeprefix(f"{domain}/") for path in paths]
+            rows[domain].append([*cells, text])
         for domain, cells in sorted(rows.items()):
             path = Path(folder) / domain / f"{part}.csv"
             files.append(tvl.write_list(path, tvl.COLUMNS, cells))
@@ -262,9 +217,13 @@ def _in_time(video: str) -> tuple[str, float, str]:
     return rig, float(match[1]) if match else -1.0, folder
 
 
+def _key(row: Cells) -> tuple[str, int]:
+    return row["video"], row["frame"]
+
+
 def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: bool) -> Lists:
     """The samples of all lists, and what the two JSON files add."""
-    samples, unlisted, untouched = list[Frame](), list[Frame](), list[Frame]()
+    samples, unlisted, untouched = list[Row](), list[Row](), list[Row]()
     files: list[str] = []
     for rig in rigs:
         for part, path in tvl.part_lists((lists or result.base) / rig).items():
@@ -275,31 +234,31 @@ def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: 
     if lists is not None and not samples:
         must = "must hold lists such as data1/train.csv"
         raise PalpateError(must, str(lists), "", argument="lists")
-    known, resting = {frame.key for frame in samples}, {frame.key for frame in untouched}
-    in_contact = known | {frame.key for frame in unlisted if frame.key not in resting}
-    unlisted = [frame for frame in unlisted if frame.key not in known]
-    both = [frame.where for frame in [*samples, *unlisted] if frame.key in resting]
+    known, resting = ({_key(row) for _, row in rows} for rows in (samples, untouched))
+    in_contact = known | ({_key(row) for _, row in unlisted} - resting)
+    unlisted = [(where, row) for where, row in unlisted if _key(row) not in known]
+    both = [where for where, row in [*samples, *unlisted] if _key(row) in resting]
     text = "not_contact.json calls them untouched; samples only where a list has them"
     tvl.suspect_rows(result, both, "contact-and-not", text)
-    unlisted = [frame for frame in unlisted if frame.key not in resting]
+    unlisted = [(where, row) for where, row in unlisted if _key(row) not in resting]
     if contact:
         samples += unlisted
     else:
         text = "in contact.json but in no list, so no samples; contact=True includes them"
-        tvl.suspect_rows(result, [f.where for f in unlisted], "unlisted-contact", text)
-    pairs = [(f, f"{f.video}/tactile/{PurePosixPath(f.vision).name}") for f in samples]
-    odd = [frame.where for frame, tactile in pairs if frame.tactile != tactile]
+        tvl.suspect_rows(result, [where for where, _ in unlisted], "unlisted-contact", text)
+    partner = lambda row: f"{row['video']}/tactile/{PurePosixPath(row['vision']).name}"  # noqa: E731
+    odd = [where for where, row in samples if row["tactile"] != partner(row)]
     text = "photo and tactile image differ in trajectory or file name"
     tvl.suspect_rows(result, odd, "unequal-names", text)
     result.facts["not_contact"] = f"{len(resting)} frames, no samples"
-    samples.sort(key=lambda frame: (_in_time(frame.video), frame.number))
+    samples.sort(key=lambda sample: (_in_time(sample[1]["video"]), sample[1]["frame"]))
     return Lists(samples, in_contact, _by_video(untouched), files)
 
 
-def _by_video(frames: Iterable[Frame]) -> dict[str, list[Frame]]:
-    by_video: dict[str, list[Frame]] = defaultdict(list)
-    for frame in frames:
-        by_video[frame.video].append(frame)
+def _by_video(rows: Iterable[Row]) -> dict[str, list[Cells]]:
+    by_video: dict[str, list[Cells]] = defaultdict(list)
+    for _, row in rows:
+        by_video[row["video"]].append(row)
     return by_video
 
 
@@ -325,18 +284,19 @@ def _json_rows(result: Scan, rig: str, name: str) -> list[Row]:
     return [(f"{path}:{k}", dict(zip(lists, row, strict=True))) for k, row in enumerate(rows, 1)]
 
 
-def _frames(result: Scan, rows: Iterable[Row], rig: str, part: str | None) -> list[Frame]:
-    """The frames of rows; bad rows become problems."""
-    frames: list[Frame] = []
-    for where, cells in rows:
-        url, tactile, background = (cells.get(n) for n in ("url", "tactile", "tactile_background"))
+def _frames(result: Scan, listed: Iterable[Row], rig: str, part: str | None) -> list[Row]:
+    """The frames of listed rows; bad rows become problems."""
+    rows: list[Row] = []
+    for where, cells in listed:
+        paths = [cells.get(name) for name in ("url", "tactile", "tactile_background")]
+        url, tactile, background = paths
         if not url or not tactile:
             lacking = " and no ".join(name for name in ("url", "tactile") if not cells.get(name))
             result.problem(where, "empty-cell", f"no {lacking} path")
             continue
         pieces = _located(url, rig).split("/")
         number = FRAME.fullmatch(PurePosixPath(pieces[-1]).stem)
-        if climbing := [p for p in (url, tactile, background) if p and re.search(CLIMBS, p)]:
+        if climbing := [path for path in paths if path and re.search(CLIMBS, path)]:
             text = f"the path {climbing[0]!r} leaves the data set"
             result.problem(where, "outside-root", text)
         elif len(pieces) != 4:
@@ -346,12 +306,13 @@ def _frames(result: Scan, rows: Iterable[Row], rig: str, part: str | None) -> li
             text = f"{pieces[-1]!r} does not begin with a frame number and a dash"
             result.problem(where, "bad-frame", text)
         else:
-            rig_name, folder = pieces[:2]
-            paths = "/".join(pieces), _located(tactile, rig), background
-            text = tvl.clean_caption(cells.get("caption"))
-            video = f"{rig_name}/{folder}"
-            frames.append(Frame(where, part, rig_name, video, int(number[1]), *paths, text))
-    return frames
+            video = "/".join(pieces[:2])
+            row: Cells = {"id": f"{video}/{int(number[1])}", "video": video}
+            row |= {"frame": int(number[1]), "text": tvl.clean_caption(cells.get("caption"))}
+            row |= {"vision": "/".join(pieces), "tactile": _located(tactile, rig)}
+            row |= {"background": background, "domain": pieces[0], "split": part}
+            rows.append((where, row))
+    return rows
 
 
 def _located(cell: str, rig: str) -> str:
@@ -361,22 +322,16 @@ def _located(cell: str, rig: str) -> str:
     return path if first == rig or RIG.fullmatch(first) else f"{rig}/{path}"
 
 
-def _swap(
-    result: Scan, frames: Sequence[Frame], swap: Swap, progress: Progress
-) -> tuple[list[Frame], set[str]]:
-    """Report swapped trajectories; with ``fix`` their frames have their paths swapped back.
-
-    Returns:
-        The frames, and the videos that were fixed.
-    """
+def _swap(result: Scan, swap: Swap, progress: Progress) -> set[str]:
+    """Report swapped trajectories; with ``fix`` swap their paths back and return their names."""
     files: dict[str, tuple[list[Path], list[Path]]] = {}
-    for video, group in _by_video(frames).items():
+    for video, group in _by_video(result.rows).items():
         some = [group[k] for k in sorted({0, len(group) // 2, len(group) - 1})]
-        sides = [[result.base / getattr(f, side) for f in some] for side in ("vision", "tactile")]
+        sides = [[result.base / row[side] for row in some] for side in ("vision", "tactile")]
         files[video] = sides[0], sides[1]
     seen = looks(files, progress)
     evidence: dict[str, str] = {}
-    for rig in sorted({frame.rig for frame in frames}):
+    for rig in sorted({row["domain"] for _, row in result.rows}):
         of_rig = {video: pair for video, pair in seen.items() if video.startswith(f"{rig}/")}
         evidence |= swapped(of_rig, tvl.IMAGE_SIZE)
     done = "their paths were swapped back" if swap == "fix" else "swap='fix' swaps them back"
@@ -385,17 +340,16 @@ def _swap(
     fixed = set(evidence) if swap == "fix" else set[str]()
     state = "fixed" if fixed else "as they are"
     result.facts["swapped_folders"] = f"{len(evidence)}, {state}" if evidence else "none"
-    back = {f.where: replace(f, vision=f.tactile, tactile=f.vision) for f in frames}
-    return [back[f.where] if f.video in fixed else f for f in frames], fixed
+    for _, row in result.rows:
+        if row["video"] in fixed:
+            row["vision"], row["tactile"] = row["tactile"], row["vision"]
+    return fixed
 
 
-def _backgrounds(
-    result: Scan,
-    frames: Sequence[Frame],
-    untouched: Mapping[str, Sequence[Frame]],
-    fixed: Collection[str],
-) -> list[str | None]:
-    """The background of each frame by the rule above; the facts count how often each source served.
+def _choose_backgrounds(
+    result: Scan, untouched: Mapping[str, Sequence[Cells]], fixed: Collection[str]
+) -> None:
+    """The background of each row by the rule above; the facts count how often each source served.
 
     The listed image of a fixed trajectory does not count: it was made of its vision.
     """
@@ -407,26 +361,27 @@ def _backgrounds(
     @cache
     def typical(video: str) -> str | None:
         side = "vision" if video in fixed else "tactile"
-        return _typical(result.base, [getattr(f, side) for f in untouched.get(video, [])])
+        return _typical(result.base, [row[side] for row in untouched.get(video, [])])
 
-    def choose(frame: Frame) -> tuple[str, str | None]:
-        listed = frame.background if frame.video not in fixed else None
-        sources = [("as listed", name) for name in (listed and _located(listed, frame.rig), listed)]
-        sources += [(FALLBACK, name) for name in (f"{frame.rig}/{FALLBACK}", FALLBACK)]
-        for kind, name in sources:
-            if name and is_file(name):
-                return kind, name
-        return ("untouched frame" if typical(frame.video) else "none"), typical(frame.video)
+    def choose(row: Cells) -> tuple[str, str | None]:
+        video, rig, listed = row["video"], row["domain"], row["background"]
+        sources = [("as listed", _located(listed, rig)), ("as listed", listed)] if listed else []
+        sources = [] if video in fixed else sources
+        sources += [(FALLBACK, f"{rig}/{FALLBACK}"), (FALLBACK, FALLBACK)]
+        default = "untouched frame" if typical(video) else "none"
+        return next((s for s in sources if is_file(s[1])), (default, typical(video)))
 
-    chosen = [choose(frame) for frame in frames]
-    for rig in sorted({frame.rig for frame in frames}):
-        pairs = zip(frames, chosen, strict=True)
-        bare = [frame.where for frame, (_, name) in pairs if frame.rig == rig and name is None]
+    kinds: Counter[str] = Counter()
+    bare: dict[str, list[str]] = defaultdict(list)
+    for where, row in result.rows:
+        kind, row["background"] = choose(row)
+        kinds[kind] += 1
+        if kind == "none":
+            bare[row["domain"]].append(where)
+    for places in bare.values():
         text = f"no image of the untouched gel, as none is listed and there is no {FALLBACK}"
-        tvl.suspect_rows(result, bare, "no-background", text)
-    kinds = sorted(Counter(kind for kind, _ in chosen).items())
-    result.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in kinds)
-    return [name for _, name in chosen]
+        tvl.suspect_rows(result, places, "no-background", text)
+    result.facts["backgrounds"] = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
 
 
 def _typical(root: Path, names: Sequence[str]) -> str | None:

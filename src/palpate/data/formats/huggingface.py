@@ -264,9 +264,8 @@ class _BatchReader:
         usable, inconclusive = manifest_rows(cells, count, self.where, classes, problems)
         self.result.inconclusive += inconclusive
         for k, row in usable:
-            by_frame = "video" in row and "frame" in row
-            default = f"{row['video']}/{row['frame']}" if by_frame else self._place(k, "")
-            row.setdefault("id", default)
+            if not {"video", "frame"} <= set(row):
+                row.setdefault("id", self._place(k, ""))
             good = True
             for target in (t for t in IMAGE_COLUMNS if t in self.maps.expressions):
                 column = stored.get(target)

@@ -227,10 +227,8 @@ def _root(source: Path, root: Path | None) -> Path:
 def _facts(
     source: Path, columns: Mapping[str, str] | None, words: Mapping[str, FrameTable]
 ) -> dict[str, str]:
-    text_source = (
-        f"column {(columns or {}).get('text', 'text')}" if words["text"].values else "none"
-    )
-    return {"dataset": source.stem, "text_source": text_source}
+    column = f"column {(columns or {}).get('text', 'text')}"
+    return {"dataset": source.stem, "text_source": column if words["text"].values else "none"}
 
 
 def _words(rows: Sequence[Row], contacts: Mapping[str, Interval]) -> dict[str, FrameTable]:

@@ -130,15 +130,14 @@ def _scenes(side: Path) -> dict[str, list[str]]:
 
 def _view_scale(scene: str, scales: list[str], requested: str | None) -> str:
     """Which scale of a scene's views is read."""
-    if requested is not None and scales and requested not in scales:
-        got = f"{requested!r}; the views of {scene!r} have {', '.join(scales)}"
-        raise PalpateError("must be a scale of all views", got, "", argument="scale")
-    if requested is None and TACTILE_SCALE not in scales and len(scales) > 1:
-        must = f"must name one of the scales of the views of {scene!r}"
+    scale = requested or (scales[0] if len(scales) == 1 else TACTILE_SCALE)
+    if scales and scale not in scales:
+        got = f"{scale!r}; the views of {scene!r} have {', '.join(scales)}"
         example = {"scale": scales[0]}
-        raise PalpateError(must, ", ".join(scales), "", argument="scale", example=example)
-    default = scales[0] if scales and TACTILE_SCALE not in scales else TACTILE_SCALE
-    return requested or default
+        raise PalpateError(
+            "must be a scale of all views", got, "", argument="scale", example=example
+        )
+    return scale
 
 
 def _scene(result: Scan, scene: str, view_scale: str, ids: dict[tuple[str, int], str]) -> None:

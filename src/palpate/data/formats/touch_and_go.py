@@ -110,8 +110,8 @@ def import_touch_and_go(
     Args:
         root: the data set.
         out: folder to write to. Frames of raw videos go to
-            ``out/images/<video>/{vision,tactile}/``; extracted frames stay where they are. After an
-            interruption the same call continues where it stopped.
+            ``out/images/<video>/{vision,tactile}/``, where frames of the other recordings are
+            linked if there are both. After an interruption the same call continues.
         labels: frame lists; default ``label.txt``, else ``train.txt`` and ``test.txt``.
         skip_bad: skip bad rows and list them, instead of raising.
         image_format: of the cached frames.
@@ -121,10 +121,6 @@ def import_touch_and_go(
         seed: with ``max_per_contact``: 0 takes the middle of each of the equal stretches, any other
             a random place in them.
         progress: progress callback.
-
-    Returns:
-        The manifest, sorted by video and frame. Its root is the data set's if all recordings are
-        extracted; if some are raw it is ``out``, and frames of the others are linked there.
 
     Raises:
         PalpateError: if the root, the list or the recordings are missing, or ``out`` holds frames
@@ -315,6 +311,8 @@ class _Lists:
         words: manifest column -> its words by frame.
         in_contact: recording -> the frames that any list calls a contact.
         facts: for the manifest.
+        sensor: the tactile sensor.
+        problems: all bad lines, each once.
     """
 
     listed: FrameList
@@ -322,18 +320,8 @@ class _Lists:
     words: Mapping[str, FrameTable | None]
     in_contact: Mapping[str, set[int]]
     facts: dict[str, str]
-
-    @property
-    def sensor(self) -> str:
-        """The tactile sensor."""
-        return WORLD.sensor if "synthetic" in self.facts else FACTS.sensor
-
-    @property
-    def problems(self) -> list[Problem]:
-        """All bad lines, each once."""
-        tables = [self.listed, *self.words.values()]
-        tables += [self.official] if self.official is not self.listed else []
-        return [problem for table in tables if table for problem in table.skipped]
+    sensor: str
+    problems: list[Problem]
 
 
 def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
@@ -367,7 +355,10 @@ def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
     facts["text_source"] = "captions.csv" if words["text"] else "none"
     if categories != CATEGORIES:
         facts["classes"] = json.dumps({str(k): name for k, name in categories.items()})
-    return _Lists(listed, official, words, in_contact, facts)
+    sensor = WORLD.sensor if "synthetic" in facts else FACTS.sensor
+    tables = [listed, *words.values(), official if official is not listed else None]
+    problems = [problem for table in tables if table for problem in table.skipped]
+    return _Lists(listed, official, words, in_contact, facts, sensor, problems)
 
 
 def _prepared(
