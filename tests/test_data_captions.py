@@ -5,27 +5,8 @@ import re
 from palpate.data.captions import ADJECTIVES, caption
 from palpate.data.formats.touch_and_go import CATEGORIES
 
-SEEN = [
-    "red",
-    "green",
-    "blue",
-    "white",
-    "black",
-    "brown",
-    "gray",
-    "gray",
-    "color",
-    "color",
-    "bright",
-    "dark",
-    "light",
-    "shiny",
-    "glossy",
-    "transparent",
-    "yellow",
-    "orange",
-    "pink",
-]
+SEEN = {"red", "green", "blue", "white", "black", "brown", "gray", "color", "bright", "dark"}
+SEEN |= {"light", "shiny", "glossy", "transparent", "yellow", "orange", "pink"}
 
 
 def test_every_material_has_touch_words_only():
@@ -36,7 +17,7 @@ def test_every_material_has_touch_words_only():
         for k in range(40):
             text = caption(material, f"v/{k}")
             words = re.findall(r"[a-z]+", text)
-            assert not set(words) & set(SEEN), text
+            assert not set(words) & SEEN, text
             assert sum(adjective in text for adjective in ADJECTIVES[material]) >= 3
             assert material.lower() not in text
             assert not re.search(r"\ba [aeiou]|\ban [^aeiou]", text), text

@@ -1,11 +1,10 @@
-"""Frame lists: the format's corners, every kind of bad line at once, and the facts of the official
-lists.
-"""
+"""Frame lists: corners of the format, every kind of bad line, facts of the official lists."""
 
 import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from palpate.core import PalpateError, ProblemsError
@@ -25,6 +24,10 @@ def write(path, text):
     return path
 
 
+def places(problems):
+    return [(p.where, p.kind) for p in problems]
+
+
 def slow_contacts(videos, frames, labels):
     """One by one, by looking for the row of the frame before."""
     at = {(v, f): label for v, f, label in zip(videos, frames, labels, strict=True)}
@@ -39,16 +42,16 @@ def slow_contacts(videos, frames, labels):
 
 def test_bom_crlf_no_last_newline_commas_spaces_and_other_letters(tmp_path):
     text = "\ufeffa, b/0000000007.jpg,3\r\n\r\nвидео 1/8.PNG, 12\r\n  v/9.jpeg,-1  \r\nv/10.jpg,0"
-    found = read_list(write(tmp_path / "l.txt", text))
-    assert found.manifest.ids == ["a, b/0000000007", "видео 1/8", "v/10"]
-    assert found.manifest.column("video") == ["a, b", "видео 1", "v"]
-    assert found.manifest.column("frame") == [7, 8, 10]
-    assert found.manifest.column("material") == ["3", "12", "0"]
-    assert found.manifest.column("vision") == [None] * 3
-    assert found.manifest.root == tmp_path
-    assert found.inconclusive == 1
-    assert found.rows["line"].to_list() == [1, 3, 5]
-    assert sorted(found.contact.rows()) == [("a, b", 7), ("v", 9), ("v", 10), ("видео 1", 8)]
+    listed = read_list(write(tmp_path / "l.txt", text))
+    assert listed.manifest.ids == ["a, b/0000000007", "видео 1/8", "v/10"]
+    assert listed.manifest.column("video") == ["a, b", "видео 1", "v"]
+    assert listed.manifest.column("frame") == [7, 8, 10]
+    assert listed.manifest.column("material") == ["3", "12", "0"]
+    assert listed.manifest.column("vision") == [None] * 3
+    assert listed.manifest.root == tmp_path
+    assert listed.inconclusive == 1
+    assert listed.rows["line"].to_list() == [1, 3, 5]
+    assert sorted(listed.contact.rows()) == [("a, b", 7), ("v", 9), ("v", 10), ("видео 1", 8)]
 
 
 BAD = {
@@ -72,97 +75,64 @@ BAD = {
 }
 
 
-def test_every_bad_line_is_told_at_once_with_its_place(tmp_path):
-    path = write(
-        tmp_path / "bad.txt",
-        "\n".join(
-            ["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]
-        ),
-    )
+def test_every_bad_line_is_reported_or_skipped_with_its_place(tmp_path):
+    lines = ["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]
+    path = write(tmp_path / "bad.txt", "\n".join(lines))
+    expected = [(f"{path}:{n}", kind) for n, (_, kind) in BAD.items()]
     with pytest.raises(ProblemsError) as caught:
         read_list(path)
-    assert [(p.where, p.kind) for p in caught.value.problems] == [
-        (f"{path}:{n}", kind) for n, (_, kind) in BAD.items()
-    ]
+    assert places(caught.value.problems) == expected
+    listed = read_list(path, skip_bad=True)
+    assert listed.manifest.ids == ["v/0000000001", "v/0000000019"]
+    assert places(listed.skipped) == expected
+    assert f"4 at {path}:12" in listed.skipped[9].text
 
 
-def test_skip_bad_leaves_them_out_and_lists_them_and_trusts_neither_of_two_labels(tmp_path):
-    path = write(
-        tmp_path / "bad.txt",
-        "\n".join(
-            ["v/0000000001.jpg,3", *(line for line, _ in BAD.values()), "v/0000000019.jpg,5"]
-        ),
-    )
-    found = read_list(path, skip_bad=True)
-    assert found.manifest.ids == ["v/0000000001", "v/0000000019"]
-    assert [(p.where, p.kind) for p in found.skipped] == [
-        (f"{path}:{n}", kind) for n, (_, kind) in BAD.items()
-    ]
-    assert f"4 at {path}:12" in found.skipped[9].text
-
-
-def test_empty_missing_folder_and_foreign_bytes(tmp_path):
+@pytest.mark.parametrize(
+    ("content", "place", "kind"),
+    [("\n \n", "", "empty-list"), (b"v/1.jpg,3\nv\xe9/2.jpg,3\n", ":2", "bad-encoding")],
+)
+def test_empty_lists_and_foreign_bytes(tmp_path, content, place, kind):
+    path = write(tmp_path / "l.txt", content)
     with pytest.raises(ProblemsError) as caught:
-        read_list(write(tmp_path / "empty.txt", "\n \n"))
-    assert [(p.where, p.kind) for p in caught.value.problems] == [
-        (str(tmp_path / "empty.txt"), "empty-list")
-    ]
-    with pytest.raises(ProblemsError) as caught:
-        read_list(write(tmp_path / "latin.txt", b"v/1.jpg,3\nv\xe9/2.jpg,3\n"))
-    assert [(p.where, p.kind) for p in caught.value.problems] == [
-        (f"{tmp_path / 'latin.txt'}:2", "bad-encoding")
-    ]
+        read_list(path)
+    assert places(caught.value.problems) == [(f"{path}{place}", kind)]
+
+
+def test_missing_lists_and_inconclusive_ones(tmp_path):
     with pytest.raises(PalpateError, match="no file"):
         read_list(tmp_path / "none.txt")
     with pytest.raises(PalpateError, match="folder"):
         read_list(tmp_path)
-    only = read_list(write(tmp_path / "unclear.txt", "v/1.jpg,-1\n"))
-    assert (len(only.manifest), only.inconclusive, only.skipped) == (0, 1, [])
+    listed = read_list(write(tmp_path / "unclear.txt", "v/1.jpg,-1\n"))
+    assert (len(listed.manifest), listed.inconclusive, listed.skipped) == (0, 1, [])
 
 
-def test_categories_beside_the_list_name_the_material_and_refuse_other_labels(tmp_path):
+def test_categories_next_to_the_list_name_the_material_and_reject_other_labels(tmp_path):
     write(tmp_path / "category_reference.txt", "Inconclusive: -1 (no)\nWood: 3\nRuber: 10\n")
     path = write(tmp_path / "l.txt", "v/1.jpg,3\nv/2.jpg,10\nv/3.jpg,11\nv/4.jpg,-1\n")
     with pytest.raises(ProblemsError) as caught:
         read_list(path)
-    assert [(p.where, p.kind) for p in caught.value.problems] == [(f"{path}:3", "unknown-label")]
+    assert places(caught.value.problems) == [(f"{path}:3", "unknown-label")]
     assert read_list(path, skip_bad=True).manifest.column("material") == ["Wood", "Rubber"]
-    assert read_list(path, categories={3: "x", 10: "y", 11: "z"}).manifest.column("material") == [
-        "x",
-        "y",
-        "z",
-    ]
+    listed = read_list(path, categories={3: "x", 10: "y", 11: "z"})
+    assert listed.manifest.column("material") == ["x", "y", "z"]
 
 
-def test_joined_lists_find_a_frame_that_stands_in_both(tmp_path):
-    a, b = (
-        write(tmp_path / "a.txt", "v/1.jpg,3\nv/2.jpg,3"),
-        write(tmp_path / "b.txt", "v/0002.jpg,3\nv/1.jpg,4\nv/3.jpg,3"),
-    )
-    found = read_lists([a, b], root=tmp_path, skip_bad=True)
-    assert [(p.where, p.kind) for p in found.skipped] == [
-        (f"{a}:1", "two-labels"),
-        (f"{b}:1", "duplicate-row"),
-        (f"{b}:2", "two-labels"),
-    ]
-    assert found.manifest.column("contact") == ["v#0001", "v#0001"]
+def test_joined_lists_detect_a_frame_in_both(tmp_path):
+    a = write(tmp_path / "a.txt", "v/1.jpg,3\nv/2.jpg,3")
+    b = write(tmp_path / "b.txt", "v/0002.jpg,3\nv/1.jpg,4\nv/3.jpg,3")
+    listed = read_lists([a, b], root=tmp_path, skip_bad=True)
+    kinds = [(f"{a}:1", "two-labels"), (f"{b}:1", "duplicate-row"), (f"{b}:2", "two-labels")]
+    assert places(listed.skipped) == kinds
+    assert listed.manifest.column("contact") == ["v#0001", "v#0001"]
 
 
-def test_touches_by_hand_and_against_a_slow_count():
+def test_contacts_by_hand_and_against_a_slow_count():
     videos, frames, labels = list("bbbaabba"), [5, 4, 9, 1, 2, 6, 7, 4], [0, 0, 0, 1, 1, 2, 2, 1]
-    assert contact_names(videos, frames, labels) == [
-        "b#0001",
-        "b#0001",
-        "b#0003",
-        "a#0001",
-        "a#0001",
-        "b#0002",
-        "b#0002",
-        "a#0002",
-    ]
+    names = [f"{v}#000{k}" for v, k in zip(videos, (1, 1, 3, 1, 1, 2, 2, 2), strict=True)]
+    assert contact_names(videos, frames, labels) == names
     assert contact_names(videos, frames, None)[5] == "b#0001"
-    import numpy as np
-
     rng = np.random.default_rng(0)
     cells = rng.permutation([(v, f) for v in range(3) for f in range(200) if rng.random() < 0.8])
     videos, frames = [f"v{v}" for v, _ in cells], [int(f) for _, f in cells]
@@ -171,7 +141,7 @@ def test_touches_by_hand_and_against_a_slow_count():
     assert contact_names([], [], []) == []
 
 
-def test_write_list_can_be_read_back_and_refuses_what_could_not(tmp_path):
+def test_write_list_can_be_read_back_and_rejects_what_could_not(tmp_path):
     write_list(tmp_path / "l.txt", [("a.b/0000000001", 3), ("c/2.png", 4)])
     assert (tmp_path / "l.txt").read_text() == "a.b/0000000001.jpg,3\nc/2.png,4\n"
     assert read_list(tmp_path / "l.txt").manifest.ids == ["a.b/0000000001", "c/2"]
@@ -184,21 +154,13 @@ def test_write_list_can_be_read_back_and_refuses_what_could_not(tmp_path):
 def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
     text = "Inconclusive: -1 (Do not use)\nWood: 3 \nMetal:4\n'Synthetic  Fabric' : 8\n"
     text += '"Ruber": 10,\nOthers: 19'
-    found = read_categories(write(tmp_path / "c.txt", text))
-    assert found == {
-        -1: "Inconclusive",
-        3: "Wood",
-        4: "Metal",
-        8: "Synthetic Fabric",
-        10: "Rubber",
-        19: "Others",
-    }
+    names = {-1: "Inconclusive", 3: "Wood", 4: "Metal", 8: "Synthetic Fabric", 10: "Rubber"}
+    assert read_categories(write(tmp_path / "c.txt", text)) == names | {19: "Others"}
+    path = write(tmp_path / "d.txt", "Wood: 3\nStone\nIron: 3\n")
     with pytest.raises(ProblemsError) as caught:
-        read_categories(write(tmp_path / "d.txt", "Wood: 3\nStone\nIron: 3\n"))
-    assert [(p.where, p.kind) for p in caught.value.problems] == [
-        (f"{tmp_path / 'd.txt'}:2", "bad-line"),
-        (f"{tmp_path / 'd.txt'}:3", "duplicate-id"),
-    ]
+        read_categories(path)
+    kinds = [(f"{path}:2", "bad-line"), (f"{path}:3", "duplicate-id")]
+    assert places(caught.value.problems) == kinds
     with pytest.raises(PalpateError, match="empty"):
         read_categories(write(tmp_path / "e.txt", "\n"))
 
@@ -208,32 +170,25 @@ def test_category_table_with_remarks_quotes_and_a_misspelling(tmp_path):
 def test_lists_of_other_tools(tmp_path, code, end):
     name = "gr\u00f6\u00dfe\u2028 a"  # a line separator that is not the end of a line
     path = tmp_path / "l.txt"
-    path.write_bytes(
-        end.join([f"{name}/0001.jpg,3", "", f"{name}/2.jpg,4", "nonsense", "v/3.jpg,5", ""]).encode(
-            code
-        )
-    )
-    found = read_list(path, skip_bad=True)
-    assert found.manifest.ids == [f"{name}/0001", f"{name}/2", "v/3"]
-    assert found.rows["line"].to_list() == [1, 3, 5]
-    assert [(p.where, p.kind) for p in found.skipped] == [(f"{path}:4", "no-comma")]
+    lines = [f"{name}/0001.jpg,3", "", f"{name}/2.jpg,4", "nonsense", "v/3.jpg,5", ""]
+    path.write_bytes(end.join(lines).encode(code))
+    listed = read_list(path, skip_bad=True)
+    assert listed.manifest.ids == [f"{name}/0001", f"{name}/2", "v/3"]
+    assert listed.rows["line"].to_list() == [1, 3, 5]
+    assert places(listed.skipped) == [(f"{path}:4", "no-comma")]
     assert is_list(path)
     path.write_bytes(end.join(["Wood: 3", "Rock: 4"]).encode(code))
     assert read_categories(path) == {3: "Wood", 4: "Rock"}
 
 
 def test_words_for_frames(tmp_path):
-    path = write(
-        tmp_path / "captions.csv",
-        'frame,text\nv/0001.jpg,"hard, cold"\nv/2.jpg,soft, warm\nx,hard\nv/3.jpg,\nv/1.jpg,soft\n',
-    )
-    found = read_frame_table(path)
-    assert found.values == {("v", 1): "hard, cold", ("v", 2): "soft, warm"}
-    assert [(p.where, p.kind) for p in found.skipped] == [
-        (f"{path}:4", "bad-path"),
-        (f"{path}:5", "bad-line"),
-        (f"{path}:6", "two-labels"),
-    ]
+    text = 'frame,text\nv/0001.jpg,"hard, cold"\nv/2.jpg,soft, warm\n'
+    text += "x,hard\nv/3.jpg,\nv/1.jpg,soft\n"
+    path = write(tmp_path / "captions.csv", text)
+    table = read_frame_table(path)
+    assert table.values == {("v", 1): "hard, cold", ("v", 2): "soft, warm"}
+    kinds = enumerate(("bad-path", "bad-line", "two-labels"), 4)
+    assert places(table.skipped) == [(f"{path}:{k}", kind) for k, kind in kinds]
 
 
 def test_listing_loads_neither_pillow_nor_av():
@@ -251,9 +206,8 @@ def test_facts_of_the_official_lists(real_data):
     runs = [f.manifest.table["contact"].n_unique() for f in (train, test, both)]
     assert [len(f.manifest) for f in (train, test, both)] == [91_982, 29_879, 121_861]
     assert runs == [3_378, 1_113, 4_491]
-    by_contact = (
-        both.manifest.table.with_columns(source=both.rows["source"]).group_by("contact").n_unique()
-    )
+    table = both.manifest.table.with_columns(source=both.rows["source"])
+    by_contact = table.group_by("contact").n_unique()
     assert by_contact["source"].max() == 1
     assert by_contact["material"].max() == 1
     assert train.manifest.table["video"].n_unique() == 120

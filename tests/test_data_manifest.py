@@ -21,9 +21,8 @@ def test_format_2_is_upgraded_and_saved_as_format_3_with_the_same_digest(tmp_pat
     assert manifest.column("material") == [None, *["Sandpaper No. 5"] * 3]
     assert manifest.facts == {"dataset": "small", "text_source": "column text"}
     manifest.save(tmp_path / "m.parquet")
-    assert (
-        pl.read_parquet_metadata(tmp_path / "m.parquet")["palpate.format"] == "palpate-manifest/3"
-    )
+    metadata = pl.read_parquet_metadata(tmp_path / "m.parquet")
+    assert metadata["palpate.format"] == "palpate-manifest/3"
     again = Manifest.load(tmp_path / "m.parquet")
     assert (again.digest, again.root) == (DIGEST_2, DATA)
     parts = dict(zip(manifest.ids, ("train", "train", "test", "val"), strict=True))
@@ -42,12 +41,8 @@ def test_round_trip_keeps_rows_digest_facts_and_a_root_that_moves_along(small_ma
 def test_digest_sees_every_cell_and_the_order(small_manifest):
     digests = {small_manifest.digest, small_manifest.take(small_manifest.ids[::-1]).digest}
     for column in ("text", "material", "vision"):
-        changed = small_manifest.table.with_columns(
-            pl.when(pl.col("id") == "v0/0")
-            .then(pl.lit("x"))
-            .otherwise(pl.col(column))
-            .alias(column)
-        )
+        cell = pl.when(pl.col("id") == "v0/0").then(pl.lit("x")).otherwise(pl.col(column))
+        changed = small_manifest.table.with_columns(cell.alias(column))
         digests.add(Manifest(changed, small_manifest.root).digest)
     assert len(digests) == 5
 
@@ -73,7 +68,7 @@ def test_every_problem_is_listed_at_once(tmp_path):
         Manifest.from_rows([], tmp_path).require_valid()
 
 
-def test_foreign_and_changed_files_are_refused(small_manifest, tmp_path):
+def test_foreign_and_changed_files_are_rejected(small_manifest, tmp_path):
     path = tmp_path / "m.parquet"
     with pytest.raises(PalpateError, match="must exist"):
         Manifest.load(path)
@@ -83,14 +78,9 @@ def test_foreign_and_changed_files_are_refused(small_manifest, tmp_path):
     small_manifest.table.write_parquet(path)
     with pytest.raises(PalpateError, match="another program"):
         Manifest.load(path)
-    small_manifest.table.head(3).write_parquet(
-        path,
-        metadata={
-            "palpate.format": "palpate-manifest/2",
-            "palpate.digest": small_manifest.digest,
-            "palpate.root": ".",
-        },
-    )
+    metadata = {"palpate.format": "palpate-manifest/2", "palpate.root": "."}
+    metadata["palpate.digest"] = small_manifest.digest
+    small_manifest.table.head(3).write_parquet(path, metadata=metadata)
     with pytest.raises(PalpateError, match="another program"):
         Manifest.load(path)
     with pytest.raises(PalpateError, match="'color'"):
@@ -100,9 +90,8 @@ def test_foreign_and_changed_files_are_refused(small_manifest, tmp_path):
 def test_a_manifest_whose_paths_climb_out_is_not_loaded(tmp_path):
     (tmp_path / "secret.png").touch()
     for path in ("../secret.png", "a/../../secret.png", str(tmp_path / "secret.png"), "C:/x.png"):
-        Manifest.from_rows([{"id": "1", "vision": path}], tmp_path / "root").save(
-            tmp_path / "root" / "manifest.parquet"
-        )
+        manifest = Manifest.from_rows([{"id": "1", "vision": path}], tmp_path / "root")
+        manifest.save(tmp_path / "root" / "manifest.parquet")
         with pytest.raises(PalpateError, match="inside the root"):
             Manifest.load(tmp_path / "root")
 

@@ -1,4 +1,4 @@
-"""Column mapping: SQL expressions, mistakes in one line, the former spelling, and the examples of the documentation."""
+"""Column mapping: SQL expressions, mistakes in one line, and docs/concepts/data.md."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.data.mapping import compile_maps, text_of
 
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "concepts" / "mapping.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "concepts" / "data.md"
 PATH = "data2/4-1702596295.70/vision/160-0.0207.jpg"
 ROW = {"path": PATH, "left image": "l.png", "rgb-path": "r", "end": "7", "none": None}
 
@@ -57,10 +57,8 @@ def test_forms(text, result):
 
 def test_expressions_use_columns_first_and_other_targets_in_any_order():
     assert mapped({"id": "video || '/1'", "video": "split_part(path, '/', 1)"})["id"] == "data2/1"
-    assert mapped({"video": "left(video, 1)", "id": "video"}, {"video": "xy"}) == {
-        "video": "x",
-        "id": "xy",
-    }
+    cells = mapped({"video": "left(video, 1)", "id": "video"}, {"video": "xy"})
+    assert cells == {"video": "x", "id": "xy"}
     maps = compile_maps({"video": "path", "id": '"left image" || path'}, list(ROW), ["video", "id"])
     assert (maps.source("video"), maps.source("id")) == ("path", None)
     assert set(maps.columns) == {"path", "left image"}
@@ -85,27 +83,6 @@ def test_mistakes_name_the_target_and_the_expression(maps, got):
         mapped(maps)
     assert caught.value.argument == "columns"
     assert got in caught.value.got
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("path[:15]", "substr(path, 1, 15)"),
-        ("path[3:9]", "substr(path, 4, 6)"),
-        ("path[-3:]", "right(path, 3)"),
-        ("path[2]", "substr(path, 3, 1)"),
-        ("part(path, 0)", "split_part(path, '/', 1)"),
-        ("name(path)", "split_part(path, '/', -1)"),
-        ("stem(path)", r"regexp_replace(split_part(path, '/', -1), '\.[^.]*$', '')"),
-        ("parent(path)", "regexp_replace(path, '/[^/]*$', '')"),
-        (r"path ~ /\/(\d+)-/", r"regexp_replace(path, '^.*?\/(\d+)-.*$', '\1')"),
-    ],
-)
-def test_the_former_spelling_is_answered_with_the_new_one(old, new):
-    with pytest.raises(PalpateError) as caught:
-        value(old)
-    assert caught.value.fix == f"Write video={new}"
-    assert value(new)
 
 
 @settings(max_examples=60, deadline=None)
@@ -135,27 +112,15 @@ def write_examples(root: Path) -> None:
     write_image(root / "tactile" / "camera_3" / "run_12" / "0007.png", 4)
 
 
+TAG, HCT = "dataset/20220601_182052", "data2/4-1702596295.70"
 EXAMPLES = {
-    "tag": {
-        "video": "20220601_182052",
-        "frame": 33833,
-        "material": "Wood",
-        "vision": "dataset/20220601_182052/video_frame/0000033833.jpg",
-        "tactile": "dataset/20220601_182052/gelsight_frame/0000033833.jpg",
-    },
-    "hct": {
-        "video": "data2/4-1702596295.70",
-        "frame": 160,
-        "domain": "data2",
-        "text": "soft, warm",
-        "vision": PATH,
-        "tactile": "data2/4-1702596295.70/tactile/160-0.0207.jpg",
-    },
-    "ssvtp": {
-        "vision": "images_rgb/image_437_rgb.jpg",
-        "tactile": "images_tac/image_437_tac.jpg",
-        "text": "hard",
-    },
+    "tag": {"video": "20220601_182052", "frame": 33833, "material": "Wood"}
+    | {"vision": f"{TAG}/video_frame/0000033833.jpg"}
+    | {"tactile": f"{TAG}/gelsight_frame/0000033833.jpg"},
+    "hct": {"video": HCT, "frame": 160, "domain": "data2", "text": "soft, warm", "vision": PATH}
+    | {"tactile": f"{HCT}/tactile/160-0.0207.jpg"},
+    "ssvtp": {"vision": "images_rgb/image_437_rgb.jpg", "text": "hard"}
+    | {"tactile": "images_tac/image_437_tac.jpg"},
     "tactile_manifest": {"video": "camera_3", "frame": 7, "tactile": "camera_3/run_12/0007.png"},
 }
 
@@ -165,6 +130,8 @@ def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```sh\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) == len(EXAMPLES)
+    for snippet in re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL):
+        exec(snippet, {})
     for block in blocks:
         command = shlex.split(block.replace("\\\n", " "))
         assert main([*command[1:], "-q"]) == 0, capsys.readouterr().err

@@ -49,24 +49,20 @@ def test_sorted_frames_are_decoded_in_one_pass(tmp_path, monkeypatch):
         assert len(seeks) == 1
 
 
-def test_numbers_outside_are_refused(tmp_path):
+def test_numbers_outside_are_rejected(tmp_path):
     with VideoReader(write_video(tmp_path / "v.mp4", 5)) as reader:
         for k in (5, -1):
             with pytest.raises(PalpateError, match="between 0 and 4"):
                 reader[k]
 
 
-def test_cut_files_are_refused_with_counts(tmp_path):
+def test_cut_files_are_rejected_with_counts(tmp_path):
     data = write_video(tmp_path / "v.mp4", 60).read_bytes()
     cut = tmp_path / "cut.mp4"
-    for length, said in [
-        (0, "0 bytes"),
-        (40, "cut short"),
-        (len(data) // 2, "of 60 declared"),
-        (len(data) - 1, "59 readable of 60"),
-    ]:
+    counts = {len(data) // 2: "of 60 declared", len(data) - 1: "59 readable of 60"}
+    for length, message in {0: "0 bytes", 40: "cut short", **counts}.items():
         cut.write_bytes(data[:length])
-        with pytest.raises(PalpateError, match=said):
+        with pytest.raises(PalpateError, match=message):
             VideoReader(cut)
     # The index at the end of the file, as a camera writes it, and lost with the end.
     with av.open(str(tmp_path / "v.mp4")) as source, av.open(str(tmp_path / "end.mp4"), "w") as out:
@@ -88,7 +84,7 @@ def test_cut_files_are_refused_with_counts(tmp_path):
         VideoReader(cut)
 
 
-def test_media_overwritten_in_the_middle_is_told_while_decoding(tmp_path):
+def test_media_overwritten_in_the_middle_is_reported_while_decoding(tmp_path):
     path = write_video(tmp_path / "v.mp4", 60, codec="mpeg4", b_frames=0)
     data = bytearray(path.read_bytes())
     with av.open(str(path)) as file:

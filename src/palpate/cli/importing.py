@@ -107,7 +107,7 @@ class Options(SourceOptions):
     """Turn a data set on disk into a manifest.
 
     Reads any known data set, a table, folders of images, an interval list, or a Hugging Face data
-    set. Expressions of --map: docs/concepts/mapping.md.
+    set. Expressions of --map: docs/concepts/data.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional]

@@ -41,11 +41,11 @@ TEMPLATES = (
 )
 #: Forms for materials without adjectives.
 UNKNOWN = (
-    "{name} to the touch",
-    "something that feels like {name}",
-    "it feels like {name}",
-    "pressing on {name}",
-    "a surface of {name}",
+    "{} to the touch",
+    "something that feels like {}",
+    "it feels like {}",
+    "pressing on {}",
+    "a surface of {}",
 )
 
 
@@ -58,11 +58,10 @@ def caption(material: str, sample_id: str, seed: int = 0) -> str:
         sample_id: the sample; equal ids get equal captions.
         seed: of the draw.
     """
-    names = {known.lower(): known for known in ADJECTIVES}
-    known = names.get(material.strip().lower())
+    known = next((n for n in ADJECTIVES if n.lower() == material.strip().lower()), None)
     rng = rng_for(seed, "caption", sample_id)
     if known is None:
-        return UNKNOWN[int(rng.integers(len(UNKNOWN)))].format(name=" ".join(material.split()))
+        return UNKNOWN[int(rng.integers(len(UNKNOWN)))].format(" ".join(material.split()))
     words = [ADJECTIVES[known][k] for k in rng.permutation(len(ADJECTIVES[known]))[:3]]
     form = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
     return form.format(*words, a="an" if words[0][0] in "aeiou" else "a")

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Generator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -67,12 +65,11 @@ class Exported:
         }
 
     def __str__(self) -> str:
-        quoted = [shlex.quote(str(p)) for p in (self.output, self.files[0], self.manifest.root)]
-        if self.form == "hf":
-            way = f"datasets.load_from_disk({str(self.output)!r}) or palpate import {quoted[0]}"
-        else:
+        way = f"datasets.load_from_disk({str(self.output)!r}) or palpate import "
+        way += shlex.quote(str(self.output))
+        if self.form != "hf":
             table = next(path for path in self.files if path.parent == self.output)
-            way = f"palpate import {shlex.quote(str(table))} --root {quoted[2]}"
+            way = f"palpate import {shlex.join([str(table), '--root', str(self.manifest.root)])}"
         count = f"{len(self.manifest)} samples in {len(self.files)} files"
         return f"Exported {self.output}: {count}\nRead it with: {way} -o DIR"
 
@@ -138,13 +135,11 @@ def _save_to_disk(
         import datasets
     except ImportError:
         raise MissingExtraError("datasets", "hf", "Writing Hugging Face data sets") from None
-    features: dict[str, Any] = {}
-    for name, kind in SCHEMA.items():
-        features[name] = datasets.Value("int64" if kind is pl.Int64 else "string")
-        if name in IMAGE_COLUMNS:
-            features[name] = datasets.Image()
-            features[f"{name}_path"] = datasets.Value("string")
-    features[ROW] = datasets.Value("int64")
+    text = datasets.Value("string")
+    columns = dict.fromkeys(SCHEMA, text) | {"frame": datasets.Value("int64")}
+    columns |= {c: datasets.Image() for c in IMAGE_COLUMNS}
+    columns |= {f"{c}_path": text for c in IMAGE_COLUMNS} | {ROW: datasets.Value("int64")}
+    features = datasets.Features(columns)
     facts = dict(manifest.facts)
     about: dict[str, Any] = {"format": MARK, "digest": manifest.digest, "facts": facts}
     about |= {} if split is None else {"rule": dict(split.rule), "split": split.digest}
@@ -153,34 +148,25 @@ def _save_to_disk(
         citation=facts.get("citation", ""),
         license=facts.get("license", ""),
         homepage=facts.get("url", ""),
-        features=datasets.Features(features),
+        features=features,
     )
     table = manifest.table.with_row_index(ROW).with_columns(pl.col(ROW).cast(pl.Int64))
-    root = str(manifest.root) + "/"
-    for name in IMAGE_COLUMNS:
-        path = pl.col(name)
-        table = table.with_columns(path.alias(f"{name}_path"), (pl.lit(root) + path).alias(name))
+    root = pl.lit(f"{manifest.root}/")
+    files = ((root + pl.col(name)).alias(name) for name in IMAGE_COLUMNS)
+    table = table.with_columns(pl.col(IMAGE_COLUMNS).name.suffix("_path"), *files)
     part_of = {} if split is None else {i: HF_PARTS[part] for i, part in split.parts.items()}
     parts = pl.Series([part_of.get(i, "all" if split is None else "unused") for i in manifest.ids])
     saved: Any = datasets.DatasetDict()
     for part in (*HF_PARTS.values(), "unused", "all"):
         rows = table.filter(parts == part).select(list(features))
         if rows.height:
-            columns = rows.to_dict(as_series=False)
-            saved[part] = datasets.Dataset.from_dict(columns, datasets.Features(features), info)
+            saved[part] = datasets.Dataset.from_dict(rows.to_dict(as_series=False), features, info)
     progress("writing images", 0, 1)
-    with _silent(datasets):
-        saved.save_to_disk(str(folder))
-    progress("writing images", 1, 1)
-
-
-@contextmanager
-def _silent(datasets: Any) -> Generator[None]:
-    """The library's progress bars off, and as they were afterwards."""
     hidden = datasets.are_progress_bars_disabled()
     datasets.disable_progress_bars()
     try:
-        yield
+        saved.save_to_disk(str(folder))
     finally:
         if not hidden:
             datasets.enable_progress_bars()
+    progress("writing images", 1, 1)

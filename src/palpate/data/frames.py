@@ -23,7 +23,6 @@ from palpate.data.video import VideoReader
 
 ImageFormat = Literal["jpg", "png"]
 IMAGE_FORMATS: tuple[str, ...] = ("jpg", "png")
-QUALITY = 95
 #: Frames of a manifest have 64 bits; longer file names are no frame numbers.
 DIGITS = 18
 
@@ -45,14 +44,11 @@ class FolderFrames:
         self._names: dict[int, str] = {}
         with os.scandir(folder) as entries:
             for entry in sorted(entries, key=lambda e: e.name):
-                stem, _, suffix = entry.name.rpartition(".")
-                if (
-                    not stem.isdecimal()
-                    or len(stem) > DIGITS
-                    or f".{suffix.lower()}" not in SUFFIXES
-                ):
+                stem, suffix = Path(entry.name).stem, Path(entry.name).suffix
+                if suffix.lower() not in SUFFIXES or not stem.isdecimal() or len(stem) > DIGITS:
                     continue
-                if (first := self._names.setdefault(int(stem), entry.name)) != entry.name:
+                first = self._names.setdefault(int(stem), entry.name)
+                if first != entry.name:
                     self.duplicates.append((entry.name, first))
                 elif entry.is_symlink() and inside(root, os.path.relpath(entry.path, root)) is None:
                     self.leaving.add(int(stem))
@@ -76,11 +72,14 @@ class FolderFrames:
 
 
 class VideoFrames:
-    """Frames of a video file, cached as images in ``cache``.
+    """Frames of a video file, cached as images in ``cache``; as for folders, but without links.
 
     Raises:
         PalpateError: if the video is cut short or unreadable.
     """
+
+    leaving: frozenset[int] = frozenset()
+    duplicates: tuple[tuple[str, str], ...] = ()
 
     def __init__(self, source: Path, cache: Path, suffix: ImageFormat, size: int | None) -> None:
         self.source, self.cache, self.suffix, self.size = source, cache, suffix, size
@@ -132,11 +131,9 @@ def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
         scale = size / min(frame.size)
         width, height = (max(size, round(side * scale)) for side in frame.size)
         frame = frame.resize((width, height), Image.Resampling.BICUBIC)
+    options = {} if path.suffix == ".png" else {"quality": 95, "subsampling": 0}
     with atomic_path(path) as part:
-        if path.suffix == ".png":
-            frame.save(part, format="PNG")
-        else:
-            frame.save(part, format="JPEG", quality=QUALITY, subsampling=0)
+        frame.save(part, format="JPEG" if options else "PNG", **options)
 
 
 def nearest_to_median(frames: Frames, indices: Sequence[int]) -> tuple[int, NDArray[np.uint8]]:
@@ -150,11 +147,8 @@ def nearest_to_median(frames: Frames, indices: Sequence[int]) -> tuple[int, NDAr
     """
     numbers, images = zip(*frames.read(sorted(indices)), strict=True)
     if len({image.shape for image in images}) > 1:
-        raise PalpateError(
-            f"The frames in {frames.source} must have one size",
-            "several",
-            "Extract them again from the video",
-        )
+        must = f"The frames in {frames.source} must have one size"
+        raise PalpateError(must, "several", "Extract them again from the video")
     median = np.median(np.stack(images), axis=0).astype(np.float32)
     best = int(np.argmin([np.abs(image - median).mean() for image in images]))
     return numbers[best], images[best]

@@ -1,4 +1,4 @@
-"""Images: one reader (8-bit RGB, whole or rejected) and one writer (8-bit PNG, fixed range).
+"""Images: read as 8-bit RGB, whole or rejected, one by one or as arrays.
 
 Everything that Pillow reads becomes 8-bit RGB by fixed rules: EXIF orientation is applied; 16-bit
 gray ``v`` becomes ``(v + 128) // 257``, so that 65535 is 255; transparency is laid over white; of
@@ -14,6 +14,7 @@ import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from threading import Event
@@ -37,18 +38,9 @@ from palpate.data.manifest import Manifest
 
 Check = Literal["decode", "header", "none"]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+_CUT = (struct.error, zlib.error, Image.DecompressionBombError)
 #: What Pillow raises for files that are cut, empty, or no images.
-BROKEN = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    IndexError,
-    TypeError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
+BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, *_CUT)
 #: What to do about unreadable files that are not being imported now.
 REFETCH = "Fetch these files again, or skip the bad ones with: palpate import"
 T = TypeVar("T")
@@ -67,11 +59,8 @@ def read_image(path: Path) -> Image.Image:
             image.load()
             return _rgb(ImageOps.exif_transpose(image))
     except BROKEN as error:
-        raise PalpateError(
-            f"The image {path} must be whole and readable",
-            _reason(path, error),
-            "Fetch the file again",
-        ) from None
+        must = f"The image {path} must be whole and readable"
+        raise PalpateError(must, _reason(path, error), "Fetch the file again") from None
 
 
 def check_image(path: Path, how: Check = "decode") -> str | None:
@@ -96,7 +85,11 @@ def check_image(path: Path, how: Check = "decode") -> str | None:
 
 
 def load_images(
-    paths: Sequence[Path], size: int, *, progress: Progress = quiet
+    paths: Sequence[Path],
+    size: int,
+    *,
+    progress: Progress = quiet,
+    into: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
     """Load images as one array; a path that occurs twice is decoded once.
 
@@ -104,6 +97,7 @@ def load_images(
         paths: (n,) files.
         size: side of the squares, in pixels.
         progress: progress callback.
+        into: array to fill; default: a new one.
 
     Returns:
         (n, size, size, 3), 0 to 255.
@@ -111,8 +105,22 @@ def load_images(
     Raises:
         ProblemsError: naming every unreadable file.
     """
-    images = np.empty((len(paths), size, size, 3), np.uint8)
-    _fill(images, paths, progress)
+    images = np.empty((len(paths), size, size, 3), np.uint8) if into is None else into
+    rows: dict[Path, list[int]] = {}
+    for k, path in enumerate(paths):
+        rows.setdefault(Path(path), []).append(k)
+
+    def decode(path: Path) -> str | None:
+        try:
+            images[rows[path]] = square(read_image(path), size)
+        except PalpateError as error:
+            return error.got
+        return None
+
+    decoded = in_threads(decode, rows, "decoding images", progress)
+    problems = [Problem(str(path), "bad-image", reason) for path, reason in decoded if reason]
+    if problems:
+        raise ProblemsError(sorted(problems, key=lambda p: p.where), REFETCH)
     return images
 
 
@@ -147,11 +155,13 @@ def cached_images(
     key = short(digest_json([2, size, image_stamp(manifest, column)]))
     file = Path(cache) / f"{column}-{size}-{key}.npy"
     shape = (len(paths), size, size, 3)
-    if (mapped := _mapped(file, shape)) is not None:
-        return mapped
+    with suppress(Exception):  # a damaged header is parsed as Python, and fails in many ways
+        mapped = np.load(file, mmap_mode="r", allow_pickle=False)
+        if mapped.shape == shape and mapped.dtype == np.uint8:
+            return mapped
     with atomic_path(file) as part:
         images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
-        _fill(images, paths, progress)
+        load_images(paths, size, progress=progress, into=images)
         images.flush()
         del images
     return np.load(file, mmap_mode="r", allow_pickle=False)
@@ -171,34 +181,13 @@ def image_stamp(manifest: Manifest, column: str) -> str:
     return digest_json([column, [[n, *stamps[p]] for n, p in zip(names, paths, strict=True)]])
 
 
-def write_png(path: Path, array: NDArray[np.uint8]) -> None:
-    """Write (h, w, 3) or (h, w) as an 8-bit PNG, atomically and without stretching its range.
-
-    Raises:
-        PalpateError: if the array is not of that type and shape.
-    """
-    if array.dtype != np.uint8 or not (
-        array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)
-    ):
-        raise PalpateError(
-            f"An image to write to {path} must be uint8 of shape (h, w, 3) or (h, w)",
-            f"{array.dtype} of shape {array.shape}",
-            "Scale to 0..255, round and clip first",
-        )
-    with atomic_path(Path(path)) as part:
-        Image.fromarray(np.ascontiguousarray(array)).save(part, format="PNG")
-
-
 def square(image: Image.Image, size: int) -> NDArray[np.uint8]:
     """The center square of an RGB image, resized: (size, size, 3), 0 to 255."""
     width, height = image.size
     side = min(width, height)
     left, top = (width - side) // 2, (height - side) // 2
-    if width != height:
-        image = image.crop((left, top, left + side, top + side))
-    if side != size:
-        image = image.resize((size, size), Image.Resampling.BICUBIC)
-    return np.asarray(image)
+    image = image.crop((left, top, left + side, top + side))
+    return np.asarray(image.resize((size, size), Image.Resampling.BICUBIC))
 
 
 def in_threads(
@@ -239,35 +228,6 @@ def in_threads(
             if stop is not None:
                 stop.set()
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _fill(images: NDArray[np.uint8], paths: Sequence[Path], progress: Progress) -> None:
-    """Decode every distinct path once into all its rows; raise all unreadable files at once."""
-    size = images.shape[1]
-    rows: dict[Path, list[int]] = {}
-    for k, path in enumerate(paths):
-        rows.setdefault(Path(path), []).append(k)
-
-    def decode(path: Path) -> str | None:
-        try:
-            images[rows[path]] = square(read_image(path), size)
-        except PalpateError as error:
-            return error.got
-        return None
-
-    decoded = in_threads(decode, rows, "decoding images", progress)
-    problems = [Problem(str(path), "bad-image", reason) for path, reason in decoded if reason]
-    if problems:
-        raise ProblemsError(sorted(problems, key=lambda p: p.where), REFETCH)
-
-
-def _mapped(file: Path, shape: tuple[int, ...]) -> NDArray[np.uint8] | None:
-    """The cached array, if the file exists and has the right type and shape."""
-    try:
-        array = np.load(file, mmap_mode="r", allow_pickle=False)
-    except Exception:  # a damaged header is parsed as Python, and fails in many ways
-        return None
-    return array if array.shape == shape and array.dtype == np.uint8 else None
 
 
 def file_stamp(path: Path) -> tuple[int, int]:

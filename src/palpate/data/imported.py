@@ -49,17 +49,13 @@ class Imported:
 
         Splits of an earlier import into the same folder that this one lacks are removed.
         """
-        folder = Path(output) / "splits"
-        for stale in folder.glob("*.json"):
-            if stale.stem not in self.splits:
-                stale.unlink()
-        for name, split in self.splits.items():
-            path = folder / f"{name}.json"
-            created += [] if path.exists() else [path]
-            split.save(path)
-        path = Path(output) / "manifest.parquet"
-        created += [] if path.exists() else [path]
-        self.manifest.save(path)
+        splits, path = Path(output) / "splits", Path(output) / "manifest.parquet"
+        items = {splits / f"{name}.json": split for name, split in self.splits.items()}
+        for stale in set(splits.glob("*.json")) - set(items):
+            stale.unlink()
+        for file, item in {**items, path: self.manifest}.items():
+            created += [] if file.exists() else [file]
+            item.save(file)
         return replace(self, path=path)
 
     def summary(self) -> dict[str, Any]:
@@ -78,8 +74,7 @@ class Imported:
 
     def to_json(self) -> dict[str, Any]:
         """The summary, all problems and the facts as a JSON object."""
-        skipped, suspicious = plain(self.skipped), plain(self.suspicious)
-        lists = {"skipped": skipped, "suspicious": suspicious}
+        lists = {"skipped": plain(self.skipped), "suspicious": plain(self.suspicious)}
         return self.summary() | lists | {"facts": dict(self.facts)}
 
     def __str__(self) -> str:
@@ -114,15 +109,8 @@ class Validation:
 
     def to_json(self) -> dict[str, Any]:
         """Facts, counts and all problems as a JSON object."""
-        lists = {kind: plain(getattr(self, kind)) for kind in ("missing", "invalid", "suspicious")}
-        facts = plain(self.facts)
-        return {
-            "format": self.format,
-            "samples": self.samples,
-            "ok": self.ok,
-            **lists,
-            "facts": facts,
-        }
+        kinds = ("format", "samples", "ok", "missing", "invalid", "suspicious", "facts")
+        return {kind: plain(getattr(self, kind)) for kind in kinds}
 
     def __str__(self) -> str:
         lists = {k: getattr(self, k.lower()) for k in ("Missing", "Invalid", "Suspicious")}
@@ -138,9 +126,7 @@ def readable(facts: Facts) -> dict[str, Any]:
     size, normalization = rows.pop("image_size"), rows.pop("normalization")
     rows["published"] = rows.pop("samples")
     rows["image_size"] = f"{size[0]} x {size[1]}" if size else None
-    return rows | {
-        f"mean, std of {k}": f"{mean}, {std}" for k, (mean, std) in normalization.items()
-    }
+    return rows | {f"mean, std of {k}": f"{m}, {std}" for k, (m, std) in normalization.items()}
 
 
 def raise_if(problems: Sequence[Problem], skip_bad: bool) -> None:
@@ -163,17 +149,13 @@ def require_some(samples: int, source: object, skipped: Sequence[Problem]) -> No
     if samples == 0 and skipped:
         raise ProblemsError(skipped, "No sample is left without these: correct the data set")
     if samples == 0:
-        raise PalpateError(
-            f"{source} must hold at least one usable sample",
-            "none",
-            "Check the labels and the folder",
-        )
+        must = f"{source} must hold at least one usable sample"
+        raise PalpateError(must, "none", "Check the labels and the folder")
 
 
 @contextmanager
 def removing_on_error(output: Path) -> Generator[list[Path]]:
     """Yield a list for new files, which are removed on an error, though not on Ctrl-C."""
-    output = Path(output)
     existed = {p for p in (output, *output.parents) if p.exists()}
     created: list[Path] = []
     try:

@@ -50,12 +50,9 @@ def import_dataset(
     options = _given(name, form, options)
     foreign = {p.name for p in output.iterdir()} - WRITTEN if output.is_dir() else set[str]()
     if foreign:
-        raise PalpateError(
-            "must be a folder that is new, empty, or an earlier import",
-            f"{output} with {sorted(foreign)[0]}",
-            "Choose another folder",
-            argument="output",
-        )
+        must = "must be a folder that is new, empty, or an earlier import"
+        got = f"{output} with {min(foreign)}"
+        raise PalpateError(must, got, "Choose another folder", argument="output")
     common: dict[str, Any] = {"skip_bad": skip_bad, "check": check, "progress": progress}
     if form.run is not None:
         return form.run(source, output, **common, **options)
@@ -97,8 +94,7 @@ def validate(
 
 
 def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
-    """Write a split in the form of the data set that the manifest came from, else as a CSV per
-    part.
+    """Write a split as lists of the data set that the manifest came from, else a CSV per part.
 
     Returns:
         The files written.
@@ -107,13 +103,11 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
         PalpateError: if the split's ids are not in the manifest, or a sample lacks what the lists
             need.
     """
-    form = FORMATS.get(str(manifest.facts.get("format", "")))
+    form = FORMATS.get(manifest.facts.get("format", ""))
     if form is not None and form.write_lists is not None:
         return form.write_lists(manifest, split, Path(output))
-    return [
-        write_table(Path(output) / f"{part}.csv", manifest.part(split, part))
-        for part in split.counts()
-    ]
+    parts = {part: manifest.part(split, part) for part in split.counts()}
+    return [write_table(Path(output) / f"{part}.csv", rows) for part, rows in parts.items()]
 
 
 def recognized(source: Path, name: str = "auto") -> tuple[str, Format]:
@@ -123,29 +117,18 @@ def recognized(source: Path, name: str = "auto") -> tuple[str, Format]:
         PalpateError: if there is no source, no such format, or none that fits.
     """
     if name != "auto" and name not in FORMATS:
-        raise PalpateError(
-            f"must be auto or one of {', '.join(FORMATS)}",
-            repr(name),
-            "Choose one of these",
-            argument="format",
-        )
+        must = f"must be auto or one of {', '.join(FORMATS)}"
+        raise PalpateError(must, repr(name), "Choose one of these", argument="format")
     if not source.exists() and (name == "auto" or not FORMATS[name].remote):
-        raise PalpateError(
-            "must exist",
-            f"nothing at {source}",
-            "Check the path; a data set on the hub needs the format hf",
-            argument="source",
-        )
+        fix = "Check the path; a data set on the hub needs the format hf"
+        raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
     if name == "auto":
         name = next((n for n, form in FORMATS.items() if form.detect(source)), "")
     if not name:
         known = "; ".join(f"{n}: {form.looks_for}" for n, form in FORMATS.items())
-        raise PalpateError(
-            f"must look like a known data set ({known})",
-            _contents(source),
-            "Name its format, or write a table of its images",
-            argument="source",
-        )
+        must = f"must look like a known data set ({known})"
+        fix = "Name its format, or write a table of its images"
+        raise PalpateError(must, _contents(source), fix, argument="source")
     return name, FORMATS[name]
 
 
@@ -166,12 +149,9 @@ def _given(name: str, form: Format, options: dict[str, Any]) -> dict[str, Any]:
         given.pop("size", None)
     if unknown := sorted(set(given) - set(form.options)):
         takes = ", ".join(k for k in form.options if k not in ("skip_bad", "check", "progress"))
-        raise PalpateError(
-            f"must be left out for the format {name}",
-            repr(given[unknown[0]]),
-            f"This format takes {takes or 'no options'}",
-            argument=unknown[0],
-        )
+        must, got = f"must be left out for the format {name}", repr(given[unknown[0]])
+        fix = f"This format takes {takes or 'no options'}"
+        raise PalpateError(must, got, fix, argument=unknown[0])
     return given
 
 

@@ -14,21 +14,23 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, write_text
-from palpate.data.manifest import SCHEMA, Manifest
-from palpate.data.texts import decoded, lines_of
+from palpate.data.manifest import CLIMBS, SCHEMA, Manifest
+from palpate.data.tables import decoded, delimiter_of, lines_of
 
 INCONCLUSIVE = -1
 PATH = r"^(?P<video>[^/\\]+)/(?P<stem>[^/\\]+)\.(?P<suffix>[A-Za-z0-9]+)$"
 #: A good line; the video takes all commas before the slash.
-LINE = r"^(?P<video>[^/\\]+)/(?P<stem>[0-9]{1,18})\.(?P<suffix>[A-Za-z0-9]+)\s*,\s*(?P<label>[+-]?[0-9]{1,18})$"  # noqa: E501
-#: Absolute paths, drive letters, and ``..`` as a component.
-CLIMBS = r"^[/\\]|^[A-Za-z]:[/\\]|(?:^|[/\\])\.\.(?:[/\\]|$)|^\.[/\\]"
+LINE = (
+    PATH.replace(r"stem>[^/\\]+", "stem>[0-9]{1,18}")[:-1] + r"\s*,\s*(?P<label>[+-]?[0-9]{1,18})$"
+)
+#: Paths that leave the data set, and those that begin with "./".
+LEAVES = CLIMBS + r"|^\.[/\\]"
 FIX = "Correct the lines, or skip the bad ones"
 #: Names that the published category table misspells.
 SPELLING = {"Ruber": "Rubber"}
@@ -58,10 +60,10 @@ class FrameList:
 def read_list(
     path: Path, *, skip_bad: bool = False, categories: Mapping[int, str] | None = None
 ) -> FrameList:
-    """Read one frame list.
+    """Read one frame list, whose folder becomes the manifest's root.
 
     Args:
-        path: the list; its folder becomes the manifest's root.
+        path: the list.
         skip_bad: skip and list bad rows instead of raising. Of a frame with two labels every row is
             bad.
         categories: label -> class name. Default: ``category_reference.txt`` next to the list if
@@ -72,11 +74,10 @@ def read_list(
         PalpateError: if there is no such file.
         ProblemsError: unless ``skip_bad``, with every bad line at once.
     """
-    path = Path(path)
-    table = path.parent / "category_reference.txt"
+    table = Path(path).parent / "category_reference.txt"
     if categories is None and table.is_file():
         categories = read_categories(table)
-    return read_lists([path], root=path.parent, skip_bad=skip_bad, categories=categories)
+    return read_lists([path], root=table.parent, skip_bad=skip_bad, categories=categories)
 
 
 def read_lists(
@@ -98,29 +99,27 @@ def read_lists(
         PalpateError: if a list is missing.
         ProblemsError: unless ``skip_bad``.
     """
-    parsed = [_parse(Path(p)) for p in paths]
-    problems = [problem for _, bad in parsed for problem in bad]
-    rows = pl.concat([table for table, _ in parsed])
-    contact = rows.select("video", "frame")
-    conclusive = rows.filter(pl.col("label") != INCONCLUSIVE)
-    inconclusive = rows.height - conclusive.height
-    rows, unknown = _unknown_labels(conclusive, categories)
-    rows, doubled = _duplicates(rows)
-    problems = _in_order([*problems, *unknown, *doubled], paths)
+    problems: list[Problem] = []
+    every = pl.concat([_parse(Path(path), problems) for path in paths])
+    conclusive = every.filter(pl.col("label") != INCONCLUSIVE)
+    rows = _without_duplicates(_with_known_labels(conclusive, categories, problems), problems)
+    order = {str(Path(path)): k for k, path in enumerate(paths)}
+    problems.sort(key=lambda p: _place(p, order))
     if problems and not skip_bad:
         raise ProblemsError(problems, FIX, example={"skip_bad": True})
-    labels = rows["label"]
-    names = {k: str(k) for k in labels.unique()} if categories is None else dict(categories)
-    table = rows.select("id", "video", "frame").with_columns(
-        contact=pl.Series(contact_names(rows["video"], rows["frame"], labels), dtype=pl.String),
-        material=labels.replace_strict(names, return_dtype=pl.String)
-        if rows.height
-        else pl.Series([], dtype=pl.String),
+    names = contact_names(rows["video"], rows["frame"], rows["label"])
+    label = pl.col("label").cast(pl.String)
+    if categories is not None:
+        known = {str(k): name for k, name in categories.items()}
+        label = label.replace(list(known), list(known.values()))
+    table = rows.select("id", "video", "frame", material=label).with_columns(
+        contact=pl.Series(names, dtype=pl.String)
     )
     empty = (pl.lit(None, kind).alias(c) for c, kind in SCHEMA.items() if c not in table.columns)
     table = table.with_columns(empty).select(list(SCHEMA))
-    facts = {"source": ", ".join(Path(p).name for p in paths)}
-    return FrameList(Manifest(table, Path(root), facts), problems, inconclusive, rows, contact)
+    facts = {"source": ", ".join(Path(path).name for path in paths)}
+    manifest, contact = Manifest(table, Path(root), facts), every.select("video", "frame")
+    return FrameList(manifest, problems, every.height - conclusive.height, rows, contact)
 
 
 def contact_names(
@@ -139,18 +138,15 @@ def contact_names(
         ``n`` names ``video#0001``; the numbers count the contacts of a video from 1 in the order of
         frames.
     """
-    video, label = pl.col("video"), pl.col("label")
-    columns = {
-        "video": pl.Series(videos, dtype=pl.String),
-        "frame": pl.Series(frames, dtype=pl.Int64),
-    }
-    table = pl.DataFrame(columns).with_row_index("row")
+    schema = {"video": pl.String, "frame": pl.Int64}
+    table = pl.DataFrame({"video": videos, "frame": frames}, schema).with_row_index("row")
     table = table.with_columns(label=pl.lit(0) if labels is None else pl.Series(labels))
     table = table.sort("video", "frame", maintain_order=True)
-    first = (video != video.shift(1)) | (label != label.shift(1)) | (pl.col("frame").diff() > 1)
-    number = first.fill_null(True).cast(pl.Int64).cum_sum().over("video")
-    table = table.with_columns(number=number.cast(pl.String).str.zfill(4)).sort("row")
-    return table.select(pl.format("{}#{}", "video", "number")).to_series().to_list()
+    same = (pl.col(name) == pl.col(name).shift(1) for name in ("video", "label"))
+    first = ~pl.all_horizontal(*same, pl.col("frame").diff() <= 1).fill_null(False)
+    number = first.cast(pl.Int64).cum_sum().over("video").cast(pl.String).str.zfill(4)
+    named = table.with_columns(contact=pl.format("{}#{}", "video", number))
+    return named.sort("row")["contact"].to_list()
 
 
 def number_together(*manifests: Manifest) -> list[Manifest]:
@@ -165,13 +161,12 @@ def number_together(*manifests: Manifest) -> list[Manifest]:
     distinct = rows.unique(["video", "frame"], maintain_order=True)
     names = contact_names(distinct["video"], distinct["frame"], distinct["material"])
     distinct = distinct.with_columns(contact=pl.Series(names, dtype=pl.String))
-    joined = rows.join(distinct, on=["video", "frame"], how="left", maintain_order="left")
+    contacts = rows.join(distinct, on=["video", "frame"], how="left", maintain_order="left")
     numbered: list[Manifest] = []
-    start = 0
     for m in manifests:
-        contact = joined["contact"].slice(start, len(m))
-        numbered.append(Manifest(m.table.with_columns(contact=contact), m.root, m.facts))
-        start += len(m)
+        table = m.table.with_columns(contacts["contact"].head(len(m)))
+        contacts = contacts.slice(len(m))
+        numbered.append(replace(m, table=table))
     return numbered
 
 
@@ -200,47 +195,57 @@ def write_list(path: Path, rows: Iterable[tuple[str, int]]) -> None:
 
 def write_table(path: Path, manifest: Manifest) -> Path:
     """Write a manifest as CSV, without its empty columns; paths stay relative to its root."""
-    write_text(Path(path), manifest.filled().write_csv())
-    return Path(path)
+    write_text(path, manifest.filled().write_csv())
+    return path
 
 
 def read_categories(path: Path) -> dict[int, str]:
-    """Read a category table: ``Name: id`` per line; quotes and remarks in brackets are ignored.
+    """Read a table of classes: ``Name: id`` lines, or CSV of id and name in either order.
+
+    Quotes and remarks in brackets after a ``Name: id`` are ignored; a CSV may have a header.
 
     Returns:
         id -> name, the inconclusive class (-1) included if it is listed; known misspellings are
         corrected.
 
     Raises:
-        PalpateError: if the file is missing or empty.
+        PalpateError: if the file is missing or names no class.
         ProblemsError: on lines of another form and on ids that occur twice.
     """
-    path = Path(path)
+    text = _text(path)
     names: dict[int, str] = {}
     problems: list[Problem] = []
-    for number, line in enumerate(_text(path).splitlines(), 1):
-        line = re.sub(r"\([^)]*\)|[\"'“”‘’]", "", line).strip().rstrip(",").strip()
-        match = re.fullmatch(r"(.*\S)\s*:\s*([+-]?\d+)", line)
-        if match is None:
-            if line:
-                problems.append(
-                    Problem(f"{path}:{number}", "bad-line", f"{line!r} is not 'Name: id'")
-                )
-        elif (label := int(match[2])) in names:
-            text = f"the id {label} names {names[label]!r} already"
+    sign = delimiter_of(Path(path), text)
+    for number, line in enumerate(text.splitlines(), 1):
+        bare = re.sub(r"\([^)]*\)|[\"'“”‘’]", "", line).strip().rstrip(",").strip()
+        name, colon, label = (part.strip() for part in bare.rpartition(":"))
+        if not colon:
+            cells = [cell.strip() for cell in next(csv.reader([line], delimiter=sign), [])]
+            cells.sort(key=lambda cell: whole(cell) is not None)  # the name goes first
+            name, label = cells if len(cells) == 2 else ("", "")
+        k = whole(label)
+        if k is None or not name:
+            if bare and (number > 1 or sign not in line):  # the first line may be a header
+                text = f"{line!r} is neither 'Name: id' nor 'id,name'"
+                problems.append(Problem(f"{path}:{number}", "bad-line", text))
+        elif k in names:
+            text = f"the id {k} names {names[k]!r} already"
             problems.append(Problem(f"{path}:{number}", "duplicate-id", text))
         else:
-            name = " ".join(match[1].split())
-            names[label] = SPELLING.get(name, name)
+            name = " ".join(name.split())
+            names[k] = SPELLING.get(name, name)
+    fix = "Write one 'Name: id' or 'id,name' a line"
     if problems:
-        raise ProblemsError(problems, "Write one 'Name: id' a line")
+        raise ProblemsError(problems, fix)
     if not names:
-        raise PalpateError(
-            f"{path} must list classes as 'Name: id'",
-            "an empty file",
-            "Fetch category_reference.txt again",
-        )
+        raise PalpateError(f"{path} must list classes", "none; is it empty?", fix)
     return names
+
+
+def whole(text: str) -> int | None:
+    """The integer that a text is (``7``, ``007``, ``7.0``), or None."""
+    match = re.fullmatch(r"([+-]?[0-9]{1,18})(?:\.0+)?", text)
+    return int(match[1]) if match else None
 
 
 @dataclass(frozen=True)
@@ -257,7 +262,6 @@ def read_frame_table(path: Path) -> FrameTable:
     Raises:
         PalpateError: if the file is missing.
     """
-    path = Path(path)
     values: dict[tuple[str, int], str] = {}
     skipped: list[Problem] = []
     for number, line in enumerate(lines_of(_text(path)), 1):
@@ -280,36 +284,32 @@ def read_frame_table(path: Path) -> FrameTable:
 def _frame_of(name: str) -> tuple[str, int] | None:
     """(video, frame) of ``video/frame.ext``; None for other paths and those that leave the root."""
     match = re.match(PATH, name)
-    if match is None or not match["stem"].isdecimal() or re.search(CLIMBS, name):
+    if match is None or not match["stem"].isdecimal() or re.search(LEAVES, name):
         return None
     return match["video"], int(match["stem"])
 
 
 def _text(path: Path) -> str:
     """The file as text; what is neither UTF-8 nor UTF-16 becomes U+FFFD."""
+    path = Path(path)
     if not path.is_file():
         got = f"the folder {path}" if path.is_dir() else f"no file {path}"
         raise PalpateError("The list must be a file", got, "Check the path")
     return decoded(path.read_bytes())
 
 
-def _parse(path: Path) -> tuple[pl.DataFrame, list[Problem]]:
-    """The well-formed rows of one list, and a problem for each other line."""
+def _parse(path: Path, problems: list[Problem]) -> pl.DataFrame:
+    """The well-formed rows of one list; every other line is a problem."""
     text = pl.col("text")
-    lines = pl.DataFrame({"text": pl.Series(lines_of(_text(path)), dtype=pl.String)})
-    lines = lines.with_row_index("line", offset=1)
+    lines = pl.DataFrame({"text": lines_of(_text(path))}).with_row_index("line", offset=1)
     lines = lines.with_columns(text.str.strip_chars()).filter(text != "")
+    if not lines.height:
+        problems.append(Problem(str(path), "empty-list", "the list has no lines"))
     table = lines.with_columns(text.str.extract_groups(LINE).alias("parts")).unnest("parts")
-    good = (
-        pl.col("label").is_not_null()
-        & ~text.str.contains(CLIMBS)
-        & ~text.str.contains("\ufffd", literal=True)
-    )
-    problems = [
-        Problem(f"{path}:{line}", *_reason(bad))
-        for line, bad in table.filter(~good).select("line", "text").iter_rows()
-    ] or ([] if table.height else [Problem(str(path), "empty-list", "the list has no lines")])
-    rows = table.filter(good).select(
+    good = pl.col("label").is_not_null() & ~text.str.contains(LEAVES + "|\ufffd")
+    for line, bad in table.filter(~good).select("line", "text").iter_rows():
+        problems.append(Problem(f"{path}:{line}", *_reason(bad)))
+    return table.filter(good).select(
         pl.lit(str(path)).alias("source"),
         "line",
         pl.format("{}/{}", "video", "stem").alias("id"),
@@ -318,7 +318,6 @@ def _parse(path: Path) -> tuple[pl.DataFrame, list[Problem]]:
         pl.col("label").cast(pl.Int64),
         "suffix",
     )
-    return rows, problems
 
 
 def _reason(line: str) -> tuple[str, str]:
@@ -329,7 +328,7 @@ def _reason(line: str) -> tuple[str, str]:
         return "bad-encoding", f"the line {line!r} is not UTF-8"
     if not comma:
         return "no-comma", f"the line {line!r} has no comma before a label"
-    if re.search(CLIMBS, path):
+    if re.search(LEAVES, path):
         return "outside-root", f"the path {path!r} leaves the data set"
     if match is None:
         return "bad-path", f"the path {path!r} is not video/frame.ext"
@@ -338,51 +337,40 @@ def _reason(line: str) -> tuple[str, str]:
     return "bad-label", f"the label {label!r} is not an integer"
 
 
-def _unknown_labels(
-    rows: pl.DataFrame, categories: Mapping[int, str] | None
-) -> tuple[pl.DataFrame, list[Problem]]:
-    label = pl.col("label")
-    if categories is None:
-        known, what = label >= 0, "is negative, but not -1 (inconclusive)"
-    else:
-        known = label.is_in([k for k in categories if k != INCONCLUSIVE])
-        what = "is not in the category table"
-    return rows.filter(known), [
-        Problem(f"{source}:{line}", "unknown-label", f"the label {value} {what}")
-        for source, line, value in rows.filter(~known).select("source", "line", "label").iter_rows()
-    ]
+def _with_known_labels(
+    rows: pl.DataFrame, categories: Mapping[int, str] | None, problems: list[Problem]
+) -> pl.DataFrame:
+    """Drop rows whose label is no class."""
+    known, what = pl.col("label") >= 0, "is negative, but not -1 (inconclusive)"
+    if categories is not None:
+        known, what = pl.col("label").is_in(list(categories)), "is not in the category table"
+    for source, line, label in rows.filter(~known).select("source", "line", "label").iter_rows():
+        text = f"the label {label} {what}"
+        problems.append(Problem(f"{source}:{line}", "unknown-label", text))
+    return rows.filter(known)
 
 
-def _duplicates(rows: pl.DataFrame) -> tuple[pl.DataFrame, list[Problem]]:
+def _without_duplicates(rows: pl.DataFrame, problems: list[Problem]) -> pl.DataFrame:
     """Drop every row of a frame with two labels, and all but the first of equal rows."""
-    again = rows.select("video", "frame").is_duplicated()
-    if not again.any():
-        return rows, []
     rows = rows.with_row_index("row")
-    problems: list[Problem] = []
+    again = rows.filter(pl.struct("video", "frame").is_duplicated())
     drop: list[int] = []
-    for (video, frame), group in rows.filter(again).group_by("video", "frame", maintain_order=True):
+    for (video, frame), group in again.group_by("video", "frame", maintain_order=True):
         places = [f"{source}:{line}" for source, line in group.select("source", "line").iter_rows()]
         labels = group["label"].to_list()
         two = len(set(labels)) > 1
-        for place, label in list(zip(places, labels, strict=True))[not two :]:
-            others = (f"{o} at {p}" for o, p in zip(labels, places, strict=True) if o != label)
-            text = f"frame {frame} of {video!r} " + (
-                f"has two labels: {label} here, {', '.join(others)}"
-                if two
-                else f"is listed at {places[0]} already"
-            )
-            problems.append(Problem(place, "two-labels" if two else "duplicate-row", text))
-        drop += group["row"].to_list()[not two :]
-    return rows.filter(~pl.col("row").is_in(drop)).drop("row"), problems
+        for k in range(0 if two else 1, len(labels)):
+            kind, text = "duplicate-row", f"is listed at {places[0]} already"
+            if two:
+                pairs = zip(labels, places, strict=True)
+                others = ", ".join(f"{o} at {p}" for o, p in pairs if o != labels[k])
+                kind, text = "two-labels", f"has two labels: {labels[k]} here, {others}"
+            problems.append(Problem(places[k], kind, f"frame {frame} of {video!r} {text}"))
+            drop.append(group["row"][k])
+    return rows.filter(~pl.col("row").is_in(drop)).drop("row")
 
 
-def _in_order(problems: Iterable[Problem], paths: Sequence[Path]) -> list[Problem]:
-    """Problems by list, then by line."""
-    rank = {str(Path(p)): k for k, p in enumerate(paths)}
-
-    def key(problem: Problem) -> tuple[int, int]:
-        name, _, line = problem.where.rpartition(":")
-        return (rank[name], int(line)) if name in rank else (rank.get(problem.where, len(rank)), 0)
-
-    return sorted(problems, key=key)
+def _place(problem: Problem, order: Mapping[str, int]) -> tuple[int, int]:
+    """Sort key: list, then line."""
+    name, _, line = problem.where.rpartition(":")
+    return (order[name], int(line)) if name in order else (order[problem.where], 0)

@@ -45,22 +45,12 @@ from palpate.core import (
     inside,
 )
 
-SCHEMA: dict[str, type[pl.DataType]] = {
-    "id": pl.String,
-    "video": pl.String,
-    "frame": pl.Int64,
-    "contact": pl.String,
-    "object": pl.String,
-    "session": pl.String,
-    "material": pl.String,
-    "text": pl.String,
-    "vision": pl.String,
-    "tactile": pl.String,
-    "background": pl.String,
-    "sensor": pl.String,
-    "domain": pl.String,
-}
 IMAGE_COLUMNS = ("vision", "tactile", "background")
+_WORDS = ("video", "frame", "contact", "object", "session", "material", "text")
+SCHEMA: dict[str, type[pl.DataType]] = {
+    **dict.fromkeys(("id", *_WORDS, *IMAGE_COLUMNS, "sensor", "domain"), pl.String),
+    "frame": pl.Int64,
+}
 #: Modality -> its image column.
 MODALITIES = {"vision": "vision", "tactile": "tactile"}
 FORMAT = "palpate-manifest/3"
@@ -98,12 +88,8 @@ class Manifest:
         """
         rows = list(rows)
         if unknown := sorted({name for row in rows for name in row} - set(SCHEMA)):
-            raise PalpateError(
-                f"must have columns among {', '.join(SCHEMA)}",
-                repr(unknown[0]),
-                "Rename the column to one of these, or leave it out",
-                argument="rows",
-            )
+            must, fix = f"must have columns among {', '.join(SCHEMA)}", "Rename or drop the column"
+            raise PalpateError(must, repr(unknown[0]), fix, argument="rows")
         table = pl.DataFrame({c: [row.get(c) for row in rows] for c in SCHEMA}, schema=SCHEMA)
         return cls(table, Path(root), facts or {})
 
@@ -143,11 +129,9 @@ class Manifest:
         """
         values = self.column(column)
         if missing := values.count(None):
-            raise PalpateError(
-                f"Every sample must have a {column} image here",
-                f"{missing} without, first {self.ids[values.index(None)]!r}",
-                f"Drop those samples, or fill the column {column}",
-            )
+            must = f"Every sample must have a {column} image here"
+            got = f"{missing} without, first {self.ids[values.index(None)]!r}"
+            raise PalpateError(must, got, f"Drop those samples, or fill the column {column}")
         return [self.root / value for value in values]
 
     def take(self, ids: Sequence[str]) -> Manifest:
@@ -158,11 +142,9 @@ class Manifest:
         """
         row = {name: k for k, name in enumerate(self.ids)}
         if missing := [i for i in ids if i not in row]:
-            raise PalpateError(
-                "Every id of the split must be in the manifest",
-                f"{len(missing)} that are not, first {missing[0]!r}",
-                "Use the split made for this manifest",
-            )
+            must = "Every id of the split must be in the manifest"
+            got = f"{len(missing)} that are not, first {missing[0]!r}"
+            raise PalpateError(must, got, "Use the split made for this manifest")
         return replace(self, table=self.table[[row[i] for i in ids]])
 
     def part(self, split: Split, *parts: str) -> Manifest:
@@ -177,7 +159,7 @@ class Manifest:
     def prefixed(self, prefix: str) -> Manifest:
         """The same samples with ``prefix`` before their ids, videos, contacts and sessions."""
         names = ("id", "video", "contact", "session")
-        return replace(self, table=self._with_prefix(prefix, names))
+        return replace(self, table=_with_prefix(self.table, prefix, names))
 
     @classmethod
     def join(cls, *manifests: Manifest) -> Manifest:
@@ -190,21 +172,17 @@ class Manifest:
         root = Path(os.path.commonpath([m.root.resolve() for m in manifests]))
         tables: list[pl.DataFrame] = []
         for m in manifests:
-            folder = m.root.resolve().relative_to(root).as_posix()
-            tables.append(m._with_prefix("" if folder == "." else f"{folder}/", IMAGE_COLUMNS))
+            folder = os.path.relpath(m.root.resolve(), root)
+            prefix = "" if folder == "." else f"{folder}/"
+            tables.append(_with_prefix(m.table, prefix, IMAGE_COLUMNS))
         table = pl.concat(tables)
         shared = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
         if len(shared):
-            raise PalpateError(
-                "Joined manifests must not share ids",
-                f"{len(shared)} shared, first {shared[0]!r}",
-                "Rename the videos of one of them",
-            )
+            got = f"{len(shared)} shared, first {shared[0]!r}"
+            fix = "Rename the videos of one of them"
+            raise PalpateError("Joined manifests must not share ids", got, fix)
         names = " + ".join(m.facts.get("dataset", "?") for m in manifests)
         return cls(table, root, {"dataset": names})
-
-    def _with_prefix(self, prefix: str, names: Sequence[str]) -> pl.DataFrame:
-        return self.table.with_columns((pl.lit(prefix) + pl.col(n)).alias(n) for n in names)
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row of the table as a reference with absolute image paths, for reports."""
@@ -223,18 +201,17 @@ class Manifest:
                 problems.append(Problem(f"row {line}", "duplicate-id", text))
 
         @cache
-        def wrong(value: str) -> str:
+        def wrong(value: str) -> tuple[str, str] | None:
             path = inside(self.root, value)
             if path is None:
-                return "outside-root"
-            return "missing-file" if files and not path.is_file() else ""
+                return "outside-root", f"{value!r} leaves the root"
+            missing = files and not path.is_file()
+            return ("missing-file", f"no file {value!r}") if missing else None
 
         for name in IMAGE_COLUMNS:
             for line, value in enumerate(self.column(name), 1):
-                if value is not None and (kind := wrong(value)):
-                    missing = kind == "missing-file"
-                    text = f"no file {value!r}" if missing else f"{value!r} leaves the root"
-                    problems.append(Problem(f"row {line}", kind, text))
+                if value is not None and (problem := wrong(value)):
+                    problems.append(Problem(f"row {line}", *problem))
         return problems
 
     def require_valid(self, *, files: bool = True) -> Manifest:
@@ -288,23 +265,21 @@ class Manifest:
             got = written or "a Parquet file of another program"
             raise PalpateError(f"The manifest {path} must have the format {FORMAT}", got, fix)
         for name in IMAGE_COLUMNS:
-            climbing = table.filter(pl.col(name).str.contains(CLIMBS))[name]
+            climbing = table[name].filter(table[name].str.contains(CLIMBS))
             if len(climbing):
-                raise PalpateError(
-                    f"Paths in {path} must stay inside the root",
-                    f"the {name} path {climbing[0]!r}",
-                    "Remove the row, or import again",
-                )
+                must, got = f"Paths in {path} must stay inside the root", f"{name} {climbing[0]!r}"
+                raise PalpateError(must, got, "Remove the row, or import again")
         facts = {k.removeprefix(FACT): v for k, v in meta.items() if k.startswith(FACT)}
         home = Path(root) if root else Path(os.path.normpath(path.parent / meta["palpate.root"]))
         manifest = cls(table, home, facts)
         if manifest.digest != meta["palpate.digest"]:
-            raise PalpateError(
-                f"The digest in {path} must match its rows",
-                "rows that were changed by another program",
-                fix,
-            )
+            must, got = f"The digest in {path} must match its rows", "rows of another program"
+            raise PalpateError(must, got, fix)
         return manifest
+
+
+def _with_prefix(table: pl.DataFrame, prefix: str, names: Iterable[str]) -> pl.DataFrame:
+    return table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in names)
 
 
 def write_parquet(

@@ -1,14 +1,12 @@
-"""Manifest columns as SQL expressions over the columns of a table, e.g. ``video = substr(path, 1,
-15)``.
+"""Manifest columns as SQL expressions over a table, e.g. ``video = substr(path, 1, 15)``.
 
 An expression is one of polars' SQL (:func:`polars.sql_expr`) over text cells. A text that is
 exactly the name of a column means that column, whatever characters it has. An expression may also
-use other mapped columns; columns of the table go first. See ``docs/concepts/mapping.md``.
+use other mapped columns; columns of the table go first. See ``docs/concepts/data.md``.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,23 +18,6 @@ from palpate.core import PalpateError
 #: What polars raises for expressions that it cannot parse or compute.
 ERRORS = (pl.exceptions.PolarsError, pl.exceptions.PanicException, ValueError, TypeError)
 FIX = "Use SQL functions on columns: substr, split_part, replace, regexp_replace, left, right, ||"
-#: The former expression language -> the same in SQL; groups are ``{0}``, ``{1}``; ``{start}``
-#: counts from 1.
-_X = r"((?:\w|\"[^\"]+\"|\((?:[^()]|\([^()]*\))*\))+)"
-_INNER = r"\(((?:[^()]|\((?:[^()]|\([^()]*\))*\))*)"
-_OLD_SPELLINGS: tuple[tuple[str, str], ...] = (
-    (_X + r"\[(\d*):(\d+)\]", "substr({0}, {start}, {length})"),
-    (_X + r"\[(\d+):\]", "substr({0}, {start})"),
-    (_X + r"\[-(\d+):\]", "right({0}, {1})"),
-    (_X + r"\[(\d+)\]", "substr({0}, {start}, 1)"),
-    (r"\bpart" + _INNER + r",\s*(-\d+)\)", "split_part({0}, '/', {1})"),
-    (r"\bpart" + _INNER + r",\s*(\d+)\)", "split_part({0}, '/', {start})"),
-    (r"\bname" + _INNER + r"\)", "split_part({0}, '/', -1)"),
-    (r"\bstem" + _INNER + r"\)", r"regexp_replace(split_part({0}, '/', -1), '\.[^.]*$', '')"),
-    (r"\bparent" + _INNER + r"\)", "regexp_replace({0}, '/[^/]*$', '')"),
-    (r"\bint" + _INNER + r"\)", "{0}"),
-    (_X + r"\s*~\s*/\^?((?:[^/\\]|\\.)+?)\$?/", r"regexp_replace({0}, '^.*?{1}.*$', '\1')"),
-)
 
 
 @dataclass(frozen=True)
@@ -56,10 +37,9 @@ class ColumnMaps:
     def source(self, target: str) -> str | None:
         """The column that a target is, if it is nothing but one."""
         expression = self.expressions.get(target)
-        names = [] if expression is None else expression.meta.root_names()
-        if expression is None or len(names) != 1 or names[0] not in self.columns:
+        if expression is None:
             return None
-        return names[0] if expression.meta.eq(pl.col(names[0])) else None
+        return next((n for n in self.columns if expression.meta.eq(pl.col(n))), None)
 
     def without(self, targets: Sequence[str]) -> ColumnMaps:
         """The maps of the other targets."""
@@ -106,12 +86,9 @@ def compile_maps(
             unknown column.
     """
     if unknown := sorted(set(maps) - set(targets)):
-        raise PalpateError(
-            f"must map columns among {', '.join(targets)}",
-            repr(unknown[0]),
-            "Write it as manifest column = expression over yours",
-            argument="columns",
-        )
+        must = f"must map columns among {', '.join(targets)}"
+        fix = "Write it as manifest column = expression over yours"
+        raise PalpateError(must, repr(unknown[0]), fix, argument="columns")
     texts = {name: name for name in targets if name in columns} | dict(maps)
     pending = {target: _parsed(target, text, columns) for target, text in texts.items()}
     ordered: dict[str, pl.Expr] = {}
@@ -120,27 +97,13 @@ def compile_maps(
         ready = {t: e for t, e in pending.items() if known.issuperset(e.meta.root_names())}
         if not ready:
             target, expression = next(iter(pending.items()))
-            missing = [name for name in expression.meta.root_names() if name not in known]
-            circular = f"{missing[0]}, which depends on {target} itself"
-            unknown_name = f"no {missing[0]} among {', '.join(columns)}"
-            got = circular if missing[0] in maps else unknown_name
+            missing = next(n for n in expression.meta.root_names() if n not in known)
+            circular = f"{missing}, which depends on {target} itself"
+            got = circular if missing in maps else f"no {missing} among {', '.join(columns)}"
             raise _unusable(target, texts[target], got)
         ordered |= ready
         pending = {t: e for t, e in pending.items() if t not in ready}
     return ColumnMaps(ordered, _columns(ordered, columns), texts)
-
-
-def sql_spelling(text: str) -> str:
-    """An expression of the former language (``path[:15]``, ``stem(path)``) in SQL; other texts as
-    they are.
-    """
-    for _ in range(9):  # expressions within expressions
-        before = text
-        for pattern, form in _OLD_SPELLINGS:
-            text = re.sub(pattern, lambda m, form=form: _rewritten(m, form), text)
-        if text == before:
-            break
-    return text
 
 
 def text_of(value: Any) -> str | None:
@@ -148,11 +111,6 @@ def text_of(value: Any) -> str | None:
     if isinstance(value, str):
         return value.strip() or None
     return None if value is None or value != value else str(value)
-
-
-def _rewritten(match: re.Match[str], form: str) -> str:
-    start, end = (int(g) if g and g.isdecimal() else 0 for g in (*match.groups(), "", "")[1:3])
-    return form.format(*match.groups(), start=start + 1, length=end - start)
 
 
 def _parsed(target: str, text: str, columns: Sequence[str]) -> pl.Expr:
@@ -170,11 +128,6 @@ def _columns(expressions: Mapping[str, pl.Expr], columns: Sequence[str]) -> tupl
 
 
 def _unusable(target: str, text: str, error: BaseException | str) -> PalpateError:
-    got = error if isinstance(error, str) else (str(error) or type(error).__name__).splitlines()[0]
-    new = sql_spelling(text)
-    return PalpateError(
-        "must map each column to a column or an SQL expression",
-        f"{target}={text}: {got}",
-        FIX if new == text else f"Write {target}={new}",
-        argument="columns",
-    )
+    got = f"{target}={text}: {(str(error) or type(error).__name__).splitlines()[0]}"
+    must = "must map each column to a column or an SQL expression"
+    return PalpateError(must, got, FIX, argument="columns")

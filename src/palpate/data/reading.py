@@ -19,8 +19,7 @@ from palpate.data.listing import LINE, read_list
 from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, read_classes
-from palpate.data.tables import TABLES, Table, header_of, open_table, table_of
-from palpate.data.texts import decoded, lines_of
+from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
 
 #: Columns of which a table needs at least one.
 NAMING = ("id", "video", *IMAGE_COLUMNS[:2])
@@ -54,21 +53,13 @@ def load(
             imported first.
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
-    keywords: dict[str, Any] = {
-        "format": format,
-        "skip_bad": skip_bad,
-        "progress": progress,
-        **options,
-    }
-    manifest, _ = read_samples(source, **keywords)
+    options |= {"format": format, "skip_bad": skip_bad, "progress": progress}
+    manifest, _ = read_samples(source, **options)
     without = not manifest.table["vision"].count() and not manifest.table["tactile"].count()
     if images and without and "format" in manifest.facts:  # lists and tables have no format
-        raise PalpateError(
-            "must have its images as files",
-            f"{source}, whose images are inside videos or tables",
-            f"Import it first: palpate import {source} -o DIR",
-            argument="source",
-        )
+        got = f"{source}, whose images are inside videos or tables"
+        fix = f"Import it first: palpate import {source} -o DIR"
+        raise PalpateError("must have its images as files", got, fix, argument="source")
     return manifest
 
 
@@ -109,9 +100,8 @@ def read_samples(
         names = options.pop("names", None)
         return _of_table(open_table(path, names), path.parent, skip_bad, options)
     # Images are not decoded here: whoever reads them reports those that are broken.
-    scan = form.scan(
-        path, **scan_options(name, form, options | {"check": "none", "progress": progress})
-    )
+    options |= {"check": "none", "progress": progress}
+    scan = form.scan(path, **scan_options(name, form, options))
     facts = {**form.facts.of_manifest(), "format": name, **scan.facts}
     return _of_scan(scan, path, facts, skip_bad, progress)
 
@@ -143,19 +133,13 @@ def _one_modality(folder: Path, options: dict[str, Any]) -> dict[str, str]:
     known = next((n for n, form in FORMATS.items() if form.detect(folder)), "")
     if "side" in options or known not in ("", "pairs"):
         return {}
-    there = [s for s, names in (("vision", VISION), ("tactile", TACTILE)) if _any(folder, names)]
-    if len(there) == 2 or not (there or known or _has_images(folder)):
+    names = {"vision": VISION, "tactile": TACTILE}
+    there = [side for side in names if any((folder / name).is_dir() for name in names[side])]
+    files = (*folder.glob("*"), *folder.glob("*/*"))
+    if len(there) == 2 or not (there or known or any(p.suffix.lower() in SUFFIXES for p in files)):
         return {}
     default = "tactile" if folder.name.lower() in TACTILE else "vision"
     return {"side": there[0] if there else default}
-
-
-def _any(folder: Path, names: tuple[str, ...]) -> bool:
-    return any((folder / name).is_dir() for name in names)
-
-
-def _has_images(folder: Path) -> bool:
-    return any(p.suffix.lower() in SUFFIXES for p in (*folder.glob("*"), *folder.glob("*/*")))
 
 
 def _of_table(
@@ -163,27 +147,18 @@ def _of_table(
 ) -> tuple[Manifest, list[Problem]]:
     """Samples of a data frame, or of a table without images."""
     if unknown := sorted(set(options) - {"columns", "root", "classes"}):
-        raise PalpateError(
-            "must be left out for a table", repr(options[unknown[0]]), "", argument=unknown[0]
-        )
+        must, got = "must be left out for a table", repr(options[unknown[0]])
+        raise PalpateError(must, got, "", argument=unknown[0])
     maps = compile_maps(options.get("columns", {}), table.names, [*SCHEMA, "split"])
     if not any(name in maps.expressions for name in NAMING):
-        raise PalpateError(
-            f"must have at least one of the columns {', '.join(NAMING)}",
-            f"{', '.join(table.names) or 'no columns'}",
-            "Map a column to one of them",
-            argument="source",
-        )
+        must = f"must have at least one of the columns {', '.join(NAMING)}"
+        got = ", ".join(table.names) or "no columns"
+        raise PalpateError(must, got, "Map a column to one of them", argument="source")
     classes = None if "classes" not in options else read_classes(Path(options["classes"]))
     cells = maps.apply(table.read(maps.columns))
-    count = len(table.lines)
-    rows, inconclusive = manifest_rows(cells, count, table.where, classes, table.problems)
-    scan = Scan(
-        rows=[(table.where(k), row) for k, row in rows],
-        base=Path(options.get("root", root)),
-        problems=table.problems,
-        inconclusive=inconclusive,
-    )
+    rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
+    places = [(table.where(k), row) for k, row in rows]
+    scan = Scan(Path(options.get("root", root)), rows=places, problems=table.problems)
     return _of_scan(scan, table.name, {"dataset": Path(table.name).stem}, skip_bad, quiet)
 
 

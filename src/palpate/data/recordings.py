@@ -12,6 +12,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -60,32 +61,22 @@ class Row:
     material: str
 
 
-@dataclass(frozen=True)
-class _Job:
-    """The needed frames of one modality of a recording; no ``frames``: its typical frame."""
-
-    video: str
-    modality: str
-    frames: set[int]
+#: The needed frames of one modality of a recording; no frames: its typical frame.
+_Job = tuple[str, str, set[int]]
 
 
 def rows_of(listed: FrameList) -> list[Row]:
     """The rows of a list, sorted by video and frame."""
     cells = listed.manifest.table.select("contact", "material")
     table = pl.concat([listed.rows, cells], how="horizontal").sort("video", "frame")
-    names = ("id", "video", "frame", "contact", "material")
-    return [
-        Row(f"{r['source']}:{r['line']}", *(r[name] for name in names))
-        for r in table.iter_rows(named=True)
-    ]
+    where = pl.format("{}:{}", "source", "line")
+    columns = (where, "id", "video", "frame", "contact", "material")
+    return [Row(*row) for row in table.select(columns).iter_rows()]
 
 
 def first_frames(rows: Iterable[Row]) -> dict[str, int]:
     """Contact -> its first frame."""
-    first: dict[str, int] = {}
-    for row in rows:
-        first[row.contact] = min(row.frame, first.get(row.contact, row.frame))
-    return first
+    return {row.contact: row.frame for row in sorted(rows, key=lambda row: -row.frame)}
 
 
 def thin(rows: Sequence[Row], most: int | None, seed: int) -> list[Row]:
@@ -94,22 +85,17 @@ def thin(rows: Sequence[Row], most: int | None, seed: int) -> list[Row]:
     Of a contact of n rows, row ``floor((i + u) n / most)`` is taken for i = 0, 1, ...; u = 1/2 for
     seed 0, otherwise drawn in [0, 1) for each contact.
     """
-    if most is None:
-        return list(rows)
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.contact, []).append(row)
     taken: list[Row] = []
     for contact, group in groups.items():
-        count = len(group)
+        if most is None or len(group) <= most:
+            taken += group
+            continue
         # The name of the stream is part of every thinned import so far.
         phase = 0.5 if seed == 0 else rng_for(seed, "frames of a touch", contact).random()
-        places = (
-            range(count)
-            if count <= most
-            else (int((i + phase) * count / most) for i in range(most))
-        )
-        taken += [group[k] for k in places]
+        taken += [group[int((i + phase) * len(group) / most)] for i in range(most)]
     return taken
 
 
@@ -128,8 +114,7 @@ class Recordings:
         suspicious: what looks wrong, but can be used.
         frames: recording -> modality -> frames, for those that could be opened.
         backgrounds: contact -> background image.
-        background_frames: contact -> the frame before it that is its background, where there is
-            one.
+        background_frames: contact -> the frame before it that is its background, if there is one.
         typical_of: contacts without such a frame -> their recording.
         extracted: whether frames of videos are files by now.
         moved: image -> its copy below ``out``, where some recordings are videos and others folders.
@@ -155,46 +140,40 @@ class Recordings:
         """Open both modalities of every recording in use; keep the rows that have both images."""
         first = {row.video: row for row in reversed(rows)}
         count = Counter(row.video for row in rows)
-        names = sorted(first)
-        for name, opened in in_threads(self._open_one, names, "reading recordings", progress):
-            if isinstance(opened, str):
-                kind, _, text = opened.partition(": ")
+        results = in_threads(self._open_one, sorted(first), "reading recordings", progress)
+        for name, opened in results:
+            if isinstance(opened, tuple):
+                kind, text = opened
                 lost = f"{text} ({count[name]} row{'s' * (count[name] != 1)} of this recording)"
                 self.problems.append(Problem(first[name].where, kind, lost))
                 continue
             self.frames[name] = opened
-            self.suspicious += [
-                Problem(
-                    str(frames.source / duplicate),
-                    "duplicate-frame",
-                    f"{read} has the same number, and is read",
-                )
-                for frames in opened.values()
-                if isinstance(frames, FolderFrames)
-                for duplicate, read in frames.duplicates
-            ]
+            for frames in opened.values():
+                for duplicate, read in frames.duplicates:
+                    text = f"{read} has the same number, and is read"
+                    place = str(frames.source / duplicate)
+                    self.suspicious.append(Problem(place, "duplicate-frame", text))
         return [row for row in rows if row.video in self.frames and self._has(row)]
 
-    def _open_one(self, name: str) -> dict[str, Frames] | str:
-        """Both modalities of a recording, or ``kind: text`` of what is wrong."""
-        files = self.videos.get(name)
-        if files is None:
-            return f"missing-video: the recording {name!r} is not in the data set"
+    def _open_one(self, name: str) -> dict[str, Frames] | tuple[str, str]:
+        """Both modalities of a recording, or (kind, text) of what is wrong."""
+        if name not in self.videos:
+            return "missing-video", f"the recording {name!r} is not in the data set"
         opened: dict[str, Frames] = {}
         for modality in MODALITIES:
-            source: Path | None = getattr(files, modality)
+            source: Path | None = getattr(self.videos[name], modality)
             if source is None:
-                return f"missing-video: the recording {name!r} has no {modality} frames"
-            if not source.is_dir():
-                cache = self.out / "images" / name / modality
-                try:
-                    opened[modality] = VideoFrames(source, cache, self.image_format, self.size)
-                except PalpateError as error:
-                    return f"bad-video: {source}: {error.got}"
-            elif inside(self.root, os.path.relpath(source, self.root)) is None:
-                return f"outside-root: {source} is a link that leaves the data set"
-            else:
+                return "missing-video", f"the recording {name!r} has no {modality} frames"
+            if source.is_dir():
+                if inside(self.root, os.path.relpath(source, self.root)) is None:
+                    return "outside-root", f"{source} is a link that leaves the data set"
                 opened[modality] = FolderFrames(source, self.root)
+                continue
+            cache = self.out / "images" / name / modality
+            try:
+                opened[modality] = VideoFrames(source, cache, self.image_format, self.size)
+            except PalpateError as error:
+                return "bad-video", f"{source}: {error.got}"
         return opened
 
     def _has(self, row: Row) -> bool:
@@ -207,12 +186,11 @@ class Recordings:
             return False
         missing = [frames for frames in opened.values() if not frames.has(row.frame)]
         for frames in missing:
-            if isinstance(frames, FolderFrames) and row.frame in frames.leaving:
+            kind, text = "missing-file", f"no image of frame {row.frame} in {frames.source}"
+            if row.frame in frames.leaving:
+                kind = "outside-root"
                 text = f"{frames.path(row.frame)} is a link that leaves the data set"
-                self.problems.append(Problem(row.where, "outside-root", text))
-            else:
-                text = f"no image of frame {row.frame} in {frames.source}"
-                self.problems.append(Problem(row.where, "missing-file", text))
+            self.problems.append(Problem(row.where, kind, text))
         return not missing
 
     def choose_backgrounds(self, rows: Sequence[Row], starts: Mapping[str, int]) -> None:
@@ -223,10 +201,10 @@ class Recordings:
         """
         for contact, video in {row.contact: row.video for row in rows}.items():
             frames = self.frames[video]["tactile"]
-            numbers, touched = frames.numbers, self.in_contact.get(video, set())
+            numbers, in_contact = frames.numbers, self.in_contact.get(video, set())
             before = bisect_right(numbers, starts[contact] - BACKGROUND_BEFORE)
             earlier = (numbers[i] for i in range(before - 1, -1, -1))
-            k = next((k for k in earlier if k not in touched), None)
+            k = next((k for k in earlier if k not in in_contact), None)
             if k is not None:
                 self.background_frames[contact] = k
                 self.backgrounds[contact] = frames.path(k)
@@ -243,35 +221,35 @@ class Recordings:
             free = numbers[low == np.searchsorted(contact, numbers + margin, "right")]
             if len(free):
                 places = np.linspace(0, len(free) - 1, min(MEDIAN_OF, len(free))).round()
-                return free[np.unique(places.astype(int))].tolist()
+                return free[places.astype(int)].tolist()
         return []
 
     def check(self, rows: list[Row], how: Check, progress: Progress) -> list[Row]:
         """Check every image of folders in use once; keep the rows whose images are whole."""
         first: dict[Path, Row] = {}
         for row in rows:
-            for path in self._folder_images(row):
+            for _, path in self._folder_images(row):
                 first.setdefault(path, row)
         bad: set[Path] = set()
         paths = () if how == "none" else first
-        for path, reason in in_threads(
-            lambda p: check_image(p, how), paths, "checking images", progress
-        ):
+        checked = in_threads(lambda p: check_image(p, how), paths, "checking images", progress)
+        for path, reason in checked:
             if reason:
                 bad.add(path)
                 self.problems.append(Problem(first[path].where, "bad-image", f"{path}: {reason}"))
+        # A bad background costs no row.
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path not in bad}
         self.problems.sort(key=place_of)
-        # A bad background costs no row.
-        return [row for row in rows if bad.isdisjoint(self._folder_images(row, backgrounds=False))]
+        return [row for row in rows if bad.isdisjoint(path for _, path in self._folder_images(row))]
 
-    def _folder_images(self, row: Row, *, backgrounds: bool = True) -> list[Path]:
-        """The images of a row that are not extracted from videos."""
-        folders = {m: f for m, f in self.frames[row.video].items() if isinstance(f, FolderFrames)}
-        paths = [frames.path(row.frame) for frames in folders.values()]
-        if backgrounds and "tactile" in folders and row.contact in self.backgrounds:
-            paths.append(self.backgrounds[row.contact])
-        return paths
+    def _folder_images(self, row: Row) -> list[tuple[str, Path]]:
+        """(modality, image) of a row and its background, without those of videos."""
+        frames = self.frames[row.video]
+        folders = [m for m in MODALITIES if isinstance(frames[m], FolderFrames)]
+        images = [(m, frames[m].path(row.frame)) for m in folders]
+        if "tactile" in folders and row.contact in self.backgrounds:
+            images.append(("tactile", self.backgrounds[row.contact]))
+        return images
 
     def decode(self, rows: list[Row], progress: Progress, *, videos: bool = True) -> list[Row]:
         """Decode what ``extract`` would, and write nothing; keep the rows whose images are whole.
@@ -282,43 +260,33 @@ class Recordings:
         whole: set[tuple[str, str, int]] = set()
 
         def work(job: _Job, stop: Event) -> None:
-            for k, _ in self.frames[job.video][job.modality].read(sorted(job.frames)):
+            video, modality, needed = job
+            for k, _ in self.frames[video][modality].read(sorted(needed)):
                 if stop.is_set():
                     return
-                whole.add((job.video, job.modality, k))
+                whole.add((video, modality, k))
 
-        jobs = self._jobs(rows) if videos else []
-        typical = self._typical(rows, videos=videos)
-        self._run("decoding frames", [*jobs, *typical], work, rows, progress)
+        jobs = [job for job in self._jobs(rows) if videos or not self._is_video(*job[:2])]
+        self._run("decoding frames", jobs, work, rows, progress)
         if not videos:
             return rows
-        return [
-            row
-            for row in rows
-            if all((row.video, m, row.frame) in whole for m in self._of_videos(row))
-        ]
+        return [r for r in rows if all((r.video, m, r.frame) in whole for m in self._videos_of(r))]
 
     def extract(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Extract the needed frames of videos; keep the rows whose images are there."""
-        jobs = self._jobs(rows)
-        self._require_same_settings(jobs)
 
         def work(job: _Job, stop: Event) -> None:
-            frames = self.frames[job.video][job.modality]
+            frames = self.frames[job[0]][job[1]]
             assert isinstance(frames, VideoFrames)
-            frames.extract(job.frames, self.created, stop)
+            frames.extract(job[2], self.created, stop)
 
-        typical = self._typical(rows, videos=True)
-        self._run("extracting frames", [*jobs, *typical], work, rows, progress, save=True)
+        jobs = self._jobs(rows)
+        self._require_same_settings(jobs)
+        self._run("extracting frames", jobs, work, rows, progress, save=True)
         self.extracted = True
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
-        rows = [
-            row
-            for row in rows
-            if all(
-                self.frames[row.video][m].path(row.frame).is_file() for m in self._of_videos(row)
-            )
-        ]
+        there = lambda r, m: self.frames[r.video][m].path(r.frame).is_file()  # noqa: E731
+        rows = [row for row in rows if all(there(row, m) for m in self._videos_of(row))]
         if self.layout(rows) == "mixed":
             self._gather(rows)
         return rows
@@ -326,30 +294,28 @@ class Recordings:
     def layout(self, rows: Iterable[Row]) -> str:
         """``raw`` if the frames are those of videos, ``extracted`` if of folders, or ``mixed``."""
         videos = {row.video for row in rows}
-        raw = {isinstance(f, VideoFrames) for v in videos for f in self.frames[v].values()}
+        raw = {self._is_video(video, m) for video in videos for m in MODALITIES}
         return "mixed" if len(raw) > 1 else "raw" if True in raw else "extracted"
 
-    def _of_videos(self, row: Row) -> list[str]:
-        """The modalities of a row that are video files."""
-        return [m for m, f in self.frames[row.video].items() if isinstance(f, VideoFrames)]
+    def _is_video(self, video: str, modality: str) -> bool:
+        return isinstance(self.frames[video][modality], VideoFrames)
 
-    def _jobs(self, rows: Iterable[Row]) -> list[_Job]:
-        """The frames of videos that the rows and their backgrounds need."""
+    def _videos_of(self, row: Row) -> list[str]:
+        """The modalities of a row that are video files."""
+        return [m for m in MODALITIES if self._is_video(row.video, m)]
+
+    def _jobs(self, rows: Sequence[Row]) -> list[_Job]:
+        """The frames of videos that rows and backgrounds need, then the typical frames needed."""
         needed: dict[tuple[str, str], set[int]] = {}
         for row in rows:
-            for modality in self._of_videos(row):
+            for modality in self._videos_of(row):
                 frames = needed.setdefault((row.video, modality), set())
                 frames.add(row.frame)
                 if modality == "tactile" and row.contact in self.background_frames:
                     frames.add(self.background_frames[row.contact])
-        return [_Job(video, modality, k) for (video, modality), k in needed.items()]
-
-    def _typical(self, rows: Iterable[Row], *, videos: bool) -> list[_Job]:
-        """Recordings whose typical frame is needed; without ``videos`` only those in folders."""
-        contacts = {row.contact for row in rows}
-        names = sorted({video for contact, video in self.typical_of.items() if contact in contacts})
-        folders = {v for v in names if isinstance(self.frames[v]["tactile"], FolderFrames)}
-        return [_Job(video, "tactile", set()) for video in names if videos or video in folders]
+        typical = {self.typical_of[r.contact] for r in rows if r.contact in self.typical_of}
+        jobs = [(video, modality, frames) for (video, modality), frames in needed.items()]
+        return [*jobs, *((video, "tactile", set[int]()) for video in sorted(typical))]
 
     def _run(
         self,
@@ -379,70 +345,55 @@ class Recordings:
 
         def attempt(job: _Job) -> str | None:
             try:
-                work(job, stop) if job.frames else choose(job.video)
+                work(job, stop) if job[2] else choose(job[0])
             except PalpateError as error:
-                return f"{self.frames[job.video][job.modality].source}: {error.got}"
+                return f"{self.frames[job[0]][job[1]].source}: {error.got}"
             return None
 
-        for job, text in in_threads(attempt, jobs, what, progress, stop=stop):
+        for (video, _, _), text in in_threads(attempt, jobs, what, progress, stop=stop):
             if text:
-                self.problems.append(Problem(first[job.video].where, "bad-video", text))
-        for contact, video in self.typical_of.items():
-            if video in typical:
-                self.backgrounds[contact] = typical[video]
+                self.problems.append(Problem(first[video].where, "bad-video", text))
+        chosen = {c: typical[video] for c, video in self.typical_of.items() if video in typical}
+        self.backgrounds |= chosen
         self.problems.sort(key=place_of)
 
     def _gather(self, rows: Sequence[Row]) -> None:
         """Link (or copy) images of folders below ``out``, so that one root holds all."""
         for row in rows:
-            for modality, frames in self.frames[row.video].items():
-                if isinstance(frames, VideoFrames):
+            for modality, path in self._folder_images(row):
+                target = self.out / "images" / row.video / modality / path.name
+                self.moved[path] = target
+                if target.is_file():
                     continue
-                paths = [frames.path(row.frame)]
-                if modality == "tactile" and row.contact in self.backgrounds:
-                    paths.append(self.backgrounds[row.contact])
-                for path in paths:
-                    target = self.out / "images" / row.video / modality / path.name
-                    if path not in self.moved and not target.is_file():
-                        target.parent.mkdir(parents=True, exist_ok=True)
-                        self.created.append(target)
-                        try:
-                            os.link(path, target)
-                        except OSError:
-                            shutil.copyfile(path, target)
-                    self.moved[path] = target
+                target.parent.mkdir(parents=True, exist_ok=True)
+                self.created.append(target)
+                try:
+                    os.link(path, target)
+                except OSError:
+                    shutil.copyfile(path, target)
 
     def _require_same_settings(self, jobs: Sequence[_Job]) -> None:
         """Record the settings of extracted frames; reject a folder with others."""
-        if not jobs:
+        videos = [job[:2] for job in jobs if self._is_video(*job[:2])]
+        if not videos:
             return
         path = self.out / "images" / "settings.json"
         settings = {"format": self.image_format, "size": self.size}
-        videos = {
-            f"{job.video}/{job.modality}": self.frames[job.video][job.modality]
-            .source.stat()
-            .st_size
-            for job in sorted(jobs, key=lambda job: (job.video, job.modality))
-        }
+        source = lambda video, m: self.frames[video][m].source  # noqa: E731
+        sizes = {f"{v}/{m}": source(v, m).stat().st_size for v, m in sorted(videos)}
         if path.is_file():
             earlier = read_json(path, "record of the extracted frames")
             known: dict[str, int] = earlier.pop("videos")
-            changed = [name for name, size in videos.items() if known.get(name, size) != size]
+            changed = [name for name, size in sizes.items() if known.get(name, size) != size]
             if earlier != settings or changed:
-                got = (
-                    f"other videos: {', '.join(changed)}"
-                    if changed
-                    else f"{earlier} there, {settings} here"
-                )
-                raise PalpateError(
-                    f"Frames in {path.parent} must be of the same videos and the same settings",
-                    got,
-                    "Choose another folder, or remove that one",
-                )
-            videos = known | videos
+                must = f"Frames in {path.parent} must be of the same videos and the same settings"
+                got = f"other videos: {', '.join(changed)}"
+                got = got if changed else f"{earlier} there, {settings} here"
+                raise PalpateError(must, got, "Choose another folder, or remove that one")
+            sizes = known | sizes
         else:
             self.created.append(path)
-        write_json(path, {**settings, "videos": videos})
+        write_json(path, {**settings, "videos": sizes})
 
     def cells(
         self,
@@ -459,28 +410,27 @@ class Recordings:
             sensor: the tactile sensor.
             words: further columns by (video, frame).
         """
-        folders: dict[Path, str] = {}
+
+        @cache
+        def folder(path: Path) -> str:
+            return Path(os.path.relpath(path.resolve(), root)).as_posix()
 
         def relative(frames: Frames, path: Path | None) -> str | None:
             if path is None or (isinstance(frames, VideoFrames) and not self.extracted):
                 return None
             path = self.moved.get(path, path)
-            if path.parent not in folders:
-                folders[path.parent] = Path(os.path.relpath(path.parent.resolve(), root)).as_posix()
-            prefix = folders[path.parent]
-            return path.name if prefix == "." else f"{prefix}/{path.name}"
+            return f"{folder(path.parent)}/{path.name}".removeprefix("./")
 
         tables = {name: table.values for name, table in (words or {}).items() if table is not None}
         cells: list[dict[str, Any]] = []
         for row in rows:
             opened = self.frames[row.video]
-            names = ("id", "video", "frame", "contact", "material")
-            row_cells = {name: getattr(row, name) for name in names} | {"sensor": sensor}
-            row_cells |= {m: relative(f, f.path(row.frame)) for m, f in opened.items()}
-            background = self.backgrounds.get(row.contact)
-            row_cells["background"] = relative(opened["tactile"], background)
-            row_cells |= {n: values.get((row.video, row.frame)) for n, values in tables.items()}
-            cells.append(row_cells)
+            values = {**vars(row), "sensor": sensor}
+            del values["where"]
+            values |= {m: relative(f, f.path(row.frame)) for m, f in opened.items()}
+            values["background"] = relative(opened["tactile"], self.backgrounds.get(row.contact))
+            values |= {name: table.get((row.video, row.frame)) for name, table in tables.items()}
+            cells.append(values)
         return cells
 
     def manifest(
@@ -496,19 +446,13 @@ class Recordings:
         """
         layout = self.layout(rows)
         root = (self.root if layout == "extracted" else self.out).resolve()
-        table = self.cells(rows, root, sensor, words)
-        kinds = Counter(
-            "none"
-            if c not in self.backgrounds
-            else "frame"
-            if c in self.background_frames
-            else "typical"
-            for c in {row.contact for row in rows}
-        )
-        backgrounds = ", ".join(f"{kind} {n}" for kind, n in sorted(kinds.items()))
-        return Manifest.from_rows(
-            table, root, {**facts, "layout": layout, "backgrounds": backgrounds}
-        )
+        kinds: Counter[str] = Counter()
+        for contact in {row.contact for row in rows}:
+            kind = "frame" if contact in self.background_frames else "typical"
+            kinds[kind if contact in self.backgrounds else "none"] += 1
+        backgrounds = ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()))
+        facts = {**facts, "layout": layout, "backgrounds": backgrounds}
+        return Manifest.from_rows(self.cells(rows, root, sensor, words), root, facts)
 
 
 def place_of(problem: Problem) -> tuple[str, int]:

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PARTS, PalpateError, Problem, ProblemsError
-from palpate.data.listing import INCONCLUSIVE, SPELLING, read_categories
-from palpate.data.tables import delimiter_of
-from palpate.data.texts import decoded
+from palpate.core import PARTS, PalpateError, Problem
+from palpate.data.listing import INCONCLUSIVE, read_categories, whole
 
 #: What tools call the parts of a split.
-PART_NAMES = {
-    **{part: part for part in PARTS},
-    "training": "train",
-    "validation": "val",
-    "valid": "val",
-    "dev": "val",
-    "testing": "test",
-}
+_SPLIT = {part: part for part in PARTS} | {"training": "train", "testing": "test"}
+PART_NAMES = _SPLIT | dict.fromkeys(("validation", "valid", "dev"), "val")
 #: Columns that a split keeps whole; where only some rows have a value, a person should look.
 GROUPS = ("video", "object", "session")
 #: What other tools write for an empty cell, in lower case.
@@ -41,8 +30,8 @@ def manifest_rows(
     """Rows of a manifest from mapped cells.
 
     ``frame``, ``start`` and ``end`` become integers; with ``classes`` the number of a material
-    becomes its name, and rows of number
-    -1 (inconclusive) are skipped; ``split`` becomes the name of a part.
+    becomes its name, and rows of number -1 (inconclusive) are skipped; ``split`` becomes the name
+    of a part.
 
     Args:
         cells: manifest column -> (count,) texts, as :meth:`ColumnMaps.apply` gives them.
@@ -59,13 +48,12 @@ def manifest_rows(
     inconclusive = 0
     for k in range(count):
         row: Row = {name: texts[k] for name, texts in cells.items() if texts[k] is not None}
-        wrong = [
-            ("bad-map", f"the expression for {n} is empty here") for n, c in row.items() if not c
-        ]
+        empty = [name for name, cell in row.items() if not cell]
+        wrong = [("bad-map", f"the expression for {name} is empty here") for name in empty]
         wrong += _make_integers(row)
         material = row.get("material")
         if classes is not None and material is not None and material not in known:
-            number = _whole(material)
+            number = whole(material)
             if number == INCONCLUSIVE:
                 inconclusive += 1
                 continue
@@ -89,72 +77,38 @@ def _make_integers(row: Row) -> Iterator[tuple[str, str]]:
     """Make integers of the cells that must be some; yield what is wrong as (kind, text)."""
     for name in INTEGERS:
         if row.get(name):
-            number = _whole(row[name])
+            number = whole(row[name])
             if number is None or number < 0:
                 yield "bad-frame", f"the {name} {row[name]!r} is not a whole number from 0"
             row[name] = number
 
 
 def read_classes(path: Path) -> dict[int, str]:
-    """Read a table of classes: ``Name: id`` lines, or CSV of id and name in either order.
+    """Read a table of classes, as :func:`read_categories`.
 
     Raises:
         PalpateError: if the file is missing or names no class.
         ProblemsError: with every line that is not a class.
     """
-    path = Path(path)
     if not path.is_file():
-        raise PalpateError(
-            "must be a table of classes", f"no file {path}", "Check the path", argument="classes"
-        )
-    text = decoded(path.read_bytes())
-    lines = [line for line in text.splitlines() if line.strip()]
-    if lines and all(re.search(r":\s*[\"']?[+-]?\d+", line) for line in lines):
-        return read_categories(path)
-    names: dict[int, str] = {}
-    problems: list[Problem] = []
-    delimiter = delimiter_of(path, lines[0] if lines else "")
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
-    for first, cells in enumerate(c for c in reader if any(c)):
-        pair = sorted((c.strip() for c in cells), key=lambda cell: _whole(cell) is None)
-        number = _whole(pair[0])
-        where = f"{path}:{reader.line_num}"
-        if len(pair) != 2 or number is None or not pair[1]:
-            if first:  # the first line may be a header
-                text = f"{', '.join(cells)!r} is not an id and a name"
-                problems.append(Problem(where, "bad-line", text))
-        elif number in names:
-            text = f"the id {number} names {names[number]!r} already"
-            problems.append(Problem(where, "duplicate-id", text))
-        else:
-            names[number] = SPELLING.get(pair[1], pair[1])
-    if problems:
-        raise ProblemsError(problems, "Write one 'Name: id' or 'id,name' a line")
-    if not names:
-        raise PalpateError(
-            f"{path} must list classes as 'Name: id' or 'id,name'", "none", "Write one a line"
-        )
-    return names
+        must, got = "must be a table of classes", f"no file {path}"
+        raise PalpateError(must, got, "Check the path", argument="classes")
+    return read_categories(path)
 
 
 def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
     """Report group columns that only some rows have, and words in them that may mean null."""
     problems: list[Problem] = []
+    count = len(rows)
     for name in GROUPS:
         without = [where for where, row in rows if name not in row]
-        if 0 < len(without) < len(rows):
-            text = f"{len(without)} of {len(rows)} rows have no {name}, so no split by {name} can"
-            text += f" place them; the first is {without[0]}"
+        if 0 < len(without) < count:
+            text = f"{len(without)} of {count} rows have no {name}, so no split by {name} can place"
+            text += f" them; the first is {without[0]}"
             problems.append(Problem(str(source), "null-group", text))
         worded = [where for where, row in rows if str(row.get(name, "")).lower() in NULL_WORDS]
         if worded:
-            text = f"{len(worded)} of {len(rows)} rows have the {name} NA, NaN, None or null, taken"
+            text = f"{len(worded)} of {count} rows have the {name} NA, NaN, None or null, taken"
             text += f" as a name; the first is {worded[0]}. For none, leave the cell empty"
             problems.append(Problem(str(source), "word-for-null", text))
     return problems
-
-
-def _whole(text: str) -> int | None:
-    """The integer that a text is (``7``, ``007``, ``7.0``), or None."""
-    match = re.fullmatch(r"([+-]?[0-9]{1,18})(?:\.0+)?", text)
-    return int(match[1]) if match else None

@@ -10,6 +10,7 @@ counted from 1. Only the requested columns are kept.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import json
@@ -23,7 +24,6 @@ import polars as pl
 
 from palpate.core import PalpateError, Problem
 from palpate.data.mapping import text_of
-from palpate.data.texts import decoded
 
 TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
 #: A column of every table that was read: the line of each row.
@@ -65,24 +65,18 @@ class Table:
                 numbers.
         """
         if double := [name for name in columns if self.names.count(name) > 1]:
-            raise PalpateError(
-                f"Columns of {self.name} must have different names",
-                f"{double[0]} twice or more",
-                "Rename one of them",
-            )
-        stores: list[list[str | None]] = [[] for _ in columns]
+            must = f"Columns of {self.name} must have different names"
+            raise PalpateError(must, f"{double[0]} twice or more", "Rename one of them")
         self.lines = []
+        rows: list[list[str | None]] = []
         for line, cells in self.records(columns):
             if problem := _unfit(cells, columns):
                 self.problems.append(Problem(f"{self.name}:{line}", *problem))
-                continue
-            self.lines.append(line)
-            for cell, store in zip(cells, stores, strict=True):
-                store.append(text_of(cell))
-        texts = {
-            name: pl.Series(s, dtype=pl.String) for name, s in zip(columns, stores, strict=True)
-        }
-        return pl.DataFrame({LINE: self.lines, **texts})
+            else:
+                self.lines.append(line)
+                rows.append([text_of(cell) for cell in cells])
+        table = pl.DataFrame(rows, dict.fromkeys(columns, pl.String), orient="row")
+        return table.insert_column(0, pl.Series(LINE, self.lines, pl.Int64))
 
     def where(self, k: int) -> str:
         """``file:line`` of row ``k``."""
@@ -104,19 +98,17 @@ def open_table(path: Path, names: Sequence[str] | None = None) -> Table:
     suffix = path.suffix.lower()
     if not path.is_file():
         raise PalpateError("The table must be a file", f"no file {path}", "Check the path")
-    if names and suffix in (".jsonl", ".json", ".parquet"):
-        raise PalpateError(
-            "must be left out for tables that name their columns", path.name, "", argument="names"
-        )
-    if suffix in (".jsonl", ".json"):
-        return _json(path)
+    if names and suffix in TABLES[2:]:
+        must = "must be left out for tables that name their columns"
+        raise PalpateError(must, path.name, "", argument="names")
     if suffix == ".parquet":
         return _parquet(path)
-    if names or suffix in TABLES:
-        return _csv(path, list(names) if names else None)
-    raise PalpateError(
-        f"A table must be one of {', '.join(TABLES)}", path.name, "Convert it, or rename it"
-    )
+    if suffix in (".jsonl", ".json"):
+        return _json(path)
+    if not names and suffix not in TABLES:
+        must = f"A table must be one of {', '.join(TABLES)}"
+        raise PalpateError(must, path.name, "Convert it, or rename it")
+    return _csv(path, names)
 
 
 def table_of(data: Any, name: str = "row") -> Table:
@@ -126,17 +118,13 @@ def table_of(data: Any, name: str = "row") -> Table:
         PalpateError: if the data is of another type.
     """
     if isinstance(data, pl.DataFrame):
-        return Table(name, data.columns, [], _frame_records(name, data.schema, data.select))
+        return _of_frame(name, data.schema, data.select)
     if hasattr(data, "to_dict") and hasattr(data, "columns"):  # pandas, which is not a dependency
         data = data.to_dict("records")
     if isinstance(data, Sequence) and all(isinstance(row, Mapping) for row in data):
         return _of_objects(name, list(enumerate(data, 1)), [])
-    raise PalpateError(
-        "must be a path, a polars or pandas frame, or a list of dictionaries",
-        type(data).__name__,
-        "Pass one of these",
-        argument="source",
-    )
+    must = "must be a path, a polars or pandas frame, or a list of dictionaries"
+    raise PalpateError(must, type(data).__name__, "Pass one of these", argument="source")
 
 
 def header_of(path: Path) -> list[str]:
@@ -158,10 +146,21 @@ def header_of(path: Path) -> list[str]:
 
 def delimiter_of(path: Path, text: str) -> str:
     """What separates the cells of a CSV file."""
-    if path.suffix.lower() == ".tsv":
-        return "\t"
     head = re.split("[\r\n]", text.lstrip("\r\n"), maxsplit=1)[0]
-    return next((sign for sign in ",;\t" if sign in head), ",")
+    signs = "\t" if path.suffix.lower() == ".tsv" else ",;\t"
+    return next((sign for sign in signs if sign in head), signs[0])
+
+
+def decoded(data: bytes) -> str:
+    """Decode UTF-8, or UTF-16 with a byte-order mark; other bytes become U+FFFD."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", errors="replace")
+    return data.decode("utf-8-sig", errors="replace")
+
+
+def lines_of(text: str) -> list[str]:
+    """The lines of a text by any of the ends LF, CR LF and CR, and by no other sign."""
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def _unfit(cells: Sequence[Any], columns: Sequence[str]) -> tuple[str, str] | None:
@@ -174,10 +173,10 @@ def _unfit(cells: Sequence[Any], columns: Sequence[str]) -> tuple[str, str] | No
     return None
 
 
-def _csv(path: Path, names: list[str] | None) -> Table:
+def _csv(path: Path, names: Sequence[str] | None) -> Table:
     problems: list[Problem] = []
     rows = _csv_rows(path, decoded(path.read_bytes()), problems)
-    header = names or [cell.strip() for cell in next(rows, (0, []))[1]]
+    header = list(names or [cell.strip() for cell in next(rows, (0, []))[1]])
 
     def records(columns: Sequence[str]) -> Iterator[Record]:
         places = [header.index(name) for name in columns]
@@ -193,36 +192,30 @@ def _csv(path: Path, names: list[str] | None) -> Table:
 
 def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[int, list[str]]]:
     """(first line, cells) of each row that is not blank."""
-    quotes = 0
-
-    def lines() -> Iterator[str]:
-        nonlocal quotes
-        for line in io.StringIO(text, newline=""):
-            quotes += line.count('"')
-            yield line
-
-    reader = csv.reader(lines(), delimiter=delimiter_of(path, text))
-    start = 1
+    lines = list(io.StringIO(text, newline=""))
+    reader = csv.reader(lines, delimiter=delimiter_of(path, text))
+    first = 1
     try:
         for cells in reader:
-            first, start = start, reader.line_num + 1
-            if reader.line_num > first and quotes % 2:  # the cell swallowed all lines after it
-                swallowed = f"a quotation mark stays open up to line {reader.line_num}"
+            last = reader.line_num
+            quotes = sum(line.count('"') for line in lines[first - 1 : last])
+            if last > first and quotes % 2:  # the cell swallowed all lines after it
+                swallowed = f"a quotation mark stays open up to line {last}"
                 problems.append(Problem(f"{path}:{first}", "open-quote", swallowed))
             elif any(cell.strip() for cell in cells):
                 yield first, cells
-            quotes = 0
+            first = last + 1
     except csv.Error as error:
         broken = f"{error}; is a quotation mark open? No row after it was read"
-        problems.append(Problem(f"{path}:{start}", "bad-row", broken))
+        problems.append(Problem(f"{path}:{first}", "bad-row", broken))
 
 
 def _json(path: Path) -> Table:
     """JSON lines, or a JSON array of objects, by the suffix."""
     text, problems = decoded(path.read_bytes()), list[Problem]()
     rows: list[tuple[int, Any]] = []
-    lines = [text] if path.suffix.lower() == ".json" else text.split("\n")
-    for number, line in enumerate(lines, 1):
+    array = path.suffix.lower() == ".json"
+    for number, line in enumerate([text] if array else text.split("\n"), 1):
         if line.strip():
             try:
                 rows.append((number, json.loads(line)))
@@ -230,13 +223,10 @@ def _json(path: Path) -> Table:
                 at = number + getattr(error, "lineno", 1) - 1
                 reason = f"not JSON: {getattr(error, 'msg', 'nested too deep')}"
                 problems.append(Problem(f"{path}:{at}", "bad-row", reason))
-    if path.suffix.lower() == ".json" and rows:
+    if array and rows:
         if not isinstance(rows[0][1], list):
-            raise PalpateError(
-                f"{path} must hold a JSON list of objects",
-                repr(text.strip()[:20]),
-                "Write [{...}, {...}], or JSON lines",
-            )
+            must, got = f"{path} must hold a JSON list of objects", repr(text.strip()[:20])
+            raise PalpateError(must, got, "Write [{...}, {...}], or JSON lines")
         rows = list(enumerate(rows[0][1], 1))
     return _of_objects(str(path), rows, problems)
 
@@ -246,12 +236,11 @@ def _of_objects(name: str, rows: Sequence[tuple[int, Any]], problems: list[Probl
     problems += [Problem(f"{name}:{line}", "bad-row", "not a JSON object") for line in wrong]
     objects = [(line, row) for line, row in rows if isinstance(row, Mapping)]
     names = list(dict.fromkeys(str(key) for _, row in objects for key in row))
-    return Table(
-        name,
-        names,
-        problems,
-        lambda columns: ((line, [row.get(c) for c in columns]) for line, row in objects),
-    )
+
+    def records(columns: Sequence[str]) -> Iterator[Record]:
+        return ((line, [row.get(c) for c in columns]) for line, row in objects)
+
+    return Table(name, names, problems, records)
 
 
 def _schema(path: Path) -> dict[str, pl.DataType]:
@@ -267,25 +256,23 @@ def _parquet(path: Path) -> Table:
     except Exception as error:  # polars raises several kinds for a file that is not Parquet
         reason = f"not Parquet: {str(error).splitlines()[0]}"
         return Table(str(path), [], [Problem(str(path), "bad-table", reason)], lambda columns: [])
-
-    def read(columns: Sequence[str]) -> pl.DataFrame:
-        return pl.read_parquet(path, columns=list(columns), glob=False)
-
-    return Table(str(path), list(schema), [], _frame_records(str(path), schema, read))
+    read = lambda columns: pl.read_parquet(path, columns=list(columns), glob=False)  # noqa: E731
+    return _of_frame(str(path), schema, read)
 
 
-def _frame_records(
+def _of_frame(
     name: str, schema: Mapping[str, pl.DataType], read: Callable[[Sequence[str]], pl.DataFrame]
-) -> _Records:
+) -> Table:
     def records(columns: Sequence[str]) -> Iterator[Record]:
         for column in columns:
             kind = schema[column]
             if kind.is_nested() or kind.base_type() in (pl.Binary, pl.Object):
-                raise PalpateError(
+                must, got = (
                     f"Columns of {name} must hold texts or numbers",
                     f"{column} of type {kind}",
-                    "For images inside the table use the format hf on its folder",
                 )
+                fix = "For images inside the table use the format hf on its folder"
+                raise PalpateError(must, got, fix)
         yield from enumerate(read(columns).iter_rows(), 1)
 
-    return records
+    return Table(name, list(schema), [], records)

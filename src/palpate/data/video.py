@@ -2,11 +2,10 @@
 
 Frame ``k`` is the ``k``-th image in order of presentation, as a full decode would count it. The
 timestamps of all packets are read first (a pass over the file without decoding); sorted, they are
-the
-index: ``pts[k]``. To reach frame ``k`` the reader seeks to the last keyframe presented at or before
-``pts[k]`` and decodes until exactly that timestamp; where decoding is already between that keyframe
-and ``k``, it continues from there. Rates and durations are not used, so B-frames, variable rates
-and clips that do not start at zero are exact.
+the index: ``pts[k]``. To reach frame ``k`` the reader seeks to the last keyframe presented at or
+before ``pts[k]`` and decodes until exactly that timestamp; where decoding is already between that
+keyframe and ``k``, it continues from there. Rates and durations are not used, so B-frames, variable
+rates and clips that do not start at zero are exact.
 """
 
 from __future__ import annotations
@@ -21,11 +20,13 @@ from numpy.typing import NDArray
 
 from palpate.core import MissingExtraError, PalpateError
 
+REWRITE = "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4"
+
 
 class VideoReader:
-    """A video file as a sequence of RGB images: ``len(reader)``, ``reader[k]``, ``reader.frames([3,
-    4, 90])``.
+    """A video file as a sequence of RGB images.
 
+    ``len(reader)``, ``reader[k]`` and ``reader.frames([3, 4, 90])`` use exact frame numbers.
     Use one reader per thread, as a context manager or with :meth:`close`.
 
     Args:
@@ -74,18 +75,14 @@ class VideoReader:
             PalpateError: if ``k`` lies outside the video, or the file breaks off before it.
         """
         if not 0 <= k < len(self):
-            raise PalpateError(
-                f"A frame of {self.path} must lie between 0 and {len(self) - 1}",
-                str(k),
-                "Take the numbers from this video's own list",
-            )
+            must = f"A frame of {self.path} must lie between 0 and {len(self) - 1}"
+            raise PalpateError(must, str(k), "Take the numbers from this video's list")
         if self._last is None or self._last[0] != k:
             self._last = (k, self._reach(k))
         return self._last[1]
 
     def frames(self, indices: Iterable[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield ``(k, (h, w, 3) image)`` in the order given; rising numbers are decoded in one
-        pass.
+        """Yield ``(k, (h, w, 3) image)`` as given; rising numbers are decoded in one pass.
 
         Raises:
             PalpateError: as for a single frame.
@@ -108,42 +105,33 @@ class VideoReader:
         """Sorted timestamps of the frames, and sorted (pts, dts) of the keyframes."""
         times: list[int] = []
         keys: list[tuple[int, int]] = []
-        packets = cut = 0
+        count = cut = 0
         # Where the index of the container is readable it counts what is presented; the header's
-        # count may
-        # include frames that an edit list removed.
-        entries = getattr(self._stream, "index_entries", None)
-        declared = len(entries) if entries else self._stream.frames
+        # count may include frames that an edit list removed.
+        declared = len(getattr(self._stream, "index_entries", None) or ()) or self._stream.frames
         try:
             for packet in self._container.demux(self._stream):
-                if packet.size == 0:
-                    continue
-                packets += 1
-                cut += packet.is_corrupt
-                if packet.is_discard:  # needed to decode what follows, never presented
+                count += packet.size > 0
+                cut += packet.is_corrupt and packet.size > 0
+                # A discarded packet is needed to decode what follows, but never presented.
+                if packet.size == 0 or packet.is_discard:
                     continue
                 if packet.pts is None:
-                    raise self._broken(
-                        "frames without timestamps",
-                        "Write it as MP4 again: ffmpeg -i FILE -c copy NEW.mp4",
-                    )
+                    raise self._broken("frames without timestamps", REWRITE)
                 times.append(packet.pts)
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts))
         except self._errors as error:
             total = declared or "an unknown number of"
-            got = f"{packets} readable of {total} frames ({_reason(error)})"
+            got = f"{count} readable of {total} frames ({_reason(error)})"
             raise self._broken(got) from None
-        if packets - cut < declared:
-            raise self._broken(
-                f"{packets - cut} readable of {declared} declared frames: the file is cut short"
-            )
+        if count - cut < declared:
+            got = f"{count - cut} readable of {declared} declared frames: the file is cut short"
+            raise self._broken(got)
         if not times:
             raise self._broken("0 frames")
         if len(set(times)) < len(times):
-            raise self._broken(
-                "two frames with one timestamp", "Write it again: ffmpeg -i FILE -c copy NEW.mp4"
-            )
+            raise self._broken("two frames with one timestamp", REWRITE)
         return sorted(times), sorted(keys)
 
     def _reach(self, k: int) -> NDArray[np.uint8]:
@@ -151,19 +139,17 @@ class VideoReader:
         target = self._pts[k]
         key = bisect_right(self._keys, target, key=lambda pair: pair[0]) - 1
         last = self._last[0] if self._last is not None else k
-        image = None
         if last < k and self._pts[last] >= self._keys[max(key, 0)][0]:
             image = self._until(target)
-        # The demuxer may land on a later keyframe, or one may be undecodable: then try earlier
-        # ones.
-        for _, time in [*reversed(self._keys[: key + 1]), (0, self._pts[0])]:
             if image is not None:
                 return image
+        # The demuxer may land on a later keyframe, or fail to decode one: then try earlier ones.
+        for _, time in [*reversed(self._keys[: key + 1]), (0, self._pts[0])]:
             self._seek(time)
             image = self._until(target)
-        if image is None:
-            raise self._broken(f"frame {k} of {len(self)} cannot be decoded")
-        return image
+            if image is not None:
+                return image
+        raise self._broken(f"frame {k} of {len(self)} cannot be decoded")
 
     def _seek(self, time: int) -> None:
         try:
