@@ -14,10 +14,7 @@ from palpate.report.notes import SENTENCES
 
 ROWS = "ids=None, groups=None, reference_ids=None, reference_groups=None, encoder=None"
 ONE_SET = "generated, *, ids=None, labels=None, groups=None, encoder=None, **options"
-IMAGES = (
-    "generated, reference, *, ids=None, groups=None, subject='generated', split=None, level=0.95, "
-    "data_range=None"
-)
+IMAGES = "generated, reference, *, data_range=None"
 CONTACT = "generated, reference, background, **options"
 
 FUNCTIONS = {
@@ -33,10 +30,7 @@ FUNCTIONS = {
     "contact_ms_ssim": CONTACT,
     "contact_psnr": CONTACT,
     "contact_residual": CONTACT,
-    "contact_scores": (
-        "generated, reference, background, *, ids=None, groups=None, subject='generated', "
-        "split=None, level=0.95, **options"
-    ),
+    "contact_scores": CONTACT,
     "contact_ssim": CONTACT,
     "d_tmmd": ONE_SET,
     "distance": (
@@ -55,15 +49,15 @@ FUNCTIONS = {
     ),
     "measure_contacts": CONTACT,
     "mmd2": "x, y, **options",
-    "ms_ssim": f"{IMAGES}, scales='auto'",
-    "ms_ssim_per_image": "generated, reference, *, data_range=None, scales='auto'",
+    "ms_ssim": f"{IMAGES}, scales='auto', **options",
+    "ms_ssim_per_image": f"{IMAGES}, scales='auto'",
     "paired_by_id": "generated_ids, reference_ids",
     "prdc": f"generated, reference, k=5, *, {ROWS}, **options",
     "precision_recall": "generated, reference, k=3, **options",
-    "psnr": IMAGES,
-    "psnr_per_image": "generated, reference, *, data_range=None",
-    "ssim": IMAGES,
-    "ssim_per_image": "generated, reference, *, data_range=None",
+    "psnr": f"{IMAGES}, **options",
+    "psnr_per_image": IMAGES,
+    "ssim": f"{IMAGES}, **options",
+    "ssim_per_image": IMAGES,
     "tmmd": f"generated, reference, *, {ROWS.replace('ids=None,', 'ids=None, labels=None,', 1)}, "
     "**options",
 }

@@ -9,10 +9,9 @@ from scipy import stats
 
 from palpate.core import Note, PalpateError, Score
 from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, mmd2, tmmd
-from palpate.metrics.intervals import permutation_test
+from palpate.metrics.intervals import Scored, permutation_test
 from palpate.metrics.kernels import Gaussian, blocked_sums
-from palpate.metrics.paired import difference, holm
-from palpate.metrics.tactile import Scored, excess_of
+from palpate.metrics.paired import difference, excess_of, holm
 from test_metrics_mmd import loop_mmd, unit_rows
 from test_metrics_tactile import change, codes, keep, share, world
 

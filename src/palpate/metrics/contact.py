@@ -45,6 +45,7 @@ from palpate.metrics.images import (
     WINDOW_SETTINGS,
     Array,
     Pairs,
+    ScoreOptions,
     fitting_scales,
     image_pairs,
     image_stack,
@@ -56,6 +57,20 @@ from palpate.metrics.images import (
 from palpate.metrics.inputs import checked_choice, checked_names
 
 Mask = NDArray[np.bool_]
+Markers = Literal["skip", "keep"]
+
+#: Data range of the SSIM of differences.
+SSIM_RANGE = 0.25
+_SSIM_SETTINGS = WINDOW_SETTINGS | {"border": "mirror", "data_range": SSIM_RANGE}
+#: Metric -> bounds, direction, further settings.
+METRICS: dict[str, tuple[tuple[float, float], bool, dict[str, Any]]] = {
+    "contact residual": ((0, 2), False, {"energy": "both"}),
+    "contact SSIM": ((-1, 1), True, _SSIM_SETTINGS),
+    "contact PSNR": ((-np.inf, np.inf), True, {"data_range": 1}),
+    "contact IoU": ((0, 1), True, {}),
+    "contact MS-SSIM": ((0, 1), True, _SSIM_SETTINGS),
+}
+
 
 #: Least change that is a contact, on the scale of [0, 1].
 LEAST = 4 / 255
@@ -161,21 +176,6 @@ def _noise(background: Array, keep: Mask) -> float:
     return 1.4826 * float(np.median(change[away])) / 6
 
 
-Markers = Literal["skip", "keep"]
-
-#: Data range of the SSIM of differences.
-SSIM_RANGE = 0.25
-_SSIM_SETTINGS = WINDOW_SETTINGS | {"border": "mirror", "data_range": SSIM_RANGE}
-#: Metric -> bounds, direction, further settings.
-METRICS: dict[str, tuple[tuple[float, float], bool, dict[str, Any]]] = {
-    "contact residual": ((0, 2), False, {"energy": "both"}),
-    "contact SSIM": ((-1, 1), True, _SSIM_SETTINGS),
-    "contact PSNR": ((-np.inf, np.inf), True, {"data_range": 1}),
-    "contact IoU": ((0, 1), True, {}),
-    "contact MS-SSIM": ((0, 1), True, _SSIM_SETTINGS),
-}
-
-
 class ContactOptions(TypedDict, total=False):
     """How contacts are compared.
 
@@ -190,27 +190,12 @@ class ContactOptions(TypedDict, total=False):
     least: float
 
 
-class ScoreOptions(ContactOptions, total=False):
+class ContactScoreOptions(ContactOptions, ScoreOptions, total=False):
     """Options of :func:`contact_scores`."""
-
-    ids: Sequence[str] | None
-    groups: Sequence[str] | None
-    subject: str
-    split: str | None
-    level: float
 
 
 def contact_scores(
-    generated: Any,
-    reference: Any,
-    background: Any,
-    *,
-    ids: Sequence[str] | None = None,
-    groups: Sequence[str] | None = None,
-    subject: str = "generated",
-    split: str | None = None,
-    level: float = 0.95,
-    **options: Unpack[ContactOptions],
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> list[Score]:
     """Mean contact residual, SSIM, PSNR, IoU and MS-SSIM, over the images that show contact.
 
@@ -218,12 +203,7 @@ def contact_scores(
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape: the real tactile image of each generated one.
         background: the same shape: the real gel without contact.
-        ids: n names, for ``details``.
-        groups: n groups (videos); the interval is then robust to whole groups deviating together.
-        subject: what is scored, kept in the scores.
-        split: digest of the split, kept in the scores.
-        level: coverage of the intervals.
-        **options: :class:`ContactOptions`.
+        **options: :class:`ContactOptions` and :class:`palpate.metrics.images.ScoreOptions`.
 
     Returns:
         Five scores. Images without contact are excluded; ``details["no_contact"]`` counts them and
@@ -232,40 +212,41 @@ def contact_scores(
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
     """
-    contacts = measure_contacts(generated, reference, background, **options)
-    return contacts.scores(ids=ids, groups=groups, subject=subject, split=split, level=level)
+    fields: dict[str, Any] = {"subject": "generated", **options}
+    how: Any = {k: fields.pop(k) for k in ContactOptions.__annotations__ if k in fields}
+    return measure_contacts(generated, reference, background, **how).scores(**fields)
 
 
 def contact_residual(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> Score:
     """Contact residual: 0 is identical, 1 empty gel. Arguments as :func:`contact_scores`."""
     return contact_scores(generated, reference, background, **options)[0]
 
 
 def contact_ssim(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> Score:
     """SSIM of the contact: 1 is identical. Arguments as :func:`contact_scores`."""
     return contact_scores(generated, reference, background, **options)[1]
 
 
 def contact_psnr(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> Score:
     """PSNR of the contact in dB. Arguments as :func:`contact_scores`."""
     return contact_scores(generated, reference, background, **options)[2]
 
 
 def contact_iou(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> Score:
     """Overlap of the masks: 1 is equal, 0 empty gel. Arguments as :func:`contact_scores`."""
     return contact_scores(generated, reference, background, **options)[3]
 
 
 def contact_ms_ssim(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
+    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> Score:
     """MS-SSIM of the contact: 1 is identical. Arguments as :func:`contact_scores`."""
     return contact_scores(generated, reference, background, **options)[4]
@@ -293,17 +274,15 @@ class Contacts:
         """One score a metric; ``fields`` as :func:`palpate.metrics.mean_score`."""
         n, none = len(self.area), self.area == 0
         names = checked_names("ids", ids, n) or [str(i) for i in range(n)]
-        no_contact = {
-            "count": int(none.sum()),
-            "ids": [names[i] for i in np.flatnonzero(none)[:10]],
-        }
-        notes = [Note("no-contact", {"count": no_contact["count"], "n": n})] if none.any() else []
+        count, first = int(none.sum()), [names[i] for i in np.flatnonzero(none)[:10]]
+        notes = [Note("no-contact", {"count": count, "n": n})] if count else []
         area, energy = (_mean(v[~none]) for v in (self.area, self.per_real_energy))
-        extra = {
+        common = {"no_contact": {"count": count, "ids": first}, "area": area}
+        more = {
             "contact residual": {"per_real_energy": energy},
             "contact IoU": {"everywhere": area},
         }
-        scales = {"scales": fitting_scales(self.settings["size"])}
+        scales = {"contact MS-SSIM": {"scales": fitting_scales(self.settings["size"])}}
         return [
             mean_score(
                 metric,
@@ -311,13 +290,12 @@ class Contacts:
                 ids=names,
                 bounds=bounds,
                 higher_is_better=up,
-                settings=self.settings | more | (scales if metric == "contact MS-SSIM" else {}),
+                settings=self.settings | settings | scales.get(metric, {}),
                 notes=notes,
-                details={"empty": _mean(self.empty[metric]), **extra.get(metric, {})}
-                | {"no_contact": no_contact, "area": area},
+                details={"empty": _mean(self.empty[metric]), **more.get(metric, {}), **common},
                 **fields,
             )
-            for metric, (bounds, up, more) in METRICS.items()
+            for metric, (bounds, up, settings) in METRICS.items()
         ]
 
 

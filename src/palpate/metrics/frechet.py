@@ -37,9 +37,8 @@ from palpate.metrics.inputs import (
     feature_set,
     require_one_encoder,
 )
-from palpate.metrics.intervals import jackknife_errors, t_interval
+from palpate.metrics.intervals import Scored, jackknife_errors, t_interval
 from palpate.metrics.paired import Comparison, difference, holm, same_samples
-from palpate.metrics.tactile import Scored
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -143,9 +142,8 @@ def compare_fid(
         delta, limits = difference(a, b), [v.score.details["infinity"] for v in (a, b)]
         limit = None if None in limits else limits[0] - limits[1]
         notes = (Note("fid-difference-biased"),) if delta.interval else delta.notes
-        differences.append(
-            replace(delta, notes=notes, details={**delta.details, "infinity": limit})
-        )
+        details = {**delta.details, "infinity": limit}
+        differences.append(replace(delta, notes=notes, details=details))
     return Comparison([s.score for s in scored.values()], holm(differences))
 
 
@@ -184,12 +182,8 @@ def _fid(
         if error > 0:  # false for NaN as well
             low, high = t_interval(value, error, parts.count - 1, level)
             limits, method = (max(0.0, low), high), parts.method
-        details |= {
-            "infinity": _infinity(sets, parts.count, value, seed),
-            "units": parts.units,
-            "unit": parts.unit,
-            "left_out": parts.left_out,
-        }
+        details["infinity"] = _infinity(sets, parts.count, value, seed)
+        details |= {"units": parts.units, "unit": parts.unit, "left_out": parts.left_out}
     score = Score(
         "FID",
         subject,
@@ -213,14 +207,13 @@ def _fid(
 
 def _notes(x: Array, y: Array, extrapolated: bool, no_interval: bool) -> tuple[Note, ...]:
     n, d = min(len(x), len(y)), x.shape[1]
-    notes: list[Note] = []
-    if copies := copies_across(x, y):
-        notes.append(Note("copied-rows", {"count": copies, "n": len(x)}))
-    if n <= d:
-        notes.append(Note("fid-mostly-bias", {"n": n, "d": d}))
-    else:
-        notes.append(Note("fid-biased", {"extrapolated": extrapolated}))
-    return (*notes, *([Note("no-interval-few-units")] if no_interval else []))
+    copies, biased = copies_across(x, y), Note("fid-biased", {"extrapolated": extrapolated})
+    notes = [
+        (copies, Note("copied-rows", {"count": copies, "n": len(x)})),
+        (True, biased if n > d else Note("fid-mostly-bias", {"n": n, "d": d})),
+        (no_interval, Note("no-interval-few-units")),
+    ]
+    return tuple(note for holds, note in notes if holds)
 
 
 def frechet_distance(mean1: Any, cov1: Any, mean2: Any, cov2: Any) -> float:

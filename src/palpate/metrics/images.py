@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,47 +43,46 @@ WINDOW_SETTINGS = {"window": WINDOW, "sigma": SIGMA, "k1": K1, "k2": K2}
 WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
+class ScoreOptions(TypedDict, total=False):
+    """Options of every score of pairs of images.
+
+    Keys:
+        ids: n names, for ``details["lowest"]``.
+        groups: n groups (videos); the interval is then robust to whole groups deviating together.
+        subject: what is scored, default ``"generated"``.
+        split: digest of the split, kept in the score.
+        level: coverage of the interval, default 0.95.
+    """
+
+    ids: Sequence[str] | None
+    groups: Sequence[str] | None
+    subject: str
+    split: str | None
+    level: float
+
+
 def ssim(
     generated: Any,
     reference: Any,
     *,
-    ids: Sequence[str] | None = None,
-    groups: Sequence[str] | None = None,
-    subject: str = "generated",
-    split: str | None = None,
-    level: float = 0.95,
     data_range: Range | None = None,
+    **options: Unpack[ScoreOptions],
 ) -> Score:
     """Mean SSIM over pairs of images; 1 is identical.
 
     Args:
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape; image i is the partner of generated image i.
-        ids: n names, for ``details["lowest"]``.
-        groups: n groups (videos); the interval is then robust to whole groups deviating together.
-        subject: what is scored, kept in the score.
-        split: digest of the split, kept in the score.
-        level: coverage of the interval.
         data_range: ``(low, high)``, or ``high`` with low = 0, of other numbers; they are mapped to
             [0, 1], so the score does not depend on the coding (``details["coding"]`` keeps it).
+        **options: see :class:`ScoreOptions`.
 
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
     """
     pairs = image_pairs(generated, reference, data_range)
-    settings = WINDOW_SETTINGS | {"data_range": 1, "border": "valid", "size": pairs.size}
-    return mean_score(
-        "SSIM",
-        _ssim(pairs),
-        ids=ids,
-        groups=groups,
-        bounds=(-1.0, 1.0),
-        level=level,
-        subject=subject,
-        split=split,
-        settings=settings,
-        details=pairs.coding,
-    )
+    settings = WINDOW_SETTINGS | {"data_range": 1, "border": "valid"}
+    return _pair_score("SSIM", pairs, _ssim(pairs), settings, (-1.0, 1.0), **options)
 
 
 def ssim_per_image(generated: Any, reference: Any, *, data_range: Range | None = None) -> Array:
@@ -95,29 +94,15 @@ def psnr(
     generated: Any,
     reference: Any,
     *,
-    ids: Sequence[str] | None = None,
-    groups: Sequence[str] | None = None,
-    subject: str = "generated",
-    split: str | None = None,
-    level: float = 0.95,
     data_range: Range | None = None,
+    **options: Unpack[ScoreOptions],
 ) -> Score:
     """Mean PSNR in dB over the pairs of images that are not identical.
 
     Arguments and errors as :func:`ssim`; images may be smaller than its window.
     """
     pairs = image_pairs(generated, reference, data_range)
-    return mean_score(
-        "PSNR",
-        _psnr(pairs),
-        ids=ids,
-        groups=groups,
-        level=level,
-        subject=subject,
-        split=split,
-        settings={"data_range": 1, "size": pairs.size},
-        details=pairs.coding,
-    )
+    return _pair_score("PSNR", pairs, _psnr(pairs), {"data_range": 1}, **options)
 
 
 def psnr_per_image(generated: Any, reference: Any, *, data_range: Range | None = None) -> Array:
@@ -129,13 +114,9 @@ def ms_ssim(
     generated: Any,
     reference: Any,
     *,
-    ids: Sequence[str] | None = None,
-    groups: Sequence[str] | None = None,
-    subject: str = "generated",
-    split: str | None = None,
-    level: float = 0.95,
     data_range: Range | None = None,
     scales: Scales = "auto",
+    **options: Unpack[ScoreOptions],
 ) -> Score:
     """Mean MS-SSIM over pairs of images; 1 is identical.
 
@@ -145,28 +126,13 @@ def ms_ssim(
     """
     pairs = image_pairs(generated, reference, data_range)
     count = _scale_count(scales, pairs.size)
-    settings = WINDOW_SETTINGS | {
-        "data_range": 1,
-        "border": "valid",
-        "size": pairs.size,
-        "scales": count,
-        "downsampling": "2 x 2 mean",
-        "weights": [round(float(v), 6) for v in scale_weights(count)],
-    }
+    weights = [round(float(v), 6) for v in scale_weights(count)]
+    settings = WINDOW_SETTINGS | {"data_range": 1, "border": "valid", "scales": count}
+    settings |= {"downsampling": "2 x 2 mean", "weights": weights}
     few = Note("fewer-scales", {"scales": count, "least": least_side(5), "auto": scales == "auto"})
-    return mean_score(
-        "MS-SSIM",
-        _ms_ssim(pairs, count),
-        ids=ids,
-        groups=groups,
-        bounds=(0.0, 1.0),
-        level=level,
-        subject=subject,
-        split=split,
-        settings=settings,
-        details=pairs.coding,
-        notes=[few] if count < len(WEIGHTS) else [],
-    )
+    notes = [few] if count < len(WEIGHTS) else []
+    values = _ms_ssim(pairs, count)
+    return _pair_score("MS-SSIM", pairs, values, settings, (0.0, 1.0), notes=notes, **options)
 
 
 def ms_ssim_per_image(
@@ -175,6 +141,18 @@ def ms_ssim_per_image(
     """MS-SSIM (n,) in [0, 1] of each pair of images; arguments and errors as :func:`ms_ssim`."""
     pairs = image_pairs(generated, reference, data_range)
     return _ms_ssim(pairs, _scale_count(scales, pairs.size))
+
+
+def _pair_score(
+    metric: str,
+    pairs: Pairs,
+    values: Array,
+    settings: dict[str, Any],
+    bounds: tuple[float, float] = (-np.inf, np.inf),
+    **fields: Any,
+) -> Score:
+    fields = {"subject": "generated", "bounds": bounds, "details": pairs.coding} | fields
+    return mean_score(metric, values, settings=settings | {"size": pairs.size}, **fields)
 
 
 def mean_score(
@@ -267,10 +245,8 @@ def paired_by_id(
             got = f"{len(repeated)} repeated: {_first(repeated)}"
             raise PalpateError(f"Every {name} id must be unique", got, "Keep one image an id")
     row, known = {name: k for k, name in enumerate(generated)}, set(reference)
-    missing, surplus = (
-        [i for i in reference if i not in row],
-        [i for i in generated if i not in known],
-    )
+    missing = [i for i in reference if i not in row]
+    surplus = [i for i in generated if i not in known]
     if missing or surplus:
         lists = (("not generated", missing), ("without reference", surplus))
         got = "; ".join(f"{len(ids)} {what}: {_first(ids)}" for what, ids in lists if ids)

@@ -55,17 +55,10 @@ def feature_set(
     groups: Any = None,
     encoder: str | None = None,
 ) -> FeatureSet:
-    """Features as a :class:`FeatureSet`: the door of every metric on features.
+    """Features as a :class:`FeatureSet`, whose columns the other arguments replace.
 
-    Args:
-        features: (n, d) array, tensor on any device, list of rows, or a FeatureSet, whose columns
-            the other arguments replace.
-        argument: name of the caller's argument, for errors and for default ids.
-        ids: n sample ids. Without, the row numbers behind the name of the argument: rows of two
-            arrays without ids are different samples.
-        labels: n classes.
-        groups: n groups, e.g. videos.
-        encoder: digest of the encoder.
+    Without ids, rows get the name of the argument and their number: rows of two arrays without ids
+    are different samples.
 
     Raises:
         PalpateError: on what does not turn into rows, or columns of another length.
@@ -148,12 +141,11 @@ def checked_features(name: str, x: Any, *, normalize: Normalize = "check", least
     """``x`` as a float32 or float64 array (n, d), checked slab by slab.
 
     An array on disk of float32 or float64 rows is read but not kept; one that has to be normalized
-    or widened is copied into memory.
+    or widened is copied into memory. Arrays of other libraries stay on their device.
 
     Args:
         name: argument or clause for errors, see :func:`invalid`.
-        x: an array (n, d), or one of a library of the array-API standard, which stays on its
-            device.
+        x: an array (n, d).
         normalize: ``"check"`` rejects rows whose L2 norm is not 1 within 1e-3; ``True`` divides by
             the norm; ``False`` takes rows as they are.
         least: the fewest rows that the estimator can use.
@@ -190,7 +182,7 @@ def _checked_norms(name: str, x: Any, normalize: Normalize) -> Any:
     if (bad := norms == 0).any():
         raise invalid(name, "must have no zero vector", f"zeros in {rows_text(bad)}", fix)
     if normalize is True:
-        scale = norms[:, None] if isinstance(x, np.ndarray) else _like(norms[:, None], x)
+        scale = norms[:, None] if isinstance(x, np.ndarray) else like(norms[:, None], x)
         return (x / scale).astype(x.dtype) if isinstance(x, np.ndarray) else x / scale
     if (bad := np.abs(norms - 1) > NORM_TOLERANCE).any():
         got = f"norm {norms[np.flatnonzero(bad)[0]]:.4g} in {rows_text(bad)}"
@@ -213,28 +205,23 @@ def checked_pair(
     if x.ndim == y.ndim == 2 and x.shape[1] != y.shape[1]:
         got, fix = f"{x.shape[1]} and {y.shape[1]}", "Embed both with the same encoder"
         raise PalpateError(f"{both} must have the same width", got, fix)
-    homes = [
-        f"{type(v).__module__.split('.')[0]} {getattr(v, 'device', '')}"
-        if is_foreign(v)
-        else "numpy"
-        for v in (x, y)
-    ]
+    homes = [_home(v) for v in (x, y)]
     if homes[0] != homes[1]:
         must = f"{both} must be arrays of one library on one device"
         raise PalpateError(must, " and ".join(homes), "Move one of them")
-    a, b = (
-        checked_features(name, v, normalize=normalize, least=least)
-        for name, v in zip(names, (x, y), strict=True)
-    )
+    given: dict[str, Any] = {"normalize": normalize, "least": least}
+    a, b = (checked_features(name, v, **given) for name, v in zip(names, (x, y), strict=True))
     if isinstance(a, np.ndarray):
         dtype = np.result_type(a.dtype, b.dtype)
         return a.astype(dtype, copy=False), b.astype(dtype, copy=False)
-    return (_like(a, b), b) if "64" in str(b.dtype) else (a, _like(b, a))
+    return (like(a, b), b) if "64" in str(b.dtype) else (a, like(b, a))
 
 
-def _like(x: Any, other: Any) -> Any:
-    """``x`` in the type, library and device of ``other``."""
-    return array_namespace(other).asarray(x, dtype=other.dtype, device=device(other))
+def _home(x: Any) -> str:
+    """Library and device of an array."""
+    if not is_foreign(x):
+        return "numpy"
+    return f"{type(x).__module__.split('.')[0]} {getattr(x, 'device', '')}"
 
 
 def _at_least_float32(x: Any) -> Any:
@@ -364,8 +351,9 @@ def host(x: Any) -> Array:
 
 
 def like(values: Any, x: Any) -> Any:
-    """NumPy ``values`` in the type, library and device of ``x``."""
-    return array_namespace(x).asarray(np.asarray(values), dtype=x.dtype, device=device(x))
+    """``values`` in the type, library and device of ``x``."""
+    values = values if is_foreign(values) else np.asarray(values)
+    return array_namespace(x).asarray(values, dtype=x.dtype, device=device(x))
 
 
 def rows_at(x: Any, index: Index) -> Any:
@@ -389,8 +377,7 @@ def blas_threads() -> int:
 def in_threads(job: Callable[[T], R], items: Iterable[T], x: Any) -> Iterator[R]:
     """``map(job, items)`` in the same order; for NumPy in threads with one BLAS thread each.
 
-    A block is a product and several passes over its result; BLAS threads would speed up the product
-    alone.
+    BLAS threads would speed up the product of a block alone, not the passes over its result.
     """
     from threadpoolctl import threadpool_limits
 

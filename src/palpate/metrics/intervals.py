@@ -22,21 +22,21 @@ Romano 2013), and exact where units are exchangeable.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy import special
 
-from palpate.core import rng_for
+from palpate.core import Score, rng_for
 from palpate.metrics.inputs import Array, Index
 
 
 @dataclass(frozen=True)
 class Totals:
-    """Sums by pair of segments.
+    """Sums by pair of segments; fields as :class:`PairSums`, of segments.
 
     Attributes:
         n: (S,) samples.
@@ -206,6 +206,130 @@ def mean_interval(
         return None, ""
     interval = t_interval(float(values.mean()), error, g - 1, level)
     return interval, f"{method}, t, {g - 1} df ({g} {what}s)"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A statistic with its jackknife.
+
+    Attributes:
+        values: (K,).
+        errors: (K,) standard errors.
+        df: their degrees of freedom.
+        method: in words.
+        replicates: (G, K) values without each unit.
+        units: (G,) units.
+        without_class: (C, 4) the first four values without each class; empty with fewer than three.
+        of_classes: whether the errors are those over classes.
+    """
+
+    values: Array
+    errors: Array
+    df: int
+    method: str
+    replicates: Array = field(repr=False)
+    units: Index = field(repr=False)
+    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
+    of_classes: bool = False
+
+    def interval(self, k: int, level: float) -> Interval | None:
+        """Interval of value k, or None where it has none."""
+        value, error = float(self.values[k]), float(self.errors[k])
+        if not (np.isfinite(value) and np.isfinite(error) and error > 0):
+            return None  # no variation between units is no evidence of certainty
+        return t_interval(value, error, self.df, level)
+
+
+def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
+    """The statistic on all samples, with its leave-one-unit-out jackknife."""
+    replicates = np.array([statistic(t) for t in sums.leave_one_out()], dtype=np.float64)
+    df = len(sums.units) - 1
+    tail = "" if unit == "group" else ", samples taken as independent"
+    method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
+    errors = jackknife_errors(replicates)
+    return Estimate(statistic(sums.totals), errors, df, method, replicates, sums.units)
+
+
+def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
+    """As :func:`estimate`, for 2C segments; over classes where one cannot spare a unit (two
+    groups).
+
+    The interval over classes also holds the differences between classes, so it errs on the wide
+    side. The first four values of the statistic must be defined for fewer classes; only they get
+    errors then.
+    """
+    over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
+    if classes < 3:
+        return over_units
+    without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
+    if np.isfinite(over_units.errors[0]):
+        return replace(over_units, without_class=without)
+    errors = np.full(len(over_units.values), np.nan)
+    errors[: without.shape[1]] = jackknife_errors(without)
+    reason = f"(a class has too few {unit}s to leave one out)"
+    method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
+    of_classes = replace(over_units, errors=errors, df=classes - 1, method=method, of_classes=True)
+    return replace(of_classes, without_class=without)
+
+
+def without_set(t: Totals, c: int) -> Totals:
+    """All sets but c, both halves of each."""
+    to = np.full(len(t.n), -1, dtype=np.intp)
+    kept = np.setdiff1d(np.arange(len(t.n)), [2 * c, 2 * c + 1])
+    to[kept] = np.arange(len(kept))
+    return t.merge(to, len(kept))
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A score and how it moves.
+
+    Attributes:
+        score: the score.
+        replicates: (G,) the value without each unit.
+        units: (G,) names of the units; see :func:`over_classes` for the other choice.
+        excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
+        design: what the value depends on besides the features: of halves of whole groups how their
+            sizes turn E into dist^2 (:class:`palpate.metrics.mmd.Design`), of other biased
+            values 1/m + 1/m' of the halves; empty where it depends on neither.
+        groups: names of all units that the set has.
+        without_class: (C, 2 or more) the value without each class, and what ``excess`` has; empty
+            with fewer than three classes.
+    """
+
+    score: Score
+    replicates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    units: Sequence[str] = ()
+    excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    design: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    groups: Sequence[str] = ()
+    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
+
+
+def over_classes(one: Scored) -> Scored:
+    """The same with classes left out in turn instead of units; ``details["left_out"]`` records it.
+
+    For classes that cannot spare a unit, and for comparisons with a set that has such classes.
+    """
+    if not len(one.without_class):
+        return one
+    details = {**one.score.details, "left_out": "class"}
+    return replace(
+        one,
+        score=replace(one.score, details=details),
+        replicates=one.without_class[:, 0],
+        units=details["classes"],
+        excess=one.without_class[:, 1] if "E" in details else np.zeros(0),
+    )
+
+
+def same_units(*sets: Scored) -> Sequence[Scored]:
+    """The sets with the same units left out, or the same classes; unchanged where neither works."""
+    by_class = [over_classes(s) for s in sets]
+    for choice in (sets, by_class):
+        if all(list(s.units) == list(choice[0].units) for s in choice):
+            return choice
+    return sets
 
 
 @dataclass(frozen=True)

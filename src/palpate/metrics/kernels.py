@@ -260,13 +260,7 @@ MOST_ITEMS = 2048
 
 @dataclass(frozen=True)
 class Sweep:
-    """What one pass over the pairs gives.
-
-    Attributes:
-        sums: by item and segment.
-        spread: (K, 3) of the doubly centered kernel of each set of segments that was requested, see
-            :func:`centered_squares`.
-    """
+    """Sums by item and segment, and (K, 3) :func:`centered_squares` of the requested segments."""
 
     sums: PairSums
     spread: Array
@@ -298,7 +292,7 @@ def kernel_sums(
         backend: see the module.
         tolerance: largest ``bound`` that ``auto`` takes moments with.
         block: most rows of a block.
-        spread: sets of segments whose centered squares are wanted.
+        spread: sets of segments whose :func:`centered_squares` are computed.
 
     Raises:
         PalpateError: if moments are requested for another kernel, or for too many items.
@@ -319,14 +313,9 @@ def kernel_sums(
     cheap = size <= max(STATE_BYTES, rows * width * 4)
     many = rows >= max(LEAST_ROWS, ROWS_A_WIDTH * width)
     if backend == "moments" or (backend == "auto" and not reason and cheap and many):
-        sweep = _moments(
-            parts,
-            items,
-            number.reshape(-1),
-            segments=segments,
-            sigma=float(kernel.bandwidth or 0),
-            spread=spread,
-        )
+        sigma = float(kernel.bandwidth or 0)
+        number = number.reshape(-1)
+        sweep = _moments(parts, items, number, segments=segments, sigma=sigma, spread=spread)
         remainder = bound(sweep.sums)
         if backend == "moments" or remainder <= tolerance:
             return sweep
@@ -336,9 +325,8 @@ def kernel_sums(
         text = f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{why}"
         warnings.warn(text, PalpateWarning, stacklevel=4)
     x = parts[0] if len(parts) == 1 else array_namespace(parts[0]).concat(list(parts), axis=0)
-    return blocked_sums(
-        x, segment, unit, segments=segments, kernel=kernel, block=block, spread=spread
-    )
+    options: dict[str, Any] = {"segments": segments, "kernel": kernel, "spread": spread}
+    return blocked_sums(x, segment, unit, block=block, **options)
 
 
 def _moments(
@@ -371,7 +359,7 @@ def blocked_sums(
     block: int = 1024,
     spread: Sequence[Index] = (),
 ) -> Sweep:
-    """Kernel sums of all samples of ``x`` (N, d) with all segments, block by block."""
+    """As :func:`kernel_sums` by blocks, of the rows ``x`` (N, d)."""
     order = np.lexsort((unit, segment))
     segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
     new = (np.diff(segment, prepend=-1) != 0) | (np.diff(unit, prepend=unit[:1]) != 0)
@@ -504,8 +492,7 @@ class _Cells:
 
 
 def centered_squares(squares: float, row_sums: Array) -> tuple[float, float, float]:
-    """Of the doubly centered kernel: the sum of squares over i != j, the trace, the squared
-    diagonal.
+    """Sum of squares over i != j, trace and squared diagonal of the doubly centered kernel.
 
     From sum_ij k^2 and row sums of a matrix whose diagonal is 0:
     ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means, and ``Kc_ii = r - 2 r_i``.

@@ -77,130 +77,21 @@ from palpate.metrics.kernels import (
     kernel_sums,
 )
 
+Estimator = Literal["unbiased", "biased", "grouped"]
 Halves = Literal["group", "random", "ordered"]
 Denominator = Literal["sum", "mean", "mean_off_diagonal"]
 Aggregate = Literal["mean_of_ratios", "ratio_of_means"]
 HALVES = ("group", "random", "ordered")
 DENOMINATORS = ("sum", "mean", "mean_off_diagonal")
 AGGREGATES = ("mean_of_ratios", "ratio_of_means")
-
-
-class Options(TypedDict, total=False):
-    """Options of ``tmmd``, ``i_tmmd``, ``ci_tmmd``, ``d_tmmd``; each records those that bear on it.
-
-    Keys:
-        preset: one of ``PRESETS``; default ``"grouped"`` where groups are known, else ``"paper"``.
-        estimator, halves, denominator, aggregate: override one entry of the preset.
-        sigma: kernel bandwidth, default 10; several are averaged; ``"median"``: the median distance
-            of the reference; ``"multi"``: five bandwidths around it
-            (:mod:`palpate.metrics.kernels`).
-        kernel: instead of the Gaussian of ``sigma``, e.g. :class:`palpate.metrics.Polynomial`.
-        scale: factor on the result, default 1000.
-        normalize: rows that are not of unit length: ``"check"`` rejects them (default), True
-            divides by the norm, False takes them as they are.
-        backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``
-            (:mod:`palpate.metrics.kernels`).
-        tolerance: largest bound with which ``auto`` takes moments, default 1e-4 at scale 1000.
-        block: rows of a kernel block, default 1024.
-        permutations: relabelings of the permutation test of TMMD, default 999; 0 for none.
-        level: coverage of intervals, default 0.95.
-        min_samples: a class with fewer is excluded, at least 4, default 4.
-        seed: of random halves, default 0.
-        subject: what is scored, default ``"generated"``.
-        split: digest of the split, kept with the score.
-    """
-
-    preset: str | None
-    estimator: Estimator
-    halves: Halves
-    denominator: Denominator
-    aggregate: Aggregate
-    sigma: Sigma
-    kernel: Kernel | None
-    scale: float
-    normalize: Normalize
-    backend: Backend
-    tolerance: float
-    block: int
-    permutations: int
-    level: float
-    min_samples: int
-    seed: int
-    subject: str
-    split: str | None
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Options with nothing left open; the fields are those of :class:`Options`."""
-
-    preset: str
-    estimator: Estimator
-    halves: Halves
-    denominator: Denominator
-    aggregate: Aggregate
-    sigma: Sigma = 10.0
-    kernel: Kernel | None = None
-    scale: float = 1000.0
-    normalize: Normalize = "check"
-    backend: Backend = "auto"
-    tolerance: float = 1e-4
-    block: int = 1024
-    permutations: int = 999
-    level: float = 0.95
-    min_samples: int = 4
-    seed: int = 0
-    subject: str = "generated"
-    split: str | None = None
-
-
-PRESETS: dict[str, Plan] = {
-    plan.preset: plan
-    for plan in (
-        Plan("paper", "unbiased", "random", "sum", "mean_of_ratios"),
-        Plan("paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"),
-        Plan("cmmd", "biased", "random", "sum", "mean_of_ratios"),
-        Plan("grouped", "grouped", "group", "sum", "ratio_of_means"),
-    )
-}
-
-
-def plan_for(options: Options, *, grouped: bool) -> Plan:
-    """The options completed; ``grouped``: whether groups are known.
-
-    Raises:
-        PalpateError: on an unknown word, a parameter out of range, or options that need groups
-            where none are known.
-    """
-    preset = options.get("preset") or ("grouped" if grouped else "paper")
-    checked_choice("preset", preset, tuple(PRESETS))
-    given: dict[str, Any] = {k: v for k, v in options.items() if k != "preset"}
-    names = [f.name for f in fields(Plan)]
-    if unknown := sorted(set(given) - set(names)):
-        must = f"must not be given: options are {', '.join(names)}"
-        raise invalid(unknown[0], must, ", ".join(unknown), "Check the spelling")
-    plan = Plan(**{**asdict(PRESETS[preset]), **given})
-    checked_choice("estimator", plan.estimator, ESTIMATORS)
-    checked_choice("halves", plan.halves, HALVES)
-    checked_choice("denominator", plan.denominator, DENOMINATORS)
-    checked_choice("aggregate", plan.aggregate, AGGREGATES)
-    checked_choice("backend", plan.backend, BACKENDS)
-    checked_number(positive=True, scale=plan.scale)
-    checked_number(tolerance=plan.tolerance)
-    checked_whole(1, block=plan.block)
-    checked_whole(0, permutations=plan.permutations, seed=plan.seed)
-    checked_whole(4, min_samples=plan.min_samples)  # two for each half
-    checked_level(plan.level)
-    checked_kernel(plan.kernel)
-    for name, value in (("estimator", "grouped"), ("halves", "group")):
-        if not grouped and getattr(plan, name) == value:
-            must = f"must know the group of every sample for {name}={value!r}"
-            raise invalid("groups", must, "none", "Pass groups, or another preset", preset="paper")
-    return plan
-
-
-Estimator = Literal["unbiased", "biased", "grouped"]
 ESTIMATORS = ("unbiased", "biased", "grouped")
+CHOICES = {
+    "estimator": ESTIMATORS,
+    "halves": HALVES,
+    "denominator": DENOMINATORS,
+    "aggregate": AGGREGATES,
+    "backend": BACKENDS,
+}
 
 
 def mmd_matrix(t: Totals, estimator: str, scale: float) -> Array:
@@ -374,15 +265,124 @@ def distance(  # noqa: PLR0913
         must = "must be wide against the features for the moments back end"
         got = f"a bound of {bound:.2g}"
         raise invalid("sigma", must, got, "Sum blocks", backend="blocked")
-    settings, bandwidth = kernel.settings(), kernel.bandwidth
-    return Distance(
-        value, bound, sums.backend, estimator, settings, bandwidth, scale, len(x), len(y)
-    )
+    how = (sums.backend, estimator, kernel.settings(), kernel.bandwidth, scale)
+    return Distance(value, bound, *how, m=len(x), n=len(y))
 
 
 def mmd2(x: Any, y: Any, **options: Any) -> float:
     """The value of :func:`distance`, with the same options."""
     return distance(x, y, **options).value
+
+
+class Options(TypedDict, total=False):
+    """Options of ``tmmd``, ``i_tmmd``, ``ci_tmmd``, ``d_tmmd``; each records those that bear on it.
+
+    Keys:
+        preset: one of ``PRESETS``; default ``"grouped"`` where groups are known, else ``"paper"``.
+        estimator, halves, denominator, aggregate: override one entry of the preset.
+        sigma: kernel bandwidth, default 10; several are averaged; ``"median"``: the median distance
+            of the reference; ``"multi"``: five bandwidths around it
+            (:mod:`palpate.metrics.kernels`).
+        kernel: instead of the Gaussian of ``sigma``, e.g. :class:`palpate.metrics.Polynomial`.
+        scale: factor on the result, default 1000.
+        normalize: rows that are not of unit length: ``"check"`` rejects them (default), True
+            divides by the norm, False takes them as they are.
+        backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``
+            (:mod:`palpate.metrics.kernels`).
+        tolerance: largest bound with which ``auto`` takes moments, default 1e-4 at scale 1000.
+        block: rows of a kernel block, default 1024.
+        permutations: relabelings of the permutation test of TMMD, default 999; 0 for none.
+        level: coverage of intervals, default 0.95.
+        min_samples: a class with fewer is excluded, at least 4, default 4.
+        seed: of random halves, default 0.
+        subject: what is scored, default ``"generated"``.
+        split: digest of the split, kept with the score.
+    """
+
+    preset: str | None
+    estimator: Estimator
+    halves: Halves
+    denominator: Denominator
+    aggregate: Aggregate
+    sigma: Sigma
+    kernel: Kernel | None
+    scale: float
+    normalize: Normalize
+    backend: Backend
+    tolerance: float
+    block: int
+    permutations: int
+    level: float
+    min_samples: int
+    seed: int
+    subject: str
+    split: str | None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Options with nothing left open; the fields are those of :class:`Options`."""
+
+    preset: str
+    estimator: Estimator
+    halves: Halves
+    denominator: Denominator
+    aggregate: Aggregate
+    sigma: Sigma = 10.0
+    kernel: Kernel | None = None
+    scale: float = 1000.0
+    normalize: Normalize = "check"
+    backend: Backend = "auto"
+    tolerance: float = 1e-4
+    block: int = 1024
+    permutations: int = 999
+    level: float = 0.95
+    min_samples: int = 4
+    seed: int = 0
+    subject: str = "generated"
+    split: str | None = None
+
+
+PRESETS: dict[str, Plan] = {
+    plan.preset: plan
+    for plan in (
+        Plan("paper", "unbiased", "random", "sum", "mean_of_ratios"),
+        Plan("paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"),
+        Plan("cmmd", "biased", "random", "sum", "mean_of_ratios"),
+        Plan("grouped", "grouped", "group", "sum", "ratio_of_means"),
+    )
+}
+
+
+def plan_for(options: Options, *, grouped: bool) -> Plan:
+    """The options completed; ``grouped``: whether groups are known.
+
+    Raises:
+        PalpateError: on an unknown word, a parameter out of range, or options that need groups
+            where none are known.
+    """
+    preset = options.get("preset") or ("grouped" if grouped else "paper")
+    checked_choice("preset", preset, tuple(PRESETS))
+    given: dict[str, Any] = {k: v for k, v in options.items() if k != "preset"}
+    names = [f.name for f in fields(Plan)]
+    if unknown := sorted(set(given) - set(names)):
+        must = f"must not be given: options are {', '.join(names)}"
+        raise invalid(unknown[0], must, ", ".join(unknown), "Check the spelling")
+    plan = Plan(**{**asdict(PRESETS[preset]), **given})
+    for name, choices in CHOICES.items():
+        checked_choice(name, getattr(plan, name), choices)
+    checked_number(positive=True, scale=plan.scale)
+    checked_number(tolerance=plan.tolerance)
+    checked_whole(1, block=plan.block)
+    checked_whole(0, permutations=plan.permutations, seed=plan.seed)
+    checked_whole(4, min_samples=plan.min_samples)  # two for each half
+    checked_level(plan.level)
+    checked_kernel(plan.kernel)
+    for name, value in (("estimator", "grouped"), ("halves", "group")):
+        if not grouped and getattr(plan, name) == value:
+            must = f"must know the group of every sample for {name}={value!r}"
+            raise invalid("groups", must, "none", "Pass groups, or another preset", preset="paper")
+    return plan
 
 
 #: More samples than this are left out in so many random blocks; in fewer where there are so many
@@ -391,8 +391,7 @@ BLOCKS, MANY, BLOCKS_OF_MANY = 1000, 100_000, 50
 
 
 def half_of(ids: Sequence[str], within: Index, plan: Plan) -> Index:
-    """0 or 1 for each sample, in halves whose sizes differ by at most one, in each value of
-    ``within``.
+    """0 or 1 for each sample: halves of each value of ``within``, equal in size to one sample.
 
     ``random`` depends on (seed, ids) and ``ordered`` on the order of the ids as strings, neither on
     the order of the rows. ``group`` gives 0 everywhere: its halves are never drawn.
@@ -510,14 +509,6 @@ def whole_sets(t: Totals) -> Totals:
     return t.merge(np.repeat(np.arange(sets), 2), sets)
 
 
-def without_set(t: Totals, c: int) -> Totals:
-    """All sets but c, both halves of each."""
-    to = np.full(len(t.n), -1, dtype=np.intp)
-    kept = np.setdiff1d(np.arange(len(t.n)), [2 * c, 2 * c + 1])
-    to[kept] = np.arange(len(kept))
-    return t.merge(to, len(kept))
-
-
 def halves_of(n: Array) -> Array:
     """(K, 2) sizes of the halves of (K,) samples: as equal as they can be."""
     return np.stack([np.ceil(n / 2), np.floor(n / 2)], axis=1)
@@ -534,8 +525,7 @@ def dispersion_of(t: Totals, plan: Plan) -> Array:
 
 
 def random_halves_sd(spread: Array, sizes: Array, estimator: str, scale: float) -> Array:
-    """Standard deviation (K,) of dist^2 between two random halves of each of K sets, by closed
-    form.
+    """Standard deviation (K,) of dist^2 between two random halves of each of K sets.
 
     Let s = +-1 mark halves of m and m' samples, n = m + m', D = m - m', and Kc be the doubly
     centered kernel matrix, whose rows add up to 0. With ``W = sum_{i != j} Kc_ij s_i s_j`` and

@@ -77,12 +77,7 @@ class Moments:
         return cls(center, float(sigma), n, zeroth, np.zeros((items, d)), second, fourth, diagonal)
 
     def add(self, x: Any, item: Index | int = 0) -> None:
-        """Add rows.
-
-        Args:
-            x: (n, d) rows.
-            item: (n,) the item of each row, or one for all.
-        """
+        """Add rows (n, d); ``item`` (n,) of each, or one for all."""
         items = np.full(len(x), item) if np.ndim(item) == 0 else np.asarray(item)
         order = np.argsort(items, kind="stable")
         cuts = np.r_[0, np.flatnonzero(np.diff(items[order])) + 1, len(x)]
@@ -110,14 +105,8 @@ class Moments:
         # The expansion of k(x, x) - 1 = 0; it is taken out of sums over i != j.
         diagonal = 2 * e + e**2 + u**2 * squares + u**2 * squares**2 / 2
         weighted = u * squares
-        return (
-            e.sum(),
-            host(root @ z),
-            host(z.T @ z),
-            weighted @ weighted,
-            diagonal.sum(),
-            float(squares.max()),
-        )
+        first, second, fourth = host(root @ z), host(z.T @ z), weighted @ weighted
+        return e.sum(), first, second, fourth, diagonal.sum(), float(squares.max())
 
     def products(self) -> tuple[Array, Array]:
         """(P, P) sums of k - 1 over i != j, and (P, P) what their remainders cannot exceed."""
@@ -154,8 +143,7 @@ class Moments:
             return np.nan, np.nan, np.nan
         about_center = self.second[items].sum(axis=0, dtype=np.float64)
         second = about_center - np.outer(first, first) / n
-        # Sum of ||z - mean||^4, with the mean distance for the cross terms: a correction of order
-        # 1/n.
+        # sum of ||z - mean||^4; the cross terms, of order 1/n, by the mean distance
         trace = float(np.trace(about_center))
         shrunk = 1 - float(first @ first) / n / trace if trace > 0 else 0.0
         inner = float(self.fourth[items].sum()) * shrunk**2
@@ -164,10 +152,9 @@ class Moments:
 
 def remainder_factor(rho: float) -> float:
     """``h(rho) = (exp(rho) - 1 - rho - rho^2 / 2) / rho^2``, accurate for small rho too."""
-    # sum_{p >= 3} rho^p / p! = exp(rho) P(3, rho), P the regularized lower incomplete gamma
-    # function.
     if rho < 1e-80:
         return rho / 6
+    # sum_{p >= 3} rho^p / p! = exp(rho) P(3, rho), P the regularized lower incomplete gamma
     return float(np.exp(rho) * special.gammainc(3, rho) / rho**2)
 
 

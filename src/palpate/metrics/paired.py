@@ -30,15 +30,21 @@ from scipy import special
 
 from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
-from palpate.metrics.intervals import Interval, jackknife_errors, mean_interval, t_interval
+from palpate.metrics.intervals import (
+    Interval,
+    Scored,
+    jackknife_errors,
+    mean_interval,
+    same_units,
+    t_interval,
+)
 from palpate.metrics.mmd import Options
 from palpate.metrics.tactile import (
-    Scored,
-    excess_of,
+    LOOSE_BOUND,
+    UNBOUNDED,
     floors_of,
     four_of,
     not_comparable,
-    same_units,
     tmmd_scored,
     with_floor,
 )
@@ -203,6 +209,40 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     return _as_difference(x, y, value, details, note=note, interval=interval, method=method)
 
 
+def excess_of(one: Scored) -> Scored | None:
+    """The between-group excess E of an I- or CI-TMMD as its own score; None where there is none.
+
+    It does not depend on the number of groups, and its floor is that of the same classes: it is
+    what to report. Where moments do not bound it, it is undefined.
+    """
+    score, d = one.score, one.score.details
+    if d.get("E") is None or score.settings.get("halves") != "group":
+        return None
+    bound = np.inf if d.get("E_bound") is None else float(d["E_bound"])  # JSON has no infinity
+    known = bound <= 2 * score.scale
+    interval = d.get("E_interval") if known else None
+    notes = [] if known else [UNBOUNDED]
+    if known and bound > LOOSE_BOUND * score.scale / 1000:
+        notes = [Note("within-bound", {"bound": bound})]
+    kept = ("unit", "left_out", "units", "backend", "version", "classes", "excluded")
+    of_excess = replace(
+        score,
+        metric=f"{score.metric} E",
+        value=d["E"] if known else None,
+        interval=tuple(interval) if interval else None,
+        null=None,
+        interval_method=score.interval_method if interval else "",
+        floor=d.get("E_floor"),
+        estimator="unbiased",
+        seed=None,
+        notes=tuple(notes),
+        details={k: d[k] for k in kept if k in d} | {"bound": bound if known else None},
+    )
+    units = one.units if len(one.excess) else ()
+    without = one.without_class[:, 1:]
+    return Scored(of_excess, one.excess, units, groups=one.groups, without_class=without)
+
+
 def _error(replicates: Array) -> float:
     return float(jackknife_errors(replicates[:, None])[0])
 
@@ -262,7 +302,7 @@ def _as_difference(
 def mean_differences(
     scores: Mapping[str, Score], values: Mapping[str, Array], groups: Sequence[str] | None
 ) -> list[Score]:
-    """Paired differences of a metric that is a mean over images.
+    """Paired differences of a metric that is a mean over images; notes are of the difference alone.
 
     Args:
         scores: of the generators, of one metric.
@@ -273,12 +313,8 @@ def mean_differences(
     Raises:
         PalpateError: if the scores are of different settings.
     """
-    return holm(
-        [
-            _mean_difference(scores[a], scores[b], values[a] - values[b], groups)
-            for a, b in combinations(scores, 2)
-        ]
-    )
+    pairs = [(scores[a], scores[b], values[a] - values[b]) for a, b in combinations(scores, 2)]
+    return holm([_mean_difference(*pair, groups) for pair in pairs])
 
 
 def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | None) -> Score:

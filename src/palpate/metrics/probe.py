@@ -262,15 +262,8 @@ def mean_over_groups(
             low, high = t_interval(mean, error, g - 1, 0.95)
             interval = (max(0.0, low), min(1.0, high))
             method = f"leave-one-group-out jackknife, t, {g - 1} df"
-    return Score(
-        metric,
-        value=mean,
-        interval=interval,
-        interval_method=method,
-        n=len(values),
-        higher_is_better=True,
-        **fields,
-    )
+    fields |= {"interval": interval, "interval_method": method, "n": len(values)}
+    return Score(metric, value=mean, higher_is_better=True, **fields)
 
 
 def _unit(x: NDArray[Any]) -> Array:

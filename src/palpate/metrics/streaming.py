@@ -50,10 +50,7 @@ class Batch:
 
     @classmethod
     def of(cls, features: Any, normalize: Normalize, *, real: bool, **columns: Any) -> Batch:
-        """A checked copy of what a caller passed: buffers are often used again.
-
-        Rows are kept as they came, widened to float32 at least.
-        """
+        """A checked copy, widened to float32 at least: callers often use their buffers again."""
         name = f"The {'real' if real else 'generated'} features of this update"
         x = checked_features(name, to_host(features), normalize=False, least=0)
         if normalize is not False:
@@ -204,19 +201,16 @@ class StreamingMetric:
 
         Args:
             features: (n, d), n may be 0: NumPy or torch on any device; half precision is widened.
-            Rows
-                are copied.
+                Rows are copied.
             real: whether these are real samples: the reference of TMMD, the floor of the others.
             ids: n sample ids, strings or integers; without, a digest of each row.
             labels: n classes, for CI- and D-TMMD.
             groups: n videos, strings or integers. Ids, labels and groups are given with every batch
-            of
-                a set, or with none.
+                of a set, or with none.
 
         Raises:
-            PalpateError: at once for rows that are NaN, infinite, zero or (``normalize="check"``)
-            not
-                of unit length, another width than before, or columns of another length.
+            PalpateError: at once for rows that :func:`palpate.metrics.inputs.checked_features`
+                rejects, another width than before, or columns of another length.
         """
         columns: dict[str, Any] = {"real": real, "ids": ids, "labels": labels, "groups": groups}
         self.state.add(Batch.of(features, self.plan.normalize, **columns))

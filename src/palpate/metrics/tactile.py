@@ -25,7 +25,7 @@ Inception. CMMD (Jayasumana et al., arXiv 2401.09603): the biased one with a Gau
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Unpack
 
 import numpy as np
@@ -45,12 +45,14 @@ from palpate.metrics.inputs import (
     require_one_encoder,
 )
 from palpate.metrics.intervals import (
-    Interval,
+    Estimate,
     PairSums,
+    Scored,
     Totals,
-    jackknife_errors,
+    class_estimate,
+    estimate,
+    over_classes,
     permutation_test,
-    t_interval,
 )
 from palpate.metrics.kernels import Kernel, Polynomial, gaussian, kernel_sums
 from palpate.metrics.mmd import (
@@ -73,7 +75,6 @@ from palpate.metrics.mmd import (
     self_distances,
     unit_index,
     whole_sets,
-    without_set,
 )
 
 
@@ -141,12 +142,10 @@ def build_table(
     Args:
         generated: the set that is halved and divided into classes.
         reference: real samples, or None where no metric needs them.
-        plan: halves, seed, bandwidth, back end, normalization.
+        plan: options.
         grouped: whether the groups of the sets are the jackknife's units; else samples are.
-        median_of: the set whose median distance ``sigma="median"`` takes; else the reference, or
-            the generated set without one.
-        further: the bound of a statistic without scale, which moments must keep within the
-            tolerance as well: D-TMMD is a ratio.
+        median_of: whose median distance ``sigma="median"`` takes; else the last set's.
+        further: a bound that moments must keep as well, of a statistic without scale (D-TMMD).
 
     Raises:
         PalpateError: on features or groups that are rejected.
@@ -171,9 +170,10 @@ def build_table(
     segment = np.append(segment, np.full(len(units) - len(segment), reference_segment))
     kernel = plan.kernel
     if kernel is None and isinstance(plan.sigma, str) and median_of is not None:
-        kernel = gaussian(plan.sigma, _rows_of_median(median_of, plan), median_of.groups)
-    if kernel is None:
-        kernel = gaussian(plan.sigma, parts[-1], sets[-1].groups)
+        name = "The features that the median distance is taken over"
+        rows = checked_features(name, median_of.features, normalize=plan.normalize)
+        kernel = gaussian(plan.sigma, rows, median_of.groups)
+    kernel = kernel or gaussian(plan.sigma, parts[-1], sets[-1].groups)
 
     def bound(sums: PairSums) -> float:
         table = Table(sums, classes, unit, unit_names, kernel, np.zeros((0, 3)))
@@ -209,11 +209,6 @@ def _segments(generated: FeatureSet, plan: Plan) -> tuple[list[str], Index]:
     return classes, 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, whole, plan)
 
 
-def _rows_of_median(median_of: FeatureSet, plan: Plan) -> Array:
-    name = "The features that the median distance is taken over"
-    return checked_features(name, median_of.features, normalize=plan.normalize)
-
-
 def _bound(table: Table, plan: Plan) -> float:
     """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most."""
     halves, reference = table.set_halves(), table.sums.segment == table.sums.segments - 1
@@ -225,107 +220,11 @@ def _bound(table: Table, plan: Plan) -> float:
     return max(b if np.isfinite(b) else np.inf for b in bounds)
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A statistic with its jackknife.
-
-    Attributes:
-        values: (K,).
-        errors: (K,) standard errors.
-        df: their degrees of freedom.
-        method: in words.
-        replicates: (G, K) values without each unit.
-        units: (G,) units.
-        without_class: (C, 4) the first four values without each class; empty with fewer than three.
-        of_classes: whether the errors are those over classes.
-    """
-
-    values: Array
-    errors: Array
-    df: int
-    method: str
-    replicates: Array = field(repr=False)
-    units: Index = field(repr=False)
-    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
-    of_classes: bool = False
-
-    def interval(self, k: int, level: float) -> Interval | None:
-        """Interval of value k, or None where it has none."""
-        value, error = float(self.values[k]), float(self.errors[k])
-        if not (np.isfinite(value) and np.isfinite(error) and error > 0):
-            return None  # no variation between units is no evidence of certainty
-        return t_interval(value, error, self.df, level)
-
-
-def estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
-    """The statistic on all samples, with its leave-one-unit-out jackknife."""
-    replicates = np.array([statistic(t) for t in sums.leave_one_out()], dtype=np.float64)
-    df = len(sums.units) - 1
-    tail = "" if unit == "group" else ", samples taken as independent"
-    method = f"leave-one-{unit}-out jackknife, t, {df} df{tail}"
-    errors = jackknife_errors(replicates)
-    return Estimate(statistic(sums.totals), errors, df, method, replicates, sums.units)
-
-
-def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: str) -> Estimate:
-    """As :func:`estimate`, for 2C segments; over classes where one cannot spare a unit (two
-    groups).
-
-    The interval over classes also holds the differences between classes, so it errs on the wide
-    side. The first four values of the statistic must be defined for fewer classes; only they get
-    errors then.
-    """
-    over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
-    if classes < 3:
-        return over_units
-    without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
-    if np.isfinite(over_units.errors[0]):
-        return replace(over_units, without_class=without)
-    errors = np.full(len(over_units.values), np.nan)
-    errors[: without.shape[1]] = jackknife_errors(without)
-    reason = f"(a class has too few {unit}s to leave one out)"
-    method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
-    return replace(
-        over_units,
-        errors=errors,
-        df=classes - 1,
-        method=method,
-        without_class=without,
-        of_classes=True,
-    )
-
-
 #: A bound at scale 1000 from which a note reports it.
 LOOSE_BOUND = 1e-4
 #: Designs that differ by less have one floor: the change is far below the noise of any floor.
 SAME_DESIGN = 0.01
 UNBOUNDED = Note("undefined", {"reason": "moments"})
-
-
-@dataclass(frozen=True)
-class Scored:
-    """A score and how it moves.
-
-    Attributes:
-        score: the score.
-        replicates: (G,) the value without each unit.
-        units: (G,) names of the units; see :func:`over_classes` for the other choice.
-        excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
-        design: what the value depends on besides the features: of halves of whole groups how their
-            sizes turn E into dist^2 (:class:`palpate.metrics.mmd.Design`), of other biased
-            values 1/m + 1/m' of the halves; empty where it depends on neither.
-        groups: names of all units that the set has.
-        without_class: (C, 2 or more) the value without each class, and what ``excess`` has; empty
-            with fewer than three classes.
-    """
-
-    score: Score
-    replicates: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    units: Sequence[str] = ()
-    excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    design: Array = field(default_factory=lambda: np.zeros(0), repr=False)
-    groups: Sequence[str] = ()
-    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
 
 
 def scored(  # noqa: PLR0913
@@ -345,20 +244,20 @@ def scored(  # noqa: PLR0913
 ) -> Scored:
     """A score with everything that the plan and the set fix.
 
-    NaN becomes None, and an undefined value loses its interval.
+    NaN becomes None, and an undefined value loses its interval and has a note ``undefined``.
 
     Args:
         metric: its name.
         table: for kernel, back end, units.
         generated: for sizes and digests.
-        plan: for subject, split, level, scale, and the options named in ``settings``.
+        plan: options; those named in ``settings`` are recorded with the score.
         settings: options that bear on this metric.
         estimate: its first value is the score's; None for an undefined one.
-        design: as :class:`Scored`; default empty.
+        design: as :class:`Scored`.
         bound: the value is within this of the exact one, rounding aside.
         limit: the largest bound that leaves a value; default: as much as a distance can be.
-        details: kept with the score.
-        notes: an undefined score has one of code ``undefined``.
+        details: of the score.
+        notes: of the score.
         **fields: further fields of the score.
     """
     value = plain(estimate.values[0]) if estimate else None
@@ -374,6 +273,9 @@ def scored(  # noqa: PLR0913
         notes = notes or [Note("undefined", {"reason": "no-pairs"})]
     elif interval is None:
         notes.append(Note("no-interval", {"reason": "too-few"}))
+    common = {"unit": table.unit, "backend": table.sums.backend}
+    common |= {"bound": plain(float(bound)) if value is not None else None, "version": __version__}
+    recorded = ("preset", "normalize", *settings)
     score = Score(
         metric,
         plan.subject,
@@ -386,18 +288,9 @@ def scored(  # noqa: PLR0913
         n=len(generated.ids),
         encoder=generated.encoder,
         split=plan.split,
-        details={
-            **plain(details),
-            "unit": table.unit,
-            "backend": table.sums.backend,
-            "bound": plain(float(bound)) if value is not None else None,
-            "version": __version__,
-        },
+        details=plain(details) | common,
         notes=tuple(notes),
-        settings={
-            **table.kernel.settings(),
-            **{name: getattr(plan, name) for name in ("preset", "normalize", *settings)},
-        },
+        settings=table.kernel.settings() | {name: getattr(plan, name) for name in recorded},
         **fields,
     )
     design = np.zeros(0) if design is None else design
@@ -410,72 +303,11 @@ def scored(  # noqa: PLR0913
     return over_classes(result) if estimate.of_classes else result
 
 
-def over_classes(one: Scored) -> Scored:
-    """The same with classes left out in turn instead of units; ``details["left_out"]`` records it.
-
-    For classes that cannot spare a unit, and for comparisons with a set that has such classes.
-    """
-    if not len(one.without_class):
-        return one
-    details = {**one.score.details, "left_out": "class"}
-    return replace(
-        one,
-        score=replace(one.score, details=details),
-        replicates=one.without_class[:, 0],
-        units=details["classes"],
-        excess=one.without_class[:, 1] if "E" in details else np.zeros(0),
-    )
-
-
-def same_units(*sets: Scored) -> Sequence[Scored]:
-    """The sets with the same units left out, or the same classes; unchanged where neither works."""
-    by_class = [over_classes(s) for s in sets]
-    for choice in (sets, by_class):
-        if all(list(s.units) == list(choice[0].units) for s in choice):
-            return choice
-    return sets
-
-
-def excess_of(one: Scored) -> Scored | None:
-    """The between-group excess E of an I- or CI-TMMD as its own score; None where there is none.
-
-    It does not depend on the number of groups, and its floor is that of the same classes: it is
-    what to report. Where moments do not bound it, it is undefined.
-    """
-    score, d = one.score, one.score.details
-    if d.get("E") is None or score.settings.get("halves") != "group":
-        return None
-    bound = np.inf if d.get("E_bound") is None else float(d["E_bound"])  # JSON has no infinity
-    known = bound <= 2 * score.scale
-    interval = d.get("E_interval") if known else None
-    notes = [] if known else [UNBOUNDED]
-    if known and bound > LOOSE_BOUND * score.scale / 1000:
-        notes = [Note("within-bound", {"bound": bound})]
-    kept = ("unit", "left_out", "units", "backend", "version", "classes", "excluded")
-    of_excess = replace(
-        score,
-        metric=f"{score.metric} E",
-        value=d["E"] if known else None,
-        interval=tuple(interval) if interval else None,
-        null=None,
-        interval_method=score.interval_method if interval else "",
-        floor=d.get("E_floor"),
-        estimator="unbiased",
-        seed=None,
-        notes=tuple(notes),
-        details={k: d[k] for k in kept if k in d} | {"bound": bound if known else None},
-    )
-    units = one.units if len(one.excess) else ()
-    without = one.without_class[:, 1:]
-    return Scored(of_excess, one.excess, units, groups=one.groups, without_class=without)
-
-
 def not_comparable(one: Scored, floor: Scored) -> str:
     """Why real samples like these give another value of this metric; '' if they do not.
 
-    Halves of whole groups grow with the share of pairs inside groups, which falls with the number
-    of groups and rises with the samples in each; a biased value falls as 1 / n; a mean over classes
-    has a floor over the same classes alone.
+    Values of halves of whole groups depend on the sizes of the groups, biased values on n, a mean
+    over classes on the classes.
 
     Returns:
         ``"classes"``, ``"groups"``, ``"group-sizes"``, ``"sizes"`` or ``""``.
@@ -592,12 +424,13 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
         notes.append(Note("copied-rows", {"count": table.copies, "n": len(generated.ids)}))
     if not table.grouped:
         notes.append(INDEPENDENT)
-    count, null, permutations = plan.permutations, None, None
-    test = permutation_test(sums, plan.estimator, plan.scale, count=count, seed=plan.seed)
-    if test is not None:
+    details: dict[str, Any] = {"units": len(sums.units), "copies": table.copies}
+    details |= {"p_value": None, "permutations": None}
+    null, draw = None, {"count": plan.permutations, "seed": plan.seed}
+    if test := permutation_test(sums, plan.estimator, plan.scale, **draw):
         null = (float(np.quantile(test.null, 0.025)), float(np.quantile(test.null, 0.975)))
-        permutations = {"count": len(test.null), "swapped": test.swapped, "dealt": test.dealt}
-        permutations["seed"] = plan.seed
+        exchanged = {"count": len(test.null), "swapped": test.swapped, "dealt": test.dealt}
+        details |= {"p_value": test.p, "permutations": exchanged | {"seed": plan.seed}}
     return scored(
         "TMMD",
         table,
@@ -609,12 +442,7 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
         estimator=plan.estimator,
         m=len(reference.ids),
         reference=reference.digest if reference.features.shape[1] else None,
-        details={
-            "units": len(sums.units),
-            "copies": table.copies,
-            "p_value": test.p if test else None,
-            "permutations": permutations,
-        },
+        details=details,
         notes=notes,
         null=null,
     )
@@ -707,15 +535,23 @@ def reference_free(
     metric: Any, generated: FeatureSet, options: Options, real: FeatureSet | None = None
 ) -> Scored:
     """One of the reference-free metrics, with real samples for its floor."""
-    grouped = generated.groups is not None
-    plan = plan_for(options, grouped=grouped)
-    further = ratio_bound if metric is d_tmmd_of else None
-    common: dict[str, Any] = {"grouped": grouped, "median_of": real, "further": further}
-    one = metric(build_table(generated, None, plan, **common), generated, plan)
+    [result] = _from_one_table([metric], generated, options, real)
     if real is None:
-        return one
+        return result
     _require_same_groups(generated, real)
-    return with_floor(one, metric(build_table(real, None, plan, **common), real, plan))
+    return with_floor(result, *_from_one_table([metric], real, options, real))
+
+
+def _from_one_table(
+    metrics: Sequence[Any], features: FeatureSet, options: Options, median_of: FeatureSet | None
+) -> list[Scored]:
+    """Reference-free metrics of one set from one pass over its pairs."""
+    grouped = features.groups is not None
+    plan = plan_for(options, grouped=grouped)
+    further = ratio_bound if d_tmmd_of in metrics else None
+    common: dict[str, Any] = {"grouped": grouped, "median_of": median_of, "further": further}
+    table = build_table(features, None, plan, **common)
+    return [metric(table, features, plan) for metric in metrics]
 
 
 def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
@@ -725,10 +561,8 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     if reason:
         least, n = plan.min_samples, len(generated.ids)
         notes = [Note("undefined", {"reason": reason, "least": least, "n": n})]
-    given: dict[str, Any] = {"details": details, "notes": notes}
-    return _mean_of_halves(
-        "I-TMMD", table, generated, plan, sums=sums, spread=table.spread[:1], **given
-    )
+    given: dict[str, Any] = {"spread": table.spread[:1], "details": details, "notes": notes}
+    return _mean_of_halves("I-TMMD", table, generated, plan, sums=sums, **given)
 
 
 def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
@@ -742,18 +576,13 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     sums, spread = table.class_halves(kept), table.spread[1 + kept]
     each, excess = self_distances(sums.totals, plan)
     sizes = whole_sets(sums.totals).n
-    details["per_class"] = {
-        name: {
-            "value": each[k],
-            "E": excess[k] if table.grouped else None,
-            "n": int(sizes[k]),
-            "units": len(np.unique(sums.unit[sums.segment // 2 == k])),
-        }
-        for k, name in enumerate(details["classes"])
-    }
-    return _mean_of_halves(
-        "CI-TMMD", table, generated, plan, sums=sums, spread=spread, details=details
-    )
+    details["per_class"] = {}
+    for k, name in enumerate(details["classes"]):
+        units = len(np.unique(sums.unit[sums.segment // 2 == k]))
+        of_class = {"value": each[k], "E": excess[k] if table.grouped else None}
+        details["per_class"][name] = of_class | {"n": int(sizes[k]), "units": units}
+    given: dict[str, Any] = {"spread": spread, "details": details}
+    return _mean_of_halves("CI-TMMD", table, generated, plan, sums=sums, **given)
 
 
 def _mean_of_halves(
@@ -808,7 +637,7 @@ def _mean_of_halves(
 
 
 def _halves_notes(plan: Plan, sums: PairSums, *, grouped: bool) -> list[Note]:
-    """What a reader of a metric of halves must know."""
+    """Notes of a metric of halves."""
     if not sums.rows.any() and not sums.diagonal.any():
         return [Note("collapse")]
     random = plan.halves == "random" and plan.estimator != "biased"
@@ -990,12 +819,10 @@ def four_scores(
     Args:
         generated: features of generated samples, with labels (for CI and D) and groups.
         reference: features of the real test samples.
-        floor: real samples on which the three reference-free metrics are computed for
-            ``Score.floor``; usually ``reference``. With halves of whole groups their values depend
-            on the number of groups and of samples in each, biased ones on the number of samples:
-            ``Score.floor`` is given where these are the same (within 1 %, else a note says why
-            not), and the floor of what does not depend on them, ``details["E_floor"]``, for any
-            groups of the same classes.
+        floor: real samples for ``Score.floor`` of the other three; usually ``reference``. Values
+            of halves of whole groups depend on the sizes of the groups, biased ones on n:
+            ``Score.floor`` is given where these are the same (within 1 %, else a note gives the
+            reason), ``details["E_floor"]`` for any groups of the same classes.
         **options: see :class:`palpate.metrics.Options`; the same for all four.
 
     Raises:
@@ -1010,18 +837,15 @@ def four_scores(
 
 
 def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> list[Scored]:
-    """The four metrics with their leave-one-unit-out values."""
+    """The four metrics as :class:`Scored`, in the order of the paper."""
     require_one_encoder(generated, reference, "reference")
-    alone = generated.groups is not None
-    both = alone and reference.groups is not None
-    plan, joint = plan_for(options, grouped=alone), plan_for(options, grouped=both)
-    table = build_table(generated, reference, joint, grouped=both, further=ratio_bound)
-    first = tmmd_of(table, generated, reference, joint)
-    if alone != both:
-        table = build_table(
-            generated, None, plan, grouped=alone, median_of=reference, further=ratio_bound
-        )
-    return [first, *(f(table, generated, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of))]
+    both = generated.groups is not None and reference.groups is not None
+    plan, metrics = plan_for(options, grouped=both), (i_tmmd_of, ci_tmmd_of, d_tmmd_of)
+    table = build_table(generated, reference, plan, grouped=both, further=ratio_bound)
+    first = tmmd_of(table, generated, reference, plan)
+    if both or generated.groups is None:
+        return [first, *(metric(table, generated, plan) for metric in metrics)]
+    return [first, *_from_one_table(metrics, generated, options, reference)]
 
 
 def floors_of(
@@ -1034,12 +858,7 @@ def floors_of(
     """
     require_one_encoder(like, floor, "floor")
     _require_same_groups(like, floor)
-    grouped = floor.groups is not None
-    plan = plan_for(options, grouped=grouped)
-    table = build_table(
-        floor, None, plan, grouped=grouped, median_of=reference, further=ratio_bound
-    )
-    return [f(table, floor, plan) for f in (i_tmmd_of, ci_tmmd_of, d_tmmd_of)]
+    return _from_one_table((i_tmmd_of, ci_tmmd_of, d_tmmd_of), floor, options, reference)
 
 
 def _require_same_groups(generated: FeatureSet, floor: FeatureSet) -> None:

@@ -91,8 +91,7 @@ class TorchMetric(Metric):
 
         Raises:
             PalpateError: as :meth:`palpate.metrics.streaming.StreamingMetric.compute`, or if
-            processes
-                differ in settings that states depend on.
+                processes differ in settings that states depend on.
         """
         self._require_settings(self.settings)
         self._score = self.plain.score_of(self._read(self.records))
