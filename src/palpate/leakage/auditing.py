@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from palpate.core import Note, PalpateError, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.groups import GROUPS
-from palpate.leakage.inputs import Data, read_all, require
+from palpate.leakage.inputs import Data, number_contacts, read_all, require
 from palpate.leakage.signals import (
     Flags,
     Gaps,
@@ -134,6 +134,8 @@ def audit(  # noqa: PLR0913
     require(not (impact and test is not None), "impact", "needs samples with a split", "no split")
     sources = [x for x in (train_or_data, test, pretrain) if x is not None]
     parts, notes = read_all(sources, skip_bad, progress, root)
+    if by == "contact":
+        parts = number_contacts(parts)
     options = _Options(
         by,
         near_frames,

@@ -50,10 +50,7 @@ def read(
 def read_all(
     sources: Sequence[Data], skip_bad: bool, progress: Progress, root: str | Path | None
 ) -> tuple[list[Manifest], list[Note]]:
-    """Several sources; the problems of all are raised together.
-
-    Contacts of bare frame lists are numbered over all of them, so that one name means one contact.
-    """
+    """Several sources; the problems of all are raised together."""
     manifests: list[Manifest] = []
     problems: list[Problem] = []
     notes: list[Note] = []
@@ -67,11 +64,14 @@ def read_all(
             notes += more
     if problems:
         raise ProblemsError(problems, "Correct the lines, or skip the bad ones")
-    bare = [k for k, manifest in enumerate(manifests) if set(manifest.facts) == {"source"}]
-    if len(bare) > 1:
-        for k, manifest in zip(bare, number_together(*(manifests[k] for k in bare)), strict=True):
-            manifests[k] = manifest
     return manifests, notes
+
+
+def number_contacts(manifests: list[Manifest]) -> list[Manifest]:
+    """Number the contacts of bare frame lists over all of them."""
+    bare = [k for k, manifest in enumerate(manifests) if set(manifest.facts) == {"source"}]
+    numbered = iter(number_together(*(manifests[k] for k in bare)) if len(bare) > 1 else ())
+    return [next(numbered, m) if k in bare else m for k, m in enumerate(manifests)]
 
 
 def _join(paths: list[Path], skip_bad: bool) -> tuple[Manifest, list[Problem]]:
