@@ -68,6 +68,7 @@ RENAMED: dict[tuple[str, str], str] = {
     ("split", "--group"): "--by",
     ("demo", "--group"): "--by",
     ("generate", "--manifest"): "a positional argument: palpate generate tag/ --split noleak.json",
+    ("split", "--noleak"): "--noleak touch-and-go (or hct), after the samples",
     ("audit", "--group"): "--by",
     ("audit", "--processes"): "--threads",
     ("import", "--set"): "with the option's own name, e.g. --labels train.txt",
