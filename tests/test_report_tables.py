@@ -3,8 +3,8 @@
 import pytest
 
 from palpate.core import Note, PalpateError
+from palpate.report.notes import decimals, number, percent, plural, score_text
 from palpate.report.tables import family_of, heat_tables, score_tables, settings_of
-from palpate.report.text import decimals, number, percent, plural, score_text
 from report_fixtures import difference, score, text_note
 
 

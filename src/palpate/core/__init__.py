@@ -1,6 +1,14 @@
 """The vocabulary that every room shares; needs NumPy alone."""
 
-from palpate.core.digest import digest_file, digest_folder, digest_json, digest_lines, short
+from palpate.core.digest import (
+    digest_file,
+    digest_folder,
+    digest_json,
+    digest_lines,
+    plain,
+    short,
+    to_numpy,
+)
 from palpate.core.errors import (
     MissingExtraError,
     PalpateError,
@@ -21,7 +29,6 @@ from palpate.core.files import (
     write_text,
 )
 from palpate.core.notes import Note
-from palpate.core.plain import plain, to_numpy
 from palpate.core.progress import Progress, quiet, track
 from palpate.core.random import rng_for, seed_for
 from palpate.core.samples import SampleRef

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from palpate.core.plain import plain
+from palpate.core.digest import plain
 
 #: Problems that a printed list shows.
 SHOWN_PROBLEMS = 40

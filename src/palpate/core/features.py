@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from palpate.core.digest import to_numpy
 from palpate.core.errors import PalpateError
 from palpate.core.files import atomic_path
-from palpate.core.plain import to_numpy
 
 #: Rows that are checked and hashed at a time: a memory-mapped array is never copied whole.
 BLOCK = 8192

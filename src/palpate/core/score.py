@@ -8,10 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from palpate.core.digest import short
+from palpate.core.digest import plain, short
 from palpate.core.errors import PalpateError
 from palpate.core.notes import Note
-from palpate.core.plain import plain
 
 #: Settings that must agree before two scores may share a column.
 COMPARABLE = (

@@ -19,11 +19,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from palpate.core.digest import digest_lines, short
+from palpate.core.digest import digest_lines, plain, short
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 from palpate.core.notes import Note
-from palpate.core.plain import plain
 
 PARTS = ("train", "val", "test")
 FORMAT = "palpate-split/1"

@@ -30,7 +30,7 @@ from palpate.core import (
     short,
 )
 from palpate.core.features import is_missing
-from palpate.core.plain import to_numpy
+from palpate.core.digest import to_numpy
 from palpate.evaluation.embedding_files import (
     SUFFIXES,
     Embeddings,

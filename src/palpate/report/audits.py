@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from palpate.report.notes import count, number, plural, score_text
 from palpate.report.results import Audit, ImpactRow, LeakPair
 from palpate.report.sentences import HARMLESS
-from palpate.report.text import count, number, plural, score_text
 
 
 class PairList(NamedTuple):

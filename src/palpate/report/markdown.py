@@ -11,7 +11,17 @@ from typing import Any
 
 from palpate.core import SampleRef, plain
 from palpate.report.audits import impact_cells, matrix_parts, matrix_rows, pair_facts, pair_lists
-from palpate.report.notes import confidence, sentence
+from palpate.report.notes import (
+    HINTS,
+    HOW_TO_READ,
+    confidence,
+    count,
+    number,
+    percent,
+    plural,
+    sentence,
+    where,
+)
 from palpate.report.results import Audit, Impact, LeakPair, Results
 from palpate.report.sentences import (
     cause_notes,
@@ -34,7 +44,6 @@ from palpate.report.tables import (
     settings_of,
     table_facts,
 )
-from palpate.report.text import HINTS, HOW_TO_READ, count, number, percent, plural, where
 
 #: Rows of images and pairs that are listed; the JSON has all.
 LISTED = 40

@@ -21,8 +21,18 @@ from markupsafe import Markup, escape
 
 from palpate import __version__
 from palpate.core import PalpateError, Progress, SampleRef, plain, quiet, write_json, write_text
-from palpate.report import audits, plots, sentences, text
-from palpate.report.notes import confidence, sentence
+from palpate.report import audits, plots, sentences
+from palpate.report.notes import (
+    HINTS,
+    HOW_TO_READ,
+    confidence,
+    count,
+    number,
+    percent,
+    plural,
+    sentence,
+    where,
+)
 from palpate.report.results import GalleryItem, LeakPair, Results
 from palpate.report.tables import heat_tables, score_tables, settings_of, table_facts
 from palpate.report.thumbnails import Album, Wanted, fit
@@ -169,7 +179,7 @@ def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
     """Photos above, tactile images below; test on the left."""
     samples = (("Test", pair.test), (head, pair.train))
     return [
-        Wanted(path, f"{name} {kind}: {text.where(s)}", f"{name} {kind}")
+        Wanted(path, f"{name} {kind}: {where(s)}", f"{name} {kind}")
         for kind in ("photo", "tactile image")
         for name, s in samples
         for path in [s.vision if kind == "photo" else s.tactile]
@@ -178,7 +188,7 @@ def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
 
 def _gallery_images(item: GalleryItem) -> list[Wanted]:
     sample = item.sample
-    name = f"{sample.material or 'sample'}, {text.where(sample)}"
+    name = f"{sample.material or 'sample'}, {where(sample)}"
     images = [
         Wanted(sample.vision, f"Photo: {name}", "Photo"),
         Wanted(sample.tactile, f"Real tactile image: {name}", "Real"),
@@ -217,10 +227,10 @@ def _gallery(results: Results, album: Album) -> list[dict[str, list[Any]]]:
 def _album_notes(album: Album, wanted: int) -> list[str]:
     notes: list[str] = []
     if album.broken:
-        images = text.plural(album.broken, "image")
+        images = plural(album.broken, "image")
         notes.append(f"{images} could not be read; a placeholder names the file.")
     if len(album.rows) < wanted:
-        skipped = text.plural(wanted - len(album.rows), "row")
+        skipped = plural(wanted - len(album.rows), "row")
         notes.append(
             f"{skipped} of images were skipped and the others made at most {album.side} px to keep "
             "the page within its size."
@@ -246,8 +256,8 @@ def environment() -> Environment:
         auto_reload=False,
     )
     functions: dict[str, Any] = {
-        "hints": text.HINTS,
-        "how_to_read": text.HOW_TO_READ,
+        "hints": HINTS,
+        "how_to_read": HOW_TO_READ,
         "open_pairs": OPEN_PAIRS,
         "table_facts": table_facts,
         "long_list": LONG_LIST,
@@ -256,8 +266,7 @@ def environment() -> Environment:
     for module in (audits, plots, sentences):
         functions |= {k: v for k, v in vars(module).items() if callable(v)}
     env.globals.update(functions)
-    names = ("count", "number", "percent", "plural")
-    env.filters.update({name: getattr(text, name) for name in names})
+    env.filters.update(count=count, number=number, percent=percent, plural=plural)
     env.filters.update(
         emphasize=_emphasize,
         leaf=_leaf,

@@ -15,8 +15,8 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from palpate.core import Score
+from palpate.report.notes import count, number, score_text
 from palpate.report.results import Audit, Impact, Signal
-from palpate.report.text import count, number, score_text
 
 WIDTH, HEIGHT, PAD = 148, 22, 7  # pixels of an interval bar
 LEFT, RIGHT = 13.0, 99.0  # percent of a histogram's width

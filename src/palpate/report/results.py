@@ -14,10 +14,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
+from palpate.core.digest import plain
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_record, write_json
 from palpate.core.notes import Note
-from palpate.core.plain import plain
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate.core import Score
+from palpate.report.notes import count, number, percent, plural, score_text
 from palpate.report.results import Audit, Results, Signal
 from palpate.report.tables import Table, score_tables
-from palpate.report.text import count, number, percent, plural, score_text
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
 #: is compared with), and what is said of a share of the test samples. The first match wins.

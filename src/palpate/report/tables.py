@@ -15,8 +15,8 @@ from typing import Any
 
 from palpate.core import Note, Score, columns, plain, short
 from palpate.core.score import ARROWS, BETTER
+from palpate.report.notes import decimals, number
 from palpate.report.results import Results
-from palpate.report.text import decimals, number
 
 #: What the name of a metric ends in where the score is the difference of two generators.
 DIFFERENCE = " difference"

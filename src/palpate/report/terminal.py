@@ -9,11 +9,10 @@ from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
-from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, sentence
+from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, count, percent, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import audit_line, cause_texts, threshold_text
 from palpate.report.tables import BEST, Cell, Table, score_tables
-from palpate.report.text import count, percent
 
 #: Columns that are text; all others are numbers, flush right.
 NAMES = ("metric", "subject", "a", "b", "notes")
