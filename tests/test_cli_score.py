@@ -64,7 +64,8 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
     scores = by_key(Results.from_json(json.loads(out)))
     want = scoring.score(
         "near.npz", "real.npz", names=["ours"], labels="labels.csv", split="s.json",
-        sigma=[10, "median"], normalize=True, presets=["paper"], companions=[], permutations=0, seed=3,
+        sigma=[10, "median"], normalize=True, presets=["paper"], companions=[],
+        permutations=0, seed=3,
     )  # fmt: skip
     assert {k: s.value for k, s in scores.items()} == {k: s.value for k, s in by_key(want).items()}
     assert json.loads(out)["commands"][0].startswith("palpate score --generated near.npz")

@@ -50,7 +50,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     require_extra("palpate probe")
     if options.output:
         guard_output(options.output, [options.manifest, options.split])
-    from palpate.evaluation import probe
+    from palpate.evaluation.probing import probe
 
     names = ("encoder", "modality", "group", "balanced", "cache", "seed")
     arguments = {name: getattr(options, name) for name in names}

@@ -19,7 +19,7 @@ Companion = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Score tactile images, or their embeddings, against real ones; several generators side by side.
+    """Score tactile images, or their embeddings, against real ones; one or several generators.
 
     With a split, its test part is scored, next to controls where the reference is a manifest.
     """
@@ -82,7 +82,7 @@ class Options(Common):
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Score, print the tables, write JSON and LaTeX."""
     _check_outputs(options)
-    from palpate.evaluation import score
+    from palpate.evaluation.scoring import score
 
     names = ("encoder", "split", "labels", "groups", "group", "estimator", "backend", "controls")
     names += ("inception", "clip", "lpips", "permutations", "seed")

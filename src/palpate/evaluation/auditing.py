@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from palpate.core import FeatureSet, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
@@ -42,7 +42,9 @@ def audit(
         from palpate.encoders.encoder_set import EncoderSet
 
         encoders = EncoderSet.load(str(encoder))
-        return embed_samples(samples, encoders, modality, cache=folder, progress=progress)
+        return embed_samples(
+            samples, encoders, cast("Any", modality), cache=folder, progress=progress
+        )
 
     def measure(samples: Manifest, split: Split, group: str, name: str) -> Impact:
         from palpate.evaluation.impact import impact as measure_impact

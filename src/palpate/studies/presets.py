@@ -44,8 +44,7 @@ class DemoPreset:
 
 
 #: Materials that feel different: with all twenty, minutes of training stay close to chance.
-_TEN = ("Wood", "Brick", "Tile", "Leather", "Synthetic Fabric", "Rubber", "Tree", "Grass", "Gravel")
-_TEN = (*_TEN, "Sand")
+_TEN = tuple("Wood,Brick,Tile,Leather,Synthetic Fabric,Rubber,Tree,Grass,Gravel,Sand".split(","))
 _TINY = replace(WORLDS["tiny"], objects_per_material=4, contacts_per_video=2, frames_per_contact=2)
 _MINI = replace(
     WORLDS["demo"],
