@@ -44,20 +44,8 @@ class DemoPreset:
 
 
 #: Materials that feel different: with all twenty, minutes of training stay close to chance.
-_TEN = tuple(
-    [
-        "Wood",
-        "Brick",
-        "Tile",
-        "Leather",
-        "Synthetic Fabric",
-        "Rubber",
-        "Tree",
-        "Grass",
-        "Gravel",
-        "Sand",
-    ]
-)
+_FIVE = ("Wood", "Brick", "Tile", "Leather", "Synthetic Fabric")
+_TEN = (*_FIVE, "Rubber", "Tree", "Grass", "Gravel", "Sand")
 _TINY = replace(WORLDS["tiny"], objects_per_material=4, contacts_per_video=2, frames_per_contact=2)
 _MINI = replace(
     WORLDS["demo"],
