@@ -306,20 +306,20 @@ class Scored:
     without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
 
 
-def over_classes(one: Scored) -> Scored:
+def over_classes(result: Scored) -> Scored:
     """The same with classes left out in turn instead of units; ``details["left_out"]`` records it.
 
     For classes that cannot spare a unit, and for comparisons with a set that has such classes.
     """
-    if not len(one.without_class):
-        return one
-    details = {**one.score.details, "left_out": "class"}
+    if not len(result.without_class):
+        return result
+    details = {**result.score.details, "left_out": "class"}
     return replace(
-        one,
-        score=replace(one.score, details=details),
-        replicates=one.without_class[:, 0],
+        result,
+        score=replace(result.score, details=details),
+        replicates=result.without_class[:, 0],
         units=details["classes"],
-        excess=one.without_class[:, 1] if "E" in details else np.zeros(0),
+        excess=result.without_class[:, 1] if "E" in details else np.zeros(0),
     )
 
 
@@ -418,9 +418,9 @@ def _studentized(second: Array, sums: PairSums, unit: Any, estimator: str) -> tu
                 matrix, inner = matrix - inner, np.zeros_like(inner)
             right = a * (b @ matrix.T)
             left = right if weight > 0 else b * (a @ matrix)
-            own = a * added if weight > 0 else np.zeros_like(a)
-            total = (right + own).sum(axis=1)
-            lost = (right + left + own - a * (b @ inner.T)) @ of_unit
+            same_row = a * added if weight > 0 else np.zeros_like(a)
+            total = (right + same_row).sum(axis=1)
+            lost = (right + left + same_row - a * (b @ inner.T)) @ of_unit
             means.append(np.column_stack([total, total[:, None] - lost]))
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = means[0] / means[1]

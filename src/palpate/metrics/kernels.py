@@ -38,6 +38,7 @@ from palpate.core import PalpateError, PalpateWarning, rng_for
 from palpate.metrics.inputs import (
     Array,
     Index,
+    checked_whole,
     host,
     in_threads,
     invalid,
@@ -141,10 +142,8 @@ class Polynomial(Kernel):
     coef0: float = 1.0
 
     def __post_init__(self) -> None:
-        degree, gamma = self.degree, 1.0 if self.gamma is None else self.gamma
-        if isinstance(degree, bool) or not isinstance(degree, int | np.integer) or degree < 1:
-            must = "must be a whole number of at least 1"
-            raise invalid("degree", must, repr(degree), "KID's is 3")
+        checked_whole(1, degree=self.degree)
+        gamma = 1.0 if self.gamma is None else self.gamma
         for name, value, least in (("gamma", gamma, 0.0), ("coef0", self.coef0, -math.inf)):
             if not (isinstance(value, int | float | np.number) and least < value < math.inf):
                 must = "must be a positive number" if name == "gamma" else "must be a finite number"

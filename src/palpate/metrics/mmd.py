@@ -147,12 +147,11 @@ class Distance:
     """A squared MMD and how it was computed.
 
     Attributes:
-        value: times ``scale``; negative values are possible for ``unbiased`` and ``grouped``.
-        bound: the value is within this of the exact one (rounding aside); 0 for the blocked back
-            end.
+        value: times ``scale``; may be negative for ``unbiased`` and ``grouped``.
+        bound: the value is within this of the exact one (rounding aside); 0 for ``blocked``.
         backend: ``"blocked"`` or ``"moments"``.
         estimator: which pairs were averaged.
-        kernel: the kernel's settings.
+        kernel: settings of the kernel.
         bandwidth: sigma, or None where there are several or none.
         scale: factor on the raw value.
         m: rows of x.
@@ -193,9 +192,7 @@ def distance(  # noqa: PLR0913
     """Squared MMD between two sets of features (paper, Eq. 2), times ``scale``.
 
     Args:
-        x: (m, d) features: anything ``np.asarray`` takes, an array on disk (``np.memmap``), or an
-            array of a library of the array-API standard (torch on CPU or CUDA), which stays on its
-            device.
+        x: (m, d) features, see :mod:`palpate.metrics.inputs`; an array on disk is streamed.
         y: (n, d) features of the same library; m and n may differ.
         sigma: bandwidth of the Gaussian kernel; several are averaged; ``"median"`` and ``"multi"``
             take the median distance of ``y``.

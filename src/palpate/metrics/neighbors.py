@@ -98,9 +98,8 @@ def prdc(
         **options: see :class:`NeighborOptions`.
 
     Returns:
-        Four scores. Intervals are of the mean over rows (generated ones for precision and density,
-        real ones for the other two), robust to whole groups deviating together; the balls are taken
-        as they are. ``details`` holds the median radii.
+        Four scores. Intervals are of the mean over rows (see :func:`prdc_rows`), robust to whole
+        groups deviating together, for fixed balls. ``details`` holds the median radii.
 
     Raises:
         PalpateError: on features that cannot be used, unequal widths, encoders of different
@@ -132,8 +131,7 @@ def prdc_rows(
 ) -> tuple[list[Score], dict[str, Array]]:
     """As :func:`prdc`, with the rows that each score is the mean of.
 
-    They are (n,) over the generated rows for Precision and Density, (m,) over the real ones for
-    Recall and Coverage.
+    (n,) over generated rows for Precision and Density, (m,) over real ones for Recall and Coverage.
     """
     checked_whole(1, k=k)
     checked_level(level)

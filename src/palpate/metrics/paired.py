@@ -209,13 +209,13 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     return _as_difference(x, y, value, details, note=note, interval=interval, method=method)
 
 
-def excess_of(one: Scored) -> Scored | None:
-    """The between-group excess E of an I- or CI-TMMD as its own score; None where there is none.
+def excess_of(result: Scored) -> Scored | None:
+    """The between-group excess E of an I- or CI-TMMD as a score; None where there is none.
 
-    It does not depend on the number of groups, and its floor is that of the same classes: it is
-    what to report. Where moments do not bound it, it is undefined.
+    It does not depend on the number of groups, and its floor is that of the same classes. Where
+    moments do not bound it, it is undefined.
     """
-    score, d = one.score, one.score.details
+    score, d = result.score, result.score.details
     if d.get("E") is None or score.settings.get("halves") != "group":
         return None
     bound = np.inf if d.get("E_bound") is None else float(d["E_bound"])  # JSON has no infinity
@@ -238,9 +238,9 @@ def excess_of(one: Scored) -> Scored | None:
         notes=tuple(notes),
         details={k: d[k] for k in kept if k in d} | {"bound": bound if known else None},
     )
-    units = one.units if len(one.excess) else ()
-    without = one.without_class[:, 1:]
-    return Scored(of_excess, one.excess, units, groups=one.groups, without_class=without)
+    units = result.units if len(result.excess) else ()
+    without = result.without_class[:, 1:]
+    return Scored(of_excess, result.excess, units, groups=result.groups, without_class=without)
 
 
 def _error(replicates: Array) -> float:

@@ -343,7 +343,7 @@ def _folds(groups: Sequence[str], folds: int, seed: int) -> NDArray[np.intp] | N
 def _choose_penalty(
     x: Array, y: NDArray[np.intp], weights: Array, fold: NDArray[np.intp] | None
 ) -> float:
-    """The penalty with the best accuracy on held-out folds; the stronger one of two equals."""
+    """The penalty with the best accuracy in cross-validation; the stronger one of two equals."""
     if fold is None:
         return 1e-2
     right = dict.fromkeys(GRID, 0.0)

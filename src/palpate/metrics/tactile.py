@@ -252,7 +252,7 @@ def scored(  # noqa: PLR0913
         generated: for sizes and digests.
         plan: options; those named in ``settings`` are recorded with the score.
         settings: options that bear on this metric.
-        estimate: its first value is the score's; None for an undefined one.
+        estimate: its first value is the score's; None for an undefined result.
         design: as :class:`Scored`.
         bound: the value is within this of the exact one, rounding aside.
         limit: the largest bound that leaves a value; default: as much as a distance can be.
@@ -303,7 +303,7 @@ def scored(  # noqa: PLR0913
     return over_classes(result) if estimate.of_classes else result
 
 
-def not_comparable(one: Scored, floor: Scored) -> str:
+def not_comparable(result: Scored, floor: Scored) -> str:
     """Why real samples like these give another value of this metric; '' if they do not.
 
     Values of halves of whole groups depend on the sizes of the groups, biased values on n, a mean
@@ -312,25 +312,25 @@ def not_comparable(one: Scored, floor: Scored) -> str:
     Returns:
         ``"classes"``, ``"groups"``, ``"group-sizes"``, ``"sizes"`` or ``""``.
     """
-    if one.score.details.get("classes") != floor.score.details.get("classes"):
+    if result.score.details.get("classes") != floor.score.details.get("classes"):
         return "classes"
-    by_group = one.score.settings.get("halves") == "group"
-    if by_group and list(one.groups) != list(floor.groups):
+    by_group = result.score.settings.get("halves") == "group"
+    if by_group and list(result.groups) != list(floor.groups):
         return "groups"
-    same = one.design.shape == floor.design.shape
-    if not same or not np.allclose(one.design, floor.design, rtol=SAME_DESIGN, atol=0):
+    same = result.design.shape == floor.design.shape
+    if not same or not np.allclose(result.design, floor.design, rtol=SAME_DESIGN, atol=0):
         return "group-sizes" if by_group else "sizes"
     return ""
 
 
-def with_floor(one: Scored, floor: Scored) -> Scored:
+def with_floor(result: Scored, floor: Scored) -> Scored:
     """The score with that of real samples as its floor, where the two are comparable.
 
     E of CI-TMMD has as its floor that of the real samples of the generator's classes, E_ratio of
     D-TMMD none where the classes differ.
     """
-    details, real = one.score.details, floor.score.details
-    reason = not_comparable(one, floor)
+    details, real = result.score.details, floor.score.details
+    reason = not_comparable(result, floor)
     classes = details.get("classes")
     more: dict[str, Any] = {}
     if "E" in details:
@@ -338,12 +338,12 @@ def with_floor(one: Scored, floor: Scored) -> Scored:
         more["E_floor"] = real.get("E") if same else _mean_excess(floor.score, classes or [])
     if "E_ratio" in details:
         more["E_ratio_floor"] = real.get("E_ratio") if classes == real.get("classes") else None
-    notes = list(one.score.notes)
-    if reason and one.score.value is not None:
+    notes = list(result.score.notes)
+    if reason and result.score.value is not None:
         notes.append(Note("no-floor", {"reason": reason}))
     value = None if reason else floor.score.value
-    score = replace(one.score, floor=value, details={**details, **more}, notes=tuple(notes))
-    return replace(one, score=score)
+    score = replace(result.score, floor=value, details={**details, **more}, notes=tuple(notes))
+    return replace(result, score=score)
 
 
 def _mean_excess(score: Score, classes: Sequence[str]) -> float | None:
@@ -833,7 +833,7 @@ def four_scores(
     if floor is not None:
         real = floors_of(feature_set(floor, argument="floor"), reference, generated, options)
         others = map(with_floor, others, real)
-    return [one.score for one in (first, *others)]
+    return [result.score for result in (first, *others)]
 
 
 def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> list[Scored]:

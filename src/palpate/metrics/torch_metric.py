@@ -23,8 +23,6 @@ import importlib
 from itertools import islice
 from typing import Any, Self
 
-from numpy.typing import NDArray
-
 from palpate.core import MissingExtraError, PalpateError, Score
 from palpate.metrics import streaming
 from palpate.metrics.streaming import Batch, Batches
@@ -174,7 +172,7 @@ class TorchMetric(Metric):
 
     def _read(self, records: Any) -> Batches:
         tensors = records if isinstance(records, list) else [records]
-        return Batches([batch for r in tensors for batch in Batch.read(_host(r))])
+        return Batches([batch for r in tensors for batch in Batch.read(r.detach().cpu().numpy())])
 
     def _append(self, batches: list[Batch]) -> None:
         records = [b.to_bytes() for b in batches if len(b.features)]
@@ -185,11 +183,6 @@ class TorchMetric(Metric):
         state = self._read(self.records)
         state.reset(keep_real=True)
         return state
-
-
-def _host(tensor: Any) -> NDArray[Any]:
-    """A tensor as an array; without a copy where it is on the CPU."""
-    return tensor.detach().cpu().numpy()
 
 
 class TMMD(TorchMetric):
