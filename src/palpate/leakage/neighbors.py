@@ -62,10 +62,10 @@ def nearest(
 
 def other_nearest(rows: Floats, k: int, progress: Progress = quiet) -> Ints:
     """(n, k) the k nearest other rows of each row; -1 where there is none."""
-    found = _search(rows, rows, k + 1, progress)[0]
-    itself = found == np.arange(len(rows))[:, None]
+    index = _search(rows, rows, k + 1, progress)[0]
+    itself = index == np.arange(len(rows))[:, None]
     itself[:, -1] |= ~itself.any(axis=1)  # among many equal rows it may not be listed
-    return found[~itself].reshape(len(rows), k)
+    return index[~itself].reshape(len(rows), k)
 
 
 def _search(queries: Floats, base: Floats, k: int, progress: Progress = quiet) -> tuple[Ints, Any]:

@@ -46,7 +46,7 @@ NODES, DRAW_NODES = 600_000, 6000
 INFEASIBLE = 2
 #: How far from the best objective a draw may stop.
 DRAW_GAP = 0.15
-#: Weight of the random cost beside the mean deviation; of a material that a part lacks.
+#: Weight of the random cost relative to the mean deviation; of a material that a part lacks.
 RANDOM, MISSING = 0.1, 10.0
 #: Weight of a deviation above the limit, where the whole program is not solved.
 ABOVE = 1000.0
@@ -189,7 +189,8 @@ class _Program:
         one = (np.ones(groups), np.ones(groups))
         present = (np.ones(self.u), np.full(self.u, np.inf))
         limits = [one, (least, wanted), (wanted, most), *caps, present]
-        low, high = (np.concatenate(side) for side in zip(*limits, strict=True))
+        low: Any = np.concatenate([low for low, _ in limits])
+        high: Any = np.concatenate([high for _, high in limits])
         matrix: Any = sparse.block_array(rows, format="csr")
         self.constraints = LinearConstraint(matrix, low, high)
 
