@@ -1,12 +1,14 @@
-"""How many files of palpate a command runs through: what a newcomer would have to open to follow it.
+"""How many files of palpate a command runs through: what a newcomer has to open to follow it.
 
 ::
 
     python benchmarks/walk.py -- palpate score --generated a/ --reference b/ --encoder palpate/mini
-    python benchmarks/walk.py --source PATH/TO/ANOTHER/CHECKOUT/src -- palpate generate photo.jpg -o t.png
+    python benchmarks/walk.py --source PATH/TO/ANOTHER/CHECKOUT/src -- palpate generate photo.jpg -o
+    t.png
 
-Counts the project files in which at least one function ran, bodies of modules and classes left out, with ``sys.setprofile``
-in all threads of the command's own process. ``--source`` measures another checkout with the same script.
+Counts the project files in which at least one function ran, bodies of modules and classes left out,
+with ``sys.setprofile`` in all threads of the command's own process. ``--source`` measures another
+checkout with the same script.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Draw the image of the docs' start page: photos, what the sensor records, what the generator makes.
+"""Draw the image of the start page: photos, the sensor's images, the generator's images.
 
     python recipes/start_image.py -o docs/images/start.png     # 20 CPU seconds
 
@@ -43,6 +43,7 @@ def draw(seed: int = 3) -> Image.Image:
 
 
 def run() -> None:
+    """Draw into the file that was named."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, required=True)
     options = parser.parse_args()

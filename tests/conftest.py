@@ -1,4 +1,4 @@
-"""Fixtures for all tests: small trees in true layouts, and the shared real data where it is present."""
+"""Fixtures for all tests: small trees in true layouts, and the shared real data where present."""
 
 from __future__ import annotations
 

@@ -110,9 +110,12 @@ def test_classifiers_find_a_planted_class_and_not_noise():
     labels, groups = np.repeat(["a", "b"], 60), np.repeat([f"v{k}" for k in range(24)], 5)
     planted = rng.standard_normal((120, 6)).astype(np.float32)
     planted[:, 0] += 6 * (labels == "a")
-    side = lambda x, rows: protocols.FeatureSet(
-        [str(k) for k in rows], x[rows], list(labels[rows]), list(groups[rows]), "e"
-    )
+
+    def side(x, rows):
+        return protocols.FeatureSet(
+            [str(k) for k in rows], x[rows], list(labels[rows]), list(groups[rows]), "e"
+        )
+
     train, test = np.arange(0, 120, 2), np.arange(1, 120, 2)
     hit, penalty = protocols.logistic(side(planted, train), side(planted, test), seed=0)
     assert hit.mean() > 0.95
@@ -153,11 +156,13 @@ def test_folds_are_combined_over_their_frames_and_videos():
 
 
 def test_the_table_holds_means_ranges_and_steps():
-    row = lambda v: {
-        "frames": (6, 2),
-        "C": {"touch": [0.01]},
-        "touch, logistic regression": (v, (v - 0.1, v + 0.1), 0.25),
-    }
+    def row(v):
+        return {
+            "frames": (6, 2),
+            "C": {"touch": [0.01]},
+            "touch, logistic regression": (v, (v - 0.1, v + 0.1), 0.25),
+        }
+
     first = dict(zip(protocols.PROTOCOLS, map(row, (0.8, 0.6, 0.5, 0.4)), strict=True))
     second = dict(zip(protocols.PROTOCOLS, map(row, (0.9, 0.7, 0.68, 0.4)), strict=True))
     np.testing.assert_allclose(protocols.steps_of([first, second]), [(20, 10), (20, 2)])

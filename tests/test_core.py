@@ -44,7 +44,10 @@ PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]
             "`val` must lie in (0, 1). Got 2. E.g. val=0.1.",
         ),
         (ProblemsError(PROBLEMS, "Fix them"), "Got 2 problems: 2 bad-line. Fix them."),
-        (MissingExtraError("av", "video", "Video"), "In palpate's checkout run: pip install -e '.[video]'."),
+        (
+            MissingExtraError("av", "video", "Video"),
+            "In palpate's checkout run: pip install -e '.[video]'.",
+        ),
     ],
 )
 def test_an_error_is_one_line_and_survives_pickling(error, text):

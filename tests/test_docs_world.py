@@ -1,6 +1,5 @@
-"""docs/concepts/world.md is true: its commands and snippets run, its tables are the code's, its figures are the benchmarks', its pictures are drawn by the recipe."""
+"""docs/concepts/world.md is true: commands and snippets run, figures are those of the studies."""
 
-import dataclasses
 import importlib.util
 import re
 import shlex

@@ -1,4 +1,4 @@
-"""The house: imports go one way, have no effects; help is quick; nothing personal in the sources."""
+"""The house: imports go one way without effects, help is quick, sources hold nothing personal."""
 
 import re
 import shutil

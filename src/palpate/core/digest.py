@@ -1,4 +1,4 @@
-"""JSON values, and digests: SHA-256 over canonical forms, so that equal content has an equal name."""
+"""JSON values, and digests: SHA-256 over canonical forms, so that equal content has one name."""
 
 from __future__ import annotations
 

@@ -29,8 +29,8 @@ from palpate.core import (
     read_json,
     short,
 )
-from palpate.core.features import is_missing
 from palpate.core.digest import to_numpy
+from palpate.core.features import is_missing
 from palpate.evaluation.embedding_files import (
     SUFFIXES,
     Embeddings,

@@ -32,8 +32,8 @@ import numpy as np
 
 from palpate import __version__
 from palpate.core import FeatureSet, Note, PalpateError, Score
-from palpate.core.features import is_missing
 from palpate.core.digest import plain
+from palpate.core.features import is_missing
 from palpate.metrics.inputs import (
     Array,
     Index,

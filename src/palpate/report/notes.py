@@ -1,4 +1,6 @@
-"""Words: numbers in sentences, and the sentence of every note code: one table a room, in Python's or the command line's wording.
+"""Words: numbers in sentences, and the sentence of every note code, one table a room.
+
+Sentences are in the wording of Python or of the command line.
 
 A template is filled with the note's parameters. ``{arg:backend=blocked}`` in it becomes
 ``backend='blocked'`` in Python and ``--backend blocked`` on the command line. Where one
