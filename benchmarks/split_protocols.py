@@ -34,8 +34,8 @@ from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
 from palpate.core import FeatureSet, rng_for, short
-from palpate.metrics.probe import retrieval
 from palpate.metrics.intervals import mean_interval
+from palpate.metrics.probe import retrieval
 from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.options import BACKGROUND_OFFSET
 from palpate.sim.plan import contact_frames, first_contact
