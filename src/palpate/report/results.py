@@ -407,7 +407,8 @@ class Results:
                 else:
                     row[name] = value
             preset = score.settings.get("preset")
-            rows.append(row | {"preset": preset, "notes": [sentence(note) for note in score.notes]})
+            notes = "; ".join(map(sentence, score.notes))  # flat, so that the frame fits a CSV
+            rows.append(row | {"preset": preset, "notes": notes})
         return pl.DataFrame(rows, infer_schema_length=None)
 
     def relative_to(self, folder: Path, base: Path) -> Results:
