@@ -54,6 +54,8 @@ from palpate.core.files import NO_ROOM
 if TYPE_CHECKING:
     from palpate.report.results import Audit, Results
 
+#: Verbs whose first arguments may stand without their option: ``palpate score a/ --reference b/``.
+LEADING = {"score": "--generated"}
 #: Verb and option of earlier versions -> how it is written now. '' stands for every verb, and for
 #: the verb itself.
 RENAMED: dict[tuple[str, str], str] = {
@@ -218,6 +220,9 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
         PalpateError: in one line what tyro would draw a box around.
     """
     join_help_lines(options)
+    leading = LEADING.get(name, "")
+    if leading and args and not args[0].startswith("-") and leading not in args:
+        args = [leading, *args]
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
