@@ -13,8 +13,7 @@ from PIL import Image
 from palpate.core import FeatureSet, PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.evaluation.embedding_files import read_embeddings
-from palpate.evaluation.inputs import read_inputs
-from palpate.evaluation.samples import read
+from palpate.evaluation.inputs import read, read_inputs
 from score_calls import paint
 
 N = 4

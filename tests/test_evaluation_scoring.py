@@ -13,10 +13,10 @@ from scipy import stats
 from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.core.score import require_comparable
 from palpate.data.manifest import Manifest
-from palpate.evaluation import companions, family, samples, score, scoring
+from palpate.evaluation import companions, inputs, score, scoring
 from palpate.metrics import Polynomial, compare, distance, i_tmmd, ssim
+from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.intervals import mean_interval
-from palpate.metrics.neighbors import prdc_rows
 from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
 
 SETS = feature_sets()
@@ -235,7 +235,7 @@ def test_a_default_companion_that_cannot_be_computed_becomes_a_note():
 
 @pytest.fixture
 def streamed(tmp_path, monkeypatch):
-    monkeypatch.setattr(samples, "STREAMED", 500)
+    monkeypatch.setattr(inputs, "STREAMED", 500)
     rng = np.random.default_rng(5)
     for name, shift in (("big", 0.1), ("base", 0.0)):
         np.save(tmp_path / f"{name}.npy", unit(rng.normal(size=(600, 16)) + 2 + shift))
@@ -245,9 +245,9 @@ def streamed(tmp_path, monkeypatch):
 def test_many_bare_rows_are_streamed_and_never_held(streamed, monkeypatch):
     calls = []
     monkeypatch.setattr(
-        family, "distance", lambda x, y, **how: calls.append((x, y)) or distance(x, y, **how)
+        scoring, "distance", lambda x, y, **how: calls.append((x, y)) or distance(x, y, **how)
     )
-    monkeypatch.setattr(samples.Samples, "feature_set", lambda *_: pytest.fail("held in memory"))
+    monkeypatch.setattr(inputs.Samples, "feature_set", lambda *_: pytest.fail("held in memory"))
     results = score(*streamed)
     [s] = results
     assert all(isinstance(x, np.memmap) for x in calls[0])
@@ -551,7 +551,7 @@ def test_an_interrupted_run_goes_on_from_its_embeddings(
         with pytest.raises(KeyboardInterrupt):
             score(made, small_manifest, cache=cache, **options)
     assert len([*cache.rglob("tactile-*.npz")]) == 3
-    monkeypatch.setattr(samples, "IN_MEMORY", 0)  # every image in a file of the cache
+    monkeypatch.setattr(inputs, "IN_MEMORY", 0)  # every image in a file of the cache
     monkeypatch.setattr(type(mini), "encode", lambda *_, **__: pytest.fail("embedded again"))
     again = by_key(score(made, small_manifest, cache=cache, **options))
     assert again.keys() == plain.keys()
@@ -565,7 +565,7 @@ def test_another_image_of_the_same_name_size_and_time_is_not_taken_from_the_cach
     tmp_path, monkeypatch, small_manifest, column
 ):
     """Decoded images in a cache are of the bytes of now."""
-    monkeypatch.setattr(samples, "IN_MEMORY", 0)
+    monkeypatch.setattr(inputs, "IN_MEMORY", 0)
     some = small_manifest.take(small_manifest.ids[:4])
     paths = [tmp_path / "root" / f"{column}{k}.bmp" for k in range(4)]
     for path, old in zip(paths, some.paths(column), strict=True):

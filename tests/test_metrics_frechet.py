@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import linalg, stats
 
 from palpate.core import FeatureSet, Note, PalpateError, Score
-from palpate.metrics import frechet
-from palpate.metrics.frechet import compare_fid, fid, frechet_distance
+from palpate.metrics import distributions
+from palpate.metrics.distributions import compare_fid, fid, frechet_distance
 
 
 def features(x, groups=None, encoder=None):
@@ -113,7 +113,7 @@ def test_many_groups_are_left_out_in_blocks_of_whole_groups_of_about_equal_size(
     rng = np.random.default_rng(7)
     x = rng.normal(size=(400, 3))
     groups = [f"v{int(g)}" for g in np.sort(rng.integers(0, 50, 400))]
-    parts = frechet._draw_parts(features(x, groups), features(x, groups), 20, 0)
+    parts = distributions._draw_parts(features(x, groups), features(x, groups), 20, 0)
     assert parts.count == 20
     assert all(
         len({int(parts.block[0][i]) for i in range(400) if groups[i] == g}) == 1

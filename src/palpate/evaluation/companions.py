@@ -44,7 +44,7 @@ from palpate.metrics import (
     ssim_per_image,
 )
 from palpate.metrics.contact import LEAST
-from palpate.metrics.neighbors import prdc_rows
+from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.paired import mean_differences
 
 Images = NDArray[np.uint8]

@@ -14,8 +14,7 @@ from typing import Any
 
 from palpate.core import FeatureSet, Note, Progress, Score, Split, rng_for
 from palpate.evaluation.companions import Features
-from palpate.evaluation.inputs import Inputs
-from palpate.evaluation.samples import Samples
+from palpate.evaluation.inputs import Inputs, Samples
 from palpate.metrics.probe import fit_probe, material_accuracy
 
 #: Rows of the tables that are not generators.

@@ -1,4 +1,10 @@
-"""The samples of one call of :func:`palpate.evaluation.score`, aligned: ids, labels, groups, split.
+"""What a call of :func:`palpate.evaluation.score` reads, as aligned samples.
+
+A source is a folder of images, a manifest, a folder of ``palpate generate``, a file of embeddings
+(:mod:`palpate.evaluation.embedding_files`), an array or tensor of images or features, a list of
+images or image files, a polars or pandas frame, or a :class:`palpate.core.FeatureSet`. The id of an
+image in a folder is its path below the folder, with ``/`` and without the suffix. Rows without ids
+are numbered.
 
 What a source lacks is completed from the keywords ``labels`` and ``groups`` (which also replace
 what a source has), then, for a generator, from the reference, by id. What is known of a part of the
@@ -7,33 +13,398 @@ ids only is an error: scores of some of the samples would pass for scores of all
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from functools import cached_property, lru_cache
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, cast
 
-from palpate.core import Note, PalpateError, Split, short
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import (
+    FeatureSet,
+    Note,
+    PalpateError,
+    ProblemsError,
+    Progress,
+    Split,
+    digest_file,
+    digest_json,
+    read_json,
+    short,
+)
+from palpate.core.digest import to_numpy
+from palpate.core.features import is_missing
 from palpate.evaluation.embedding_files import (
     GROUPS,
     LABELS,
+    SUFFIXES,
+    Embeddings,
     as_polars,
+    checked,
+    embeddings_of_table,
     first_of,
+    read_embeddings,
     read_parquet,
     require_ids,
     text_column,
 )
-from palpate.evaluation.samples import (
-    KINDS,
-    Samples,
-    Source,
-    is_image_file,
-    picked,
-    read,
-    without_suffix,
-)
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from palpate.data.manifest import Manifest
+
+
+Source = Any
+KINDS = (
+    "a folder of images, a manifest, a folder of palpate generate, or embeddings "
+    f"({', '.join(SUFFIXES)})"
+)
+#: Decoded images of more bytes than this are kept in a file of the cache.
+IN_MEMORY = 1 << 30
+#: Embeddings of more rows without labels and groups are streamed, for TMMD alone.
+STREAMED = 50_000
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples of one generator or the reference: ``features``, ``manifest`` or ``images`` is set.
+
+    Attributes:
+        source: path or name, for errors.
+        ids: n distinct ids.
+        numbered: whether the ids are row numbers, which pair nothing.
+        labels, groups: n strings each ('' where unknown), or None.
+        group: what the groups are: a column name, ``video`` for groups that came with features.
+        manifest: image files (column ``tactile``; a reference may have ``vision``, ``background``).
+        images: (n, h, w, 3) uint8.
+        features: (n, d), possibly memory-mapped.
+        encoder: digest of the encoder that made the features.
+        path: file of the features.
+        widened: half-precision type that the features were converted from, if any.
+        generator: settings of ``palpate generate``, for its folders.
+    """
+
+    source: str
+    ids: list[str]
+    numbered: bool = False
+    labels: list[str] | None = None
+    groups: list[str] | None = None
+    group: str | None = None
+    manifest: Manifest | None = None
+    images: NDArray[np.uint8] | None = None
+    features: NDArray[Any] | None = None
+    encoder: str | None = None
+    path: Path | None = None
+    widened: str = ""
+    generator: Mapping[str, Any] | None = None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def streamed(self) -> bool:
+        """Whether there are too many rows to hold, and nothing but TMMD to compute from them."""
+        bare = self.labels is None and self.groups is None
+        return self.features is not None and bare and len(self) > STREAMED
+
+    @property
+    def has_background(self) -> bool:
+        """Whether every sample has its no-contact image."""
+        return self.manifest is not None and not self.manifest.table["background"].null_count()
+
+    def take(self, ids: Sequence[str]) -> Samples:
+        """The samples of ``ids``, in that order.
+
+        Raises:
+            PalpateError: if an id is missing.
+        """
+        row = {name: k for k, name in enumerate(self.ids)}
+        if missing := [i for i in ids if i not in row]:
+            must = f"{self.source} must have every id of the split's test part"
+            got = f"{len(missing)} of {len(ids)} missing, first {missing[0]!r}"
+            raise PalpateError(must, got, "Use the split that was made for it")
+        at = [row[i] for i in ids]
+        groups = picked(self.groups, at)
+        return replace(
+            self,
+            ids=list(ids),
+            labels=picked(self.labels, at),
+            groups=groups if groups and any(groups) else None,
+            manifest=self.manifest and self.manifest.take(ids),
+            images=None if self.images is None else self.images[at],
+            features=None if self.features is None else self.features[at],
+        )
+
+    def feature_set(self, features: NDArray[Any], encoder: str | None) -> FeatureSet:
+        """Features of these samples with their ids, labels and groups.
+
+        Raises:
+            PalpateError: on NaN or infinity; the rows are named.
+        """
+        try:
+            return FeatureSet(self.ids, features, self.labels, self.groups, encoder)
+        except PalpateError as error:
+            raise PalpateError(f"{self.source}: {error.must}", error.got, error.fix) from None
+
+    @cached_property
+    def side(self) -> int:
+        """The shorter side of the images.
+
+        Raises:
+            PalpateError: if they differ in size.
+        """
+        if self.manifest is None:
+            return min(cast("NDArray[np.uint8]", self.images).shape[1:3])
+        sizes = {path: _image_size(path) for path in self.manifest.paths("tactile")}
+        first = next(iter(sizes))
+        if other := next((p for p, size in sizes.items() if size != sizes[first]), None):
+            got = " and ".join("{} of {} x {}".format(p.name, *sizes[p]) for p in (first, other))
+            must = f"All images of {self.source} must have one size for scores of pixels"
+            fix, example = "Resize them, or request other companions", {"companions": ["fid"]}
+            raise PalpateError(must, got, fix, example=example)
+        return min(sizes[first])
+
+    def pixels(
+        self, size: int, cache: Path, progress: Progress, column: str = "tactile"
+    ) -> NDArray[np.uint8]:
+        """The images as squares, (n, size, size, 3); many of them memory-mapped from the cache."""
+        from palpate.data.images import cached_images, load_images, square
+
+        if self.manifest is None:
+            from PIL import Image
+
+            images = cast("NDArray[np.uint8]", self.images)
+            return np.stack([square(Image.fromarray(image), size) for image in images])
+        if len(self) * size * size * 3 > IN_MEMORY:
+            return cached_images(self.manifest, column, size, self.folder(cache, column), progress)
+        return load_images(self.manifest.paths(column), size, progress=progress)
+
+    def folder(self, cache: Path, column: str = "tactile") -> Path:
+        """A folder of the cache for the bytes of these images, whatever their names and times."""
+        return cache / short(self.image_digest(column))
+
+    def image_digest(self, column: str = "tactile") -> str:
+        """SHA-256 over id and bytes of every image, in any order: the same for a copied folder."""
+        if self.manifest is None:
+            images = cast("NDArray[np.uint8]", self.images)
+            digests = [hashlib.sha256(image.tobytes()).hexdigest() for image in images]
+        else:
+            paths = self.manifest.paths(column)
+            digests = [_file_digest(path, path.stat().st_ctime_ns) for path in paths]
+        return digest_json(sorted(map(list, zip(self.ids, digests, strict=True))))
+
+    @property
+    def digest(self) -> str:
+        """Digest of the images, or of the file of features."""
+        if self.features is None:
+            return self.image_digest()
+        return digest_file(self.path) if self.path else self.feature_set(self.features, None).digest
+
+
+def picked(column: Sequence[str] | None, at: Sequence[int]) -> list[str] | None:
+    """Some entries of a column; None stays None."""
+    return None if column is None else [column[k] for k in at]
+
+
+@lru_cache(maxsize=1 << 20)
+def _file_digest(path: Path, _changed: int) -> str:
+    """SHA-256 of a file, read once per run unless its time of change differs."""
+    return digest_file(path)
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    from PIL import Image
+
+    from palpate.data.images import read_image
+
+    try:
+        with Image.open(path) as image:  # reads the header alone
+            return image.size
+    except OSError:
+        return read_image(path).size  # raises the reason
+
+
+def read(source: Source, name: str, group: str = "video") -> Samples:
+    """Read one source; see the head of this module.
+
+    Args:
+        source: what holds the samples.
+        name: what errors call a source that is no path.
+        group: manifest column of the groups.
+
+    Raises:
+        PalpateError: if it is nothing that can be scored, or empty.
+    """
+    if isinstance(source, str | Path):
+        samples = _read_path(Path(source), group)
+    elif isinstance(source, FeatureSet):
+        labels, groups = map(_strings, (source.labels, source.groups))
+        known = Embeddings(source.features, list(source.ids), labels, groups, source.encoder)
+        samples = _of_embeddings(known, name)
+    elif hasattr(source, "table") and hasattr(source, "root"):
+        samples = _of_manifest(source, name, group)
+    elif hasattr(source, "columns"):
+        samples = _read_frame(source, name, group)
+    else:
+        samples = _read_array(source, name)
+    if not len(samples):
+        raise PalpateError(f"There must be samples in {samples.source}", "none", f"Pass {KINDS}")
+    return samples
+
+
+def _strings(column: Sequence[Any] | None) -> list[str] | None:
+    return None if column is None else ["" if is_missing(v) else str(v) for v in column]
+
+
+def _read_path(path: Path, group: str) -> Samples:
+    if not path.exists():
+        raise PalpateError("What is scored must exist", f"nothing at {path}", f"Pass {KINDS}")
+    if path.is_file() and not _is_manifest(path):
+        if path.suffix.lower() not in SUFFIXES:
+            fix = "Pass one of these; pickles are never loaded"
+            raise PalpateError(f"{path} must be {KINDS}", path.suffix or "no suffix", fix)
+        return _of_embeddings(read_embeddings(path), str(path), path)
+    require_utf8("Paths of images", str(path.resolve()))
+    from palpate.data.manifest import Manifest
+
+    if path.is_file() or (path / "manifest.parquet").is_file():
+        manifest = Manifest.load(path)
+        kinds = ("empty", "null-id", "duplicate-id")
+        problems = [p for p in manifest.problems() if "tactile" in p.text or p.kind in kinds]
+        if problems:
+            raise ProblemsError(problems, "Fix the rows, or import again and skip them")
+        return _of_manifest(manifest, str(path), group)
+    index = path / "index.json"
+    content = read_json(index, "index of generated images") if index.is_file() else None
+    if isinstance(content, dict) and str(content.get("format")).startswith("palpate-generated/"):
+        from palpate.diffusion.generation import Generated
+
+        folder = Generated.load(path)
+        rows = [{"id": i, "tactile": f"images/{file}"} for i, file in folder.files.items()]
+        samples = _of_manifest(Manifest.from_rows(rows, path), str(path), group)
+        return replace(samples, generator=folder.settings)
+    return _of_manifest(Manifest.from_rows(_folder_rows(path), path), str(path), group)
+
+
+def _is_manifest(path: Path) -> bool:
+    try:
+        return path.suffix.lower() == ".parquet" and "palpate.format" in read_parquet(path)[0]
+    except Exception:  # not a Parquet file; the reader of embeddings reports it
+        return False
+
+
+def require_utf8(what: str, text: str) -> None:
+    """Raise if a path or a file name cannot be written down as UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise PalpateError(f"{what} must be UTF-8", ascii(text), "Rename it") from None
+
+
+def _folder_rows(path: Path) -> list[dict[str, str]]:
+    rows: dict[str, str] = {}
+    for file in sorted(path.rglob("*")):
+        relative = file.relative_to(path).as_posix()
+        hidden = any(part.startswith(".") for part in relative.split("/"))
+        if hidden or not is_image_file(file) or not file.is_file():
+            continue
+        require_utf8(f"File names in {path}", relative)
+        if (name := without_suffix(relative)) in rows:
+            must = f"Images in {path} must differ in name, suffixes aside"
+            raise PalpateError(must, f"{rows[name]!r} and {relative!r}", "Rename one of them")
+        rows[name] = relative
+    return [{"id": name, "tactile": file} for name, file in rows.items()]
+
+
+def is_image_file(path: str | Path) -> bool:
+    """Whether a path has the suffix of an image."""
+    from palpate.data.images import SUFFIXES as IMAGE_SUFFIXES
+
+    return PurePosixPath(path).suffix.lower() in IMAGE_SUFFIXES
+
+
+def without_suffix(name: str) -> str:
+    """A path without the suffix of an image; another suffix is part of the name."""
+    return name[: -len(PurePosixPath(name).suffix)] if is_image_file(name) else name
+
+
+def _of_manifest(manifest: Manifest, source: str, group: str) -> Samples:
+    labels, groups = (
+        [v or "" for v in values] if any(values := manifest.column(name)) else None
+        for name in ("material", group)
+    )
+    kind = group if groups else None
+    return Samples(source, manifest.ids, False, labels, groups, kind, manifest)
+
+
+def _of_embeddings(embeddings: Embeddings, source: str, path: Path | None = None) -> Samples:
+    return Samples(
+        source,
+        embeddings.ids or [str(k) for k in range(len(embeddings.features))],
+        embeddings.ids is None,
+        embeddings.labels,
+        embeddings.groups,
+        "video" if embeddings.groups else None,
+        features=embeddings.features,
+        encoder=embeddings.encoder,
+        path=path,
+        widened=embeddings.widened,
+    )
+
+
+def _read_frame(frame: Any, name: str, group: str) -> Samples:
+    table = as_polars(frame)
+    if "tactile" not in table.columns:
+        return _of_embeddings(checked(embeddings_of_table(table, name), name), name)
+    from palpate.data.manifest import SCHEMA, Manifest
+
+    rows = table.select(c for c in table.columns if c in SCHEMA).to_dicts()
+    return _of_manifest(Manifest.from_rows(rows, Path.cwd()), name, group)
+
+
+def _read_array(source: Any, name: str) -> Samples:
+    """An array or tensor of features or images, or a list of images or image files."""
+    items: list[Any] = list(source) if isinstance(source, list | tuple) else []
+    if items and isinstance(items[0], str | Path):
+        from palpate.data.manifest import Manifest
+
+        paths = [Path(item).absolute() for item in items]
+        ids = [without_suffix(p.name) for p in paths]
+        ids = ids if len(set(ids)) == len(ids) else [without_suffix(str(p)) for p in paths]
+        rows = [{"id": i, "tactile": str(p)} for i, p in zip(ids, paths, strict=True)]
+        return _of_manifest(Manifest.from_rows(rows, Path.cwd()), name, "video")
+    try:
+        array = np.stack([_as_array(item) for item in items]) if items else _as_array(source)
+    except (TypeError, ValueError) as error:
+        fix = f"Pass {KINDS}, an array or tensor, or a list of images of one size"
+        raise PalpateError(f"{name} must be something to score", str(error), fix) from None
+    if array.ndim == 2:
+        return _of_embeddings(checked(Embeddings(array), name), name)
+    images = _as_images(array, name)
+    return Samples(name, [str(k) for k in range(len(images))], True, images=images)
+
+
+def _as_array(value: Any) -> NDArray[Any]:
+    return to_numpy(value.convert("RGB") if hasattr(value, "getbands") else value)
+
+
+def _as_images(array: NDArray[Any], name: str) -> NDArray[np.uint8]:
+    """(n, h, w, c) or (n, c, h, w) of uint8, or of floats in [0, 1], as (n, h, w, 3) uint8."""
+    if array.ndim == 3:
+        array = array[..., None]
+    if array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[3] not in (1, 3):
+        array = np.moveaxis(array, 1, 3)
+    unit = array.dtype.kind == "f" and array.size and array.min() >= 0 and array.max() <= 1
+    if array.ndim != 4 or array.shape[3] not in (1, 3) or not (unit or array.dtype == np.uint8):
+        must = f"{name} must be features (n, d), or images of uint8 or of floats in [0, 1]"
+        raise PalpateError(must, f"{array.dtype} of shape {array.shape}", "Scale and reshape it")
+    array = np.round(array * 255).astype(np.uint8) if unit else array
+    return np.ascontiguousarray(np.broadcast_to(array, (*array.shape[:3], 3)))
+
 
 #: Name of the reference in tables and errors.
 REFERENCE = "reference"

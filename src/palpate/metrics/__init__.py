@@ -16,7 +16,7 @@ from palpate.metrics.contact import (
     contact_ssim,
     measure_contacts,
 )
-from palpate.metrics.frechet import compare_fid, fid, frechet_distance
+from palpate.metrics.distributions import compare_fid, fid, frechet_distance, prdc, precision_recall
 from palpate.metrics.images import (
     mean_score,
     ms_ssim,
@@ -29,7 +29,6 @@ from palpate.metrics.images import (
 )
 from palpate.metrics.kernels import Gaussian, Linear, Polynomial
 from palpate.metrics.mmd import PRESETS, Distance, Options, distance, mmd2
-from palpate.metrics.neighbors import prdc, precision_recall
 from palpate.metrics.paired import Comparison, compare, compare_tmmd
 from palpate.metrics.streaming import CITMMD, DTMMD, ITMMD, TMMD
 from palpate.metrics.tactile import ci_tmmd, cmmd, d_tmmd, four_scores, i_tmmd, kid, tmmd
