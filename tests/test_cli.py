@@ -61,7 +61,7 @@ def test_fail_over_is_a_limit(capsys, lists, limit, status):
         (["train", "tag/"], "Write: palpate train generator"),
         (["audit", "a", "b", "--towers=x"], "--towers of palpate audit is now written --encoder"),
         (["audit", "no.txt", "such.txt"], "no.txt"),
-        (["audit", "--color", "red"], "Unrecognized"),
+        (["audit", "--color", "red"], "Got --color"),
         (["split", "nowhere", "-o", "s.json"], "nowhere"),
         (["split", "nowhere", "-o", "s.json", "--train", "most"], "most"),
         (["import", "nowhere", "-o", "out"], "nowhere"),
@@ -110,7 +110,7 @@ def test_every_new_spelling_exists(capsys):
         if option and verb and new.startswith("-"):
             with pytest.raises(SystemExit):
                 main([*verb.split(), "--help"])
-            assert re.search(rf"{new}\b", capsys.readouterr().out), (verb, option, new)
+            assert re.search(rf"{new.split()[0]}\b", capsys.readouterr().out), (verb, option, new)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

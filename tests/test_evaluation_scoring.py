@@ -599,3 +599,13 @@ def test_pairs_without_a_finite_value_are_excluded_from_a_difference():
     [difference] = mean_differences(scores, {"a": a, "b": b}, None)
     assert difference.value == pytest.approx((a - b)[kept].mean(), rel=1e-12)
     assert (difference.details["better"], difference.details["decided"]) == ("a", True)
+
+
+def test_one_name_may_be_a_string():
+    rows = np.random.default_rng(0).normal(size=(2, 40, 8))
+    rows /= np.linalg.norm(rows, axis=-1, keepdims=True)
+    results = score(*rows, presets="paper", companions="fid", permutations=0)
+    assert {s.settings.get("preset") for s in results if s.metric == "TMMD"} == {"paper"}
+    assert any(s.metric.startswith("FID") for s in results)
+    with pytest.raises(PalpateError, match="`presets` must be of .*paper"):
+        score(*rows, presets="papers")

@@ -21,7 +21,8 @@ def usage(group: str = "") -> str:
     if group:
         return f"usage: palpate {group}VERB [options]\n\n{listed}\n"
     return (
-        f"palpate {__version__}: tactile images from photos, and honest scores for them.\n\n"
+        f"palpate {__version__}: tactile images from photos, splits that do not leak, scores "
+        "with intervals.\n\n"
         f"usage: palpate VERB [options]\n\n{listed}\n\n"
         "  palpate VERB --help    options and an example of one verb\n"
         "  palpate --version      the version\n\n"

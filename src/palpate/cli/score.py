@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +15,53 @@ from palpate.core import PalpateError
 Companion = Literal[
     "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """What the samples are called, and what belongs together."""
+
+    names: tuple[str, ...] = ()
+    """Names of the generators in the tables, instead of those of their folders and files."""
+    labels: Path | None = None
+    """CSV or Parquet file with the columns id, material, video, in place of what the inputs
+    have."""
+    groups: Path | None = None
+    """The same for groups alone, where labels and groups are in two files."""
+    group: Literal["auto", "video", "contact", "object"] = "auto"
+    """What stays together in halves and intervals; `auto` takes what the split kept whole, else the
+    video."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metrics:
+    """What is computed, and how."""
+
+    presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ()
+    """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole
+    videos together. Default: both, or `paper` without groups."""
+    sigma: tuple[str, ...] = ("10",)
+    """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it)."""
+    estimator: Literal["unbiased", "biased", "grouped"] | None = None
+    """Instead of the presets' estimators."""
+    backend: Literal["auto", "blocked", "moments"] = "auto"
+    """Kernel-sum backend."""
+    normalize: Literal["check", "yes", "no"] = "check"
+    """Embeddings that are not of unit length: stop, divide by the norm, or keep them."""
+    companions: tuple[Companion, ...] | None = None
+    """Scores next to the TMMD family. Default: all whose inputs are there; `none` for none."""
+    inception: Path | None = None
+    """TorchScript file of Inception: FID and KID of its features, as published."""
+    clip: str | None = None
+    """Folder or hub id of a CLIP: CMMD of its features, as published."""
+    lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
+    """The two files of LPIPS: AlexNet's weights and the heads."""
+    controls: bool = True
+    """With a split: score the no-contact image and real images of the same material as well."""
+    permutations: int = 999
+    """Relabelings of the permutation test of TMMD; 0 for none."""
+    seed: int = 0
+    """Of random halves, permutations and the control images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,48 +82,15 @@ class Options(Common):
     split: Path | None = None
     """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe
     and the controls."""
-    names: tuple[str, ...] = ()
-    """Names of the generators in the tables, instead of those of their folders and files."""
-    labels: Path | None = None
-    """CSV or Parquet file with the columns id, material, video, in place of what the inputs
-    have."""
-    groups: Path | None = None
-    """The same for groups alone, where labels and groups are in two files."""
     output: OptionalOutPath = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
     latex: Path | None = None
     """Write the tables as LaTeX (booktabs; longtable for many differences)."""
-    presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ()
-    """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole
-    videos together. Default: both, or `paper` without groups."""
-    sigma: tuple[str, ...] = ("10",)
-    """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it)."""
-    estimator: Literal["unbiased", "biased", "grouped"] | None = None
-    """Instead of the presets' estimators."""
-    backend: Literal["auto", "blocked", "moments"] = "auto"
-    """Kernel-sum backend."""
-    normalize: Literal["check", "yes", "no"] = "check"
-    """Embeddings that are not of unit length: stop, divide by the norm, or keep them."""
-    permutations: int = 999
-    """Relabelings of the permutation test of TMMD; 0 for none."""
-    companions: tuple[Companion, ...] | None = None
-    """Scores next to the TMMD family. Default: all whose inputs are there; `none` for none."""
-    inception: Path | None = None
-    """TorchScript file of Inception: FID and KID of its features, as published."""
-    clip: str | None = None
-    """Folder or hub id of a CLIP: CMMD of its features, as published."""
-    lpips: Annotated[tuple[Path, Path] | None, tyro.conf.arg(metavar="BACKBONE HEADS")] = None
-    """The two files of LPIPS: AlexNet's weights and the heads."""
-    group: Literal["auto", "video", "contact", "object"] = "auto"
-    """What stays together in halves and intervals; `auto` takes what the split kept whole, else the
-    video."""
     cache: Path | None = None
     """Folder for embeddings and decoded images. Default: one next to -o, for a run that is
     interrupted; removed at the end."""
-    controls: bool = True
-    """With a split: score the no-contact image and real images of the same material as well."""
-    seed: int = 0
-    """Of random halves, permutations and the control images."""
+    samples: Samples = field(default_factory=Samples)
+    metrics: Metrics = field(default_factory=Metrics)
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -84,16 +98,17 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     _check_outputs(options)
     from palpate.evaluation.scoring import score
 
-    names = ("encoder", "split", "labels", "groups", "group", "estimator", "backend", "controls")
-    names += ("inception", "clip", "lpips", "permutations", "seed")
-    cache = _cache(options)
-    arguments: dict[str, Any] = {name: getattr(options, name) for name in names}
-    arguments |= {
-        "names": options.names or None,
-        "presets": options.presets or None,
-        "sigma": [_number_or_word(text) for text in options.sigma],
-        "normalize": {"check": "check", "yes": True, "no": False}[options.normalize],
-        "companions": _companions(options),
+    cache, metrics = _cache(options), options.metrics
+    arguments: dict[str, Any] = {
+        "encoder": options.encoder,
+        "split": options.split,
+        **vars(options.samples),
+        **vars(metrics),
+        "names": options.samples.names or None,
+        "presets": metrics.presets or None,
+        "sigma": [_number_or_word(text) for text in metrics.sigma],
+        "normalize": {"check": "check", "yes": True, "no": False}[metrics.normalize],
+        "companions": _companions(metrics.companions),
         "cache": cache,
     }
     with terminal.progress() as progress:
@@ -115,7 +130,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
 
 def _check_outputs(options: Options) -> None:
     """Raise before anything is computed if an output cannot be written."""
-    read = (options.reference, options.split, options.labels, options.groups, *options.generated)
+    samples = options.samples
+    read = (options.reference, options.split, samples.labels, samples.groups, *options.generated)
     inputs = [path for path in read if path]
     if options.output:
         guard_output(options.output, inputs)
@@ -137,11 +153,11 @@ def _cache(options: Options) -> Path | None:
     return output.absolute().parent / f".{output.name}.work"
 
 
-def _companions(options: Options) -> tuple[str, ...] | None:
-    if options.companions is None or "none" not in options.companions:
-        return options.companions
-    if len(options.companions) > 1:
-        got = " ".join(options.companions)
+def _companions(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+    if names is None or "none" not in names:
+        return names
+    if len(names) > 1:
+        got = " ".join(names)
         raise PalpateError("must be none, or names", got, "Drop none", argument="companions")
     return ()
 

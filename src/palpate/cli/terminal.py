@@ -31,7 +31,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -223,14 +223,14 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
     leading = LEADING.get(name, "")
     if leading and args and not args[0].startswith("-") and leading not in args:
         args = [leading, *args]
-    box = io.StringIO()
+    box, about = io.StringIO(), inspect.cleandoc(options.__doc__ or "")
     try:
         with contextlib.redirect_stderr(box):
             return tyro.cli(
                 options,
                 prog=f"palpate {name}",
                 args=list(args),
-                description=f"{options.__doc__}\n\nExample: {VERBS[name].example}",
+                description=f"{about}\n\nExample: {VERBS[name].example}",
                 config=CONFIG,
             )
     except SystemExit as stop:
@@ -238,6 +238,11 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
             raise
         _answer_renamed(name, args)
         words = " ".join(re.sub(r"[\u2500-\u257f]+", " ", box.getvalue()).split())
+        if unknown := re.search(r"Unrecognized.*?(--[a-z][\w-]*)", words):
+            near = difflib.get_close_matches(unknown[1], _option_names(options), 1, 0.75)
+            fix = f"Did you mean: {near[0]}" if near else f"See: palpate {name} --help"
+            must = f"An option of palpate {name} must be one of its help"
+            raise PalpateError(must, unknown[1], fix) from None
         hints = r"For full helptext|Argument helptext|Full error|If your arguments"
         got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
         must = f"The options of palpate {name} must be as its help says"
@@ -245,17 +250,49 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
 
 
 def join_help_lines(options: type[Any]) -> None:
-    """Make the help of each option one paragraph: tyro keeps the line breaks of its docstring."""
+    """Make the help of each option one paragraph with a default that says something.
+
+    tyro keeps the line breaks of a docstring, and shows ``None`` for what is not given.
+    """
     for cls in filter(dataclasses.is_dataclass, options.__mro__):
+        hints = get_type_hints(cls, include_extras=True)
+        for name in cls.__annotations__:
+            default = cls.__dataclass_fields__[name].default
+            if default is None or default is False or default == ():
+                cls.__annotations__[name] = _with_hint(hints[name], "")
+            elif default is True:
+                cls.__annotations__[name] = _with_hint(hints[name], "(on by default)")
         body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # type: ignore[attr-defined]
         for statement, doc in pairwise(body):
             if isinstance(statement, ast.AnnAssign) and isinstance(doc, ast.Expr):
                 field: Any = cls.__dataclass_fields__[ast.unparse(statement.target)]
                 text = " ".join(str(ast.literal_eval(doc.value)).split())
                 field.metadata = {**field.metadata, "help": text}
+    for group in (field.default_factory for field in dataclasses.fields(options)):
+        # The groups of `palpate world` are made by the verb and have no source.
+        if dataclasses.is_dataclass(group) and group.__module__ != "types":
+            join_help_lines(group)  # type: ignore[arg-type]
+
+
+def _with_hint(hint: Any, text: str) -> Any:
+    """Annotate a type with what its help shows as the default, unless it says so itself."""
+    extras = list(getattr(hint, "__metadata__", ()))
+    for k, extra in enumerate(extras):
+        if hasattr(extra, "help_behavior_hint"):
+            if extra.help_behavior_hint is None:
+                extras[k] = dataclasses.replace(extra, help_behavior_hint=text)
+            return Annotated[hint.__origin__, *extras]
+    return Annotated[hint, tyro.conf.arg(help_behavior_hint=text)]
+
+
+def _option_names(options: type[Any]) -> list[str]:
+    """Return the option names of a verb."""
+    names: list[str] = []
     for field in dataclasses.fields(options):
-        if dataclasses.is_dataclass(field.default):
-            join_help_lines(type(field.default))
+        if dataclasses.is_dataclass(field.default_factory):
+            names += _option_names(field.default_factory)
+        names.append(f"--{field.name.replace('_', '-')}")
+    return names
 
 
 def _answer_renamed(name: str, args: Sequence[str]) -> None:
@@ -415,8 +452,9 @@ def run_verb(name: str, args: Sequence[str]) -> int:
 
 def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:
     if name not in VERBS:
-        near = difflib.get_close_matches(name, VERBS, 1)
-        new = RENAMED.get((name, ""))
+        first = [arg for arg in args[:1] if not arg.startswith("-") and not Path(arg).exists()]
+        near = difflib.get_close_matches(" ".join([name, *first]), VERBS, 1)
+        new = None if first and near else RENAMED.get((name, ""))
         fix = f"Write: {new}" if new else f"Did you mean: palpate {near[0]}" if near else ""
         must = f"The verb must be one of {', '.join(VERBS)}"
         raise PalpateError(must, repr(name), fix or "See: palpate --help")

@@ -65,7 +65,7 @@ VERBS: dict[str, Verb] = {
     ),
     "probe": Verb(
         "probe",
-        "Tell how well an encoder's embeddings name the material",
+        "Measure how well an encoder's embeddings predict the material",
         "palpate probe tag/ --split noleak.json --encoder encoders/",
     ),
     "report": Verb(

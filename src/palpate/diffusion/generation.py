@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -158,8 +159,9 @@ def generate(  # noqa: PLR0913 - a public verb
     """Make a tactile image for each photo; running it again continues a half-done folder.
 
     Args:
-        photos: a photo, a folder of them, a list, id -> file, or a manifest (or its file or
-            folder), whose columns ``vision`` and, for a pipeline w/ BG, ``background`` are used.
+        photos: a photo, a folder of them, a list, id -> file, PIL images, a uint8 array
+            (n, h, w, 3), a tensor (n, 3, h, w), or a manifest (or its file, folder or frame), whose
+            columns ``vision`` and, for a pipeline w/ BG, ``background`` are used.
             The ids, which with ``seed`` decide the noise, are paths below a folder, file names, or
             those of the manifest.
         model: a pipeline, a folder of ``palpate train generator``, a hub id, or the shipped
@@ -182,10 +184,17 @@ def generate(  # noqa: PLR0913 - a public verb
         PalpateError: on wrong arguments, or if the folder was made with other settings.
         ProblemsError: naming every unreadable photo, before any image is made, unless ``skip_bad``.
     """
-    manifest = _manifest(photos)
-    if manifest is not None and split is not None:
-        split = split if isinstance(split, Split) else Split.load(Path(split))
-        manifest = manifest.part(split, part)
+    if _in_memory(photos):
+        with tempfile.TemporaryDirectory() as folder:
+            options: dict[str, Any] = {
+                "seed": seed,
+                "guidance": guidance,
+                "steps": steps,
+                "batch": batch,
+            }
+            options |= {"device": device, "progress": progress}
+            return generate(_as_files(photos, Path(folder)), model=model, output=output, **options)
+    manifest = _manifest(photos, split, part)
     table = {} if manifest is not None else photo_ids(cast("Photos", photos))
     paths = manifest.paths("vision") if manifest is not None else list(table.values())
     output = None if output is None else Path(output)
@@ -330,8 +339,37 @@ def file_name(sample_id: str) -> str:
     return f"{plain or 'sample'}-{short(hashlib.sha256(sample_id.encode()).hexdigest())}.png"
 
 
-def _manifest(photos: Manifest | Photos) -> Manifest | None:
-    """The manifest that ``photos`` is or names, or None for photos."""
+def _in_memory(photos: Any) -> bool:
+    """Return whether photos are images, arrays or tensors instead of files."""
+    first = photos[0] if isinstance(photos, list | tuple) and photos else photos
+    return isinstance(first, Image.Image | np.ndarray) or hasattr(first, "detach")
+
+
+def _as_files(photos: Any, folder: Path) -> dict[str, Path]:
+    """Write images in memory to ``folder`` without loss; their ids are their numbers."""
+    from palpate.encoders.encoder import list_images
+
+    files: dict[str, Path] = {}
+    for k, image in enumerate(list_images(photos)):
+        files[str(k)] = folder / f"{k}.png"
+        cast("Image.Image", image).save(files[str(k)])
+    return files
+
+
+def _manifest(photos: Any, split: Split | str | Path | None, part: str) -> Manifest | None:
+    """The part of the manifest that ``photos`` is or names, or None for photos."""
+    manifest = _whole_manifest(photos)
+    if manifest is None or split is None:
+        return manifest
+    split = split if isinstance(split, Split) else Split.load(Path(split))
+    return manifest.part(split, part)
+
+
+def _whole_manifest(photos: Any) -> Manifest | None:
+    if hasattr(photos, "columns"):
+        from palpate.data.reading import load
+
+        return load(photos)
     if isinstance(photos, str | Path):
         path = Path(photos)
         if path.suffix != ".parquet" and not (path / "manifest.parquet").is_file():

@@ -153,7 +153,12 @@ class Chosen:
 
 
 def choose(
-    requested: Sequence[str] | None, weights: Weights, *, images: bool, encoder: bool, gel: bool
+    requested: Sequence[str] | None,
+    weights: Weights,
+    *,
+    images: bool,
+    encoder: bool,
+    background: bool,
 ) -> Chosen:
     """Sort the requested companions by what they need; None means all whose inputs are there.
 
@@ -162,7 +167,7 @@ def choose(
         weights: of standard encoders.
         images: whether there are images (else embeddings).
         encoder: whether there are features of an encoder.
-        gel: whether the reference has backgrounds.
+        background: whether the reference has backgrounds.
 
     Raises:
         PalpateError: for an unknown name, or a companion whose inputs are not there.
@@ -170,19 +175,32 @@ def choose(
     has = {name: weights.for_features(name)[1] is not None for name in FEATURES if name != "prdc"}
     if requested is None:
         names = [n for n in FEATURES if has.get(n) or (encoder and n != "cmmd")]
-        able = {"contact": gel, "lpips": weights.lpips is not None}
+        able = {"contact": background, "lpips": weights.lpips is not None}
         names += [n for n in PAIRS if able.get(n, True)] if images else []
     else:
         names = list(dict.fromkeys(requested))
     for name in names:
-        _require(name, weights, images=images, encoder=encoder, gel=gel, standard=has.get(name))
+        _require(
+            name,
+            weights,
+            images=images,
+            encoder=encoder,
+            background=background,
+            standard=has.get(name),
+        )
     standard = [n for n in names if has.get(n)]
     features = [n for n in names if n in FEATURES and n not in standard]
     return Chosen(requested is None, features, standard, [n for n in names if n in PAIRS])
 
 
 def _require(
-    name: str, weights: Weights, *, images: bool, encoder: bool, gel: bool, standard: bool | None
+    name: str,
+    weights: Weights,
+    *,
+    images: bool,
+    encoder: bool,
+    background: bool,
+    standard: bool | None,
 ) -> None:
     """Raise if a companion is unknown or lacks its inputs."""
     argument: dict[str, Any] = {"argument": "companions"}
@@ -192,7 +210,7 @@ def _require(
     if name in PAIRS and not images:
         must = "must need no images for embeddings"
         raise PalpateError(must, name, "Score folders of images, or drop it", **argument)
-    if name == "contact" and not gel:
+    if name == "contact" and not background:
         must = "must need no background images where the reference has none"
         fix = "Pass a reference with a column background, or drop it"
         raise PalpateError(must, name, fix, **argument)

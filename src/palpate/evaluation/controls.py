@@ -63,7 +63,7 @@ def material_accuracies(train: FeatureSet, features: Features) -> list[Score]:
     ]
 
 
-def with_doubts(score: Score, inputs: Inputs, encoders: Any, split: Split) -> Score:
+def with_warnings(score: Score, inputs: Inputs, encoders: Any, split: Split) -> Score:
     """Note an encoder or a generator that may have seen test samples (paper, section 5)."""
     notes = list(score.notes)
     card = getattr(encoders, "card", None)

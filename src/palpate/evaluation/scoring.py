@@ -10,7 +10,7 @@ notes, results. Metrics of one name with another bandwidth get names of their ow
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +37,7 @@ from palpate.evaluation.controls import (
     SAME_MATERIAL,
     control_samples,
     material_accuracies,
-    with_doubts,
+    with_warnings,
 )
 from palpate.evaluation.inputs import REFERENCE, Inputs, Samples, Source, read_inputs
 from palpate.metrics import PRESETS, compare, distance, paired_by_id, tmmd
@@ -278,8 +278,9 @@ def score(  # noqa: PLR0913
         40
     """
     split = split if isinstance(split, Split | None) else Split.load(Path(split))
+    companions = [companions] if isinstance(companions, str) else companions
     family = Family(
-        presets=tuple(dict.fromkeys(presets or ())),
+        presets=_names(presets, PRESETS, "presets") or (),
         sigmas=_sigmas(sigma),
         estimator=estimator,
         options={"backend": backend, "permutations": permutations, "normalize": normalize},
@@ -321,7 +322,7 @@ def score(  # noqa: PLR0913
             )
             outcome = run.score(companions, controls=controls)
     if split is not None:
-        outcome.scores = [with_doubts(s, inputs, encoders, split) for s in outcome.scores]
+        outcome.scores = [with_warnings(s, inputs, encoders, split) for s in outcome.scores]
     settings = _settings(inputs, family, outcome, encoders)
     if split is not None:
         settings["split rule"] = dict(split.rule)
@@ -334,6 +335,19 @@ def score(  # noqa: PLR0913
         settings=settings,
         notes=[*outcome.notes, *_copies(outcome), *_below_floor(outcome)],
     )
+
+
+def _names(
+    names: str | Sequence[str] | None, known: Collection[str], argument: str
+) -> tuple[str, ...] | None:
+    """One name or several, without repeats; None stays None."""
+    if names is None:
+        return None
+    unique = tuple(dict.fromkeys([names] if isinstance(names, str) else names))
+    if unknown := [name for name in unique if name not in known]:
+        must = f"must be of {', '.join(known)}"
+        raise PalpateError(must, repr(unknown[0]), "Choose of these", argument=argument)
+    return unique
 
 
 def _sigmas(sigma: float | str | Sequence[float | str]) -> tuple[float | str, ...]:
@@ -375,9 +389,9 @@ class _Run:
         images = real.features is None
         encoder = self.encoders is not None or not images
         chosen = choose(
-            companions, self.weights, images=images, encoder=encoder, gel=real.has_background
+            companions, self.weights, images=images, encoder=encoder, background=real.has_background
         )
-        pairs = self._pairable(chosen.default) if chosen.pairs else False
+        pairs = self._can_pair(chosen.default) if chosen.pairs else False
         controls = controls and encoder and images and self.inputs.train is not None
         extra: dict[str, Samples] = {}
         if controls:
@@ -433,7 +447,7 @@ class _Run:
         x = embed(samples.manifest, self.encoders, "tactile", cache=folder, **options)
         return samples.feature_set(x.features, digest)
 
-    def _pairable(self, default: bool) -> bool:
+    def _can_pair(self, default: bool) -> bool:
         """Whether every generated image has its reference; some without one are a mistake."""
         real, made = self.inputs.reference, self.inputs.generators
         if real.numbered:  # pairs by position are taken on request alone

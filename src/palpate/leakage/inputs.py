@@ -40,7 +40,7 @@ def read(
     if len(paths) > 1 and all(isinstance(path, (str, Path)) for path in paths):
         manifest, skipped = _join([Path(path) for path in paths], skip_bad)
     else:
-        source = paths[0] if len(paths) == 1 else data
+        source = paths[0] if len(paths) == 1 and not isinstance(paths[0], dict) else data
         manifest, skipped = read_samples(source, skip_bad=skip_bad, root=root, progress=progress)
     shown = [str(problem) for problem in skipped[:SHOWN]]
     notes = [Note("rows-skipped", {"count": len(skipped), "problems": shown})] if skipped else []
@@ -54,11 +54,14 @@ def read_all(
     manifests: list[Manifest] = []
     problems: list[Problem] = []
     notes: list[Note] = []
-    for source in sources:
+    for source, name in zip(sources, ("train_or_data", "test", "pretrain"), strict=False):
         try:
             manifest, more = read(source, skip_bad, progress, root)
         except ProblemsError as error:
             problems += error.problems
+        except PalpateError as error:
+            error.argument = name if error.argument == "source" else error.argument
+            raise
         else:
             manifests.append(manifest)
             notes += more

@@ -192,6 +192,7 @@ def _unstable(p: Mapping[str, Any], _: Style) -> str:
 def _excluded_classes(p: Mapping[str, Any], _: Style) -> str:
     names: dict[str, list[str]] = {}
     for name, why in p["excluded"].items():
+        name = "samples" if why == "no-label" else name
         names.setdefault(EXCLUDED.get(why, str(why)), []).append(name)
     return "Excluded: " + "; ".join(f"{few(n)} ({why})" for why, n in names.items())
 

@@ -69,7 +69,7 @@ def _with_interval(score: Score | None) -> str:
 def _distance_fact(run: DemoRun) -> str:
     source = "photos and no-contact images" if run.options.background else "photos alone"
     gel = _score(run, "TMMD", BACKGROUND, "grouped")
-    versus = f", the empty gel {_with_interval(gel)}" if gel is not None else ""
+    versus = f", the no-contact image {_with_interval(gel)}" if gel is not None else ""
     value = _with_interval(_score(run, "TMMD", "generated", "grouped"))
     start = f"Distance: {len(run.generated.ids)} tactile images generated from {source}"
     return f"{start} have TMMD (grouped) {value} to the real ones{versus} (lower is better)."
@@ -82,7 +82,7 @@ def _material_fact(run: DemoRun) -> str:
     if made is None or real is None:
         materials = run.manifest.table["material"].drop_nulls().n_unique()
         return f"Material: {materials} materials, too few for a probe."
-    more = f", of the empty gel {gel:.1%}" if gel is not None else ""
+    more = f", of the no-contact image {gel:.1%}" if gel is not None else ""
     more += f"; chance is {made.details['chance']:.1%}"
     start = "Material: a probe fitted to real train images is right on"
     return f"{start} {real:.1%} of the real test images and {made:.1%} of the generated ones{more}."
