@@ -607,5 +607,5 @@ def test_one_name_may_be_a_string():
     results = score(*rows, presets="paper", companions="fid", permutations=0)
     assert {s.settings.get("preset") for s in results if s.metric == "TMMD"} == {"paper"}
     assert any(s.metric.startswith("FID") for s in results)
-    with pytest.raises(PalpateError, match="`presets` must be of .*paper"):
+    with pytest.raises(PalpateError, match=r"`presets` must be of .*paper"):
         score(*rows, presets="papers")
