@@ -118,7 +118,8 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
         if not path.is_dir():
             return [path]
         files = (p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
-        return sorted(files)
+        images: list[Path | Image.Image] = [*sorted(files)]
+        return images
     if isinstance(inputs, Image.Image):
         return [inputs.convert("RGB")]
     if hasattr(inputs, "shape"):

@@ -278,7 +278,7 @@ def score(  # noqa: PLR0913
         40
     """
     split = split if isinstance(split, Split | None) else Split.load(Path(split))
-    companions = [companions] if isinstance(companions, str) else companions
+    requested: Any = [companions] if isinstance(companions, str) else companions
     family = Family(
         presets=_names(presets, PRESETS, "presets") or (),
         sigmas=_sigmas(sigma),
@@ -299,7 +299,7 @@ def score(  # noqa: PLR0913
     weights: dict[str, Any] = {"inception": inception, "clip": clip, "lpips": lpips}
     encoders = None
     if inputs.reference.features is None:
-        if encoder is None and not companions:
+        if encoder is None and not requested:
             fix = "Pass an encoder, or request companions of pixels"
             example = {"encoder": "palpate/mini", "companions": ["ssim", "psnr"]}
             got, must = "none", "must be given for images"
@@ -308,7 +308,7 @@ def score(  # noqa: PLR0913
     elif used := [n for n, v in {"encoder": encoder, "cache": cache, **weights}.items() if v]:
         raise PalpateError("must go with images", "embeddings", "Drop it", argument=used[0])
     if any(s.streamed for s in (inputs.reference, *inputs.generators.values())):
-        outcome = score_streamed(inputs, family, companions, progress)
+        outcome = score_streamed(inputs, family, requested, progress)
     else:
         with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
             run = _Run(
@@ -320,7 +320,7 @@ def score(  # noqa: PLR0913
                 cache is not None,
                 progress,
             )
-            outcome = run.score(companions, controls=controls)
+            outcome = run.score(requested, controls=controls)
     if split is not None:
         outcome.scores = [with_warnings(s, inputs, encoders, split) for s in outcome.scores]
     settings = _settings(inputs, family, outcome, encoders)

@@ -266,7 +266,9 @@ def environment() -> Environment:
     for module in (audits, plots, sentences):
         functions |= {k: v for k, v in vars(module).items() if callable(v)}
     env.globals.update(functions)
-    env.filters.update(count=count, number=number, percent=percent, plural=plural)
+    words: dict[str, Any] = {"count": count, "number": number}
+    words |= {"percent": percent, "plural": plural}
+    env.filters.update(words)
     env.filters.update(
         emphasize=_emphasize,
         leaf=_leaf,
