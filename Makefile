@@ -26,17 +26,17 @@ demo: $(READY)   ## the whole pipeline on the embedded world; DATA=path runs it 
 test: test-fast test-slow  ## all tests, fast ones first
 
 test-fast: $(DEV)  ## tests of under about five seconds each
-	$(PYTEST) -m "not slow and not browser and not nightly"
+	$(PYTEST) -m "not slow and not browser"
 
 test-slow: $(DEV)  ## the slow ones, and the page in a browser
-	$(PYTEST) -m "(slow or browser) and not nightly"
+	$(PYTEST) -m "slow or browser"
 
-nightly: $(DEV)  ## what takes longer: studies of coverage, the shipped models made again
-	$(PYTEST) -m nightly --timeout=3600
-	$(BIN)/python recipes/mini.py --out runs/mini --verify
+nightly: $(DEV)  ## what takes longer: the metrics at full size, the shipped models made again
+	$(BIN)/python benchmarks/metrics.py
+	$(BIN)/python recipes/mini.py --work runs/mini --verify
 
 coverage: $(DEV)  ## line and branch coverage of the fast tests
-	$(PYTEST) -m "not slow and not browser and not nightly" --cov --cov-report=term --cov-report=xml
+	$(PYTEST) -m "not slow and not browser" --cov --cov-report=term --cov-report=xml
 
 lint: $(DEV)     ## style, types, and the direction of imports
 	$(BIN)/ruff format --check .
@@ -65,7 +65,7 @@ $(READY):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "palpate needs Python 3.11 or newer; got $$($(PYTHON) --version). Try: make PYTHON=python3.12"; exit 2; }
 	$(PYTHON) -m venv --clear $(VENV)
 	$(PIP) $$(grep '^torch==' constraints.txt)
-	$(PIP) -c constraints.txt -e ".[video,torch,probe]"
+	$(PIP) -c constraints.txt -e ".[video,torch]"
 	touch $@
 
 $(DEV): $(READY)

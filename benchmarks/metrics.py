@@ -1,10 +1,10 @@
 """Speed and memory of the metrics next to the peers', on the same features in one run.
 
-    python benchmarks/metrics.py                                 # n = m = 14,000, d = 768: ten
-    minutes python benchmarks/metrics.py --n 4000 --repeats 3            # a first look python
-    benchmarks/metrics.py --parts disk --disk-rows 1000000  # 2 x 3 GB in a temporary folder python
-    benchmarks/metrics.py --parts gpu --device cuda --n 100000 python benchmarks/metrics.py --write
-    docs/studies/metric_speed.md
+    python benchmarks/metrics.py                         # n = m = 14,000, d = 768; ten minutes
+    python benchmarks/metrics.py --n 4000 --repeats 3    # a first look
+    python benchmarks/metrics.py --parts disk --disk-rows 1000000    # 6 GB in a temporary folder
+    python benchmarks/metrics.py --parts gpu --device cuda --n 100000
+    python benchmarks/metrics.py --write docs/studies/metric_speed.md
 
 Every line runs in a fresh process, which draws the same features from the same seed first; peak
 memory is the process's largest resident set minus what it had with the features drawn. Ratios are

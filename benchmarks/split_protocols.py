@@ -1,7 +1,7 @@
 """One world, several ways to cut it: how much of a touch probe's accuracy is leakage.
 
     python benchmarks/split_protocols.py --seeds 0 1 2 --write docs/studies/world_protocols.md
-    python benchmarks/split_protocols.py --seeds 0 --modalities touch          # a first look, about five minutes
+    python benchmarks/split_protocols.py --seeds 0 --modalities tactile    # a first look, five minutes
 
 The contact frames of a preset are cut into train and test by random frame (as HCT-Orig), by random whole touch (as the Touch and Go lists), by whole
 video, and by whole object (a video counts with its first object; the other objects of a mixed video are in no other). A split seed deals the units into
@@ -430,7 +430,7 @@ def main():
         "--modalities", nargs="+", default=["tactile", "vision"], choices=("tactile", "vision")
     )
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--write", type=Path, help="Markdown file to write (needs touch)")
+    parser.add_argument("--write", type=Path, help="Markdown file to write (needs tactile)")
     chosen = parser.parse_args()
     options, start = PRESETS[chosen.preset], time.perf_counter()
     frames = render(options, chosen.processes)

@@ -3,8 +3,7 @@
 ::
 
     python benchmarks/walk.py -- palpate score --generated a/ --reference b/ --encoder palpate/mini
-    python benchmarks/walk.py --source PATH/TO/ANOTHER/CHECKOUT/src -- palpate generate photo.jpg -o
-    t.png
+    python benchmarks/walk.py --source OTHER/CHECKOUT/src -- palpate generate photo.jpg -o t.png
 
 Counts the project files in which at least one function ran, bodies of modules and classes left out,
 with ``sys.setprofile`` in all threads of the command's own process. ``--source`` measures another

@@ -1,8 +1,7 @@
 """How fast the synthetic world renders, and what more workers give.
 
     python benchmarks/world_speed.py                     # frames, objects, random access; a minute
-    python benchmarks/world_speed.py --parts workers     # the preset small with one and two
-    processes
+    python benchmarks/world_speed.py --parts workers     # one and two processes
 
 Times are CPU seconds of this process, medians over videos, and wall-clock ratios for workers.
 """
