@@ -59,7 +59,7 @@ def test_fail_over_is_a_limit(capsys, lists, limit, status):
         (["audti"], "Did you mean: palpate audit"),
         (["encoder", "tag/"], "Write: palpate train encoder"),
         (["train", "tag/"], "Write: palpate train generator"),
-        (["audit", "a", "b", "--towers=x"], "--towers of palpate audit is now written --encoder"),
+        (["audit", "a", "b", "--towers=x"], "--towers of palpate audit is now --encoder"),
         (["audit", "no.txt", "such.txt"], "no.txt"),
         (["audit", "--color", "red"], "Got --color"),
         (["split", "nowhere", "-o", "s.json"], "nowhere"),

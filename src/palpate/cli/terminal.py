@@ -69,15 +69,14 @@ RENAMED: dict[tuple[str, str], str] = {
     ("train generator", "--encoder"): "--clip",
     ("split", "--group"): "--by",
     ("demo", "--group"): "--by",
-    ("generate", "--manifest"): "a positional argument: palpate generate tag/ --split noleak.json",
+    ("generate", "--manifest"): "the first argument: palpate generate tag/ --split noleak.json",
     ("split", "--noleak"): "--noleak touch-and-go (or hct), after the samples",
     ("audit", "--group"): "--by",
     ("audit", "--processes"): "--threads",
-    ("import", "--set"): "with the option's own name, e.g. --labels train.txt",
-    ("validate", "--set"): "with the option's own name, e.g. --labels train.txt",
+    ("import", "--set"): "an option for each name, e.g. --labels train.txt",
+    ("validate", "--set"): "an option for each name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",
-    ("score", "MANIFEST"): "--reference",
-    ("score", "--controls"): "--no-controls",
+    ("score", "--controls"): "the default; --no-controls turns it off",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' stands for every verb.
@@ -238,10 +237,11 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
             raise
         _answer_renamed(name, args)
         words = " ".join(re.sub(r"[\u2500-\u257f]+", " ", box.getvalue()).split())
-        if unknown := re.search(r"Unrecognized.*?(--[a-z][\w-]*)", words):
+        if unknown := re.search(r"Unrecognized options: (\S+)", words):
             near = difflib.get_close_matches(unknown[1], _option_names(options), 1, 0.75)
             fix = f"Did you mean: {near[0]}" if near else f"See: palpate {name} --help"
-            must = f"An option of palpate {name} must be one of its help"
+            kind = "An option" if unknown[1].startswith("-") else "An argument"
+            must = f"{kind} of palpate {name} must be one of its help"
             raise PalpateError(must, unknown[1], fix) from None
         hints = r"For full helptext|Argument helptext|Full error|If your arguments"
         got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
@@ -296,11 +296,10 @@ def _option_names(options: type[Any]) -> list[str]:
 
 
 def _answer_renamed(name: str, args: Sequence[str]) -> None:
-    """Raise for an option or a first argument of an earlier version, with its new name."""
-    first = ["MANIFEST"] if args and not args[0].startswith("-") else []
-    for option in (*first, *(arg.partition("=")[0] for arg in args if arg.startswith("--"))):
+    """Raise for an option of an earlier version, with its new name."""
+    for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
         if new := RENAMED.get((name, option)) or RENAMED.get(("", option)):
-            must = f"{option} of palpate {name} is now written {new}"
+            must = f"{option} of palpate {name} is now {new}"
             raise PalpateError(must, option, f"See: palpate {name} --help")
 
 
