@@ -401,7 +401,7 @@ def _file_error(error: OSError) -> PalpateError:
     return PalpateError(f"{place} must be readable and writable", got, fix)
 
 
-def _complain(line: str) -> None:
+def _print_error(line: str) -> None:
     sys.stderr.write(f"{line}\n")
 
 
@@ -425,9 +425,9 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         return status
     except (PalpateError, OSError) as caught:
         error = caught if isinstance(caught, PalpateError) else _file_error(caught)
-        _complain(f"palpate {name}: {error_line(name, error)}")
+        _print_error(f"palpate {name}: {error_line(name, error)}")
         if isinstance(error, ProblemsError):
-            list_problems(error.problems, _complain)
+            list_problems(error.problems, _print_error)
         if as_json:
             _write_json(error.to_json())
         return USER_ERROR

@@ -1,8 +1,8 @@
 """Contact metrics: image minus background inside the contact mask.
 
-Most pixels of a tactile image show the sensor, and a generator that paints the empty gel gets them
-right. Here every image is reduced to d = image - background in [-1, 1] and compared where the real
-image shows contact, so that untouched gel earns nothing:
+Most pixels of a tactile image show the sensor, and a generator that returns the no-contact image
+(the background) gets them right. Here every image is reduced to d = image - background in [-1, 1]
+and compared where the real image shows contact, so that the no-contact image earns nothing:
 
 * *Mask*: root mean square of d over the channels, markers filled from around them, blurred by a
   Gaussian of 1/48 of the shorter side, above a threshold: 4 gray levels, or three times what the
@@ -13,15 +13,16 @@ image shows contact, so that untouched gel earns nothing:
   the real clips of Touch and Go they hold three quarters of the squared d), so they are skipped
   unless ``markers="keep"``.
 * *Residual*: ``sum (d' - d)^2 / sum (d'^2 + d^2)`` over the mask, d' generated. 0: identical; 1:
-  empty gel, and on average any contact unrelated to the real one; 2: its negative. The sum below is
-  over both, because sum d^2 alone would reward the empty gel (``details["per_real_energy"]``).
+  the no-contact image, and on average any contact unrelated to the real one; 2: its negative. The
+  sum below is over both, because sum d^2 alone would reward the no-contact image
+  (``details["per_real_energy"]``).
 * *SSIM*: the SSIM map of d' and d, with a window at every pixel, averaged over mask and channels.
   Its data range is 0.25, a few deviations of a contact: with 2, the range of d, C2 exceeds the
-  contact's variance and empty gel scores above a real image of the same material.
+  contact's variance and the no-contact image scores above a real image of the same material.
 * *MS-SSIM*: the same maps at every scale that the image holds, weighted by the share of a cell in
   the mask.
 * *PSNR*: -10 log10 of the mean squared d' - d over the mask, data range 1. A squared error prefers
-  empty gel to a wrong contact: compare with ``details["empty"]``, the score of empty gel.
+  the no-contact image to a wrong contact: compare with ``details["empty"]``, its score.
 * *IoU*: of the generated mask and the real one. ``details["everywhere"]``: a contact everywhere.
 
 For a network that compares images, such as LPIPS, :func:`contact_images` gives the differences as
@@ -220,7 +221,7 @@ def contact_scores(
 def contact_residual(
     generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> Score:
-    """Contact residual: 0 is identical, 1 empty gel. Arguments as :func:`contact_scores`."""
+    """Contact residual: 0 is identical, 1 no contact. Arguments as :func:`contact_scores`."""
     return contact_scores(generated, reference, background, **options)[0]
 
 
@@ -241,7 +242,7 @@ def contact_psnr(
 def contact_iou(
     generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
 ) -> Score:
-    """Overlap of the masks: 1 is equal, 0 empty gel. Arguments as :func:`contact_scores`."""
+    """Overlap of the masks: 1 is equal, 0 no contact. Arguments as :func:`contact_scores`."""
     return contact_scores(generated, reference, background, **options)[3]
 
 
@@ -258,8 +259,8 @@ class Contacts:
 
     Attributes:
         values: metric -> (n,), those of :data:`METRICS`; a PSNR is infinite where identical.
-        empty: metric -> (n,) score of empty gel.
-        per_real_energy: (n,) squared error over the energy of the real contact; 1 for empty gel.
+        empty: metric -> (n,) score of the no-contact image.
+        per_real_energy: (n,) squared error over the energy of the real contact; 1 for no contact.
         area: (n,) share of the pixels in the real mask, 0 where it is empty.
         settings: of the comparison.
     """
