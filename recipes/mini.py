@@ -125,7 +125,7 @@ def main() -> int:
     return 0
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
     """Print a line at once."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
@@ -135,7 +135,7 @@ class Recipe:
     """The parts, each a stage of a run folder; a finished stage is read, not made again."""
 
     def __init__(self, work: Path, share: float) -> None:
-        self.run, self.share = Run(work, say), share
+        self.run, self.share = Run(work, print_line), share
         self.cache = work / "cache"
         self.shown = 0.0
 
@@ -144,7 +144,7 @@ class Recipe:
         at = done / total if total else 0.0
         if at >= self.shown + 0.05 or at in (0.0, 1.0) or at < self.shown:
             self.shown = at
-            say(f"  {what}: {done} of {total} {remark}")
+            print_line(f"  {what}: {done} of {total} {remark}")
 
     def make(self, last: str) -> None:
         """Makes the parts up to ``last``, leaving out those that it does not need."""
@@ -380,7 +380,7 @@ class Recipe:
         ship(target, encoders, autoencoder, pipeline, scores, self._worlds(), LIMITS)
         if PAGE.is_file():
             write_page(PAGE, target)
-        say(f"Shipped in {target}")
+        print_line(f"Shipped in {target}")
 
     def _worlds(self) -> list[dict[str, Any]]:
         stages = {name: self.run.stages[f"world {name}"].facts for name in WORLDS}
@@ -419,13 +419,13 @@ class Recipe:
             said = {row["score"]: row["value"] for row in cards[part]["scores"]}
             if missing := sorted(set(said) - {row["score"] for row in scored}):
                 bad += len(missing)
-                say(f"{part}: the card has former scores: {', '.join(missing)}  DIFFERS")
+                print_line(f"{part}: the card has former scores: {', '.join(missing)}  DIFFERS")
             for row in scored:
                 value, card = row["value"], said.get(row["score"])
                 same = card is not None and abs(value - card) <= 0.002 * max(1.0, abs(card))
                 bad += not same
                 known = "nothing" if card is None else f"{card:.4g}"
-                say(
+                print_line(
                     f"{part}: {row['score']}: {value:.4g}, the card says {known}"
                     f"{'' if same else '  DIFFERS'}"
                 )

@@ -61,7 +61,7 @@ def test_shipped_models_replace_three_stages(mini, tmp_path):
     assert len(notes["models-shipped"]["models"]) == 3
     assert "models-of-this-run" not in notes
     lines: list[str] = []
-    run_demo(OPTIONS, tmp_path / "run", say=lines.append)
+    run_demo(OPTIONS, tmp_path / "run", print_line=lines.append)
     assert all("already done" in line for line in lines)
     # Another page changes nothing; another card changes everything that carries it.
     folder = shipped_folder("palpate/mini", "clip")
@@ -69,7 +69,7 @@ def test_shipped_models_replace_three_stages(mini, tmp_path):
     for name, stages in kept.items():
         (folder / name).write_text((folder / name).read_text().replace("}", "} ", 1) + "\n")
         lines.clear()
-        run_demo(OPTIONS, tmp_path / "run", say=lines.append)
+        run_demo(OPTIONS, tmp_path / "run", print_line=lines.append)
         assert {line.split(":")[0] for line in lines if "already done" in line} == stages
 
 

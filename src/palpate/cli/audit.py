@@ -116,12 +116,12 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         shutil.rmtree(temporary, ignore_errors=True)
     terminal.show(result)
     for command in result.commands:
-        terminal.say(f"Next: {command}")
+        terminal.print_line(f"Next: {command}")
     leaked = max(result.leaked_fraction, *(a.fraction for a in (result, *result.others)))
     limit = options.outputs.fail_over
     failed = limit is not None and leaked > limit
     if failed:
-        terminal.say(f"FAIL: leaked fraction {round(leaked, 5)} is over {limit}")
+        terminal.print_line(f"FAIL: leaked fraction {round(leaked, 5)} is over {limit}")
     return result.to_json() | {"failed": failed}, FAILED_CHECK if failed else 0
 
 

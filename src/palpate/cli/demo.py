@@ -63,7 +63,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     try:
         with terminal.progress() as progress:
             demo = run_demo(
-                DemoOptions(data=data, **chosen), output, say=terminal.say, progress=progress
+                DemoOptions(data=data, **chosen),
+                output,
+                print_line=terminal.print_line,
+                progress=progress,
             )
     except PalpateError:
         if output.is_dir() and not any(output.iterdir()):  # nothing was done

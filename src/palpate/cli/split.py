@@ -122,7 +122,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         terminal.print(f"{name}: {row['counts']}, deviation {row['deviation']}, {row['digest']}")
     different = len({s.digest for s in splits})
     if different < len(splits):
-        terminal.say(
+        terminal.print_line(
             f"Note: only {different} of {len(splits)} splits differ: --tolerance 0.02 gives more"
         )
     return {"splits": rows, "different": different, "path": str(options.output)}, 0

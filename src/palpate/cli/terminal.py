@@ -119,7 +119,7 @@ class Terminal:
         self.out = Console(highlight=False, quiet=self.json, width=width)
         self.err = Console(stderr=True, highlight=False, quiet=self.silent)
 
-    def say(self, line: str) -> None:
+    def print_line(self, line: str) -> None:
         """Print a remark on standard error."""
         self.err.print(line, markup=False, soft_wrap=True)
 
@@ -127,7 +127,7 @@ class Terminal:
         """Print a note on standard error, with options in place of arguments."""
         from palpate.report.notes import COMMAND_LINE, sentence
 
-        self.say(f"Note: {sentence(note, COMMAND_LINE)}")
+        self.print_line(f"Note: {sentence(note, COMMAND_LINE)}")
 
     def print(self, line: str) -> None:
         """Print a line of the result on standard output."""
@@ -142,8 +142,8 @@ class Terminal:
     def problems(self, title: str, problems: Sequence[Problem]) -> None:
         """List problems on standard error, below a title and their number."""
         if problems:
-            self.say(f"{title} {len(problems)}:")
-            list_problems(problems, self.say)
+            self.print_line(f"{title} {len(problems)}:")
+            list_problems(problems, self.print_line)
 
     def skipped(self, problems: Sequence[Problem]) -> None:
         """List what ``--skip-bad`` skipped."""
@@ -165,7 +165,7 @@ class Terminal:
         if self.silent:
             yield quiet
         elif not self.err.is_terminal:
-            yield _LogProgress(self.say)
+            yield _LogProgress(self.print_line)
         else:
             from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
             from rich.progress import Progress as Bars
@@ -193,23 +193,23 @@ class Terminal:
 class _LogProgress:
     """At most a line every ten seconds, and one at the end of what took long."""
 
-    def __init__(self, say: Callable[[str], None], every: float = 10.0) -> None:
-        self.say, self.every = say, every
+    def __init__(self, print_line: Callable[[str], None], every: float = 10.0) -> None:
+        self.print_line, self.every = print_line, every
         self.last = time.monotonic()
         self.shown: set[str] = set()
 
     def __call__(self, what: str, done: int, total: int, remark: str = "") -> None:
         ended = bool(total) and done >= total and what in self.shown
         if ended or time.monotonic() - self.last >= self.every:
-            self.say(f"  {what} {done}{f'/{total}' if total else ''} {remark}".rstrip())
+            self.print_line(f"  {what} {done}{f'/{total}' if total else ''} {remark}".rstrip())
             self.last = time.monotonic()
             self.shown = self.shown - {what} if ended else self.shown | {what}
 
 
-def list_problems(problems: Sequence[Problem], say: Callable[[str], None]) -> None:
+def list_problems(problems: Sequence[Problem], print_line: Callable[[str], None]) -> None:
     """Print the first problems, one a line."""
     for line in problem_lines(problems):
-        say(line)
+        print_line(line)
 
 
 def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
@@ -337,14 +337,16 @@ def require_extra(purpose: str) -> None:
 
 
 def guard_output(
-    output: Path, inputs: Sequence[Path] = (), marks: Sequence[bytes] = (b'"format": "palpate-',)
+    output: Path,
+    inputs: Sequence[Path] = (),
+    signatures: Sequence[bytes] = (b'"format": "palpate-',),
 ) -> None:
     """Check that an output file replaces neither an input nor a foreign file, and is writable.
 
     Args:
         output: the file to write.
         inputs: what the command reads.
-        marks: an existing file must hold one of these in its first 4 KB to be replaced.
+        signatures: an existing file must hold one of these in its first 4 KB to be replaced.
 
     Raises:
         PalpateError: saying which.
@@ -357,7 +359,7 @@ def guard_output(
     if output.is_file():
         with open(output, "rb") as file:
             head = file.read(4096)
-        if head and not any(mark in head for mark in marks):
+        if head and not any(each in head for each in signatures):
             must = f"{output} must be new, or a file of the kind that this command writes"
             raise PalpateError(must, "another file", "Choose another file, or remove it")
 

@@ -86,7 +86,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if options.sheet:
         render_sheet(world, options.sheet)
     if seen_by_mini(world):
-        terminal.say(f"Seed {world.seed}: {SEEN}")
+        terminal.print_line(f"Seed {world.seed}: {SEEN}")
     with terminal.progress() as progress:
         record = write_world(options.output, world, workers=options.workers, progress=progress)
     facts = {"folder": str(record.folder), "digest": record.digest, **record.counts}

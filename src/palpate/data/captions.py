@@ -1,6 +1,6 @@
 """Captions made from the name of a material, for data that has labels but no words.
 
-``caption`` draws three adjectives of the material and a sentence form from (seed, sample id), so a
+``caption`` draws three adjectives of the material and a template from (seed, sample id), so a
 sample has one caption whatever the order. The words are about touch alone: no color, no light. Such
 captions say no more than the label does; a score that uses them measures the label.
 """
@@ -39,7 +39,7 @@ TEMPLATES = (
     "pressing on it feels {0}, {1}, {2}",
     "{a} {0}, {1}, {2} surface",
 )
-#: Forms for materials without adjectives.
+#: Templates for materials without adjectives.
 UNKNOWN = (
     "{} to the touch",
     "something that feels like {}",
@@ -63,5 +63,5 @@ def caption(material: str, sample_id: str, seed: int = 0) -> str:
     if known is None:
         return UNKNOWN[int(rng.integers(len(UNKNOWN)))].format(" ".join(material.split()))
     words = [ADJECTIVES[known][k] for k in rng.permutation(len(ADJECTIVES[known]))[:3]]
-    form = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
-    return form.format(*words, a="an" if words[0][0] in "aeiou" else "a")
+    template = TEMPLATES[int(rng.integers(len(TEMPLATES)))]
+    return template.format(*words, a="an" if words[0][0] in "aeiou" else "a")

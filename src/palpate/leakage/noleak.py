@@ -30,7 +30,7 @@ RATIOS: dict[str, tuple[float, float]] = {
 }
 SEEDS = range(5)
 HCT_GROUPS = ("video", "session")
-#: Seconds between the starts of two HCT folders that count as one sitting.
+#: Seconds between the starts of two HCT folders that count as one session.
 SESSION_GAP = "60 s"
 
 

@@ -375,8 +375,8 @@ def blocked_sums(
         items = by_item.sums(k, i, j) if by_item else None
         if by_segment is None:
             return items, None, None, None
-        marks = by_segment.marks
-        across, down = host(k @ marks[j]), host(k.T @ marks[i])
+        indicators = by_segment.indicators
+        across, down = host(k @ indicators[j]), host(k.T @ indicators[i])
         return items, across, down, by_segment.sums(k * k, i, j)
 
     todo = [(i, j) for i in range(len(blocks)) for j in range(i, len(blocks))]
@@ -468,20 +468,20 @@ class _Cells:
 
     Attributes:
         present: of each block the cells that occur, ascending.
-        marks: of each block (n, R) indicators of these, in float64 on the device of the rows.
+        indicators: of each block (n, R) indicators of these, in float64 on the device of the rows.
         total: (C, C) sums so far.
     """
 
     def __init__(self, cell: Index, cells: int, blocks: Sequence[slice], z: Any) -> None:
         self.present = [np.unique(cell[b]) for b in blocks]
         wide = array_namespace(z).astype(z[:0], array_namespace(z).float64)
-        marks = (cell[b][:, None] == p for b, p in zip(blocks, self.present, strict=True))
-        self.marks = [like(m.astype(np.float64), wide) for m in marks]
+        indicators = (cell[b][:, None] == p for b, p in zip(blocks, self.present, strict=True))
+        self.indicators = [like(m.astype(np.float64), wide) for m in indicators]
         self.total = np.zeros((cells, cells))
 
     def sums(self, k: Any, i: int, j: int) -> Array:
         """The sums of a block of values."""
-        return host(self.marks[i].T @ k @ self.marks[j])
+        return host(self.indicators[i].T @ k @ self.indicators[j])
 
     def add(self, sums: Array, i: int, j: int) -> None:
         """Add the sums of block (i, j), and of its mirror image."""

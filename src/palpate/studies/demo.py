@@ -143,7 +143,7 @@ def run_demo(
     options: DemoOptions,
     folder: Path,
     *,
-    say: Callable[[str], None] = lambda line: None,
+    print_line: Callable[[str], None] = lambda line: None,
     progress: Progress = quiet,
 ) -> DemoRun:
     """Run all stages, or those that are not there yet for the same inputs.
@@ -151,13 +151,13 @@ def run_demo(
     Args:
         options: what to run.
         folder: run folder; running again with the same folder resumes.
-        say: called with one line per stage.
+        print_line: called with one line per stage.
         progress: called with what is done within a stage.
 
     Raises:
         PalpateError: on bad data or options; finished stages stay.
     """
-    demo = _Demo(options, Run(Path(folder), say), progress)
+    demo = _Demo(options, Run(Path(folder), print_line), progress)
     manifest = demo.data()
     split, audits = demo.split(manifest)
     pretraining = None

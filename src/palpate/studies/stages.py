@@ -51,12 +51,12 @@ class Run:
 
     Attributes:
         folder: where the stages lie; made if absent.
-        say: called with one line for each stage begun or reused.
+        print_line: called with one line for each stage begun or reused.
         stages: the finished stages of this run by name, in order.
     """
 
     folder: Path
-    say: Callable[[str], None] = lambda line: None
+    print_line: Callable[[str], None] = lambda line: None
     stages: dict[str, Stage] = field(default_factory=dict[str, Stage])
 
     def stage(
@@ -79,12 +79,12 @@ class Run:
         final = self.folder / name
         done = _record(final / "stage.json")
         if done.get("digest") == digest:
-            self.say(f"{name}: already done ({done['seconds']:.0f} s then)")
+            self.print_line(f"{name}: already done ({done['seconds']:.0f} s then)")
             stage = Stage(final, digest, done["facts"], done["seconds"], reused=True)
         else:
-            self.say(f"{name}: ...")
+            self.print_line(f"{name}: ...")
             stage = _build(final, digest, inputs, build)
-            self.say(f"{name}: done in {stage.seconds:.0f} s")
+            self.print_line(f"{name}: done in {stage.seconds:.0f} s")
         self.stages[name] = stage
         return stage
 

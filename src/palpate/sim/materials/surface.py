@@ -121,8 +121,8 @@ def draw_surface(name: str, material: Material, n: int, rng: np.random.Generator
     known = not material.subtypes or surface.subtype in material.subtypes
     require(known, f"draw one of its subtypes {material.subtypes}", repr(surface.subtype))
     words = tuple(surface.words)
-    say = 2 <= len(words) == len(set(words)) <= 4 and all(is_line(word) for word in words)
-    require(say, "say how it feels in 2 to 4 different words", words)
+    fits = 2 <= len(words) == len(set(words)) <= 4 and all(is_line(word) for word in words)
+    require(fits, "say how it feels in 2 to 4 different words", words)
     shares = (surface.gloss, surface.softness)
     require(all(0.0 <= v <= 1.0 for v in shares), "have gloss and softness in [0, 1]", shares)
     noun = surface.noun or material.noun
