@@ -59,6 +59,8 @@ def test_fail_over_is_a_limit(capsys, lists, limit, status):
         (["audti"], "Did you mean: palpate audit"),
         (["encoder", "tag/"], "Write: palpate train encoder"),
         (["train", "tag/"], "Write: palpate train generator"),
+        (["validate", "--formats"], "Did you mean: --format."),
+        (["validate", "--listt"], "Did you mean: --list."),
         (["audit", "a", "b", "--towers=x"], "--towers of palpate audit is now --encoder"),
         (["audit", "no.txt", "such.txt"], "no.txt"),
         (["audit", "--color", "red"], "Got --color"),

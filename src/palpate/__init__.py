@@ -14,8 +14,9 @@ Every name is imported on first use: ``import palpate`` itself loads neither tor
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from palpate._lazy import lazy_names
 
 __version__ = "0.1.0.dev0"
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from palpate.sim import World
 
 #: Public name -> the room that holds it.
-_ROOMS = {
+_MODULES = {
     "Encoder": "encoders",
     "Manifest": "data",
     "Score": "core",
@@ -65,14 +66,7 @@ __all__ = [
     "validate",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name from its room on first use (PEP 562)."""
-    if name not in _ROOMS:
-        raise AttributeError(f"module 'palpate' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"palpate.{_ROOMS[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy_names(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:

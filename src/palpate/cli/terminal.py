@@ -35,7 +35,6 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from palpate.cli.verbs import BUG, FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
 from palpate.core import (
@@ -46,6 +45,7 @@ from palpate.core import (
     Problem,
     ProblemsError,
     Progress,
+    fact_lines,
     problem_lines,
     quiet,
 )
@@ -151,13 +151,9 @@ class Terminal:
 
     def facts(self, title: str, rows: Mapping[str, Any]) -> None:
         """Print a two-column table of names and values."""
-        self.out.print(title, style="bold")
-        table = Table(show_header=False, box=None, pad_edge=False)
-        table.add_column(style="dim")
-        table.add_column(overflow="fold")
-        for name, value in rows.items():
-            table.add_row(name, "-" if value is None else str(value))
-        self.out.print(table)
+        self.out.print(title, style="bold", markup=False)
+        for line in fact_lines(rows):
+            self.print(line)
 
     @contextlib.contextmanager
     def progress(self) -> Generator[Progress]:
@@ -242,7 +238,7 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
             fix = f"Did you mean: {near[0]}" if near else f"See: palpate {name} --help"
             kind = "An option" if unknown[1].startswith("-") else "An argument"
             must = f"{kind} of palpate {name} must be one of its help"
-            raise PalpateError(must, unknown[1], fix) from None
+            raise PalpateError(must, unknown[1].rstrip(","), fix) from None
         hints = r"For full helptext|Argument helptext|Full error|If your arguments"
         got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
         must = f"The options of palpate {name} must be as its help says"
@@ -286,13 +282,11 @@ def _with_hint(hint: Any, text: str) -> Any:
 
 
 def _option_names(options: type[Any]) -> list[str]:
-    """Return the option names of a verb."""
-    names: list[str] = []
-    for field in dataclasses.fields(options):
-        if dataclasses.is_dataclass(field.default_factory):
-            names += _option_names(field.default_factory)
-        names.append(f"--{field.name.replace('_', '-')}")
-    return names
+    """Return the option names of a verb, as its help shows them."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        tyro.cli(options, args=["--help"], config=CONFIG)
+    return re.findall(r"^\W*(?:-\w\b[^,\n]*, )?(--[a-z][\w-]*)", text.getvalue(), re.MULTILINE)
 
 
 def _answer_renamed(name: str, args: Sequence[str]) -> None:

@@ -16,6 +16,7 @@ from palpate.core.errors import (
     Problem,
     ProblemsError,
     problem_lines,
+    require_choice,
 )
 from palpate.core.features import FeatureSet
 from palpate.core.files import (
@@ -34,6 +35,7 @@ from palpate.core.random import rng_for, seed_for
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
+from palpate.core.text import fact_lines
 
 __all__ = [
     "PARTS",
@@ -55,6 +57,7 @@ __all__ = [
     "digest_folder",
     "digest_json",
     "digest_lines",
+    "fact_lines",
     "inside",
     "plain",
     "problem_lines",
@@ -62,6 +65,7 @@ __all__ = [
     "read_json",
     "read_record",
     "reading_entry",
+    "require_choice",
     "require_comparable",
     "rng_for",
     "seed_for",

@@ -7,7 +7,7 @@ without a traceback and exits with status 2.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,6 +70,18 @@ class PalpateError(Exception):
         """Return the error as a JSON object: ``error, must, got, fix, argument``."""
         names = ("must", "got", "fix", "argument")
         return {"error": type(self).__name__} | {name: getattr(self, name) for name in names}
+
+
+def require_choice(argument: str, value: Any, choices: Iterable[str]) -> None:
+    """Check that an argument is one of ``choices``.
+
+    Raises:
+        PalpateError: if it is not.
+    """
+    choices = list(choices)
+    if value not in choices:
+        must = f"must be one of {', '.join(choices)}"
+        raise PalpateError(must, repr(value), "Choose one of these", argument=argument)
 
 
 class PalpateWarning(UserWarning):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from palpate._lazy import lazy_names
 
 if TYPE_CHECKING:
     from palpate.data.exporting import Exported, export_dataset
@@ -35,11 +36,4 @@ __all__ = [
     "validate",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use (PEP 562)."""
-    if name not in _MODULES:
-        raise AttributeError(f"module 'palpate.data' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"palpate.data.{_MODULES[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy_names(__name__, _MODULES)

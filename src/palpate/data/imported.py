@@ -8,7 +8,15 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from palpate.core import PalpateError, Problem, ProblemsError, Split, plain, problem_lines
+from palpate.core import (
+    PalpateError,
+    Problem,
+    ProblemsError,
+    Split,
+    fact_lines,
+    plain,
+    problem_lines,
+)
 from palpate.data.manifest import Manifest
 
 if TYPE_CHECKING:
@@ -172,9 +180,7 @@ def removing_on_error(output: Path) -> Generator[list[Path]]:
 
 def _text(title: str, rows: Mapping[str, Any], lists: Mapping[str, Sequence[Problem]]) -> str:
     """A table of names and values, and lists of problems, as text."""
-    width = max(map(len, rows))
-    cells = ((name, "-" if value is None else value) for name, value in rows.items())
-    lines = [title, *(f"{name:<{width}}  {value}" for name, value in cells)]
+    lines = [title, *fact_lines(rows)]
     for name, problems in lists.items():
         if problems:
             lines += [f"{name}: {len(problems)}", *problem_lines(problems)]

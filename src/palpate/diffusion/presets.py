@@ -29,7 +29,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from palpate.core import PalpateError
+from palpate.core import require_choice
 from palpate.diffusion.autoencoder_training import AutoencoderOptions
 from palpate.diffusion.denoiser import ConditionPolicy, Schedule, UNetOptions
 from palpate.diffusion.pipeline import SamplerOptions
@@ -152,7 +152,5 @@ def preset_named(name: str) -> DiffusionPreset:
     Raises:
         PalpateError: if there is none.
     """
-    if name not in PRESETS:
-        must = f"must be one of {', '.join(PRESETS)}"
-        raise PalpateError(must, repr(name), "Choose one of these", argument="preset")
+    require_choice("preset", name, PRESETS)
     return PRESETS[name]

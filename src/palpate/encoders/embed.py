@@ -24,6 +24,7 @@ from palpate.core import (
     Progress,
     digest_json,
     quiet,
+    require_choice,
     short,
 )
 from palpate.data.captions import caption
@@ -214,9 +215,7 @@ def _forward(
 
 
 def _require(modality: str, batch: int) -> None:
-    if modality not in MODALITIES:
-        must, fix = f"must be one of {', '.join(MODALITIES)}", "Choose one of these"
-        raise PalpateError(must, repr(modality), fix, argument="modality")
+    require_choice("modality", modality, MODALITIES)
     if batch < 1:
         raise PalpateError(
             "must be at least 1", str(batch), "", argument="batch", example={"batch": 128}

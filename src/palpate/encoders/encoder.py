@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import PalpateError, Progress, quiet, require_choice
 from palpate.data.images import SUFFIXES, read_image, square
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images, embed_texts
@@ -37,9 +37,7 @@ class Encoder:
     modality: Modality
 
     def __post_init__(self) -> None:
-        if self.modality not in self.encoders.modalities:
-            must = f"must be one of {', '.join(self.encoders.modalities)} for these encoders"
-            raise PalpateError(must, repr(self.modality), "Choose another", argument="modality")
+        require_choice("modality", self.modality, self.encoders.modalities)
 
     @classmethod
     def from_pretrained(
@@ -56,9 +54,6 @@ class Encoder:
         Raises:
             PalpateError: if there is no such set, or it has no such encoder.
         """
-        if modality not in get_args(Modality):
-            must = f"must be one of {', '.join(get_args(Modality))}"
-            raise PalpateError(must, repr(modality), "Choose one of these", argument="modality")
         return cls(EncoderSet.load(source, device=str(pick_device(device))), modality)
 
     @property

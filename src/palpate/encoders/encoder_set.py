@@ -39,6 +39,7 @@ from transformers import AutoTokenizer, CLIPModel, CLIPVisionConfig, CLIPVisionM
 from palpate.core import PalpateError, atomic_folder, digest_json, read_record, seed_for, write_json
 from palpate.data.images import square
 from palpate.encoders.models import (
+    FIX_ENCODERS,
     UNREADABLE,
     architecture,
     digest_modules,
@@ -388,8 +389,7 @@ class EncoderSet:
             PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub
                 is out of reach.
         """
-        fix = "Train one with: palpate train encoder"
-        folder = find_model(source, "encoders", "set of encoders", fix)
+        folder = find_model(source, "encoders", "set of encoders", FIX_ENCODERS)
         about = _read_card(folder, (FORMAT, FORMAT_1))
         # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
         clip = load_clip(source if is_shipped(source) else folder / "clip")

@@ -49,6 +49,7 @@ PARTS: dict[Part, str] = {
 }
 PREFIX = "palpate/"
 FIX_MODEL = "Make one with: palpate train generator"
+FIX_ENCODERS = "Train one with: palpate train encoder"
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 #: Raised for an unreachable hub, absent files, foreign formats and pickled objects.
 UNREADABLE = (

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 from transformers import CLIPConfig, CLIPVisionConfig
 
-from palpate.core import PalpateError
+from palpate.core import require_choice
 from palpate.training.loop import LoopOptions
 
 Targets = Literal["diagonal", "identical-text"]
@@ -234,7 +234,5 @@ def preset(name: str) -> EncoderPreset:
     Raises:
         PalpateError: if there is none of that name.
     """
-    if name not in PRESETS:
-        must = f"must be one of {', '.join(PRESETS)}"
-        raise PalpateError(must, repr(name), "Choose one of these", argument="preset")
+    require_choice("preset", name, PRESETS)
     return PRESETS[name]

@@ -27,7 +27,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from transformers import CLIPConfig, CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from palpate.core import PalpateError, Progress, digest_file, digest_json, quiet, read_record
+from palpate.core import (
+    PalpateError,
+    Progress,
+    digest_file,
+    digest_json,
+    quiet,
+    read_record,
+    require_choice,
+)
 from palpate.encoders.embed import exact, require_rgb
 from palpate.encoders.encoder_set import (
     CLIP_FILES,
@@ -132,9 +140,7 @@ def load_standard(
             another kind of model, naming the file and where to get it; or if the hub is out of
             reach.
     """
-    if kind not in KINDS:
-        must = f"must be one of {', '.join(KINDS)}"
-        raise PalpateError(must, repr(kind), "Choose one of these", argument="kind")
+    require_choice("kind", kind, KINDS)
     if kind == "clip":
         if sha256 is not None:
             must, fix = "must go with a TorchScript file", "Leave it out; a CLIP is no program"

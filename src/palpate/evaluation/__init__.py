@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from palpate._lazy import lazy_names
 
 if TYPE_CHECKING:
     from palpate.evaluation.probing import probe
@@ -10,15 +12,4 @@ if TYPE_CHECKING:
 
 __all__ = ["probe", "score"]
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use."""
-    if name == "score":
-        from palpate.evaluation.scoring import score
-
-        return score
-    if name == "probe":
-        from palpate.evaluation.probing import probe
-
-        return probe
-    raise AttributeError(f"module 'palpate.evaluation' has no attribute {name!r}")
+__getattr__ = lazy_names(__name__, {"probe": "probing", "score": "scoring"})

@@ -366,9 +366,13 @@ def load_encoders(encoder: Any, progress: Progress) -> Any:
     if encoder is None or not isinstance(encoder, str | Path):
         return encoder
     progress(f"loading {encoder}", 0, 1)
+    from palpate.encoders.models import FIX_ENCODERS, find_model
+
+    # A wrong name answers at once; torch takes seconds to import.
+    find_model(encoder, "encoders", "set of encoders", FIX_ENCODERS)
     from palpate.encoders.encoder_set import EncoderSet
 
-    return EncoderSet.load(str(encoder))
+    return EncoderSet.load(encoder)
 
 
 @dataclass(frozen=True)

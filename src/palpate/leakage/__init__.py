@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from palpate._lazy import lazy_names
 
 if TYPE_CHECKING:
     from palpate.leakage.auditing import audit
@@ -17,8 +18,4 @@ __all__ = ["audit", "split", "verify"]
 
 _MODULES = {"audit": "auditing", "split": "splitting", "verify": "verifying"}
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module 'palpate.leakage' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"palpate.leakage.{_MODULES[name]}"), name)
+__getattr__ = lazy_names(__name__, _MODULES)

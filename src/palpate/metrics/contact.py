@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.core import Note, PalpateError, Score
+from palpate.core import Note, PalpateError, Score, require_choice
 from palpate.metrics.images import (
     WINDOW,
     WINDOW_SETTINGS,
@@ -55,7 +55,7 @@ from palpate.metrics.images import (
     multiscale_similarity,
     require_side,
 )
-from palpate.metrics.inputs import checked_choice, checked_names
+from palpate.metrics.inputs import checked_names
 
 Mask = NDArray[np.bool_]
 Markers = Literal["skip", "keep"]
@@ -367,7 +367,7 @@ def _checked(
     least: float = LEAST,
 ) -> tuple[Pairs, Pairs, Markers, float]:
     """Generated and real images, each with its background; errors as :func:`contact_scores`."""
-    checked_choice("markers", markers, ("skip", "keep"))
+    require_choice("markers", markers, ("skip", "keep"))
     check_least(least)
     real = image_pairs(reference, background, arguments=("reference", "background"))
     require_side(real.size, WINDOW, "contact metrics")

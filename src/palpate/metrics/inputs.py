@@ -15,7 +15,7 @@ import mmap
 import os
 import sys
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -320,13 +320,6 @@ def checked_number(*, positive: bool = False, **values: Any) -> None:
         if not number or not np.isfinite(value) or value < 0 or (positive and value == 0):
             must = "must be positive" if positive else "must be a finite number of at least 0"
             raise invalid(name, must, repr(value), "Drop it for the default")
-
-
-def checked_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Reject a word that is not among ``choices``."""
-    if value not in choices:
-        must = f"must be one of {', '.join(choices)}"
-        raise invalid(name, must, repr(value), "Choose one of these")
 
 
 def require_one_encoder(a: FeatureSet, b: FeatureSet, what: str) -> None:

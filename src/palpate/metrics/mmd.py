@@ -52,12 +52,11 @@ from typing import Any, Literal, TypedDict
 
 import numpy as np
 
-from palpate.core import PalpateError, PalpateWarning, seed_for
+from palpate.core import PalpateError, PalpateWarning, require_choice, seed_for
 from palpate.metrics.inputs import (
     Array,
     Index,
     Normalize,
-    checked_choice,
     checked_level,
     checked_names,
     checked_number,
@@ -217,8 +216,8 @@ def distance(  # noqa: PLR0913
             fewer than two rows for ``"unbiased"``, or groups that are missing or too few for
             ``"grouped"``.
     """
-    checked_choice("estimator", estimator, ESTIMATORS)
-    checked_choice("backend", backend, BACKENDS)
+    require_choice("estimator", estimator, ESTIMATORS)
+    require_choice("backend", backend, BACKENDS)
     checked_number(positive=True, scale=scale)
     checked_number(tolerance=tolerance)
     checked_whole(1, block=block)
@@ -359,7 +358,7 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
             where none are known.
     """
     preset = options.get("preset") or ("grouped" if grouped else "paper")
-    checked_choice("preset", preset, tuple(PRESETS))
+    require_choice("preset", preset, tuple(PRESETS))
     given: dict[str, Any] = {k: v for k, v in options.items() if k != "preset"}
     names = [f.name for f in fields(Plan)]
     if unknown := sorted(set(given) - set(names)):
@@ -367,7 +366,7 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
         raise invalid(unknown[0], must, ", ".join(unknown), "Check the spelling")
     plan = Plan(**{**asdict(PRESETS[preset]), **given})
     for name, choices in CHOICES.items():
-        checked_choice(name, getattr(plan, name), choices)
+        require_choice(name, getattr(plan, name), choices)
     checked_number(positive=True, scale=plan.scale)
     checked_number(tolerance=plan.tolerance)
     checked_whole(1, block=plan.block)

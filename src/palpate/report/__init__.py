@@ -6,9 +6,9 @@ library.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from palpate._lazy import lazy_names
 from palpate.report.results import Audit, Results
 
 if TYPE_CHECKING:
@@ -16,10 +16,6 @@ if TYPE_CHECKING:
     from palpate.report.sentences import summary_lines
 
 __all__ = ["Audit", "Results", "summary_lines", "write_report"]
-_LAZY = {"summary_lines": "sentences", "write_report": "page"}
+_MODULES = {"summary_lines": "sentences", "write_report": "page"}
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"palpate.report.{_LAZY[name]}"), name)
+__getattr__ = lazy_names(__name__, _MODULES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from palpate.core import PalpateError
+from palpate.core import require_choice
 from palpate.sim import PRESETS as WORLDS
 from palpate.sim import WorldOptions
 
@@ -92,7 +92,5 @@ def preset(name: str) -> DemoPreset:
     Raises:
         PalpateError: if there is none of that name.
     """
-    if name not in PRESETS:
-        must = f"must be one of {', '.join(PRESETS)}"
-        raise PalpateError(must, repr(name), "Choose one of these", argument="preset")
+    require_choice("preset", name, PRESETS)
     return PRESETS[name]

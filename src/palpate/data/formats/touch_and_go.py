@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from palpate.core import PalpateError, Problem, Progress, Split, quiet
+from palpate.core import PalpateError, Problem, Progress, Split, quiet, require_choice
 from palpate.data.formats.base import WORLD, Facts, Format, Row, Scan, world_facts
 from palpate.data.formats.layout import require_folder, subfolders
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
@@ -231,9 +231,7 @@ def require_frame_options(image_format: str, size: int | None) -> None:
     """
     if size is not None and size < 1:
         raise PalpateError("must be at least 1 pixel", str(size), "", argument="size")
-    if image_format not in IMAGE_FORMATS:
-        must = f"must be one of {', '.join(IMAGE_FORMATS)}"
-        raise PalpateError(must, repr(image_format), "", argument="image_format")
+    require_choice("image_format", image_format, IMAGE_FORMATS)
 
 
 def extracted(
