@@ -38,7 +38,7 @@ class Options(Common):
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
-    """Train, and print how well a linear probe tells the materials of the test part apart."""
+    """Train, and print the accuracy of a linear material probe on the test part."""
     require_extra("palpate train encoder")
     from palpate.encoders.contrastive import train_encoder
 

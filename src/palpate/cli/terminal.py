@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 #: Verbs whose first arguments may stand without their option: ``palpate score a/ --reference b/``.
 LEADING = {"score": "--generated"}
-#: Verb and option of earlier versions -> how it is written now. '' stands for every verb, and for
+#: Verb and option of earlier versions -> how it is written now. '' is every verb, or
 #: the verb itself.
 RENAMED: dict[tuple[str, str], str] = {
     ("encoder", ""): "palpate train encoder",
@@ -79,7 +79,7 @@ RENAMED: dict[tuple[str, str], str] = {
     ("score", "--controls"): "the default; --no-controls turns it off",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
-#: argument's own name ("--sigma"). '' stands for every verb.
+#: argument's own name ("--sigma"). '' is every verb.
 OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "train_or_data"): "TRAIN",
     ("audit", "test"): "TEST",

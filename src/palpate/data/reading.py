@@ -99,7 +99,7 @@ def read_samples(
     if name == "pairs" and path.is_file() and columns.isdisjoint(("vision", "tactile")):
         names = options.pop("names", None)
         return _of_table(open_table(path, names), path.parent, skip_bad, options)
-    # Images are not decoded here: whoever reads them reports those that are broken.
+    # Images are not decoded here: broken ones are reported when they are read.
     options |= {"check": "none", "progress": progress}
     scan = form.scan(path, **scan_options(name, form, options))
     facts = {**form.facts.of_manifest(), "format": name, **scan.facts}

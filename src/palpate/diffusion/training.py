@@ -342,7 +342,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         latents: (n, c, h, w) of the autoencoder, not normalized; a memory map will do.
         conditions: embeddings (n, d) by source; ``policy.sources`` are needed, others only give
             their mean.
-        stats: normalize the latents, of tactile and background images alike.
+        stats: normalize the latents of tactile and background images.
         unet: geometry of the network.
         policy: how embeddings become tokens, and which train.
         schedule: the forward process and the target.

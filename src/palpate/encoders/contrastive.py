@@ -74,8 +74,8 @@ def train_encoder(
 ) -> EncoderSet:
     """Train a tactile encoder on the train part of a split, against frozen vision and text.
 
-    A linear probe then scores how well it tells the materials of the test part apart; the score
-    goes into the card (``card["scores"]``). Run again with the same ``output`` to resume.
+    The accuracy of a linear material probe on the test part goes into the card
+    (``card["scores"]``). Run again with the same ``output`` to resume.
 
     Args:
         data: a manifest, or anything that :func:`palpate.data.load` reads.

@@ -81,7 +81,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 @dataclass(frozen=True)
 class Preprocess:
-    """What happens to the images of one encoder, in training and evaluation alike.
+    """How one encoder prepares its images, in training and in evaluation.
 
     Attributes:
         size: side of what the encoder sees, in pixels.

@@ -177,7 +177,7 @@ class Linear(Kernel):
 
 
 def checked_kernel(kernel: Any) -> None:
-    """Reject what is no kernel; None stands for the Gaussian of ``sigma``."""
+    """Reject what is no kernel; None is the Gaussian of ``sigma``."""
     if kernel is not None and not isinstance(kernel, Kernel):
         must = "must be a kernel: Gaussian(), Polynomial(), Linear() or another Kernel"
         raise invalid("kernel", must, repr(kernel), "Import one from palpate.metrics")

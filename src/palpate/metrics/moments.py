@@ -35,7 +35,7 @@ from palpate.metrics.intervals import PairSums
 CHUNK = 2048
 #: Second moments of all items are float64 up to this many bytes, else float32.
 WIDE = 256 << 20
-#: Largest ``rho`` that the bound is formed for (exp(30) is 1e13), and what stands for no bound.
+#: Largest ``rho`` that the bound is formed for (exp(30) is 1e13), and the value for no bound.
 WIDEST, NO_BOUND = 30.0, 1e30
 #: Sums over samples; ``rho`` is a maximum.
 ADDITIVE = ("n", "zeroth", "first", "second", "fourth", "diagonal")

@@ -30,7 +30,7 @@ RESULTS_FORMATS = (RESULTS_FORMAT, "palpate-results/1")
 AUDIT_FORMATS = (AUDIT_FORMAT, "palpate-audit/1")
 #: Rows of the group-by-part matrix that an audit keeps.
 MATRIX_ROWS = 60
-#: Why two images look alike. Only ``content`` is a leak.
+#: Why two images are similar. Only ``content`` is a leak.
 CAUSES = ("content", "nothing touched", "sensor drift")
 
 
@@ -41,7 +41,7 @@ class LeakPair:
     Attributes:
         gap: distance in frames, if both lie in one video; else None.
         score: strength of the signal in [0, 1]; None where only the gap is known.
-        cause: why two images look alike (one of ``CAUSES``).
+        cause: why two images are similar (one of ``CAUSES``).
     """
 
     test: SampleRef

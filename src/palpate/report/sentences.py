@@ -10,7 +10,7 @@ from palpate.report.results import Audit, Results, Signal
 from palpate.report.tables import Table, score_tables
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
-#: is compared with), and what is said of a share of the test samples. The first match wins.
+#: is compared with), and the sentence about a share of the test samples. The first match wins.
 KINDS: tuple[tuple[str, str, str], ...] = (
     (
         "identical sample",
@@ -57,7 +57,7 @@ def data_of(audit: Audit) -> str:
 
 
 def _kind(kind: str, audit: Audit) -> tuple[str, str]:
-    """Return the meaning of a kind of leak, and what is said of a share of the test samples."""
+    """Return the meaning of a kind of leak, and the sentence about a share of the test samples."""
     thing = kind.removeprefix("shared ")
     words = {"thing": thing, "data": data_of(audit), "a": "an" if thing[:1] in "aeiou" else "a"}
     for start, meaning, share in KINDS:

@@ -16,7 +16,7 @@ from palpate.studies.demo import DemoRun
 
 #: Rows of the gallery; more would be folded away.
 GALLERY = 40
-#: Rows per contact: its frames look alike.
+#: Rows per contact: its frames are similar.
 PER_CONTACT = 2
 
 
