@@ -1,0 +1,224 @@
+"""Path templates: where the images of anyone's folder are, e.g. ``{object}/photo/{frame}.jpg``.
+
+==============  ====================================================================================
+in a template   matches
+==============  ====================================================================================
+``{name}``      one or more characters of one name; the earlier field takes as many as it can
+``{name:d}``    all digits of a number (``0007`` is 7); the field ``frame`` is always one
+``{name:**}``   any number of folders, also none
+``*``  ``**``   the same as the first and the last, but not kept
+==============  ====================================================================================
+
+Everything else stands for itself. A field that occurs twice is equal in both places. Where the last
+name has no dot, any suffix goes: ``{frame}`` is ``{frame}.*``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from palpate.core import PalpateError, Problem
+from palpate.data.manifest import CLIMBS
+
+_TOKEN = re.compile(
+    r"(?<![^/])(?:\*\*|\{(?P<deep>\w+):\*\*\})(?P<end>/|$)"
+    r"|\{(?P<field>\w+)(?::(?P<spec>[^{}]*))?\}|(?P<star>\*+)|(?P<literal>[^{}*]+)|(?P<wrong>.)"
+)
+FIX = "Write fields as {object}, {frame:d} or {video:**}, and * for what does not matter"
+#: The frames of a manifest have 64 bits, so a longer number is none.
+_DIGITS = "[0-9]{1,18}"
+#: Field -> value, in the order of the template.
+Fields = dict[str, str]
+#: (path below the root, fields) of the files that match, in the order of the walk.
+Matches = Sequence[tuple[str, Fields]]
+
+
+@dataclass(frozen=True)
+class Template:
+    """A path with fields; see the module.
+
+    Attributes:
+        text: as it was written.
+        fields: names in the order of the path.
+        digits: those that are numbers.
+        pattern: of a whole path below the root.
+    """
+
+    text: str
+    fields: tuple[str, ...]
+    digits: frozenset[str]
+    pattern: re.Pattern[str]
+
+    @classmethod
+    def parse(cls, text: str, argument: str | None = None) -> Template:
+        """Read a template.
+
+        Args:
+            text: the template.
+            argument: the name of the argument that holds it, for errors.
+
+        Raises:
+            PalpateError: if it is empty, leaves the root, or has a field that cannot be read.
+        """
+        path = text.strip().removeprefix("./")
+        must = "must be a path below the folder" if argument else "A template is a path"
+        if not path or path.endswith("/") or re.search(CLIMBS, path):
+            raise PalpateError(must, repr(text), FIX, argument=argument)
+        pieces: list[str] = []
+        specs: dict[str, str] = {}
+        loose = False  # whether a digit before a number could belong to the piece before it
+        for token in _TOKEN.finditer(path):
+            name, spec = token["deep"] or token["field"], "**" if token["deep"] else token["spec"]
+            spec = "d" if name == "frame" and not spec else spec or ""
+            if token["wrong"] or (
+                name and (spec not in ("", "d", "**") or not name.isidentifier())
+            ):
+                got = f"{token[0]!r} in {text!r}"
+                raise PalpateError("must have fields that can be read", got, FIX, argument=argument)
+            if name and name in specs:
+                pieces.append(f"(?P={name})")
+            else:
+                pieces.append(_piece(token, name, spec, loose=loose))
+                specs |= {name: spec} if name else {}
+            loose = token["literal"] is None
+        last = path.rpartition("/")[2]
+        if "." not in re.sub(r"\{\w+:?[^{}]*\}", "", last) and not last.endswith("*"):
+            pieces.append(r"\.[^/]*" if not last.endswith(":**}") else "")
+        digits = frozenset(name for name, spec in specs.items() if spec == "d")
+        return cls(path, tuple(specs), digits, re.compile("".join(pieces), re.DOTALL))
+
+    def match(self, path: str) -> Fields | None:
+        """The fields of a path below the root, numbers without leading zeros; None if it differs.
+
+        A field of folders that matches none is left out.
+        """
+        match = self.pattern.fullmatch(path)
+        if match is None:
+            return None
+        values = {name: value for name, value in match.groupdict().items() if value is not None}
+        return values | {n: str(int(values[n])) for n in self.digits}
+
+
+def _piece(token: re.Match[str], name: str | None, spec: str, *, loose: bool) -> str:
+    """The pattern of a token."""
+    if token["literal"]:
+        return re.escape(token["literal"])
+    if token["star"]:
+        return "[^/]*"
+    group = f"(?P<{name}>" if name else "(?:"
+    if spec == "d":
+        return f"{'(?<![0-9])' * loose}{group}{_DIGITS})(?![0-9])"
+    if token["end"] is None:
+        return f"{group}[^/]+)"
+    return f"(?:{group}.+)/)?" if token["end"] else f"{group}.+)"
+
+
+def walk(root: Path, suffixes: tuple[str, ...] = ("",)) -> tuple[list[str], list[str]]:
+    """All files below a folder, in the order of their names; hidden ones are skipped.
+
+    Args:
+        root: the folder.
+        suffixes: of the files, in lower case.
+
+    Returns:
+        Paths below the root, and links to folders outside it, which are not followed; other links
+        are followed once.
+    """
+    files: list[str] = []
+    outside: list[str] = []
+    seen: set[str] = set()
+    home = os.path.realpath(root)
+    for folder, below, names in os.walk(root, followlinks=True):
+        real, place = os.path.realpath(folder), os.path.relpath(folder, root).replace(os.sep, "/")
+        prefix = "" if place == "." else f"{place}/"
+        if real in seen or os.path.commonpath((real, home)) != home:
+            outside += [] if real in seen else [place]
+            below.clear()
+            continue
+        seen.add(real)
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        names = (n for n in sorted(names) if not n.startswith(".") and n.lower().endswith(suffixes))
+        files += [prefix + name for name in names]
+    return files, outside
+
+
+def matches_of(files: Sequence[str], template: Template) -> Matches:
+    """The files that a template matches, with their fields."""
+    fields = ((path, template.match(path)) for path in files)
+    return [(path, values) for path, values in fields if values is not None]
+
+
+def walk_matches(root: Path, template: Template, suffixes: tuple[str, ...] = ("",)) -> Matches:
+    """The files below a folder that a template matches, with their fields."""
+    return matches_of(walk(root, suffixes)[0], template)
+
+
+def join(
+    sides: Mapping[str, Matches], optional: Sequence[str] = ("background",)
+) -> tuple[list[Fields], list[Problem]]:
+    """Join the files of several templates by their equal fields.
+
+    Several files of one side may share one of the other (a photo of an object, a background of a
+    video); where both sides have several for the same fields, no row is made.
+
+    Args:
+        sides: column -> its files; the first decides the order of the rows.
+        optional: columns whose file a row may lack.
+
+    Returns:
+        Rows with all fields and the path of each column, and what has no partner or too many.
+
+    Raises:
+        PalpateError: if two sides of several files share no field.
+    """
+    (first, matches), *others = sides.items()
+    rows = [fields | {first: path} for path, fields in matches]
+    problems: list[Problem] = []
+    for side, matches in others:
+        known = {name for row in rows for name in row} - set(sides)
+        keys = tuple(sorted(known & {name for _, fields in matches for name in fields}))
+        if not keys and len(rows) > 1 and len(matches) > 1:
+            must = "Templates must share a field, which tells what belongs together"
+            got = f"none for {len(rows)} files of {first} and {len(matches)} of {side}"
+            raise PalpateError(must, got, "Give one part of both paths the same field")
+        partners = _by_key([(fields, path) for path, fields in matches], keys)
+        alone = _by_key([(row, row[first]) for row in rows], keys)
+        for key in partners.keys() - alone.keys() if side not in optional else ():
+            text = f"no {first} image {_named(keys, key)}"
+            problems += [Problem(path, "unpaired", text) for _, path in partners[key]]
+        joined: list[Fields] = []
+        for row in rows:
+            key = tuple(map(row.get, keys))
+            files = partners.get(key, [])
+            if len(files) > 1 and len(alone[key]) > 1:
+                text = f"{len(alone[key])} {first} and {len(files)} {side} images"
+                text += f" {_named(keys, key)}; a further field must tell them apart"
+                problems.append(Problem(row[first], "ambiguous", text))
+            elif not files and side not in optional:
+                problems.append(
+                    Problem(row[first], "unpaired", f"no {side} image {_named(keys, key)}")
+                )
+            else:
+                joined += [fields | row | {side: path} for fields, path in files] or [row]
+        rows = joined
+    return rows, sorted(problems, key=lambda problem: problem.where)
+
+
+def _by_key(
+    items: Sequence[tuple[Fields, str]], keys: tuple[str, ...]
+) -> dict[tuple[str | None, ...], list[tuple[Fields, str]]]:
+    groups: dict[tuple[str | None, ...], list[tuple[Fields, str]]] = defaultdict(list)
+    for fields, path in items:
+        groups[tuple(map(fields.get, keys))].append((fields, path))
+    return dict(groups)
+
+
+def _named(keys: Sequence[str], values: Sequence[str | None]) -> str:
+    """``with object=cup, frame=7``."""
+    pairs = zip(keys, values, strict=True)
+    return "with " + (", ".join(f"{key}={value}" for key, value in pairs) or "the same fields")
