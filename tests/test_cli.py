@@ -173,7 +173,7 @@ def test_files_that_cannot_be_written_or_read_are_mistakes_too(
 def test_no_output_replaces_an_input_or_a_foreign_file(capsys, lists, small_manifest, tmp_path):
     manifest, audit, notes = (tmp_path / n for n in ("m/manifest.parquet", "a.json", "notes.html"))
     small_manifest.save(manifest)
-    assert call(capsys, "audit", *lists, "-o", audit)[0] == 0
+    assert call(capsys, "audit", *lists, "-o", audit)[0] == 1
     notes.write_text("my notes")
     kept = {p: p.read_bytes() for p in (*map(Path, lists), manifest, audit, notes)}
     for args in (
@@ -187,7 +187,7 @@ def test_no_output_replaces_an_input_or_a_foreign_file(capsys, lists, small_mani
     assert {p: p.read_bytes() for p in kept} == kept
     for _ in range(2):  # its own earlier output may be replaced
         assert call(capsys, "report", audit, "-o", tmp_path / "page.html", "-q")[0] == 0
-        assert call(capsys, "audit", *lists, "-o", audit)[0] == 0
+        assert call(capsys, "audit", *lists, "-o", audit)[0] == 1
         assert call(capsys, "split", manifest.parent, "-o", tmp_path / "s.json")[0] == 0
 
 
@@ -223,7 +223,7 @@ def test_bad_lines_of_both_lists_are_reported_together_or_skipped(capsys, lists)
     assert sorted(line for _, line in places) == sorted("34563456")
     status, out, _ = call(capsys, "audit", *lists, "--json", "--skip-bad")
     data = json.loads(out)
-    assert (status, data["test_samples"]) == (0, 2)
+    assert (status, data["test_samples"]) == (1, 2)
     notes = [note["params"] for note in data["notes"] if note["code"] == "rows-skipped"]
     assert sum(params["count"] for params in notes) == 8
 

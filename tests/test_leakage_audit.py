@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -15,6 +16,7 @@ from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.leakage import audit, signals
 from palpate.leakage.auditing import known_group
+from palpate.leakage.inputs import NAMES, shared_names
 from palpate.leakage.signals import Gaps, nearest_in_video
 from palpate.report.results import Audit
 
@@ -124,6 +126,36 @@ def test_the_published_lists_leak_as_measured(real_data):
     contacts = audit(lists / "train.txt", lists / "test.txt", by="contact")
     numbers = (contacts.groups_train, contacts.groups_test, contacts.groups_shared)
     assert numbers == (3378, 1113, 0)  # no contact mixes the lists
+
+
+def test_names_count_where_they_are_declared_or_the_roots_are_one_data_set(tmp_path):
+    """A row: facts of train and of test, and whether the names of different roots count."""
+    row = {"id": "x/1", "video": "x", "frame": 1, "tactile": "x/1.png"}
+    folder = {"format": "pairs", "layout": "folders", "dataset": "tactile"}
+    table = {"format": "pairs", "layout": "table csv", "dataset": "t"}
+    world = {"format": "touch-and-go", "dataset": "palpate's procedural world", "digest": "a"}
+    ycb = {"format": "ycb-slide", "dataset": "YCB-Slide"}
+    for a, b, expected in (
+        (folder, folder, ()),
+        ({"source": "train.txt"}, {"source": "test.txt"}, ()),
+        (table, folder, ()),
+        (table, table, ("video", "contact", "object", "session")),
+        ({}, {}, ("video", "contact", "object", "session")),  # the id is the path
+        (ycb, ycb, NAMES),
+        (world, world, NAMES),
+        (world, world | {"digest": "b"}, ()),
+    ):
+        parts = [Manifest.from_rows([row], tmp_path / r, f) for r, f in (("1", a), ("2", b))]
+        assert shared_names(*parts, "auto") == expected, (a, b)
+        assert shared_names(parts[0], replace(parts[1], root=parts[0].root), "auto") == NAMES
+        result = audit(*parts, images=False)
+        assert (result.groups_shared, result.leaked_fraction) == (
+            (1, 1.0) if expected else (0, 0.0)
+        )
+    declared = Manifest.from_rows([row | {"id": "press 7"}], tmp_path / "1")
+    assert "id" in shared_names(declared, replace(declared, root=tmp_path / "2"), "auto")
+    with pytest.raises(PalpateError, match="`identity` must be auto, names or images"):
+        audit(declared, declared, identity="paths")
 
 
 @pytest.mark.parametrize("kind", ["polars", "pandas"])

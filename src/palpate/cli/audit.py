@@ -34,6 +34,10 @@ class Comparison:
     """What train and test must not share; `auto`: the video, or what is known instead of it."""
     near_frames: int = 30
     """A gap of up to this many frames within a video is a leak by itself."""
+    identity: Literal["auto", "names", "images"] = "auto"
+    """What equal names in train and test mean: `names` the same thing, `images` nothing, so that
+    bytes and images decide; `auto`: names where both have one root, are of one published data set,
+    or have them from columns of tables."""
     images: bool = True
     """Compare image files and their content, not only tables."""
     modalities: tuple[Modality, ...] = ("vision", "tactile")
@@ -58,8 +62,8 @@ class Outputs:
     """Every signal of every test sample (.parquet or .csv)."""
     worst: int = 12
     """How many of the strongest pairs to keep for each signal."""
-    fail_over: float | None = None
-    """Exit with status 1 if more than this fraction of the test samples leaks by any signal."""
+    fail_over: float = 0.0
+    """Exit with status 1 if more than this fraction of the test samples leaks (1: never)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,11 +121,13 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     terminal.show(result)
     for command in result.commands:
         terminal.print_line(f"Next: {command}")
-    leaked = max(result.leaked_fraction, *(a.fraction for a in (result, *result.others)))
-    limit = options.outputs.fail_over
-    failed = limit is not None and leaked > limit
-    if failed:
-        terminal.print_line(f"FAIL: leaked fraction {round(leaked, 5)} is over {limit}")
+    leaked, limit = (
+        max(a.leaked_fraction for a in (result, *result.others)),
+        options.outputs.fail_over,
+    )
+    failed = leaked > limit
+    if failed and limit:
+        terminal.print_line(f"FAIL: leaked fraction {leaked} is over {limit}")
     return result.to_json() | {"failed": failed}, FAILED_CHECK if failed else 0
 
 
@@ -138,7 +144,7 @@ def _check(options: Options) -> None:
             f"{len(options.paths)} path(s) {'with' if options.split else 'without'} a split",
             "E.g. palpate audit train.txt test.txt",
         )
-    if not 0 <= (outputs.fail_over or 0) <= 1:
+    if not 0 <= outputs.fail_over <= 1:
         raise PalpateError("must lie in [0, 1]", str(outputs.fail_over), "", argument="fail_over")
     for argument, path, suffixes in (
         ("table", outputs.table, (".parquet", ".csv")),
@@ -170,7 +176,7 @@ def _check(options: Options) -> None:
 def _next_commands(options: Options, audit: Audit) -> list[str]:
     """Commands that answer the finding."""
     source = shlex.join(map(str, options.paths))
-    if not audit.fraction or not (options.split or all(p.is_file() for p in options.paths)):
+    if not audit.leaked_fraction or not (options.split or all(p.is_file() for p in options.paths)):
         return []
     near = any(s.flagged for s in audit.signals if s.kind.startswith("near-duplicate"))
     by = "" if options.comparison.by == "auto" else f" --by {options.comparison.by}"

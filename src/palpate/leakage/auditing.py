@@ -23,7 +23,15 @@ from numpy.typing import NDArray
 from palpate.core import Note, PalpateError, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.groups import GROUPS
-from palpate.leakage.inputs import Data, number_contacts, read_all, require
+from palpate.leakage.inputs import (
+    Data,
+    Identity,
+    number_contacts,
+    read_all,
+    require,
+    shared_names,
+    tell_apart,
+)
 from palpate.leakage.signals import (
     Flags,
     Gaps,
@@ -54,6 +62,7 @@ class _Options:
 
     by: str
     near_frames: int
+    identity: Identity
     images: bool
     modalities: Sequence[str]
     false_positives: float
@@ -72,6 +81,7 @@ def audit(  # noqa: PLR0913
     pretrain: Data = None,
     by: str = "auto",
     near_frames: int = 30,
+    identity: Identity = "auto",
     images: bool = True,
     modalities: Sequence[str] = ("vision", "tactile"),
     false_positives: float = 0.001,
@@ -97,6 +107,9 @@ def audit(  # noqa: PLR0913
         by: what train and test must not share: a column, or ``auto`` for the video or what is known
             instead of it.
         near_frames: a gap of up to this many frames within a video is a leak by itself.
+        identity: what equal names in train and test mean: ``names`` the same thing, ``images``
+            nothing, so that bytes and images decide; ``auto`` names where both have one root, are
+            of one published data set, or have the names from columns of tables.
         images: compare image files and their content, not only tables.
         modalities: the images to compare.
         false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
@@ -127,6 +140,8 @@ def audit(  # noqa: PLR0913
     require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", by)
     require(near_frames >= 0, "near_frames", "must be at least 0", near_frames, 30)
     require(worst >= 0, "worst", "must be at least 0", worst, 12)
+    known = identity in ("auto", "names", "images")
+    require(known, "identity", "must be auto, names or images", identity, "names")
     known = set(modalities) <= set(MODALITIES)
     require(known, "modalities", "must be among vision, tactile", list(modalities), ["vision"])
     rate = false_positives
@@ -139,6 +154,7 @@ def audit(  # noqa: PLR0913
     options = _Options(
         by,
         near_frames,
+        identity,
         images,
         modalities,
         false_positives,
@@ -150,13 +166,13 @@ def audit(  # noqa: PLR0913
     )
     if split is None:
         title = name or f"{_name(train_or_data, 'train')} / {_name(test, 'test')}"
-        result = _compare(parts[0], parts[1], None, options, title)
+        result = _compare(parts[0], parts[1], options, title)
         test_part = parts[1]
     else:
         whole, parted = parts[0], split if isinstance(split, Split) else Split.load(Path(split))
         test_part, val = whole.part(parted, "test"), whole.part(parted, "val")
         title = name or str(parted.rule.get("name") or _name(split, "split"))
-        result = _compare(whole.part(parted, "train"), test_part, val, options, title)
+        result = _compare(whole.part(parted, "train"), test_part, options, title, val=val)
         notes += _split_notes(whole, parted, val, result.group)
         result = replace(result, split=parted.digest)
         if impact is not None:
@@ -165,10 +181,9 @@ def audit(  # noqa: PLR0913
             except PalpateError as error:  # the audit itself must not be lost
                 notes.append(Note("impact-failed", {"reason": str(error)}))
     if pretrain is not None:
-        against = _compare(
-            parts[-1], test_part, None, options, f"{_name(pretrain, 'pretraining')} / test"
-        )
-        result = replace(result, others=[replace(against, against="pretraining")])
+        title = f"{_name(pretrain, 'pretraining')} / test"
+        against = _compare(parts[-1], test_part, options, title, against="pretraining")
+        result = replace(result, others=[against])
     return replace(result, notes=[*result.notes, *notes])
 
 
@@ -207,6 +222,11 @@ def _known(manifest: Manifest, column: str) -> bool:
     return manifest.table[column].null_count() < len(manifest)
 
 
+def _with_images(train: Manifest, test: Manifest) -> bool:
+    """Whether some images can be compared."""
+    return any(_known(train, c) and _known(test, c) for c in MODALITIES)
+
+
 def _group(train: Manifest, test: Manifest, options: _Options) -> str:
     """The group to audit by.
 
@@ -219,8 +239,7 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
                 f"The {part} part must hold samples", "none", "Check the split or list file"
             )
     group = known_group(train, test) if options.by == "auto" else options.by
-    comparable = any(_known(train, c) and _known(test, c) for c in MODALITIES)
-    if group == NO_GROUP and options.images and comparable:
+    if group == NO_GROUP and options.images and _with_images(train, test):
         return group
     if group == NO_GROUP or not (_known(train, group) and _known(test, group)):
         raise PalpateError(
@@ -233,16 +252,24 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
 
 
 def _compare(
-    train: Manifest, test: Manifest, val: Manifest | None, options: _Options, name: str
+    train: Manifest,
+    test: Manifest,
+    options: _Options,
+    name: str,
+    *,
+    val: Manifest | None = None,
+    against: str = "train",
 ) -> Audit:
     """Audit one part against another."""
     group = _group(train, test, options)
+    shared = shared_names(train, test, options.identity)
+    train, test, equal = tell_apart(train, test, shared, (against, "test"))
     a, b = train.table, test.table
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
-    shared = sorted(groups[0] & groups[1])
-    in_shared = int(b[group].is_in(shared).fill_null(False).sum()) if shared else 0
+    in_both = sorted(groups[0] & groups[1])
+    in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
     gaps = nearest_in_video(a, b)
-    flags = _signals(train, test, group, gaps, options)
+    flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
     timed = gaps.frames[gaps.frames >= 0]
     last = int(timed.max()) if timed.size else 0
@@ -256,9 +283,9 @@ def _compare(
         test_samples=b.height,
         groups_train=len(groups[0]),
         groups_test=len(groups[1]),
-        groups_shared=len(shared),
+        groups_shared=len(in_both),
         test_samples_in_shared_groups=in_shared,
-        leaked_fraction=round(in_shared / b.height, 5),
+        leaked_fraction=0.0,
         identical_samples=int(flags[0].flag.sum()),
         gap_min=int(timed.min()) if timed.size else None,
         gap_median=_plain(float(np.median(timed))) if timed.size else None,
@@ -267,7 +294,8 @@ def _compare(
         gap_counts=np.histogram(timed, edges)[0].tolist() if edges else [],
         worst=pairs,
         materials=_materials(a, b, group),
-        notes=_notes(train, test, group, options),
+        notes=_notes(train, test, group, equal, options),
+        against=against,
         signals=[replace(s, worst=pairs) if s.kind == "time gap" else s for s in signals],
         leaking_samples=int(leaks.sum()),
         matrix=_matrix(
@@ -278,8 +306,14 @@ def _compare(
     )
 
 
-def _notes(train: Manifest, test: Manifest, group: str, options: _Options) -> list[Note]:
+def _notes(
+    train: Manifest, test: Manifest, group: str, equal: Mapping[str, int], options: _Options
+) -> list[Note]:
     notes = [Note("no-group")] if group == NO_GROUP else []
+    if equal:
+        params = {"equal": dict(equal), "roots": [str(train.root), str(test.root)]}
+        images = options.images and _with_images(train, test)
+        notes.append(Note("equal-names", params | {"images": images}))
     for part, samples in (("train", train), ("test", test)):
         if group != NO_GROUP and (nulls := samples.table[group].null_count()):
             notes.append(Note("group-nulls", {"count": nulls, "part": part, "group": group}))
@@ -290,10 +324,16 @@ def _notes(train: Manifest, test: Manifest, group: str, options: _Options) -> li
 
 
 def _signals(
-    train: Manifest, test: Manifest, group: str, gaps: Gaps, options: _Options
+    train: Manifest,
+    test: Manifest,
+    group: str,
+    gaps: Gaps,
+    options: _Options,
+    *,
+    named: Sequence[str],
 ) -> list[Flags]:
     """Every signal that can be checked, the exact ones first."""
-    flags: list[Flags | None] = [identical_samples(train, test, gaps)]
+    flags: list[Flags | None] = [identical_samples(train, test, gaps, named)]
     if options.images:
         flags.append(identical_bytes(train, test, options.progress))
     if group != NO_GROUP:

@@ -1,12 +1,21 @@
-"""Samples for an audit or a split, from whatever names them."""
+"""Samples for an audit or a split, from whatever names them, and what equal names mean.
+
+A name is no identity: ``0001.jpg`` of two folders are two files. Equal names mean the same thing
+where both parts have one root, are of one published data set, or have their names from the columns
+of tables, in which somebody declared them. Elsewhere bytes and images decide.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import polars as pl
 
 from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, quiet
+from palpate.data.formats import FORMATS
 from palpate.data.listing import number_together, read_categories, read_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import is_list, read_samples
@@ -15,6 +24,12 @@ from palpate.data.reading import is_list, read_samples
 Data = Any
 #: Problems that a note names.
 SHOWN = 40
+#: What equal names mean: the same thing, or nothing, or (auto) what the sources say.
+Identity = Literal["auto", "names", "images"]
+#: Columns of names; those of several samples, which are renamed where they mean nothing.
+NAMES = ("id", "video", "contact", "object", "session")
+#: Formats of tables in which somebody names things.
+DECLARING = (None, "pairs", "intervals", "hf")
 
 
 def require(ok: bool, argument: str, must: str, got: Any, example: Any = None) -> None:
@@ -75,6 +90,62 @@ def number_contacts(manifests: list[Manifest]) -> list[Manifest]:
     bare = [k for k, manifest in enumerate(manifests) if set(manifest.facts) == {"source"}]
     numbered = iter(number_together(*(manifests[k] for k in bare)) if len(bare) > 1 else ())
     return [next(numbered, m) if k in bare else m for k, m in enumerate(manifests)]
+
+
+def shared_names(train: Manifest, test: Manifest, identity: Identity) -> tuple[str, ...]:
+    """The columns in which equal values of both parts mean the same thing."""
+    facts = [[m.facts.get(fact) for fact in ("format", "dataset", "digest")] for m in (train, test)]
+    published = {form.facts.name for form in FORMATS.values()}
+    one = train.root.resolve() == test.root.resolve() or (
+        facts[0] == facts[1] and (facts[0][1] in published or facts[0][2] is not None)
+    )
+    if identity != "auto":
+        return NAMES if identity == "names" else ()
+    return NAMES if one else tuple(c for c in NAMES if _declares(train, c) and _declares(test, c))
+
+
+def _declares(manifest: Manifest, column: str) -> bool:
+    """Whether the names of a column are from a table, and not from the paths of files."""
+    facts, table = manifest.facts, manifest.table
+    layout = facts.get("layout", "table")
+    if "source" in facts or facts.get("format") not in DECLARING or not layout.startswith("table"):
+        return False
+    stems = [pl.col(c).str.replace(r"\.[^./]+$", "") == pl.col("id") for c in ("tactile", "vision")]
+    return column != "id" or not table.select(pl.any_horizontal(*stems).any()).item()
+
+
+def tell_apart(
+    train: Manifest, test: Manifest, shared: Sequence[str], parts: tuple[str, str]
+) -> tuple[Manifest, Manifest, dict[str, int]]:
+    """Rename what has equal names in both parts without being the same thing.
+
+    Args:
+        train: samples.
+        test: the samples to tell from them.
+        shared: columns whose names mean the same thing in both.
+        parts: prefixes of the names, for ``train`` and ``test``.
+
+    Returns:
+        Both parts (ids stay as they are), and how many names of which column are equal.
+    """
+    equal: dict[str, int] = {}
+    for column in (c for c in NAMES if c not in shared):
+        both = train.table[column].drop_nulls().unique()
+        both = both.filter(both.is_in(test.table[column].implode()))
+        if len(both):
+            equal[column] = len(both)
+        if len(both) and column != "id":
+            train, test = (
+                replace(m, table=m.table.with_columns(_prefixed(column, both, part)))
+                for m, part in zip((train, test), parts, strict=True)
+            )
+    return train, test, equal
+
+
+def _prefixed(column: str, names: pl.Series, part: str) -> pl.Expr:
+    name = pl.col(column)
+    renamed = pl.format("{}: {}", pl.lit(part), name)
+    return pl.when(name.is_in(names.implode())).then(renamed).otherwise(name).alias(column)
 
 
 def _join(paths: list[Path], skip_bad: bool) -> tuple[Manifest, list[Problem]]:

@@ -17,7 +17,7 @@ The signals of the images' content, whose thresholds are calibrated, are in ``ne
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -152,13 +152,24 @@ class Flags:
         return LeakPair(test.ref(a), train.ref(b), gap, score, cause)
 
 
-def identical_samples(train: Manifest, test: Manifest, gaps: Gaps) -> Flags:
-    """Test samples whose id, or whose video and frame, are in train."""
-    place = {name: k for k, name in enumerate(train.ids)}
+def identical_samples(
+    train: Manifest, test: Manifest, gaps: Gaps, named: Collection[str] = ("id", "video")
+) -> Flags:
+    """Test samples whose id, or whose video and frame, are in train.
+
+    Args:
+        train: samples.
+        test: the samples in question.
+        gaps: the nearest train frames.
+        named: columns in which equal names mean the same thing; without ``id`` and ``video``
+            nothing can be checked.
+    """
+    place = {name: k for k, name in enumerate(train.ids)} if "id" in named else {}
     same = np.array([place.get(name, -1) for name in test.ids], np.int64)
     nearest = np.where(same >= 0, same, np.where(gaps.frames == 0, gaps.row, -1))
     flag = nearest >= 0
-    return Flags("identical sample", flag.astype(np.float32), flag, nearest)
+    score = np.where({"id", "video"} & {*named}, flag, np.nan).astype(np.float32)
+    return Flags("identical sample", score, flag, nearest)
 
 
 def shared_group(train: Manifest, test: Manifest, column: str, *, counts: bool) -> Flags | None:

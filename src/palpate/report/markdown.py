@@ -257,7 +257,7 @@ def _finding(audit: Audit) -> list[str]:
         )
     facts += [f"split: {audit.split}"] if audit.split else []
     return [
-        f"### {esc(against + audit.name)}: {esc(percent(audit.fraction))} leaked",
+        f"### {esc(against + audit.name)}: {esc(percent(audit.leaked_fraction))} leaked",
         "",
         *pipe_table(["", esc(audit.against), "test"], rows),
         *_items([*facts, *map(sentence, audit.notes)]),

@@ -265,6 +265,15 @@ def _blank_images(params: Mapping[str, Any], _: Style) -> str:
     )
 
 
+def _equal_names(p: Mapping[str, Any], style: Style) -> str:
+    equal = " and ".join(plural(n, f"equal {column}") for column, n in p["equal"].items())
+    decided = "bytes and images decide" if p["images"] else "there are no images to compare"
+    return (
+        f"{p['roots'][0]} and {p['roots'][1]} have {equal}, which mean nothing by themselves: "
+        f"{decided}. If both are one data set: {style:identity=names}"
+    )
+
+
 def _median_backgrounds(params: Mapping[str, Any], _: Style) -> str:
     names = {"video": "their video", "sensor": "their sensor", "all": "all frames"}
     medians = [f"{params[k]} take the median of {name}" for k, name in names.items() if params[k]]
@@ -313,6 +322,7 @@ LEAKAGE: dict[str, Sentence] = {
         "{count} of {of} are so similar that they are taken for copies across videos and do "
         "not set the threshold"
     ),
+    "equal-names": _equal_names,
     "empty-files": "{count} files are empty (0 bytes) and were not compared",
     "group-few": (
         "There are fewer than {parts} {group}s: whole contacts are kept together instead, and"

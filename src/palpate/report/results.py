@@ -176,7 +176,7 @@ class Audit:
     Attributes:
         name: ``"Orig"``, ``"NoLeak"`` or a file name.
         group: the column that must not be shared (``video``, ``contact``, ``object`` ...).
-        leaked_fraction: test samples in shared groups / test samples.
+        leaked_fraction: ``leaking_samples`` / ``test_samples``; 0 without test samples.
         gap_min, gap_median, gap_max: distance to the nearest train frame of the same video, over
             test samples that have one; else None.
         gap_edges, gap_counts: histogram of those distances; ``len(edges) == len(counts) + 1``.
@@ -225,12 +225,10 @@ class Audit:
     others: Sequence[Audit] = ()
     table: Any = field(default=None, compare=False, repr=False)
 
-    @property
-    def fraction(self) -> float:
-        """Leaking share of the test samples: by any signal, or by groups where none was checked."""
-        if not self.signals:
-            return self.leaked_fraction
-        return self.leaking_samples / self.test_samples if self.test_samples else 0.0
+    def __post_init__(self) -> None:
+        if self.signals and self.test_samples:  # files of earlier versions counted groups alone
+            share = self.leaking_samples / self.test_samples
+            object.__setattr__(self, "leaked_fraction", round(share, 5) or share)
 
     def __str__(self) -> str:
         """The finding, the signals, and the notes: a few lines."""

@@ -115,7 +115,9 @@ def leak_line(audit: Audit) -> str:
         several = len(audit.signals) != 1
         signals = f"any of the {len(audit.signals)} signals" if several else "the one signal"
         return f"None of {total} leaks by {signals} checked."
-    return f"{count(n)} of {total} {'leaks' if n == 1 else 'leak'} ({percent(audit.fraction)})."
+    return (
+        f"{count(n)} of {total} {'leaks' if n == 1 else 'leak'} ({percent(audit.leaked_fraction)})."
+    )
 
 
 def audit_line(audit: Audit) -> str:

@@ -136,6 +136,7 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     for signal in audit.signals:
         share = f"{count(signal.flagged)} of {count(signal.checked)} ({percent(signal.fraction)})"
         facts = [share, threshold_text(signal), *cause_texts(signal)]
+        facts = facts if signal.checked else ["none could be checked"]
         lines.append(f"  {signal.kind:<{width}}  {', '.join(facts)}")
     for signal in audit.signals:
         lines += [f"  {signal.kind}: {sentence(note, style)}" for note in signal.notes]
