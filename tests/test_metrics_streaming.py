@@ -84,6 +84,17 @@ def test_neither_order_nor_batches_matter(seed, step, preset):
         assert same(straight, both(cls(preset=preset), g, r, step=step, order=order).compute())
 
 
+@every_class
+def test_real_is_the_second_argument_as_in_torchmetrics(cls):
+    g, r = sets()
+    metric, named = cls(), cls()
+    metric.update(g.features, False)
+    metric.update(r.features, True)
+    named.update(g.features)
+    named.update(r.features, real=True)
+    assert same(metric.compute(), named.compute())
+
+
 def test_ids_that_are_not_given_depend_on_the_rows_alone():
     g, _ = sets()
     g = change(g, features=np.concatenate([g.features[:-2], g.features[:2]]))  # with repeated rows

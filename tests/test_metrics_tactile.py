@@ -12,7 +12,7 @@ from scipy import stats
 
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, mmd2, tmmd
-from palpate.metrics.mmd import half_of
+from palpate.metrics.mmd import half_of, sample_units
 from palpate.report.notes import sentence
 from test_metrics_mmd import loop_mmd, unit_rows
 
@@ -88,12 +88,34 @@ def test_tmmd_equals_the_double_loop(seed, m, n, frames):
         assert grouped.value == pytest.approx(
             loop_mmd(g.features, r.features, "grouped", g.groups, r.groups), abs=1e-9
         )
-    paper = tmmd(without_groups(g), without_groups(r))
+    paper = tmmd(without_groups(g), without_groups(change(r, ids=[f"r {i}" for i in r.ids])))
     assert (paper.estimator, paper.settings["preset"]) == ("unbiased", "paper")
     assert paper.value == pytest.approx(loop_mmd(g.features, r.features, "unbiased"), abs=1e-9)
     assert tmmd(g, r, preset="cmmd").value == pytest.approx(
         loop_mmd(g.features, r.features, "biased"), abs=1e-9
     )
+
+
+def test_pairs_of_one_scene_are_excluded_where_ids_are_shared(monkeypatch):
+    g, r = (without_groups(world(3, videos=6, frames=1, draw=k)) for k in (None, 1))
+    score = tmmd(g, r)
+    assert (score.settings["preset"], score.details["unit"]) == ("grouped", "sample")
+    want = loop_mmd(g.features, r.features, "grouped", g.ids, r.ids)
+    assert score.value == pytest.approx(want, abs=1e-9)
+    assert "dependent-pairs" not in codes(score)
+    paper = tmmd(g, r, preset="paper")
+    assert paper.value == pytest.approx(loop_mmd(g.features, r.features, "unbiased"), abs=1e-9)
+    [note] = [n for n in paper.notes if n.code == "dependent-pairs"]
+    assert note.params == {"count": 18}
+    first, *others = four_scores(g, r)  # no scene is twice in one set: the others are as they were
+    assert first.value == score.value
+    assert [s.settings["preset"] for s in others] == ["paper"] * 3
+    monkeypatch.setattr("palpate.metrics.mmd.BLOCKS", 6)  # many ids: blocks of them
+    assert tmmd(g, r).details["unit"] == "random-block"
+    units = dict(zip(g.ids, sample_units(g.ids, 0)[0], strict=True))
+    blocks = [[units[i] for i in s.ids] for s in (g, r)]
+    want = loop_mmd(g.features, r.features, "grouped", *blocks)
+    assert tmmd(g, r).value == pytest.approx(want, abs=1e-9)
 
 
 @pytest.mark.parametrize("estimator", ["unbiased", "biased"])
@@ -459,7 +481,7 @@ def test_undefined_scores_have_a_reason():
         (i_tmmd(change(s, groups=s.ids)), "single-samples", "no group has two samples"),
         (i_tmmd(s.take(s.ids[:3])), "few-samples", "fewer than 4 samples .n = 3"),
         (tmmd(one, one), "few-groups", "two groups"),
-        (tmmd(without_groups(s.take(s.ids[:1])), without_groups(s)), "one-sample", "two samples"),
+        (tmmd(s.features[:1], s.features), "one-sample", "two samples"),
     ):
         assert (score.value, codes(score)[0]) == (None, f"undefined:{reason}")
         assert re.match(f"Undefined: .*{text}", sentence(score.notes[0]))
@@ -515,7 +537,7 @@ def test_unstable_classes_are_flagged():
         (lambda g: four_scores(g, g, floor=without_groups(g)), ["floor", "groups"]),
         (lambda g: i_tmmd(without_groups(g), halves="group"), ["halves='group'"]),
         (lambda g: i_tmmd(without_groups(g), preset="grouped"), ["grouped"]),
-        (lambda g: tmmd(g, without_groups(g), estimator="grouped"), ["grouped"]),
+        (lambda g: tmmd(g, g.features, estimator="grouped"), ["grouped"]),
         (lambda g: i_tmmd(change(g, groups=[None, *g.groups[1:]])), ["groups", "1 row (0)"]),
         (lambda g: i_tmmd(change(g, features=3 * g.features)), ["L2-normalized", "norm 3"]),
         (

@@ -39,9 +39,11 @@ class Metrics:
 
     presets: tuple[Literal["grouped", "paper", "paper-tables", "cmmd"], ...] = ()
     """Readings of the TMMD family: `paper` is the formula to the letter, `grouped` keeps whole
-    videos together. Default: both, or `paper` without groups."""
-    sigma: tuple[str, ...] = ("10",)
-    """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it)."""
+    videos together. Default: both; without groups `paper`, and `grouped` for TMMD of images whose
+    ids are those of the reference."""
+    sigma: tuple[str, ...] = ()
+    """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it).
+    Default: 10, comparable with the literature, and `multi`, which sees more than the mean."""
     estimator: Literal["unbiased", "biased", "grouped"] | None = None
     """Instead of the presets' estimators."""
     backend: Literal["auto", "blocked", "moments"] = "auto"
@@ -106,7 +108,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         **vars(metrics),
         "names": options.samples.names or None,
         "presets": metrics.presets or None,
-        "sigma": [_number_or_word(text) for text in metrics.sigma],
+        "sigma": [_number_or_word(text) for text in metrics.sigma] or None,
         "normalize": {"check": "check", "yes": True, "no": False}[metrics.normalize],
         "companions": _companions(metrics.companions),
         "cache": cache,

@@ -9,18 +9,20 @@ notes, results. Metrics of one name with another bandwidth get names of their ow
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 
 from palpate import __version__
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split, quiet, rng_for
 from palpate.evaluation.companions import (
+    MANY,
     Chosen,
     Features,
     Name,
@@ -41,12 +43,11 @@ from palpate.evaluation.controls import (
 )
 from palpate.evaluation.inputs import REFERENCE, Inputs, Samples, Source, read_inputs
 from palpate.metrics import PRESETS, compare, distance, paired_by_id, tmmd
+from palpate.metrics.mmd import sample_units
 from palpate.report.results import GalleryItem, Results
 
 #: Bandwidth of the paper; the name of a metric says any other one where several are requested.
 SIGMA = 10.0
-#: Metrics that look at one set alone.
-REFERENCE_FREE = ("I-TMMD", "CI-TMMD", "D-TMMD", "material accuracy")
 #: Error of streamed moments at scale 1000 from which a note reports it.
 BOUND = 1e-4
 
@@ -57,7 +58,7 @@ class Family:
 
     Attributes:
         presets: empty for those that fit the groups.
-        sigmas: bandwidths.
+        sigmas: bandwidths; empty for the default.
         estimator: in place of the presets' own.
         options: backend, permutations, normalize; the companion ``cmmd`` takes them as well.
         common: seed and digest of the split, for all metrics.
@@ -69,20 +70,21 @@ class Family:
     options: Mapping[str, Any]
     common: Mapping[str, Any]
 
-    def presets_for(self, *, grouped: bool) -> Sequence[str]:
-        """The requested presets, or those that fit."""
-        fits = grouped and self.estimator in (None, "grouped")
-        return self.presets or (("grouped", "paper") if fits else ("paper",))
+    def columns(self, *, grouped: bool, rows: int) -> list[tuple[str | None, float | str]]:
+        """(preset, bandwidth) of each column; None is the preset that fits the ids of a metric."""
+        fits: Sequence[str | None] = ("paper",)
+        if self.estimator in (None, "grouped"):
+            fits = ("grouped", "paper") if grouped else (None,)
+        sigmas = self.sigmas or ((SIGMA, "multi") if rows <= MANY else (SIGMA,))
+        return [(p, s) for p in self.presets or fits for s in sigmas]
 
-    def label(self, preset: str) -> str:
-        """A preset as tables name it: with the estimator if that is not its usual one."""
-        usual = self.estimator in (None, PRESETS[preset].estimator)
-        return preset if usual else f"{preset}, {self.estimator}"
-
-    def named(self, score: Score, preset: str, sigma: float | str) -> Score:
-        """A score with its preset, and an unusual bandwidth of several in the metric's name."""
-        score = replace(score, settings={**score.settings, "preset": self.label(preset)})
-        if len(self.sigmas) < 2 or sigma == SIGMA:
+    def named(self, score: Score, sigma: float | str) -> Score:
+        """A score with an unusual estimator in its preset, and bandwidth in the metric's name."""
+        preset = score.settings["preset"]
+        if self.estimator not in (None, PRESETS[preset].estimator):
+            preset = f"{preset}, {self.estimator}"
+        score = replace(score, settings={**score.settings, "preset": preset})
+        if len(self.sigmas) == 1 or sigma == SIGMA:
             return score
         tag = f"(σ {sigma})" if isinstance(sigma, str) else f"(σ = {sigma:g})"
         base = score.metric.removesuffix(" difference")
@@ -103,8 +105,10 @@ def score_family(
     sets = {**features.generators, **features.controls}
     grouped = [s.groups is not None for s in (features.reference, *sets.values())]
     floor = features.reference if len(set(grouped)) == 1 else None
-    columns = [(p, s) for p in family.presets_for(grouped=all(grouped)) for s in family.sigmas]
+    columns = family.columns(grouped=all(grouped), rows=features.rows)
     outcome = Outcome()
+    if not family.sigmas and features.rows > MANY:
+        outcome.notes.append(Note("wide-sigma-alone", {"rows": MANY}))
     for done, (preset, sigma) in enumerate(columns):
         options: dict[str, Any] = {
             **features.family,
@@ -126,8 +130,12 @@ def score_family(
                 (outcome.differences, result.differences, result.excess.differences),
             )
             for results, own, excess in both:
-                named = (family.named(s, preset, sigma) for s in _interleaved(own, excess))
-                results += named
+                results += [family.named(s, sigma) for s in _interleaved(own, excess)]
+            outcome.notes += [
+                Note("below-floor", {"metric": s.metric, "subject": s.subject})
+                for s in (family.named(s, sigma) for s in result.excess.scores)
+                if s.floor and s.interval and s.interval[1] < s.floor
+            ]
         progress("TMMD family", done + 1, len(columns))
     return outcome
 
@@ -155,15 +163,22 @@ def score_streamed(
     auto = options["backend"] == "auto"
     if auto:
         options["backend"] = "moments"
-    columns = [(p, s) for p in family.presets_for(grouped=False) for s in family.sigmas]
+    real, digest, seed = inputs.reference, inputs.reference.digest, family.common["seed"]
+    columns = family.columns(grouped=False, rows=sys.maxsize)
     todo = [(n, s, p, sigma) for n, s in inputs.generators.items() for p, sigma in columns]
     outcome = Outcome(notes=[*inputs.notes, Note("streamed")])
-    for done, (name, samples, preset, sigma) in enumerate(todo):
+    for done, (name, samples, fitting, sigma) in enumerate(todo):
         progress("streaming", done, len(todo))
-        x, y = samples.features, inputs.reference.features
+        x, y = samples.features, real.features
+        scenes, units = not {*samples.ids}.isdisjoint(real.ids), dict[str, Any]()
+        preset = fitting or ("grouped" if scenes else "paper")
         estimator: Any = family.estimator or PRESETS[preset].estimator
+        if scenes and estimator == "grouped":
+            of_rows, *_ = sample_units([*samples.ids, *real.ids], seed)
+            units = {"groups_x": of_rows[: len(samples)], "groups_y": of_rows[len(samples) :]}
         called = (f"The features of {name!r}", "The reference features")
-        d = distance(x, y, sigma=cast("Any", sigma), estimator=estimator, names=called, **options)
+        how: dict[str, Any] = {"sigma": sigma, "estimator": estimator, **units, **options}
+        d = distance(x, y, names=called, **how)
         notes = [Note("no-interval-streamed")]
         if d.bound > BOUND and auto:
             fix, example = "Choose a larger one, or wait for the exact sum", {"backend": "blocked"}
@@ -180,22 +195,14 @@ def score_streamed(
             scale=d.scale,
             n=d.m,
             m=d.n,
+            reference=digest,
             split=family.common["split"],
             settings={**d.kernel, "preset": preset, "normalize": options["normalize"]},
             details={"backend": d.backend, "bound": d.bound, "version": __version__},
             notes=notes,
         )
-        outcome.scores.append(family.named(streamed, preset, sigma))
-    outcome.scores = compared_with(outcome.scores, inputs.reference.digest)
+        outcome.scores.append(family.named(streamed, sigma))
     return outcome
-
-
-def compared_with(scores: Sequence[Score], reference: str) -> list[Score]:
-    """Scores with the digest of the real images, where they compare with them."""
-    return [
-        s if s.metric.startswith(REFERENCE_FREE) else replace(s, reference=reference)
-        for s in scores
-    ]
 
 
 Preset = Literal["grouped", "paper", "paper-tables", "cmmd"]
@@ -214,7 +221,7 @@ def score(  # noqa: PLR0913
     groups: Source = None,
     group: str = "auto",
     presets: Sequence[Preset] | None = None,
-    sigma: float | str | Sequence[float | str] = SIGMA,
+    sigma: float | str | Sequence[float | str] | None = None,
     estimator: Literal["unbiased", "biased", "grouped"] | None = None,
     backend: Literal["auto", "blocked", "moments"] = "auto",
     normalize: Literal["check"] | bool = "check",
@@ -246,8 +253,10 @@ def score(  # noqa: PLR0913
         group: the column whose values stay together in halves and intervals; ``auto`` takes what
             the split kept whole, else the video.
         presets: readings of the TMMD family (:data:`palpate.metrics.PRESETS`). Default: ``grouped``
-            and ``paper`` where groups are known, else ``paper``.
-        sigma: bandwidth or bandwidths: numbers, ``"median"``, ``"multi"``.
+            and ``paper`` where groups are known; else ``paper``, but ``grouped`` for TMMD of sets
+            that share ids, whose pairs of one scene are dependent.
+        sigma: bandwidth or bandwidths: numbers, ``"median"``, ``"multi"``. Default: 10, which is
+            comparable, and ``multi``, which sees more than the mean (up to 50,000 rows).
         estimator: instead of the presets' own.
         backend: of kernel sums.
         normalize: for embeddings that are not of unit length: raise, divide by the norm, or keep
@@ -300,8 +309,8 @@ def score(  # noqa: PLR0913
     encoders = None
     if inputs.reference.features is None:
         if encoder is None and not requested:
-            fix = "Pass an encoder, or request companions of pixels"
-            example = {"encoder": "palpate/mini", "companions": ["ssim", "psnr"]}
+            fix = "Pass an encoder, or request only companions that compare pixels, e.g. ssim"
+            example = {"encoder": "palpate/mini"}
             got, must = "none", "must be given for images"
             raise PalpateError(must, got, fix, argument="encoder", example=example)
         encoders = load_encoders(encoder, progress)
@@ -333,7 +342,7 @@ def score(  # noqa: PLR0913
         scores=[*outcome.scores, *map(_with_verdict, outcome.differences)],
         gallery=_gallery(inputs, seed),
         settings=settings,
-        notes=[*outcome.notes, *_copies(outcome), *_below_floor(outcome)],
+        notes=[*outcome.notes, *_copies(outcome)],
     )
 
 
@@ -350,7 +359,9 @@ def _names(
     return unique
 
 
-def _sigmas(sigma: float | str | Sequence[float | str]) -> tuple[float | str, ...]:
+def _sigmas(sigma: float | str | Sequence[float | str] | None) -> tuple[float | str, ...]:
+    if sigma is None:
+        return ()
     values = [sigma] if isinstance(sigma, int | float | str) else list(sigma)
     for value in values or ["nothing"]:
         word = isinstance(value, str)  # the square of a number must be finite
@@ -429,8 +440,8 @@ class _Run:
             outcome.scores += material_accuracies(train, features)
         if images:
             digest = real.digest
-            outcome.scores = compared_with(outcome.scores, digest)
-            outcome.differences = compared_with(outcome.differences, digest)
+            for scores in (outcome.scores, outcome.differences):
+                scores[:] = [replace(s, reference=digest) if s.m else s for s in scores]
         return outcome
 
     def _features(self, samples: Samples) -> FeatureSet:
@@ -553,7 +564,8 @@ def _settings(inputs: Inputs, family: Family, outcome: Outcome, encoders: Any) -
             name: {"file": s.source, "rows": len(s), "digest": s.digest}
             for name, s in {**made, REFERENCE: real}.items()
         }
-    options |= {"sigma": list(family.sigmas), **family.options}
+    sigmas = list(family.sigmas) or [s for _, s in family.columns(grouped=False, rows=len(real))]
+    options |= {"sigma": sigmas, **family.options}
     return settings
 
 
@@ -574,18 +586,6 @@ def _copies(outcome: Outcome) -> list[Note]:
             params = {"subject": s.subject, "copies": count, "n": s.n}
             copies.setdefault(s.subject, Note("copies", params))
     return [*copies.values()]
-
-
-def _below_floor(outcome: Outcome) -> list[Note]:
-    """Generators that vary less than real images do, which no metric without reference rewards."""
-    return [
-        Note("below-floor", {"metric": s.metric, "subject": s.subject})
-        for s in outcome.scores
-        if s.metric.startswith(("I-TMMD E", "CI-TMMD E"))
-        and s.floor
-        and s.interval
-        and s.interval[1] < s.floor
-    ]
 
 
 def _gallery(inputs: Inputs, seed: int) -> list[GalleryItem]:

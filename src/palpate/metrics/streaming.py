@@ -134,21 +134,21 @@ class Batches:
         columns: dict[str, Any] = {
             name: [v for b in batches for v in getattr(b, name)] for name in batches[0].given
         }
-        columns.setdefault("ids", row_ids(features))
+        columns.setdefault("ids", row_ids(features, "real" if real else "generated"))
         return FeatureSet(features=features, encoder=encoder, **columns)
 
 
-def row_ids(features: NDArray[Any]) -> list[str]:
+def row_ids(features: NDArray[Any], kind: str) -> list[str]:
     """Ids for rows without: a digest of the row, so that neither order nor process matters.
 
-    Repeated rows are numbered.
+    Repeated rows are numbered. ``kind`` keeps a copied row from passing for one of the same scene.
     """
     seen: dict[str, int] = {}
     ids: list[str] = []
     for row in features:
         name = blake2b(row.tobytes(), digest_size=12).hexdigest()
         seen[name] = seen.get(name, -1) + 1
-        ids.append(f"{name}-{seen[name]}")
+        ids.append(f"{kind} {name}-{seen[name]}")
     return ids
 
 
@@ -191,8 +191,8 @@ class StreamingMetric:
     def update(
         self,
         features: Any,
-        *,
         real: bool = False,
+        *,
         ids: Any = None,
         labels: Any = None,
         groups: Any = None,
@@ -203,7 +203,8 @@ class StreamingMetric:
             features: (n, d), n may be 0: NumPy or torch on any device; half precision is widened.
                 Rows are copied.
             real: whether these are real samples: the reference of TMMD, the floor of the others.
-            ids: n sample ids, strings or integers; without, a digest of each row.
+            ids: n sample ids, strings or integers; an id in both sets is one scene, whose pairs
+                TMMD excludes where there are no groups. Without, a digest of each row.
             labels: n classes, for CI- and D-TMMD.
             groups: n videos, strings or integers. Ids, labels and groups are given with every batch
                 of a set, or with none.

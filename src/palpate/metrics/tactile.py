@@ -377,7 +377,8 @@ def tmmd(
         ids: n ids of ``generated``; without, all rows are different samples.
         labels: n classes, for CI- and D-TMMD.
         groups: n groups (videos), which are left out as a whole.
-        reference_ids: m ids; an id in both sets is the same sample.
+        reference_ids: m ids; an id in both sets is the same scene. Without groups of both sets,
+            shared ids act as groups: the default preset excludes the pairs of one scene.
         reference_groups: m groups; groups count only if both sets have them, and a group in both
             sets is the same group.
         encoder: digest of the encoder of both.
@@ -408,9 +409,14 @@ def tmmd_scored(generated: FeatureSet, reference: FeatureSet, options: Options) 
     """TMMD with its leave-one-unit-out values."""
     require_one_encoder(generated, reference, "reference")
     grouped = generated.groups is not None and reference.groups is not None
-    plan = plan_for(options, grouped=grouped)
+    plan = plan_for(options, grouped=grouped or bool(shared_ids(generated, reference)))
     table = build_table(generated, reference, plan, grouped=grouped)
     return tmmd_of(table, generated, reference, plan)
+
+
+def shared_ids(generated: FeatureSet, reference: FeatureSet) -> int:
+    """How many ids both sets have: a generated and a real image of one scene are dependent."""
+    return len({str(i) for i in generated.ids} & {str(i) for i in reference.ids})
 
 
 def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Plan) -> Scored:
@@ -424,6 +430,8 @@ def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Pl
         notes.append(Note("copied-rows", {"count": table.copies, "n": len(generated.ids)}))
     if not table.grouped:
         notes.append(INDEPENDENT)
+        if plan.estimator != "grouped" and (count := shared_ids(generated, reference)):
+            notes.append(Note("dependent-pairs", {"count": count}))
     details: dict[str, Any] = {"units": len(sums.units), "copies": table.copies}
     details |= {"p_value": None, "permutations": None}
     null, draw = None, {"count": plan.permutations, "seed": plan.seed}
@@ -840,10 +848,11 @@ def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> l
     """The four metrics as :class:`Scored`, in the order of the paper."""
     require_one_encoder(generated, reference, "reference")
     both = generated.groups is not None and reference.groups is not None
-    plan, metrics = plan_for(options, grouped=both), (i_tmmd_of, ci_tmmd_of, d_tmmd_of)
+    paired = not both and bool(shared_ids(generated, reference))
+    plan, metrics = plan_for(options, grouped=both or paired), (i_tmmd_of, ci_tmmd_of, d_tmmd_of)
     table = build_table(generated, reference, plan, grouped=both, further=ratio_bound)
     first = tmmd_of(table, generated, reference, plan)
-    if both or generated.groups is None:
+    if both or (generated.groups is None and not paired):
         return [first, *(metric(table, generated, plan) for metric in metrics)]
     return [first, *_from_one_table(metrics, generated, options, reference)]
 

@@ -69,8 +69,8 @@ class TorchMetric(Metric):
     def update(
         self,
         features: Any,
-        *,
         real: bool = False,
+        *,
         ids: Any = None,
         labels: Any = None,
         groups: Any = None,

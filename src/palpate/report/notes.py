@@ -209,6 +209,10 @@ METRICS: dict[str, Sentence] = {
     "independent-samples": (
         "The interval takes samples as independent; frames of one video are not: give groups"
     ),
+    "dependent-pairs": (
+        "{count} ids are in both sets: a generated and a real image of one scene are not "
+        "independent and pull this value below the truth; preset grouped excludes their pairs"
+    ),
     "random-halves": (
         "Random halves carry no signal: the unbiased value averages 0 over halvings for any data; "
         "halves of whole videos do (preset grouped)"
@@ -483,6 +487,10 @@ EVALUATION: dict[str, Sentence] = {
     "too-many-rows": (
         "{name} skipped: it forms all pairs of more than {rows:,} rows; request it with "
         "{arg:companions}"
+    ),
+    "wide-sigma-alone": (
+        "Sigma 10 alone: several bandwidths form all pairs of more than {rows:,} rows; request "
+        "them with {arg:sigma=multi}"
     ),
     "widened": "The features in {source}: {type} was widened to float32; its rounding stays",
     "within-bound": "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments",

@@ -218,7 +218,7 @@ def notes_of(score: Score) -> list[Note]:
     lacks_floor = score.floor is None and not score.metric.endswith(DIFFERENCE)
     if lacks_floor and defined(score) and family in ("TMMD", "I-TMMD", "CI-TMMD", "D-TMMD"):
         code = "no-floor-of-tmmd" if family == "TMMD" else "floor-unknown"
-        notes += [] if any(note.code.startswith("no-floor") for note in notes) else [Note(code)]
+        notes += [] if any(note.code == "no-floor" for note in notes) else [Note(code)]
     return notes
 
 
