@@ -53,7 +53,8 @@ def test_import_with_maps_classes_and_what_is_suspicious(capsys, table, tmp_path
     assert (status, facts["samples"], facts["materials"], facts["skipped"]) == (0, 4, 2, [])
     assert [p["kind"] for p in facts["suspicious"]] == ["null-group"]
     assert Manifest.load(tmp_path / "m").column("tactile") == [f"t/{k}_tac.jpg" for k in range(4)]
-    status, out, _ = call(capsys, *args)
+    assert "--overwrite" in call(capsys, *args)[2]
+    status, out, _ = call(capsys, *args, "--overwrite")
     assert "Suspicious, but imported: 1" in out
     assert "1 of 4 rows have no video" in out
 
@@ -64,7 +65,7 @@ def test_options_of_the_format_pass_through(capsys, tag, tmp_path):
     status, out, _ = call(capsys, *command, "--json")
     assert (status, json.loads(out)["samples"]) == (0, 2)
     lists = ["--labels", tag / "train.txt", tag / "test.txt"]
-    status, out, _ = call(capsys, *command, *lists, "--json")
+    status, out, _ = call(capsys, *command, *lists, "--json", "--overwrite")
     assert (status, json.loads(out)["samples"]) == (0, 4)
     # Options that matter to an import alone do no harm.
     status, out, _ = call(capsys, "validate", tag, *options, "--json")
@@ -134,8 +135,16 @@ def test_a_folder_of_one_kind_and_its_mistakes(capsys, table, tmp_path):
     command = ["import", table.parent / "v", "--as", "vision", "-o", tmp_path / "m", "--json"]
     status, out, _ = call(capsys, *command)
     assert (status, json.loads(out)["samples"]) == (0, 4)
-    status, _, err = call(capsys, "import", table.parent / "v", "-o", tmp_path / "n")
-    assert (status, "--as tactile" in err) == (2, True)
+    folder = tmp_path / "things"
+    (table.parent / "v").rename(folder)
+    # Xtmp_path / "x" / "things")
+    for path in folder.iterdir():
+        path.rename(path.with_name(path.name.replace("rgb", "a")))
+    status, _, err = call(capsys, "import", folder, "-o", tmp_path / "n")
+    assert status == 2
+    for side in ("tactile", "vision"):  # complete commands to choose from
+        command = shlex.split(next(line for line in err.splitlines() if f"--{side}" in line))
+        assert call(capsys, *command[1:], "-o", tmp_path / side)[0] == 0
     status, _, err = call(capsys, "import", table, "--as", "vision", "-o", tmp_path / "n")
     assert (status, "Traceback" in err) == (2, False)
 

@@ -152,7 +152,8 @@ def test_objectfolder_table_of_materials(tmp_path):
     root = make_objectfolder(tmp_path / "data").source
     table = tmp_path / "table.csv"
     (root / "objectfolder_real_metadata.csv").rename(table)
-    material = lambda **kw: import_dataset(root, tmp_path / "out", **kw).manifest.column("material")  # noqa: E731
+    out = {"output": tmp_path / "out", "overwrite": True}
+    material = lambda **kw: import_dataset(root, **out, **kw).manifest.column("material")  # noqa: E731
     assert set(material()) == {None}
     assert material(metadata=table)[-1] == "Iron"
     with pytest.raises(PalpateError, match=r"github\.com/alanzjl/t3"):
@@ -291,7 +292,7 @@ def test_ycb_slide_simulated_part(tmp_path):
     assert result.facts["simulated"] == "yes"
     assert result.splits == {}
     with pytest.raises(PalpateError, match="real or sim"):
-        import_dataset(tmp_path / "data" / "ycb", tmp_path / "out", part="both")
+        import_dataset(tmp_path / "data" / "ycb", tmp_path / "bad", part="both")
 
 
 def test_ycb_slide_reports_everything_bad(tmp_path):

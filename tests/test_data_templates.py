@@ -3,7 +3,7 @@
 import pytest
 
 from palpate.core import PalpateError
-from palpate.data.templates import Template, join, matches_of, walk
+from palpate.data.templates import Template, assign, join, walk
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def sides(**templates):
     """The matches of templates among files that are named below."""
     files = ["cup/v/1.jpg", "cup/v/2.jpg", "cup/t/1.png", "cup/t/3.png", "mug/v/1.jpg"]
     files += ["mug/t/1.png", "mug/bg.png", "all.png"]
-    return {side: matches_of(files, Template.parse(text)) for side, text in templates.items()}
+    return assign(files, {side: Template.parse(text) for side, text in templates.items()})
 
 
 def test_equal_fields_join_and_what_a_side_lacks_is_named():
@@ -86,3 +86,14 @@ def test_one_file_may_serve_many_but_many_serve_many_only_by_a_field():
     assert problems[0].text.startswith("2 tactile and 2 vision images with object=cup")
     with pytest.raises(PalpateError, match="must share a field"):
         join(sides(tactile="*/t/{frame}.png", vision="{object}/v/*.jpg"))
+
+
+def test_a_file_belongs_to_the_template_that_spells_out_most():
+    matches = assign(
+        ["a.png", "a_real.png"],
+        {"vision": Template.parse("{name}.png"), "tactile": Template.parse("{name}_real.png")},
+    )
+    assert matches == {
+        "vision": [("a.png", {"name": "a"})],
+        "tactile": [("a_real.png", {"name": "a"})],
+    }

@@ -24,16 +24,25 @@ Maps = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class TableOptions:
-    """Tables, folders of images, interval lists, Hugging Face data sets."""
+    """Folders of images, tables, interval lists, Hugging Face data sets."""
 
+    vision: str | None = None
+    """Where the photos of a folder are: `"{object}/press_{contact}/photo/{frame}.jpg"`. Fields are
+    columns and join the sides; `{frame:d}` takes digits, `{video:**}` folders of any depth, `*` and
+    `**` what does not matter. Without a template the folder is searched for its layout.
+    """
+    tactile: str | None = None
+    """Where its tactile images are, likewise."""
+    background: str | None = None
+    """Where its tactile images without contact are, likewise."""
     columns: Maps = ()
-    """Manifest columns as columns of yours, or as polars SQL over them (over `path` for a folder of
-    images):
+    """Manifest columns as columns of yours, or as polars SQL over them (over the fields and `path`
+    for a folder of images):
     `--map vision=rgb tactile="replace(rgb, '_rgb', '_tac')" "video=substr(rgb, 1, 15)"`."""
     root: Path | None = None
     """Folder that paths are relative to (default: the folder of the table)."""
     side: Annotated[Literal["vision", "tactile"] | None, tyro.conf.arg(name="as")] = None
-    """What a single folder of images shows."""
+    """What the images of a folder show, if all show one thing."""
     classes: Path | None = None
     """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers; -1 is
     inconclusive and skipped.
@@ -106,8 +115,8 @@ class SourceOptions(Common):
 class Options(SourceOptions):
     """Turn a data set on disk into a manifest.
 
-    Reads any known data set, a table, folders of images, an interval list, or a Hugging Face data
-    set. Expressions of --map: docs/concepts/data.md.
+    Reads any known data set, a folder of images, a table, an interval list, or a Hugging Face data
+    set. Eight layouts with their commands: docs/your-data.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -118,6 +127,8 @@ class Options(SourceOptions):
     """Folder for manifest.parquet, the data set's own splits and extracted frames."""
     skip_bad: Switch = False
     """Skip and list bad rows and files, instead of an error."""
+    overwrite: Switch = False
+    """Replace the manifest of an earlier import."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -131,6 +142,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             format=options.format,
             check=options.check,
             skip_bad=options.skip_bad,
+            overwrite=options.overwrite,
             progress=progress,
             **format_options(options),
         )

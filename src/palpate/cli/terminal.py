@@ -29,6 +29,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -305,18 +306,20 @@ def option_name(verb: str, argument: str) -> str:
 
 def error_line(verb: str, error: PalpateError) -> str:
     """Return an error in one line, with options in place of arguments."""
-
-    def example(argument: str, value: Any) -> str:
-        name = option_name(verb, argument)
-        if isinstance(value, bool):
-            return name if value else name.replace("--", "--no-", 1)
-        if isinstance(value, Mapping):  # e.g. columns={"vision": "rgb"}
-            value = [f"{key}={cell}" for key, cell in value.items()]
-        values = value if isinstance(value, list | tuple) else [value]
-        words = shlex.join(map(str, values))
-        return f"{name} {words}" if name.startswith("-") else words
-
+    example = partial(_option, verb)
     return error.message(lambda argument: option_name(verb, argument), example)
+
+
+def _option(verb: str, argument: str, value: Any) -> str:
+    """Return how the command line writes an argument with its value."""
+    name = option_name(verb, argument)
+    if isinstance(value, bool):
+        return name if value else name.replace("--", "--no-", 1)
+    if isinstance(value, Mapping):  # e.g. columns={"vision": "rgb"}
+        value = [f"{key}={cell}" for key, cell in value.items()]
+    values = value if isinstance(value, list | tuple) else [value]
+    words = shlex.join(map(str, values))
+    return f"{name} {words}" if name.startswith("-") else words
 
 
 def require_extra(purpose: str) -> None:
@@ -424,6 +427,9 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         _print_error(f"palpate {name}: {error_line(name, error)}")
         if isinstance(error, ProblemsError):
             list_problems(error.problems, _print_error)
+        for choice in error.choices:  # the same command with what it lacks
+            more = [_option(name, argument, value) for argument, value in choice.items()]
+            _print_error(f"  {' '.join([shlex.join(['palpate', *name.split(), *args]), *more])}")
         if as_json:
             _write_json(error.to_json())
         return USER_ERROR

@@ -27,6 +27,7 @@ class PalpateError(Exception):
         fix: what to do next, in words that name no option (``"Choose a smaller share"``).
         argument: name of the Python argument that is at fault; the command line shows its option.
         example: arguments that would work (``{"train": 0.8}``); each front end writes them its way.
+        choices: arguments of several calls that would work, for the user to choose from.
     """
 
     def __init__(
@@ -37,9 +38,10 @@ class PalpateError(Exception):
         *,
         argument: str | None = None,
         example: Mapping[str, Any] | None = None,
+        choices: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         self.must, self.got, self.fix = must, got, fix
-        self.argument, self.example = argument, dict(example or {})
+        self.argument, self.example, self.choices = argument, dict(example or {}), list(choices)
         super().__init__(must, got, fix)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -68,7 +70,7 @@ class PalpateError(Exception):
 
     def to_json(self) -> dict[str, Any]:
         """Return the error as a JSON object: ``error, must, got, fix, argument``."""
-        names = ("must", "got", "fix", "argument")
+        names = ("must", "got", "fix", "argument", *(["choices"] if self.choices else []))
         return {"error": type(self).__name__} | {name: getattr(self, name) for name in names}
 
 

@@ -28,7 +28,7 @@ import polars as pl
 from palpate.core import MissingExtraError, Progress, Split, atomic_folder, quiet, write_text
 from palpate.data.formats.huggingface_source import MARK, ROW
 from palpate.data.importing import write_lists
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, write_parquet
+from palpate.data.manifest import IMAGE_COLUMNS, Manifest, write_parquet
 
 Form = Literal["hf", "csv", "jsonl", "parquet"]
 #: What Hugging Face calls our parts.
@@ -136,7 +136,7 @@ def _save_to_disk(
     except ImportError:
         raise MissingExtraError("datasets", "hf", "Writing Hugging Face data sets") from None
     text = datasets.Value("string")
-    columns = dict.fromkeys(SCHEMA, text) | {"frame": datasets.Value("int64")}
+    columns = dict.fromkeys(manifest.table.columns, text) | {"frame": datasets.Value("int64")}
     columns |= {c: datasets.Image() for c in IMAGE_COLUMNS}
     columns |= {f"{c}_path": text for c in IMAGE_COLUMNS} | {ROW: datasets.Value("int64")}
     features = datasets.Features(columns)

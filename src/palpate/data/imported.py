@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import polars as pl
+
 from palpate.core import (
     PalpateError,
     Problem,
@@ -17,12 +19,14 @@ from palpate.core import (
     plain,
     problem_lines,
 )
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 if TYPE_CHECKING:
     from palpate.data.formats import Facts
 
 FIX = "Correct these, or skip the bad rows and list them"
+#: Rows that an import shows of a folder.
+EXAMPLES = 3
 #: Manifest column -> what its distinct values are called in a summary.
 COUNTED = {"video": "videos", "contact": "contacts", "material": "materials"}
 
@@ -87,7 +91,8 @@ class Imported:
 
     def __str__(self) -> str:
         lists = {"Skipped": self.skipped, "Suspicious, but imported": self.suspicious}
-        return _text(f"Imported {self.facts.get('dataset', '')}", self.summary(), lists)
+        rows = self.summary() | _understood(self.manifest)
+        return _text(f"Imported {self.facts.get('dataset', '')}", rows, lists)
 
 
 @dataclass(frozen=True)
@@ -126,6 +131,25 @@ class Validation:
         rows = {"format": self.format, "samples": self.samples, **counts, **readable(self.facts)}
         verdict = "Complete." if self.ok else "Not complete."
         return f"{_text('Validated ' + self.facts.name, rows, lists)}\n{verdict}"
+
+
+def _understood(manifest: Manifest) -> dict[str, str]:
+    """The templates of a folder with three rows of what they gave; what words will be used."""
+    table, facts = manifest.filled(), manifest.facts
+    rows = {c: facts[f"template_{c}"] for c in IMAGE_COLUMNS if f"template_{c}" in facts}
+    step = max(1, (len(table) - 1) // (EXAMPLES - 1))
+    for k, row in enumerate(table.gather_every(step).head(EXAMPLES).iter_rows(named=True), 1):
+        cells = (f"{name}={cell}" for name, cell in row.items() if name not in IMAGE_COLUMNS)
+        rows |= {f"example {k}": ", ".join(cells)} if rows else {}
+    return rows | ({"captions": words} if (words := words_of(manifest.table)) else {})
+
+
+def words_of(table: pl.DataFrame) -> str:
+    """What captions are made of for samples without a text, in words."""
+    without = table.filter(pl.col("text").is_null())
+    counts = {c: without[c].count() for c in ("material", "object")}
+    made = [f"{n} made from the name of the {column}" for column, n in counts.items() if n]
+    return ", ".join(made[:1])
 
 
 def readable(facts: Facts) -> dict[str, Any]:

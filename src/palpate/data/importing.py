@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from palpate.data.formats.base import MISSING, WORLD, finished, import_scanned, 
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation
 from palpate.data.listing import write_table
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 #: All that an import writes.
 WRITTEN = {"manifest.parquet", "splits", "images"}
@@ -24,6 +25,7 @@ def import_dataset(
     *,
     format: str = "auto",  # noqa: A002 (the word that the command line uses)
     skip_bad: bool = False,
+    overwrite: bool = False,
     check: Check = "decode",
     progress: Progress = quiet,
     **options: Any,
@@ -35,6 +37,7 @@ def import_dataset(
         output: folder to write to: new, empty, or an earlier import.
         format: a name in ``FORMATS``, or ``auto`` for the first that the source looks like.
         skip_bad: skip and list bad rows instead of raising.
+        overwrite: replace the manifest of an earlier import.
         check: how images are checked.
         progress: progress callback.
         options: options of the format (``columns``, ``root``, ``size`` ...); None means the
@@ -42,17 +45,21 @@ def import_dataset(
 
     Raises:
         PalpateError: if the source is missing or looks like no known format, an option does not
-            belong to the format, or the output holds other files.
+            belong to the format, or the output holds a manifest or other files.
         ProblemsError: with every bad row and file at once; nothing is left behind.
     """
     source, output = Path(source), Path(output)
-    name, form = recognized(source, format)
+    name, form = recognized(source, format, options)
     options = _given(name, form, options)
     foreign = {p.name for p in output.iterdir()} - WRITTEN if output.is_dir() else set[str]()
     if foreign:
         must = "must be a folder that is new, empty, or an earlier import"
         got = f"{output} with {min(foreign)}"
         raise PalpateError(must, got, "Choose another folder", argument="output")
+    if (output / "manifest.parquet").exists() and not overwrite:
+        must, fix = "must hold no manifest yet", "Choose another folder, or replace this one"
+        example = {"overwrite": True}
+        raise PalpateError(must, str(output), fix, argument="output", example=example)
     common: dict[str, Any] = {"skip_bad": skip_bad, "check": check, "progress": progress}
     if form.run is not None:
         return form.run(source, output, **common, **options)
@@ -82,7 +89,7 @@ def validate(
         PalpateError: as :func:`import_dataset`.
     """
     source = Path(source)
-    name, form = recognized(source, format)
+    name, form = recognized(source, format, options)
     options = options | {"check": check, "progress": progress}
     scan = form.scan(source, **scan_options(name, form, options))
     rows = finished(scan, check, progress)
@@ -110,8 +117,10 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
     return [write_table(Path(output) / f"{part}.csv", rows) for part, rows in parts.items()]
 
 
-def recognized(source: Path, name: str = "auto") -> tuple[str, Format]:
-    """The named format, or the first that the source looks like.
+def recognized(
+    source: Path, name: str = "auto", options: Mapping[str, Any] | None = None
+) -> tuple[str, Format]:
+    """The named format, or the first that the source looks like; templates are of ``pairs``.
 
     Raises:
         PalpateError: if there is no source, no such format, or none that fits.
@@ -123,7 +132,9 @@ def recognized(source: Path, name: str = "auto") -> tuple[str, Format]:
         fix = "Check the path; a data set on the hub needs the format hf"
         raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
     if name == "auto":
-        name = next((n for n, form in FORMATS.items() if form.detect(source)), "")
+        templated = any((options or {}).get(column) for column in IMAGE_COLUMNS)
+        looks = (n for n, form in FORMATS.items() if form.detect(source))
+        name = "pairs" if templated else next(looks, "")
     if not name:
         known = "; ".join(f"{n}: {form.looks_for}" for n, form in FORMATS.items())
         must = f"must look like a known data set ({known})"

@@ -18,8 +18,9 @@ column         type     meaning (null where the data set has none; never invente
 ``domain``     string   recording condition that changes the look (rig, lighting)
 =============  =======  ==========================================================================
 
-Paths use ``/`` and may not leave the root. The digest is SHA-256 over the rows in order; it does
-not depend on the root, so a data set has one digest on every disk.
+Further columns of text may follow, named by the user. Paths use ``/`` and may not leave the root.
+The digest is SHA-256 over the rows in order; it does not depend on the root, so a data set has one
+digest on every disk.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class Manifest:
     """Samples and where their images are.
 
     Attributes:
-        table: the rows, with exactly the columns of ``SCHEMA``.
+        table: the rows: the columns of ``SCHEMA``, then further ones of text.
         root: folder that the image paths are relative to.
         facts: facts about the source (``dataset``, ``text_source`` ...), kept in the file, not in
             the digest.
@@ -79,18 +80,22 @@ class Manifest:
 
     @classmethod
     def from_rows(
-        cls, rows: Iterable[Mapping[str, Any]], root: Path, facts: Mapping[str, str] | None = None
+        cls,
+        rows: Iterable[Mapping[str, Any]],
+        root: Path,
+        facts: Mapping[str, str] | None = None,
+        more: Iterable[str] = (),
     ) -> Manifest:
-        """Make a manifest of dictionaries; absent columns become null.
+        """Make a manifest of dictionaries; absent columns become null, ``more`` are further ones.
 
         Raises:
             PalpateError: on an unknown column.
         """
-        rows = list(rows)
-        if unknown := sorted({name for row in rows for name in row} - set(SCHEMA)):
+        rows, schema = list(rows), SCHEMA | dict.fromkeys(more, pl.String)
+        if unknown := sorted({name for row in rows for name in row} - set(schema)):
             must, fix = f"must have columns among {', '.join(SCHEMA)}", "Rename or drop the column"
             raise PalpateError(must, repr(unknown[0]), fix, argument="rows")
-        table = pl.DataFrame({c: [row.get(c) for row in rows] for c in SCHEMA}, schema=SCHEMA)
+        table = pl.DataFrame({c: [row.get(c) for row in rows] for c in schema}, schema=schema)
         return cls(table, Path(root), facts or {})
 
     def __len__(self) -> int:
@@ -107,15 +112,15 @@ class Manifest:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over all rows in order, columns in the order of ``SCHEMA``."""
-        cells = [pl.col(c).cast(pl.String).fill_null("\x00") for c in SCHEMA]
-        rows = self.table.select(pl.concat_str(cells, separator="\x1f"))
-        return digest_lines(rows.to_series().to_list())
+        """SHA-256 over all rows in order, and the names of columns beyond ``SCHEMA``."""
+        cells = pl.all().cast(pl.String).fill_null("\x00")
+        rows = self.table.select(pl.concat_str(cells, separator="\x1f")).to_series().to_list()
+        more = self.table.columns[len(SCHEMA) :]
+        return digest_lines(["\x1f".join(more), *rows] if more else rows)
 
     def filled(self) -> pl.DataFrame:
         """The table without the columns that are all null."""
-        names = [name for name in SCHEMA if self.table[name].null_count() < len(self)]
-        return self.table.select(names)
+        return self.table.select(c for c in self.table if c.null_count() < len(self))
 
     def path(self, relative: str) -> Path:
         """The absolute path of an image named in the table."""
@@ -175,7 +180,7 @@ class Manifest:
             folder = os.path.relpath(m.root.resolve(), root)
             prefix = "" if folder == "." else f"{folder}/"
             tables.append(_with_prefix(m.table, prefix, IMAGE_COLUMNS))
-        table = pl.concat(tables)
+        table = pl.concat(tables, how="diagonal")
         shared = table.filter(pl.col("id").is_duplicated())["id"].unique().sort()
         if len(shared):
             got = f"{len(shared)} shared, first {shared[0]!r}"
@@ -261,7 +266,9 @@ class Manifest:
         written = meta.get("palpate.format")
         if written == FORMAT_2:
             table = table.rename({"touch": "contact"}, strict=False)
-        if written not in (FORMAT, FORMAT_2) or table.columns != list(SCHEMA):
+        further = table.schema.dtypes()[len(SCHEMA) :]
+        known = table.columns[: len(SCHEMA)] == list(SCHEMA) and {pl.String}.issuperset(further)
+        if written not in (FORMAT, FORMAT_2) or not known:
             got = written or "a Parquet file of another program"
             raise PalpateError(f"The manifest {path} must have the format {FORMAT}", got, fix)
         for name in IMAGE_COLUMNS:

@@ -9,10 +9,8 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, quiet
-from palpate.data.formats import FORMATS
-from palpate.data.formats.base import Scan, finished
-from palpate.data.formats.pairs import TACTILE, VISION
-from palpate.data.images import SUFFIXES
+from palpate.data.formats import Format
+from palpate.data.formats.base import Scan, finished, manifest_of
 from palpate.data.imported import raise_if, require_some
 from palpate.data.importing import recognized, scan_options
 from palpate.data.listing import LINE, read_list
@@ -92,16 +90,15 @@ def read_samples(
         if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
             listed = read_list(path, skip_bad=skip_bad)
             return listed.manifest, listed.skipped
-        if path.is_dir():
-            options |= _one_modality(path, options)
-    name, form = ("pairs", FORMATS["pairs"]) if "side" in options else recognized(path, format)
+    chosen = "pairs" if "side" in options else format
+    name, form = recognized(path, chosen, options)
     columns = {*header_of(path), *options.get("columns", {})} if path.is_file() else set[str]()
     if name == "pairs" and path.is_file() and columns.isdisjoint(("vision", "tactile")):
         names = options.pop("names", None)
         return _of_table(open_table(path, names), path.parent, skip_bad, options)
     # Images are not decoded here: broken ones are reported when they are read.
-    options |= {"check": "none", "progress": progress}
-    scan = form.scan(path, **scan_options(name, form, options))
+    more = {"check": "none", "progress": progress}
+    scan = _scanned(form, path, scan_options(name, form, options | more))
     facts = {**form.facts.of_manifest(), "format": name, **scan.facts}
     return _of_scan(scan, path, facts, skip_bad, progress)
 
@@ -128,18 +125,14 @@ def is_list(path: Path) -> bool:
     return re.match(LINE, line) is not None
 
 
-def _one_modality(folder: Path, options: dict[str, Any]) -> dict[str, str]:
-    """``side`` for a folder of images of one modality: vision unless its name says tactile."""
-    known = next((n for n, form in FORMATS.items() if form.detect(folder)), "")
-    if "side" in options or known not in ("", "pairs"):
-        return {}
-    names = {"vision": VISION, "tactile": TACTILE}
-    there = [side for side in names if any((folder / name).is_dir() for name in names[side])]
-    files = (*folder.glob("*"), *folder.glob("*/*"))
-    if len(there) == 2 or not (there or known or any(p.suffix.lower() in SUFFIXES for p in files)):
-        return {}
-    default = "tactile" if folder.name.lower() in TACTILE else "vision"
-    return {"side": there[0] if there else default}
+def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
+    """Scan a source; a folder whose names do not say what its images show is one of photos."""
+    try:
+        return form.scan(path, **options)
+    except PalpateError as error:
+        if not error.choices:
+            raise
+        return form.scan(path, **options, side="vision")
 
 
 def _of_table(
@@ -168,5 +161,4 @@ def _of_scan(
     rows = finished(scan, "none", progress)
     raise_if(scan.problems, skip_bad)
     require_some(len(rows), source, scan.problems)
-    manifest = Manifest.from_rows((row for _, row in rows), scan.base.resolve(), facts)
-    return manifest, scan.problems
+    return manifest_of(scan, rows, facts), scan.problems

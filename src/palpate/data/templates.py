@@ -47,12 +47,14 @@ class Template:
         fields: names in the order of the path.
         digits: those that are numbers.
         pattern: of a whole path below the root.
+        letters: how many characters stand for themselves.
     """
 
     text: str
     fields: tuple[str, ...]
     digits: frozenset[str]
     pattern: re.Pattern[str]
+    letters: int
 
     @classmethod
     def parse(cls, text: str, argument: str | None = None) -> Template:
@@ -90,7 +92,9 @@ class Template:
         if "." not in re.sub(r"\{\w+:?[^{}]*\}", "", last) and not last.endswith("*"):
             pieces.append(r"\.[^/]*" if not last.endswith(":**}") else "")
         digits = frozenset(name for name, spec in specs.items() if spec == "d")
-        return cls(path, tuple(specs), digits, re.compile("".join(pieces), re.DOTALL))
+        pattern = re.compile("".join(pieces), re.DOTALL)
+        letters = sum(len(token["literal"] or "") for token in _TOKEN.finditer(path))
+        return cls(path, tuple(specs), digits, pattern, letters)
 
     def match(self, path: str) -> Fields | None:
         """The fields of a path below the root, numbers without leading zeros; None if it differs.
@@ -147,15 +151,22 @@ def walk(root: Path, suffixes: tuple[str, ...] = ("",)) -> tuple[list[str], list
     return files, outside
 
 
-def matches_of(files: Sequence[str], template: Template) -> Matches:
-    """The files that a template matches, with their fields."""
-    fields = ((path, template.match(path)) for path in files)
-    return [(path, values) for path, values in fields if values is not None]
-
-
 def walk_matches(root: Path, template: Template, suffixes: tuple[str, ...] = ("",)) -> Matches:
     """The files below a folder that a template matches, with their fields."""
-    return matches_of(walk(root, suffixes)[0], template)
+    return assign(walk(root, suffixes)[0], {"": template})[""]
+
+
+def assign(files: Sequence[str], templates: Mapping[str, Template]) -> dict[str, Matches]:
+    """The files of each template; of several that match, the one that spells out most has it."""
+    matches: dict[str, list[tuple[str, Fields]]] = {side: [] for side in templates}
+    for path in files:
+        fields = {side: template.match(path) for side, template in templates.items()}
+        fields = {side: values for side, values in fields.items() if values is not None}
+        most = max((templates[side].letters for side in fields), default=0)
+        for side, values in fields.items():
+            if templates[side].letters == most:
+                matches[side].append((path, values))
+    return dict(matches)
 
 
 def join(

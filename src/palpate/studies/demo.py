@@ -238,7 +238,7 @@ class _Demo:
         size = None if self.options.data is None else 4 * self.diffusion.size
 
         def build(folder: Path) -> dict[str, Any]:
-            options: dict[str, Any] = {"size": size, "progress": self.progress}
+            options: dict[str, Any] = {"size": size, "overwrite": True, "progress": self.progress}
             options["skip_bad"] = self.options.skip_bad
             imported = import_dataset(source, folder, **options)
             texts_of(imported.manifest)  # raises for samples with neither text nor material
@@ -294,7 +294,7 @@ class _Demo:
         tree = self.world("pretraining", self.preset.pretraining)
 
         def build(folder: Path) -> dict[str, Any]:
-            imported = import_dataset(tree, folder, progress=self.progress)
+            imported = import_dataset(tree, folder, overwrite=True, progress=self.progress)
             return {"digest": imported.manifest.digest, "samples": len(imported.manifest)}
 
         world = {"pretraining": self.run.stages["pretraining"].digest}

@@ -109,6 +109,7 @@ class Scan:
         splits: the data set's own splits, by name.
         split_name, split_rule: of the split in the rows' cells ``split``, if they have any.
         inconclusive: rows skipped because their label marks the material as unclear.
+        more: columns beyond those of every manifest.
     """
 
     base: Path
@@ -120,6 +121,7 @@ class Scan:
     split_name: str = ""
     split_rule: dict[str, Any] = field(default_factory=dict)
     inconclusive: int = 0
+    more: tuple[str, ...] = ()
 
     def problem(self, where: object, kind: str, text: str) -> None:
         """Report something that makes a row or file unusable."""
@@ -194,8 +196,7 @@ def import_scanned(
     raise_if(scan.problems, skip_bad)
     require_some(len(rows), source, scan.problems)
     with removing_on_error(out) as created:
-        cells = (row for _, row in rows)
-        manifest = Manifest.from_rows(cells, scan.base.resolve(), {**facts, **scan.facts})
+        manifest = manifest_of(scan, rows, {**facts, **scan.facts})
         ids = set(manifest.ids)
         splits: dict[str, Split] = {}
         for name, split in scan.splits.items():
@@ -205,12 +206,17 @@ def import_scanned(
         return imported.save(out, created)
 
 
+def manifest_of(scan: Scan, rows: Iterable[Row], facts: Mapping[str, str]) -> Manifest:
+    """The manifest of finished rows."""
+    return Manifest.from_rows((row for _, row in rows), scan.base.resolve(), facts, scan.more)
+
+
 def finished(scan: Scan, check: Check, progress: Progress = quiet) -> list[Row]:
     """Rows with paths inside the root, whole images and unique ids; other rows become problems.
 
     The cells ``split`` of the rows that remain become the split ``scan.split_name``.
     """
-    rows = _checked_images(scan, _checked_paths(scan), check, progress)
+    rows = _checked_images(scan, _two_images(scan, _checked_paths(scan)), check, progress)
     rows = _unique(scan, rows)
     scan.problems.sort(key=place_of)
     return rows
@@ -249,6 +255,17 @@ def _checked_paths(scan: Scan) -> list[Row]:
                 scan.problem(where, path, f"{column}: {text}")
             row[column] = path
         if not any(text for _, text in results.values()):
+            good.append((where, row))
+    return good
+
+
+def _two_images(scan: Scan, rows: list[Row]) -> list[Row]:
+    """Rows whose photo is not their tactile image."""
+    good: list[Row] = []
+    for where, row in rows:
+        if (path := row.get("vision")) is not None and path == row.get("tactile"):
+            scan.problem(where, "same-image", f"{path!r} is both its photo and its tactile image")
+        else:
             good.append((where, row))
     return good
 

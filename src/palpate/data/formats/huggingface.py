@@ -193,14 +193,16 @@ def _scan(
     progress: Progress,
 ) -> Scan:
     """Read all rows; ``store`` takes their images."""
-    maps = compile_maps(columns, source.names, list(SCHEMA))
+    own = {*SCHEMA, ROW, *(f"{name}_path" for name in IMAGE_COLUMNS)}
+    more = tuple(name for name in source.names if source.description and name not in own)
+    maps = compile_maps(columns, source.names, [*SCHEMA, *more])
     if not {"vision", "tactile"} & set(maps.expressions):
         got = f"no vision and no tactile among {', '.join(source.names) or 'no columns'}"
         must, example = f"{source.name} must have a column for the images", {"vision": "COLUMN"}
         raise PalpateError(must, got, "Map your columns", example={"columns": example})
     names = dict(enumerate(source.labels.get(maps.source("material") or "", ()))) or None
     names = names if classes is None else read_classes(Path(classes))
-    result = Scan(store.folder or source.folder or Path(), dict(source.facts))
+    result = Scan(store.folder or source.folder or Path(), dict(source.facts), more=more)
     places: list[int] = []
     total = sum(len(data) for data in source.splits.values() if hasattr(data, "__len__"))
     for split, first, batch in _batches(source):

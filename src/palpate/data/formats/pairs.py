@@ -1,4 +1,4 @@
-"""Anyone's data: a table of image paths, two folders of equal file names, or one folder of images.
+"""Anyone's data: a table of image paths, or a folder whose templates say what its images are.
 
 **A table** is CSV, TSV, JSON lines, a JSON array or Parquet (:mod:`palpate.data.tables`) with one
 sample a row. The columns ``vision`` and ``tactile`` hold image paths relative to the root (default:
@@ -7,23 +7,23 @@ be there, and so may ``split`` (train, val or test); other columns are ignored, 
 (:mod:`palpate.data.mapping`) make columns of differently named ones. Empty cells are null. An
 absent ``id`` is made from ``video`` and ``frame``, else from the tactile (or vision) path.
 
-**Two folders**::
+**A folder** has a template (:mod:`palpate.data.templates`) for each side, given or found from the
+names of the files (:mod:`palpate.data.detection`)::
 
-    root/
-      vision/  (or rgb, image, images)         a.jpg  rec/b_7.jpg
-      tactile/ (or touch, gelsight, digit)     a.png  rec/b_7.jpg     equal stems at any depth
+    {object}/press_{contact}/photo/{frame}.jpg
+    {object}/press_{contact}/touch/{frame}.jpg
 
-**One folder** of images of one kind, named by ``side``, is a set to search for near-duplicates. In
-both layouts the folder of a file is its video, and a stem that ends in an integer gives the frame;
-map expressions may override this, from the column ``path``: the path below the folder of images.
+Fields become columns, also new ones, and equal fields join the sides. The id is made of all fields.
+A ``contact`` or ``video`` of one name below several folders is several, named by those fields, too.
+Map expressions may use the fields and ``path``, the path of the tactile (or vision) image.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import posixpath
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Literal
@@ -31,23 +31,22 @@ from typing import Literal
 import polars as pl
 
 from palpate.core import PalpateError, Progress, quiet
-from palpate.data.formats.base import Cells, Facts, Format, Scan
-from palpate.data.formats.layout import Images, paired, require_folder
+from palpate.data.detection import ROLES, detect_layout, template_of
+from palpate.data.formats.base import Cells, Facts, Format, Scan, few
+from palpate.data.formats.layout import require_folder
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import SCHEMA
-from palpate.data.mapping import compile_maps
+from palpate.data.mapping import ColumnMaps, compile_maps
 from palpate.data.rows import manifest_rows, odd_groups, read_classes
 from palpate.data.tables import TABLES, header_of, open_table
+from palpate.data.templates import FIX, Fields, Matches, Template, assign, join, walk
 
 Side = Literal["vision", "tactile"]
-VISION = ("vision", "rgb", "image", "images")
-TACTILE = ("tactile", "touch", "gelsight", "digit")
-SIDES = {"vision": VISION, "tactile": TACTILE}
+SIDES = ("vision", "tactile")
 #: What may be mapped.
 TARGETS = (*SCHEMA, "split")
 LOOKS_FOR = (
-    f"a table ({', '.join(TABLES)}) with the columns vision and tactile, or a folder with "
-    f"{'|'.join(VISION)}/ and {'|'.join(TACTILE)}/, or a folder of images"
+    f"a table ({', '.join(TABLES)}) with the columns vision and tactile, or a folder of images"
 )
 FACTS = Facts(
     name="your own data",
@@ -60,19 +59,20 @@ MAP = {"columns": {"vision": "YOUR_COLUMN"}}
 
 
 def detect(source: Path) -> bool:
-    """Whether this is a table file, a folder with two sides, or a folder with images below it."""
+    """Whether this is a table file, or a folder with images below it."""
     if source.is_file():
         suffix = source.suffix.lower()
         return suffix in TABLES and (suffix != ".json" or bool(header_of(source)))
-    if all(_folders(source, side) for side in SIDES):
-        return True
-    files = (name for _, _, names in islice(os.walk(source), 50) for name in names)
+    files = (name for _, _, names in islice(os.walk(source), 500) for name in names)
     return any(name.lower().endswith(SUFFIXES) for name in files)
 
 
 def scan(
     source: Path,
     *,
+    vision: str | None = None,
+    tactile: str | None = None,
+    background: str | None = None,
     root: Path | None = None,
     columns: Mapping[str, str] | None = None,
     names: str | None = None,
@@ -80,21 +80,25 @@ def scan(
     side: Side | None = None,
     progress: Progress = quiet,
 ) -> Scan:
-    """Read the rows of a table, or the files of one folder or two.
+    """Read the rows of a table, or the images of a folder.
 
     Args:
         source: a table or a folder.
+        vision: template of the photos of a folder; without any template the names are searched.
+        tactile: template of its tactile images.
+        background: template of its tactile images without contact.
         root: folder that the table's paths are relative to.
-        columns: manifest column (or ``split``) -> map expression over the columns of the table.
+        columns: manifest column (or ``split``) -> map expression over the columns of the table, or
+            over the fields of a folder.
         names: columns of a table without a header line, separated by commas.
         classes: table of classes, whose numbers are in the column of the material; rows of -1 are
             skipped as inconclusive.
-        side: what the images of a single folder show.
+        side: what the images of a folder show, if all show one thing.
         progress: called before and after reading.
 
     Raises:
-        PalpateError: if the source is missing or of another form, lacks a needed column, or an
-            expression cannot be read.
+        PalpateError: if the source is missing or of another form, lacks a needed column, a template
+            or an expression cannot be read, or the names do not say which images are which.
         ProblemsError: on bad lines in the table of classes.
     """
     source = Path(source)
@@ -103,29 +107,29 @@ def scan(
     is_table = source.is_file()
     if not is_table:
         require_folder(source, FACTS.name)
-    foreign = {"side": side} if is_table else {"root": root, "names": names}
-    if given := [name for name, value in foreign.items() if value is not None]:
+    given = {"vision": vision, "tactile": tactile, "background": background}
+    foreign = {"side": side, **given} if is_table else {"root": root, "names": names}
+    if wrong := [name for name, value in foreign.items() if value is not None]:
         must = f"must come with a {'folder' if is_table else 'table'}"
-        raise PalpateError(must, str(source), "Leave it out", argument=given[0])
+        raise PalpateError(must, str(source), "Leave it out", argument=wrong[0])
     progress("reading rows", 0, 1)
-    layout = "folders" if side is None else f"folder of {side} images"
-    layout = f"table {source.suffix.lower()[1:] or 'csv'}" if is_table else layout
     base = source.parent if is_table else source
-    result = Scan(base if root is None else Path(root), {"layout": layout})
+    result = Scan(base if root is None else Path(root))
     if is_table:
+        result.facts["layout"] = f"table {source.suffix.lower()[1:] or 'csv'}"
         _read_table(result, source, maps, names, labels)
     else:
-        single = {} if side is None else {p: {side: p} for p in _images(result, ".").files.values()}
-        _add_files(result, _pairs(result) if side is None else single, maps, labels)
+        templates = {column: text for column, text in given.items() if text is not None}
+        _read_folder(result, templates, side, maps, labels)
     progress("reading rows", 1, 1)
     result.suspicious += odd_groups(source, result.rows)
     absent = [name for name in SIDES if result.rows and name not in result.rows[0][1]]
-    if absent and side is None:
+    if absent and is_table:
         text = f"no column {absent[0]}, so the samples have one image each; map one if there is one"
         result.suspect(source, "one-sided", text)
     worded = any("text" in row for _, row in result.rows)
     result.facts["text_source"] = f"column {maps.get('text', 'text')}" if worded else "none"
-    result.facts["dataset"] = source.stem
+    result.facts["dataset"] = source.resolve().stem
     if any("split" in row for _, row in result.rows):
         result.split_name = "Orig"
         result.split_rule = {"method": "official", "column": maps.get("split", "split")}
@@ -152,8 +156,10 @@ def _read_table(
         got = f"no tactile among {columns}, and no vision" if columns else "an empty file"
         must = f"{path} must have the columns vision and tactile, or one of them"
         raise PalpateError(must, got, "Map your columns to them", example=MAP)
-    cells = compiled.apply(table.read(compiled.columns))
+    frame = table.read(compiled.columns)
+    cells = compiled.apply(frame)
     result.problems += table.problems
+    _report_unchanged(result, compiled, frame, cells)
     rows, result.inconclusive = manifest_rows(
         cells, len(table.lines), table.where, classes, result.problems
     )
@@ -169,74 +175,132 @@ def _read_table(
             result.rows.append((table.where(k), row))
 
 
-def _add_files(
+def _read_folder(
     result: Scan,
-    files: Mapping[str, Cells],
+    given: Mapping[str, str],
+    side: Side | None,
     maps: Mapping[str, str],
     classes: Mapping[int, str] | None,
 ) -> None:
-    """Add image files by their path below the folder of images; map expressions go first."""
-    paths = list(files)
-    sides = [side for side in SIDES if any(side in row for row in files.values())]
-    columns = {"path": paths, **{side: [row[side] for row in files.values()] for side in sides}}
-    compiled = compile_maps(maps, list(columns), TARGETS)
-    compiled = compiled.without([target for target in TARGETS if target not in maps])
-    cells = compiled.apply(pl.DataFrame(columns, schema=dict.fromkeys(columns, pl.String)))
-    places = [str(row.get("tactile") or row["vision"]) for row in files.values()]
-    rows, result.inconclusive = manifest_rows(
-        cells, len(paths), places.__getitem__, classes, result.problems
+    """Add the images of a folder, by its templates; map expressions go first."""
+    files, outside = walk(result.base, SUFFIXES)
+    for place in outside:
+        text = "a link to a folder outside the root, which is not followed"
+        result.suspect(place, "outside-root", text)
+    texts = given or _templates(files, result.base, side)
+    templates = {side: Template.parse(text, side) for side, text in texts.items()}
+    matches = {s: _distinct(result, found) for s, found in assign(files, templates).items()}
+    for side_, template in templates.items():
+        if not matches[side_]:
+            got = f"{template.text}, which matches none of {few(files)}"
+            raise PalpateError("must match images", got, FIX, argument=side_)
+    order = [column for column in ("tactile", "vision", "background") if column in templates]
+    rows, problems = join({column: matches[column] for column in order})
+    result.problems += problems
+    result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
+    used = {path for found in matches.values() for path, _ in found}
+    result.suspect(
+        result.base, "unmatched", "images of no template", (f for f in files if f not in used)
     )
-    for k, row in rows:
-        stem = posixpath.splitext(paths[k])[0]
-        defaults: Cells = {"id": stem}
-        if "/" in stem:
-            defaults["video"] = posixpath.dirname(stem)
-        if number := re.search(r"\d{1,18}$", stem):
-            defaults["frame"] = int(number[0])
-        result.rows.append((places[k], {**defaults, **files[paths[k]], **row}))
+    if "background" in templates:
+        without = [row[order[0]] for row in rows if "background" not in row]
+        result.suspect(result.base, "no-background", "images without a background", without)
+    fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
+    _add_ids(rows, fields)
+    _name_apart(rows, fields)
+    places = [row[order[0]] for row in rows]
+    names = dict.fromkeys((*fields, *order, "id"))
+    table = pl.DataFrame(
+        {"path": places} | {name: [row.get(name) for row in rows] for name in names},
+        schema=dict.fromkeys(("path", *names), pl.String),
+    )
+    result.more = tuple(name for name in fields if name not in TARGETS)
+    compiled = compile_maps(maps, table.columns, (*TARGETS, *result.more))
+    cells = compiled.apply(table)
+    _report_unchanged(result, compiled, table, cells)
+    numbered, result.inconclusive = manifest_rows(
+        cells, len(places), places.__getitem__, classes, result.problems
+    )
+    result.rows += [(places[k], row) for k, row in numbered]
 
 
-def _pairs(result: Scan) -> dict[str, Cells]:
-    """Path of the tactile image below its folder -> the paths of both images below the source."""
-    sides: list[Images[str]] = []
-    for side, names in SIDES.items():
-        folders = _folders(result.base, side)
-        if len(folders) != 1:
-            must = f"{result.base} must hold one folder of {side} images ({', '.join(names)})"
-            got = f"{len(folders)} of them: {', '.join(folders)}" if folders else "none of them"
-            fix = "Rename the folder; for one folder of images of one kind say what they show"
-            raise PalpateError(must, got, fix, example={"side": "tactile"})
-        sides.append(_images(result, folders[0]))
-    vision, tactile = sides
-    return {
-        tactile.files[stem]: {"vision": vision.path(stem), "tactile": tactile.path(stem)}
-        for stem in paired(result, tactile, vision)
-    }
+def _templates(files: Sequence[str], folder: Path, side: Side | None) -> dict[str, str]:
+    """The templates that the names of the images suggest.
+
+    Raises:
+        PalpateError: with commands to choose from, if they do not say what the images show.
+    """
+    if not files:
+        suffixes = ", ".join(SUFFIXES)
+        raise PalpateError(f"{folder} must hold images ({suffixes})", "none", "Check the path")
+    if side is not None:
+        return {side: template_of(files)}
+    layout = detect_layout(files, folder.resolve().name)
+    if layout.certain and _fit(files, layout.templates):
+        return layout.templates
+    (first, *second) = layout.templates.values()
+    choices = [{"tactile": template_of(files)}, {"vision": template_of(files)}]
+    if second:
+        choices = [{"vision": first, "tactile": second[0]}, {"vision": second[0], "tactile": first}]
+        choices.append({"tactile": template_of(files)})
+    must = f"The names of the images in {folder} must say what they show"
+    got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
+    raise PalpateError(must, got, "Choose one of these", choices=choices)
 
 
-def _folders(source: Path, side: str) -> list[str]:
-    return [name for name in SIDES[side] if (source / name).is_dir()]
+def _distinct(result: Scan, matches: Matches) -> Matches:
+    """The files of one side without those that differ from an earlier one by the suffix alone."""
+    first: dict[str, tuple[str, Fields]] = {}
+    for path, fields in matches:
+        if (before := first.setdefault(posixpath.splitext(path)[0], (path, fields)))[0] != path:
+            result.problem(path, "duplicate-id", f"{before[0]} has the same stem")
+    return list(first.values())
 
 
-def _images(result: Scan, place: str) -> Images[str]:
-    """Path without suffix -> path of the images at any depth below a folder."""
-    files: dict[str, str] = {}
-    for path in _walk(result.base / place):
-        stem = posixpath.splitext(path)[0]
-        if (before := files.setdefault(stem, path)) != path:
-            where, text = posixpath.join(place, path), f"{before} has the same stem"
-            result.problem(posixpath.normpath(where), "duplicate-id", text)
-    return Images(place, dict(sorted(files.items())))
+def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
+    """Whether templates join most of the files that they match."""
+    matches = assign(files, {side: Template.parse(text) for side, text in templates.items()})
+    with contextlib.suppress(PalpateError):
+        rows, _ = join(matches)
+        return 2 * len(rows) >= max(map(len, matches.values()))
+    return False
 
 
-def _walk(base: Path) -> Iterator[str]:
-    """Images below a folder, relative to it; hidden ones are skipped, links are followed once."""
-    seen: set[str] = set()
-    for folder, below, files in os.walk(base, followlinks=True):
-        real = os.path.realpath(folder)
-        below[:] = sorted(n for n in below if real not in seen and not n.startswith("."))
-        prefix = Path(folder).relative_to(base)
-        for name in sorted(files) if real not in seen else ():
-            if name.lower().endswith(SUFFIXES) and not name.startswith("."):
-                yield (prefix / name).as_posix()
-        seen.add(real)
+def _name_apart(rows: Sequence[Cells], fields: Sequence[str]) -> None:
+    """Name a video or contact by the fields before it, too, where its name alone means several."""
+    for column, outer in (("video", ("object", "session")), ("contact", ("video", "object"))):
+        before = fields[: fields.index(column)] if column in fields else ()
+        around = [name for name in outer if name in before]
+        around = around[:1] if column == "contact" else around  # the video has its object's name
+        named = [row for row in rows if column in row]
+        pairs = {(row[column], *map(row.get, around)) for row in named}
+        if len(pairs) > len({row[column] for row in named}):
+            for row in named:
+                row[column] = "/".join(
+                    [*(row[name] for name in around if name in row), row[column]]
+                )
+
+
+def _add_ids(rows: Sequence[Cells], fields: Sequence[str]) -> None:
+    """Make ids of the fields, if they are different for all rows; else they are the paths."""
+    ids = ["/".join(row[name] for name in fields if name in row) for row in rows]
+    if fields and "id" not in fields and len(set(ids)) == len(ids):
+        for row, i in zip(rows, ids, strict=True):
+            row["id"] = i
+
+
+def _report_unchanged(
+    result: Scan, maps: ColumnMaps, table: pl.DataFrame, cells: Mapping[str, Sequence[str | None]]
+) -> None:
+    """Report replacements that left cells as they were."""
+    known = {**table.to_dict(as_series=False), **cells}
+    for target, expression in maps.expressions.items():
+        roots = expression.meta.root_names() if "replace(" in maps.texts[target] else []
+        columns = zip(*(known[name] for name in roots), strict=True)
+        rows = enumerate(zip(cells[target], columns, strict=True)) if roots else ()
+        same = [k for k, (value, others) in rows if value is not None and value in others]
+        if same:
+            text = (
+                f"{target} is as before in {len(same)} of {len(table)} rows, since nothing matched"
+            )
+            result.suspect(f"{target}={maps.texts[target]}", "no-match", text)

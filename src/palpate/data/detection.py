@@ -1,0 +1,254 @@
+"""The templates of a folder, found from the names of its files.
+
+Names are cut into words, numbers and signs. A word such as ``photo`` or ``gelsight`` that stands in
+some paths and not in others gives their side. Without such words, two names of one place (sibling
+folders, endings of names) under which the same paths recur are two sides, though nothing says
+which. What the paths of a side have in common is written out; what varies becomes a field:
+
+- digits at the end of file names are the ``frame``;
+- a word before what varies names it (``press_3``: ``contact``), else its values do (``train``,
+  ``Wood``);
+- of the other folders the innermost is the ``video`` of the images in it and the one around it the
+  ``object``; folders at several depths are one ``video``.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from palpate.data.captions import ADJECTIVES
+from palpate.data.rows import PART_NAMES
+
+#: Column -> words that say that an image belongs there; those of ``_WEAK`` say so if no other does.
+ROLES = {
+    "vision": ("vision", "visual", "rgb", "photo", "photos", "camera", "cam", "color", "webcam"),
+    "tactile": ("tactile", "touch", "touches", "tac", "gelsight", "gel", "digit", "gelslim"),
+    "background": ("background", "backgrounds", "bg", "nocontact"),
+}
+_WEAK = {"image": "vision", "images": "vision", "img": "vision", "pictures": "vision"}
+_ROLE_OF = {word: role for role, words in ROLES.items() for word in words}
+_MEANING = {
+    "video": ("video", "clip", "seq", "sequence", "recording", "rec", "run", "take", "trial"),
+    "contact": ("contact", "press", "touch", "grasp", "tap", "poke", "interaction"),
+    "object": ("object", "obj", "item"),
+    "material": ("material", "mat", "class", "category"),
+    "session": ("session", "day", "date"),
+    "sensor": ("sensor", "gelsight", "digit", "gel"),
+}
+_MEANING_OF = {word: column for column, words in _MEANING.items() for word in words}
+_MATERIALS = {name.lower() for name in ADJECTIVES}
+_TOKEN = re.compile(r"[A-Za-z]+|[0-9]+|[^A-Za-z0-9]")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a folder seems to hold.
+
+    Attributes:
+        templates: column -> template, most likely first.
+        certain: whether names say what each side shows.
+    """
+
+    templates: dict[str, str]
+    certain: bool = True
+
+
+def detect_layout(files: Sequence[str], folder: str) -> Layout:
+    """The templates of the images below a folder.
+
+    Args:
+        files: paths below it, at least one.
+        folder: its name, which may say what its only side shows.
+    """
+    stems = {path: posixpath.splitext(path)[0] for path in files}
+    sides = _by_role(stems)
+    if not sides and (roles := {_ROLE_OF[w] for w in _words(folder) if w in _ROLE_OF}):
+        sides = {min(roles): list(files)} if len(roles) == 1 else {}
+    if sides and set(sides) != {"background"}:
+        order = [side for side in ROLES if side in sides]
+        return Layout({side: template_of(sides[side]) for side in order})
+    halves = _by_recurrence(stems)
+    if halves is None:
+        return Layout({"tactile": template_of(files)}, certain=False)
+    vision, tactile = map(template_of, halves)
+    return Layout({"vision": vision, "tactile": tactile}, certain=False)
+
+
+def _words(text: str) -> list[str]:
+    return [token.lower() for token in _TOKEN.findall(text)]
+
+
+def _by_role(stems: dict[str, str]) -> dict[str, list[str]]:
+    """Side -> its files, by words that some have and others have not; else by a word of all.
+
+    Files without such a word are the other side, if each is the partner of one with a word.
+    """
+    words = {path: _words(stem) for path, stem in stems.items()}
+    shared = set.intersection(*map(set, words.values()))
+    sides: dict[str, list[str]] = defaultdict(list)
+    for path, own in words.items():
+        strong = [_ROLE_OF[word] for word in own if word in _ROLE_OF and word not in shared]
+        weak = [_WEAK[word] for word in own if word in _WEAK and word not in shared]
+        # The picture of an empty gel may lie in the folder of the tactile images.
+        role = "background" if "background" in strong else (strong or weak or [""])[-1]
+        sides[role].append(path)
+    plain = sides.pop("", [])
+    if not sides:
+        roles = {_ROLE_OF[word] for word in shared if word in _ROLE_OF} or {
+            _WEAK[word] for word in shared if word in _WEAK
+        }
+        return {min(roles): list(stems)} if len(roles) == 1 else {}
+    if plain and len(said := sides.keys() & {"vision", "tactile"}) == 1:
+        (known,) = said
+        bare = {_without_role(stems[path], known) for path in sides[known]}
+        if 2 * sum(stems[path] in bare for path in plain) < len(plain):
+            return {}
+        sides["tactile" if known == "vision" else "vision"] = plain
+    return dict(sides)
+
+
+def _without_role(stem: str, role: str) -> str:
+    """A path without the words of a role and the sign before each."""
+    words = "|".join(ROLES[role])
+    return re.sub(rf"(?i)[_\-. ]?(?<![A-Za-z])(?:{words})(?![A-Za-z])", "", stem)
+
+
+def _by_recurrence(stems: dict[str, str]) -> tuple[list[str], list[str]] | None:
+    """Two groups with the same paths but for one folder, or for an ending of the names."""
+    parts = {path: tuple(stem.split("/")) for path, stem in stems.items()}
+    for depth in range(min(map(len, parts.values())) - 1):
+        values = sorted({names[depth] for names in parts.values()})
+        if len(values) == 2:
+            one, two = ([p for p, names in parts.items() if names[depth] == v] for v in values)
+            bare = [{parts[p][:depth] + parts[p][depth + 1 :] for p in side} for side in (one, two)]
+            if 2 * len(bare[0] & bare[1]) > len(bare[0] | bare[1]):
+                return one, two
+    known = set(stems.values())
+    longer = [
+        path
+        for path, stem in stems.items()
+        if (ending := re.search(r"[_\-. ]+[A-Za-z]+$", stem)) and stem[: ending.start()] in known
+    ]
+    if not longer or 3 * len(longer) < len(stems):
+        return None
+    return [path for path in stems if path not in set(longer)], longer
+
+
+def template_of(files: Sequence[str]) -> str:
+    """The template of the paths of one side."""
+    places = [path.split("/") for path in files]
+    folders = [place[:-1] for place in places]
+    names = [posixpath.splitext(place[-1]) for place in places]
+    suffixes = {suffix for _, suffix in names}
+    fields: set[str] = set()
+    pieces = _folders(folders, fields)
+    free = [k for k, piece in enumerate(pieces) if piece is None]
+    several = len(set(map(tuple, folders))) < len(files)
+    for k in reversed(free):
+        default = "object" if fields & {"video", "contact"} else "video" if several else "sample"
+        pieces[k] = f"{{{_new(fields, default, 'object', f'folder_{k + 1}')}}}"
+    stem = _stem([stem for stem, _ in names], fields)
+    return "/".join([*map(str, pieces), stem + (min(suffixes) if len(suffixes) == 1 else ".*")])
+
+
+def _new(fields: set[str], *names: str) -> str:
+    """The first of some names that is no field yet."""
+    name = next(name for name in names if name not in fields)
+    fields.add(name)
+    return name
+
+
+def _folders(folders: Sequence[Sequence[str]], fields: set[str]) -> list[str | None]:
+    """The pieces of the folders; None for one that no word and no value names."""
+    if len(set(map(len, folders))) > 1:
+        first, last = (_common(folders, end) for end in (1, -1))
+        fields.add("video")
+        return [*map(_literal, first), "{video:**}", *map(_literal, reversed(last))]
+    pieces: list[str | None] = []
+    for values in zip(*folders, strict=True):
+        before, middles, after = _affixes(values)
+        column = _column(before, middles)
+        if not middles:
+            pieces.append(before)
+        elif column in fields or not column:
+            pieces.append(None)
+        else:
+            pieces.append(f"{before}{{{_new(fields, column)}}}{after}")
+    return pieces
+
+
+def _common(folders: Sequence[Sequence[str]], step: int) -> list[str]:
+    """The folders that all paths begin (step 1) or end (-1) with."""
+    common: list[str] = []
+    for values in zip(*(names[::step] for names in folders), strict=False):
+        if len(set(values)) > 1:
+            break
+        common.append(values[0])
+    shortest = min(map(len, folders))
+    return common if step == 1 else common[: max(0, shortest - len(_common(folders, 1)))]
+
+
+def _column(before: str, middles: Sequence[str]) -> str:
+    """What a varying part of a name is: by the word before it, else by its values."""
+    words = [word for word in _words(before) if word.isalpha()]
+    if words and words[-1] in _MEANING_OF:
+        return _MEANING_OF[words[-1]]
+    values = {middle.lower() for middle in middles}
+    if values and values <= PART_NAMES.keys():
+        return "split"
+    return "material" if values and values <= _MATERIALS else ""
+
+
+def _stem(stems: Sequence[str], fields: set[str]) -> str:
+    """The piece of the file names, without their suffix."""
+    before, middles, after = _affixes(stems)
+    if not middles:
+        return "{frame:d}" if re.fullmatch("[0-9]{1,18}", before) else before
+    column = _column(before, middles)
+    if column and column not in fields and not all(map(str.isdecimal, middles)):
+        return f"{before}{{{column}}}{after}"
+    if all(re.fullmatch("[0-9]{1,18}", middle) for middle in middles):
+        return f"{before}{{frame:d}}{after}"
+    numbered = [re.fullmatch(r"(.*?)([_\-. ]?)([0-9]{1,18})", middle) for middle in middles]
+    heads = {match[1] for match in numbered if match}
+    signs = {match[2] for match in numbered if match}
+    if all(numbered) and len(signs) == 1 and "" not in heads and 2 * len(heads) <= len(stems):
+        kind = "video" if any(re.search("[0-9]", head) for head in heads) else "object"
+        return f"{before}{{{_new(fields, kind, 'name')}}}{min(signs)}{{frame:d}}{after}"
+    return f"{before}{{name}}{after}"
+
+
+def _affixes(values: Sequence[str]) -> tuple[str, list[str], str]:
+    """(what all values begin with, what varies, what all end with), cut between words and numbers.
+
+    Equal values have no middle. Signs of templates are written as ``*``.
+    """
+    distinct = [_TOKEN.findall(value) for value in dict.fromkeys(values)]
+    if len(distinct) == 1:
+        return _literal(values[0]), [], ""
+    p, s = (_shared([tokens[::step] for tokens in distinct]) for step in (1, -1))
+    for first, last in ((p, s), (0, s), (p, 0), (0, 0)):
+        middles = ["".join(tokens[first : len(tokens) - last]) for tokens in distinct]
+        if all(len(tokens) > first + last for tokens in distinct):
+            tokens = distinct[0]
+            after = "".join(tokens[len(tokens) - last :])
+            return _literal("".join(tokens[:first])), middles, _literal(after)
+    return "", list(values), ""
+
+
+def _shared(lists: Sequence[Sequence[str]]) -> int:
+    """How many first items are equal in all lists."""
+    count = 0
+    for items in zip(*lists, strict=False):
+        if len(set(items)) > 1:
+            break
+        count += 1
+    return count
+
+
+def _literal(text: str) -> str:
+    return re.sub(r"[{}*]+", "*", text)
