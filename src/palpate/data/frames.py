@@ -1,4 +1,4 @@
-"""Frames of one modality of a recording: a folder of images, or a video with a cache of images.
+"""Frames of one modality of a recording: a folder, or a video or stack with a cache of images.
 
 A cached frame is ``<cache>/%010d.jpg`` (quality 95, no chroma subsampling, since the color of a gel
 carries the surface normal) or ``.png``, written whole or not at all, so an interrupted run goes on
@@ -18,13 +18,24 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.core import PalpateError, atomic_path, inside
+from palpate.data.contacts import SIZE, thumbnail
 from palpate.data.images import SUFFIXES, read_image
+from palpate.data.stacks import SUFFIX, StackReader
 from palpate.data.video import VideoReader
 
 ImageFormat = Literal["jpg", "png"]
 IMAGE_FORMATS: tuple[str, ...] = ("jpg", "png")
 #: Frames of a manifest have 64 bits; longer file names are no frame numbers.
 DIGITS = 18
+
+
+#: (n, 48, 64, 3) thumbnails and, of a video, (n,) seconds.
+Stream = tuple[NDArray[np.uint8], NDArray[np.float64] | None]
+
+
+def reader_of(source: Path) -> VideoReader | StackReader:
+    """A reader of a video, or of a stack in a ``.npy`` file."""
+    return (StackReader if source.suffix.lower() == SUFFIX else VideoReader)(source)
 
 
 class FolderFrames:
@@ -70,9 +81,21 @@ class FolderFrames:
         """Yield ``(k, (h, w, 3) image)``."""
         return ((k, np.asarray(read_image(self.path(k)))) for k in indices)
 
+    def stream(self) -> Stream | None:
+        """Thumbnails of all frames; None if numbers are missing.
+
+        Raises:
+            PalpateError: if an image is unreadable.
+        """
+        if not self.numbers or self.numbers[-1] - self.numbers[0] >= len(self.numbers):
+            return None
+        small = (2 * SIZE[0], 2 * SIZE[1])
+        images = (read_image(self.path(k), at_least=small) for k in self.numbers)
+        return np.stack([thumbnail(image) for image in images]), None
+
 
 class VideoFrames:
-    """Frames of a video file, cached as images in ``cache``; as for folders, but without links.
+    """Frames of a video or stack, cached as images in ``cache``; as for folders, without links.
 
     Raises:
         PalpateError: if the video is cut short or unreadable.
@@ -83,7 +106,7 @@ class VideoFrames:
 
     def __init__(self, source: Path, cache: Path, suffix: ImageFormat, size: int | None) -> None:
         self.source, self.cache, self.suffix, self.size = source, cache, suffix, size
-        with VideoReader(source) as reader:
+        with reader_of(source) as reader:
             self.numbers: Sequence[int] = range(len(reader))
 
     def __len__(self) -> int:
@@ -104,8 +127,17 @@ class VideoFrames:
         Raises:
             PalpateError: if the video breaks off.
         """
-        with VideoReader(self.source) as reader:
+        with reader_of(self.source) as reader:
             yield from reader.frames(indices)
+
+    def stream(self) -> Stream:
+        """Thumbnails of all frames, and when each is presented, in seconds.
+
+        Raises:
+            PalpateError: if the video breaks off.
+        """
+        with reader_of(self.source) as reader:
+            return reader.thumbnails(SIZE), reader.seconds
 
     def extract(self, frames: set[int], created: list[Path], stop: Event) -> None:
         """Cache the frames that are not cached yet; new files are added to ``created``.

@@ -32,6 +32,7 @@ from palpate.data.frames import (
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.listing import FrameList, FrameTable
 from palpate.data.manifest import Manifest
+from palpate.data.streams import Finding, findings
 
 #: The background is this many frames before the contact.
 BACKGROUND_BEFORE = 4
@@ -271,6 +272,23 @@ class Recordings:
         if not videos:
             return rows
         return [r for r in rows if all((r.video, m, r.frame) in whole for m in self._videos_of(r))]
+
+    def check_streams(self, progress: Progress) -> None:
+        """Report what looks wrong with whole recordings: lag, frozen streams, another gel ..."""
+
+        def check(video: str) -> list[Finding]:
+            try:
+                streams = {m: frames.stream() for m, frames in self.frames[video].items()}
+            except PalpateError:
+                return []  # reported where its frames are read
+            there = {m: stream for m, stream in streams.items() if stream is not None}
+            seconds = {m: times for m, (_, times) in there.items() if times is not None}
+            return findings({m: images for m, (images, _) in there.items()}, seconds)
+
+        results = in_threads(check, sorted(self.frames), "checking streams", progress)
+        self.suspicious += [
+            Problem(video, *problem) for video, problems in sorted(results) for problem in problems
+        ]
 
     def extract(self, rows: list[Row], progress: Progress) -> list[Row]:
         """Extract the needed frames of videos; keep the rows whose images are there."""

@@ -90,6 +90,37 @@ class VideoReader:
         for k in indices:
             yield k, self[k]
 
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """(n,) when each frame is presented."""
+        return np.asarray(self._pts) * float(self._stream.time_base or 1)
+
+    def thumbnails(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """All frames, reduced to (width, height) while they are decoded: (n, height, width, 3).
+
+        Raises:
+            PalpateError: if the video breaks off.
+        """
+        from av.video.reformatter import Interpolation, VideoReformatter
+
+        images = np.empty((len(self), size[1], size[0], 3), np.uint8)
+        resize, place = VideoReformatter().reformat, {pts: k for k, pts in enumerate(self._pts)}
+        area = Interpolation.AREA
+        self._last = None
+        self._seek(self._keys[0][1] if self._keys else self._pts[0])
+        assert self._decoded is not None
+        try:
+            for frame in self._decoded:
+                if (k := place.pop(frame.pts, None)) is not None:
+                    image = resize(frame, *size, "rgb24", interpolation=area)
+                    images[k] = image.to_ndarray()
+        except self._errors as error:
+            raise self._broken(f"a frame that cannot be decoded ({_reason(error)})") from None
+        if place:
+            k = min(place.values())
+            raise self._broken(f"frame {k} of {len(self)} cannot be decoded")
+        return images
+
     def close(self) -> None:
         """Close the file."""
         self._decoded = None

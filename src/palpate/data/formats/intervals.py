@@ -126,6 +126,8 @@ def scan(
     listed = _read(work, source, columns, classes, half_open)
     rows, contacts = _prepared(work, listed, every, check, progress)
     rows = work.decode(rows, progress, videos=check == "decode")
+    if check == "decode":
+        work.check_streams(progress)
     words = _words(rows, contacts)
     result = Scan(base, _facts(source, columns, words), scan_rows(work, rows, check, None, words))
     result.problems, result.suspicious = work.problems, work.suspicious

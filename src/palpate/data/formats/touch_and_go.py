@@ -166,6 +166,8 @@ def scan(
     work = Recordings(root, root, videos, lists.in_contact, "jpg", None, [])
     rows = _prepared(work, lists, rows_of(lists.listed), check, progress)
     rows = work.decode(rows, progress, videos=check == "decode")
+    if check == "decode":
+        work.check_streams(progress)
     result = Scan(root, lists.facts)
     result.rows = scan_rows(work, rows, check, lists.sensor, lists.words)
     result.problems, result.suspicious = work.problems, work.suspicious

@@ -1,0 +1,172 @@
+"""Contacts in a tactile video: the untouched gel, how far each frame is from it, and the presses.
+
+1. *Thumbnails* of 64 x 48, blurred by a Gaussian of one pixel, the mean of each channel removed:
+   brightness is no contact.
+2. *Reference*: the frame that most resembles frames at other times. The untouched gel comes back
+   between presses, while no two presses are the same; so a press at frame 0 does no harm. Of at
+   most 200 evenly spaced frames it is the one whose distance to its nearest neighbors, at least a
+   tenth of the video away, is least (the neighbor at 5 % of the frames counts). A gel that is
+   untouched for less than that, or pressed at rest for longer than it is free, must be declared.
+3. *Contact energy* of a frame: root mean square of its difference to the reference, in gray levels.
+4. *Contacts*: peaks of the energy (over a median of 5 frames) with a prominence of three tenths of
+   its 98 % quantile, at least 1 gray level and 4 times the change between frames of the quietest
+   quarter. A contact lasts while the energy is above half way between the trough on that side and
+   the peak, so a gel that relaxes slowly, or a soft press after a hard one, has a level of its own.
+5. *Background* of a contact: the last frame before it whose energy is within a tenth of the way
+   from the trough to the peak; the reference where there is none.
+
+Measured on five real clips of Touch and Go (``benchmarks/contacts.py``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage, signal
+
+Floats = NDArray[np.float32]
+Pixels = NDArray[np.uint8]
+#: (width, height) of a thumbnail.
+SIZE = (64, 48)
+#: Frames that are compared for the reference, how far apart, and which neighbor counts.
+SAMPLED, APART, NEIGHBOR = 200, 0.1, 0.05
+#: Least height of a contact: share of the strongest, gray levels, times the noise.
+PROMINENCE, LEAST, TIMES_NOISE = 0.3, 1.0, 4.0
+#: Frames that are worked on at once.
+CHUNK = 512
+#: Where a contact begins, and up to where the gel is at rest, from trough to peak.
+HALF, REST = 0.5, 0.1
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What :func:`find_contacts` found; frames are positions in the video.
+
+    Attributes:
+        energy: (n,) contact energy, in gray levels.
+        reference: the frame that shows the untouched gel.
+        method: how it was chosen: ``declared`` or ``found``.
+        runs: (first, last) frame of each contact, both included.
+        backgrounds: for each contact the frame that shows the gel before it.
+    """
+
+    energy: Floats
+    reference: int
+    method: str
+    runs: list[tuple[int, int]]
+    backgrounds: list[int]
+
+
+def thumbnail(image: Any, size: tuple[int, int] = SIZE) -> Pixels:
+    """(48, 64, 3) of an image or (h, w, 3), each pixel the mean of those that it covers."""
+    picture = image if isinstance(image, Image.Image) else Image.fromarray(image)
+    return np.asarray(picture.convert("RGB").resize(size, Image.Resampling.BOX))
+
+
+def find_contacts(thumbnails: Pixels, reference: int | None = None) -> Contacts:
+    """Find the contacts of one video.
+
+    Args:
+        thumbnails: (n, 48, 64, 3) frames in order, 0 to 255; at least one.
+        reference: the frame that shows the untouched gel, if it is known.
+    """
+    method = "found" if reference is None else "declared"
+    reference = find_reference(thumbnails) if reference is None else reference
+    energy = contact_energy(thumbnails, thumbnails[reference])
+    runs, backgrounds = _contacts(energy, _noise(thumbnails), reference)
+    return Contacts(energy, reference, method, runs, backgrounds)
+
+
+def contact_energy(thumbnails: Pixels, reference: Pixels) -> Floats:
+    """(n,) contact energy of thumbnails (n, 48, 64, 3) against one of the untouched gel."""
+    gel = _shapes(reference[None])
+    parts = (thumbnails[k : k + CHUNK] for k in range(0, len(thumbnails), CHUNK))
+    return np.concatenate([_distances(_shapes(part), gel) for part in parts])
+
+
+def find_reference(thumbnails: Pixels) -> int:
+    """The frame that most resembles frames at other times, of (n, 48, 64, 3)."""
+    count = len(thumbnails)
+    sampled = np.unique(np.linspace(0, count - 1, min(count, SAMPLED)).round().astype(np.int64))
+    x = _shapes(thumbnails[sampled])
+    squares = np.square(x).sum(axis=1)
+    distances = squares[:, None] + squares - 2 * x @ x.T
+    places = np.arange(len(x))
+    distances[np.abs(places[:, None] - places) <= APART * len(x)] = np.inf
+    nearest = np.sort(distances, axis=1)[:, max(0, int(NEIGHBOR * len(x)) - 1)]
+    return int(sampled[nearest.argmin()])
+
+
+def rest_before(energy: Floats, first: int, after: int, peak: float) -> int | None:
+    """The last frame between ``after`` and ``first``, both excluded, that is at rest; or None.
+
+    Args:
+        energy: (n,) contact energy.
+        first: where the contact begins.
+        after: the last frame of the contact before it; -1 if there is none.
+        peak: energy of the contact.
+    """
+    gap = energy[after + 1 : first]
+    if not len(gap) or gap.min() > HALF * peak:
+        return None
+    level = gap.min() + REST * (peak - gap.min())
+    return after + 1 + int(np.flatnonzero(gap <= level)[-1])
+
+
+def _shapes(thumbnails: Pixels) -> Floats:
+    """(n, 48 * 64 * 3): blurred, without the mean of each channel."""
+    blurred = ndimage.gaussian_filter(thumbnails.astype(np.float32), (0, 1, 1, 0))
+    return (blurred - blurred.mean(axis=(1, 2), keepdims=True)).reshape(len(blurred), -1)
+
+
+def _distances(frames: Floats, reference: Floats) -> Floats:
+    return np.sqrt(np.square(frames - reference).mean(axis=1))
+
+
+def _noise(thumbnails: Pixels) -> float:
+    """Change between frames in the quietest quarter of the video, of at most 200 pairs."""
+    last = len(thumbnails) - 1
+    k = np.unique(np.linspace(0, max(0, last - 1), min(last, SAMPLED)).round().astype(np.int64))
+    changes = _distances(_shapes(thumbnails[k + 1]), _shapes(thumbnails[k])) if len(k) else [0]
+    return float(np.quantile(changes, 0.25))
+
+
+def _contacts(
+    energy: Floats, noise: float, reference: int
+) -> tuple[list[tuple[int, int]], list[int]]:
+    """First and last frame of each contact, and its background."""
+    smooth = ndimage.median_filter(energy, 5, mode="nearest")
+    height = max(PROMINENCE * float(np.quantile(smooth, 0.98)), LEAST, TIMES_NOISE * noise)
+    # The gel is taken as untouched before the video and after it.
+    peaks: list[int] = []
+    for peak in (signal.find_peaks(np.pad(smooth, 1), prominence=height)[0] - 1).tolist():
+        # Equal peaks have no trough between them for scipy.
+        if not peaks or smooth[peaks[-1] : peak].min() <= smooth[peak] - height:
+            peaks.append(peak)
+    troughs = [0, *(a + int(smooth[a:b].argmin()) for a, b in pairwise(peaks)), len(energy) - 1]
+    runs: list[tuple[int, int]] = []
+    backgrounds: list[int] = []
+    after = -1
+    for peak, (low, high) in zip(peaks, pairwise(troughs), strict=False):
+        first = peak - _reach(smooth[low : peak + 1][::-1], height)
+        last = peak + _reach(smooth[peak : high + 1], height)
+        rest = rest_before(smooth, first, after, float(smooth[peak]))
+        runs.append((first, last))
+        backgrounds.append(reference if rest is None else rest)
+        after = last
+    return runs, backgrounds
+
+
+def _reach(slope: Floats, height: float) -> int:
+    """How far a contact reaches from its peak, ``slope[0]``, down to the trough of that side.
+
+    A video that begins or ends within a contact has no trough there: it is that of the reference.
+    """
+    trough = float(slope.min()) if slope[0] - slope.min() >= height else 0.0
+    below = np.flatnonzero(slope < trough + HALF * (slope[0] - trough))
+    return int(below[0]) - 1 if len(below) else len(slope) - 1

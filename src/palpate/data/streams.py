@@ -1,0 +1,146 @@
+"""Whether the streams of a recording can be trusted: what a person should look at.
+
+All checks see thumbnails (:mod:`palpate.data.contacts`), so a difference is in gray levels.
+
+* ``frozen-stream``: at least 15 frames in a row that differ by at most 0.05 each, while most of the
+  stream differs by more. Sensors and cameras have noise; only a stalled one repeats itself.
+* ``dropped-frames``: places where the timestamps leap by over 1.5 times their median step. Streams
+  of a variable rate (the middle half of the steps differs by over a quarter) are not judged.
+* ``unequal-streams``: photo and tactile videos whose lengths differ by over 2 %, at least 3 frames,
+  or whose rates do: frame k of one is not the instant of frame k of the other.
+* ``lag``: the change between frames of both streams, less its slow part, is correlated at all
+  shifts of up to a third of the recording, at most 2 s at 30 fps. A shift of at least 3 frames is
+  reported where its correlation is at least 0.6, and 0.25 above that of every shift more than 5
+  frames away, 0 included. Where photos do not show the press (the camera looks elsewhere, or is
+  shaken by hand), no shift stands out and nothing can be said.
+* ``changed-gel``: the untouched gel found in the first third and in the last differ by at least 4
+  gray levels, and by 0.7 times the strongest contact of either third.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from palpate.data.contacts import Pixels, contact_energy, find_contacts
+
+#: (kind, text) of what looks wrong.
+Finding = tuple[str, str]
+FROZEN, STILL = 15, 0.05
+LEAP, VARIABLE = 1.5, 0.25
+SHORTER, FEWEST = 0.02, 3
+LONGEST_LAG, LEAST_LAG, CORRELATION, MARGIN, NEAR = 60, 3, 0.6, 0.25, 5
+GEL, OF_CONTACT = 4.0, 0.7
+#: Shorter recordings are not correlated, and their thirds hold too little.
+LEAST_FRAMES = 60
+
+
+def findings(
+    thumbnails: Mapping[str, Pixels], seconds: Mapping[str, NDArray[np.float64]]
+) -> list[Finding]:
+    """What looks wrong with one recording.
+
+    Args:
+        thumbnails: ``vision``, ``tactile`` or both -> (n, 48, 64, 3) frames in order.
+        seconds: of those that are videos -> (n,) when each frame is presented.
+    """
+    changes = {name: _changes(images) for name, images in thumbnails.items()}
+    problems = [p for name, change in changes.items() for p in _frozen(name, change)]
+    problems += [p for name, times in seconds.items() for p in _dropped(name, times)]
+    if len(changes) == 2:
+        problems += _unequal(thumbnails, seconds) or _lag(changes["tactile"], changes["vision"])
+    return problems + (_changed_gel(thumbnails["tactile"]) if "tactile" in thumbnails else [])
+
+
+def _changes(images: Pixels) -> NDArray[np.float64]:
+    """(n - 1,) root mean square of the change to the next frame."""
+    pairs = zip(images[1:], images[:-1], strict=True)
+    return np.sqrt(
+        [np.square(np.subtract(after, before, dtype=np.float32)).mean() for after, before in pairs]
+    )
+
+
+def _frozen(name: str, changes: NDArray[np.float64]) -> list[Finding]:
+    still = np.pad(changes <= STILL, 1)
+    edges = np.flatnonzero(still[1:] != still[:-1]).reshape(-1, 2)
+    longest = edges[np.diff(edges)[:, 0].argmax()] if len(edges) else [0, 0]
+    count = int(longest[1] - longest[0]) + 1
+    if count < FROZEN or (np.median(changes) <= STILL and count < len(changes) + 1):
+        return []
+    text = f"frames {longest[0]} to {longest[1]} of {name} are the same image ({count} of "
+    return [("frozen-stream", f"{text}{len(changes) + 1} frames)")]
+
+
+def _dropped(name: str, seconds: NDArray[np.float64]) -> list[Finding]:
+    steps = np.diff(seconds)
+    if len(steps) < FEWEST:
+        return []
+    step, spread = float(np.median(steps)), float(np.subtract(*np.quantile(steps, [0.75, 0.25])))
+    leaps = np.flatnonzero(steps > LEAP * step)
+    if not len(leaps) or spread > VARIABLE * step:
+        return []
+    lost = int((steps[leaps] / step).round().sum()) - len(leaps)
+    text = f"by its timestamps {name} lacks {lost} frame{'s' * (lost != 1)} at {len(leaps)} "
+    text += f"place{'s' * (len(leaps) != 1)}, the first after frame {leaps[0]}"
+    return [("dropped-frames", text)]
+
+
+def _unequal(
+    thumbnails: Mapping[str, Pixels], seconds: Mapping[str, NDArray[np.float64]]
+) -> list[Finding]:
+    lengths = {name: len(images) for name, images in thumbnails.items()}
+    short, long = sorted(lengths.values())
+    if long - short >= max(FEWEST, SHORTER * long):
+        text = " and ".join(f"{count} frames of {name}" for name, count in lengths.items())
+        return [("unequal-streams", f"{text}: frame k may not be one instant in both")]
+    rates = {name: 1 / float(np.median(np.diff(t))) for name, t in seconds.items() if len(t) > 1}
+    if len(rates) == 2 and max(rates.values()) > (1 + SHORTER) * min(rates.values()):
+        text = " and ".join(f"{rate:.3g} frames a second in {name}" for name, rate in rates.items())
+        return [("unequal-streams", f"{text}: frame k is not one instant in both")]
+    return []
+
+
+def _lag(tactile: NDArray[np.float64], vision: NDArray[np.float64]) -> list[Finding]:
+    count = min(len(tactile), len(vision))
+    if count < LEAST_FRAMES:
+        return []
+    x, y = (_quick(changes[:count]) for changes in (tactile, vision))
+    most = min(LONGEST_LAG, count // 3)
+    lags = np.arange(-most, most + 1)
+    values = np.array([_correlation(x, y, int(lag)) for lag in lags])
+    best = int(values.argmax())
+    lag, others = int(lags[best]), values[np.abs(lags - lags[best]) > NEAR]
+    second = max(float(others.max(initial=-1)), float(values[most]))
+    if abs(lag) < LEAST_LAG or values[best] < max(CORRELATION, second + MARGIN):
+        return []
+    text = f"tactile changes {abs(lag)} frames {'after' if lag > 0 else 'before'} vision does "
+    return [("lag", f"{text}(correlation {values[best]:.2f}; {values[most]:.2f} as they are)")]
+
+
+def _quick(changes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Changes over a frame or two, without the level of the second around."""
+    return ndimage.gaussian_filter1d(changes, 1.5) - ndimage.gaussian_filter1d(changes, 20)
+
+
+def _correlation(x: NDArray[np.float64], y: NDArray[np.float64], lag: int) -> float:
+    """Of x, ``lag`` frames later, with y."""
+    a, b = x[max(0, lag) : len(x) + min(0, lag)], y[max(0, -lag) : len(y) - max(0, lag)]
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b / np.sqrt((a @ a) * (b @ b) + 1e-9))
+
+
+def _changed_gel(tactile: Pixels) -> list[Finding]:
+    if len(tactile) < LEAST_FRAMES:
+        return []
+    third = len(tactile) // 3
+    ends = [find_contacts(tactile[:third]), find_contacts(tactile[-third:])]
+    first, last = ends[0].reference, len(tactile) - third + ends[1].reference
+    change = float(contact_energy(tactile[[last]], tactile[first])[0])
+    strongest = max(float(np.quantile(end.energy, 0.98)) for end in ends)
+    if change < max(GEL, OF_CONTACT * strongest):
+        return []
+    text = f"the untouched gel of frame {first} and that of frame {last} differ by {change:.1f} "
+    return [("changed-gel", f"{text}gray levels, the strongest contact by {strongest:.1f}")]
