@@ -1,10 +1,13 @@
 """Captions: only the words of the piece, good grammar, never color or light."""
 
+import math
 import re
 
+import numpy as np
 import pytest
 
 from palpate.sim import MATERIALS, Video, WorldOptions, plan_world
+from palpate.sim.felt import SCALES, measure
 from palpate.sim.text import NAMED, UNNAMED, article, listed, phrase
 
 COLORS = (
@@ -119,3 +122,52 @@ def test_the_share_of_named_captions_is_obeyed():
         )
         texts = [Video(options, k).text(t) for k in range(4) for t in range(4)]
         assert all(("wood" in text.lower()) is (templates is NAMED) for text in texts)
+
+
+FELT = {w for scale in SCALES.values() for level in scale.words for w in level}
+
+
+def felt_texts(**options):
+    options = WorldOptions(tile=64, size=32, captions="felt", contacts_per_video=2, **options)
+    videos = [Video(options, plan) for plan in plan_world(options)]
+    return [
+        (v.plan.object_of(k).material, v.object_of(k).surface.noun, v.text(k))
+        for v in videos
+        for k in range(2)
+    ]
+
+
+def test_felt_captions_use_the_words_of_the_scales_and_name_no_material():
+    rows = felt_texts(objects_per_material=3, layout="hct")
+    for _, noun, text in rows:
+        assert set(text.split(", ")) <= FELT
+        assert noun.removeprefix("a ") not in text
+    words_of = {
+        m: {w for other, _, t in rows if other == m for w in t.split(", ")} for m, *_ in rows
+    }
+    assert words_of["Sand"] & words_of["Concrete"]  # two materials share words
+
+
+def test_felt_captions_follow_the_surface():
+    n, px = 64, 14 / 64
+    x = np.arange(n) * px
+    waves = 0.2 * np.sin(2 * np.pi * x / 2.0) * np.ones((n, 1))
+    rng = np.random.default_rng(0)
+    flat, lined, noisy = np.zeros((n, n)), waves, 0.2 * rng.standard_normal((n, n))
+    felt = {k: measure(h, px, 0.0, 0.0) for k, h in zip("fln", (flat, lined, noisy), strict=True)}
+    assert felt["f"]["roughness"] < felt["l"]["roughness"] < felt["n"]["roughness"]
+    assert felt["l"]["direction"] > 0.95 > 0.2 > felt["n"]["direction"]
+    assert felt["l"]["regularity"] > 0.9 > 0.2 > felt["n"]["regularity"]
+    assert felt["l"]["grain"] == pytest.approx(math.log(2.0), abs=0.05)
+    tilted = measure(lined + 0.3 * x[:, None] - 0.1 * x, px, 0.0, 0.0)
+    assert tilted == pytest.approx(felt["l"], abs=0.02)  # how the pad lies is not felt
+    soft, hard = measure(lined, px, 0.9, 0.0), felt["l"]
+    assert soft["hardness"] < hard["hardness"]
+    assert soft["friction"] > hard["friction"] > measure(lined, px, 0.0, 0.9)["friction"]
+
+
+def test_an_uncertain_describer_changes_words_and_the_label_captions_keep_their_digest():
+    sure, unsure = (felt_texts(objects_per_material=1, describer=d) for d in (0.0, 2.0))
+    assert sum(a == b for a, b in zip(sure, unsure, strict=True)) < len(sure) / 2
+    assert WorldOptions().digest == WorldOptions(captions="label", describer=3.0).digest
+    assert len({WorldOptions(captions="felt", describer=d).digest for d in (0.1, 0.2)}) == 2

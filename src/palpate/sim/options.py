@@ -109,7 +109,11 @@ class WorldOptions:
     objects_per_video: int = _number(3, 1, 14, "a mixed video has 2 to this many objects")
     mixed: float = _share(0.12, "share of the videos with several objects")
     sensors: int = _number(3, 1, 100, "gel units; each video uses one of them")
-    named: float = _share(0.5, "share of captions that name the material; others only adjectives")
+    captions: Literal["label", "felt"] = _choice(
+        "the words of the drawn sub-type, or words for the measured surface", "label", "felt"
+    )
+    named: float = _share(0.5, "share of label captions that name the material")
+    describer: float = _number(0.15, 0.0, 5.0, "noise of felt captions, in levels of a word scale")
     # physics
     curved: float = _share(0.4, "share of the objects that are curved")
     radius_mm: Span = _span((25.0, 90.0), 5.0, 1000.0, "their radius (of dents 3.3 times)")
@@ -194,7 +198,10 @@ class WorldOptions:
     def format_2(self) -> dict[str, Any]:
         """Return the options under the names of format 2, over which digests are taken."""
         values = {_FORMAT_2.get(k, k): v for k, v in dataclasses.asdict(self).items()}
-        return values | {"leak": "touch" if self.leak == "contact" else self.leak}
+        values["leak"] = "touch" if self.leak == "contact" else self.leak
+        if self.captions == "label":  # worlds from before felt captions keep their digest
+            del values["captions"], values["describer"]
+        return values
 
     def rng(self, purpose: str, *ids: str | int) -> np.random.Generator:
         """Return a generator that depends on VERSION, the seed, the purpose and the ids alone."""

@@ -1,16 +1,19 @@
 """What a contact feels like, in words.
 
-The adjectives come from the piece that was drawn (its sub-type), never from the class alone, and
-never name color or light. A share ``named`` of the captions also names the material; the others use
-adjectives alone, so that text is not just the label. In the layout of HCT a caption is, as there, a
-list of adjectives (``rugged, rough``), then the noun if named (``rugged, rough, tree bark``).
+Captions of ``felt`` name what is measured on the surface (:mod:`palpate.sim.felt`), never the
+material. In those of ``label`` the adjectives come from the piece that was drawn (its sub-type),
+never from the class alone, and never name color or light. A share ``named`` of them also names the
+material; the others use adjectives alone, so that text is not just the label. In the layout of HCT
+a caption is, as there, a list of adjectives (``rugged, rough``), then the noun if named (``rugged,
+rough, tree bark``).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from palpate.sim.felt import describe
 from palpate.sim.materials import Surface
 from palpate.sim.options import WorldOptions
 
@@ -57,5 +60,17 @@ def caption(options: WorldOptions, video: int, contact: int, surface: Surface) -
         return ", ".join([*words, bare(surface.noun)] if named else words)
     templates = NAMED if named else UNNAMED
     template = templates[int(rng.integers(len(templates)))]
-    sentence = template.format(phrase=phrase(words, surface.noun), list=listed(words))
-    return f"{sentence[0].upper()}{sentence[1:]}."
+    return _sentence(template.format(phrase=phrase(words, surface.noun), list=listed(words)))
+
+
+def felt_caption(options: WorldOptions, video: int, contact: int, felt: Mapping[str, float]) -> str:
+    """Write the caption of a contact from what :func:`~palpate.sim.felt.measure` returns."""
+    rng = options.rng("felt text", video, contact)
+    words = describe(felt, options.describer, rng)
+    if options.layout == "hct":
+        return ", ".join(words)
+    return _sentence(UNNAMED[int(rng.integers(len(UNNAMED)))].format(list=listed(words)))
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."

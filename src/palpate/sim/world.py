@@ -183,7 +183,7 @@ def _facts(options: WorldOptions) -> dict[str, str]:
         "synthetic": "yes",
         "world_version": str(VERSION),
         "world_options": options.digest,
-        "text_source": "the drawn sub-type",
+        "text_source": "measured surface" if options.captions == "felt" else "the drawn sub-type",
         "layout": options.layout,
     }
     if options.layout == "hct":
