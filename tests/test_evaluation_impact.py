@@ -388,6 +388,44 @@ def test_tactile_minus_background_is_the_difference(small_manifest: Manifest) ->
     assert notes == []
 
 
+def test_new_objects_have_rows_of_their_own_where_the_split_knows_its_objects() -> None:
+    """Frames of an object are alike, and objects of a material no more than others."""
+    rows = [
+        {
+            "id": f"{o}/{v}/{f}",
+            "video": f"{o}/{v}",
+            "frame": f,
+            "object": f"o{o}",
+            "material": f"m{o % 2}",
+        }
+        for o in range(16)
+        for v in range(3)
+        for f in range(4)
+    ]
+    samples = Manifest.from_rows(rows, Path())
+    objects = np.random.default_rng(0).normal(size=(16, 12)).astype(np.float32)
+    features = {"object": np.repeat(objects, 12, axis=0)}
+    result = impact(samples, by_frame(samples), features=features)
+    accuracy = {(row.group, row.classifier): (row.given, row.clean) for row in result.rows}
+    assert accuracy["video", "1-NN"] == (1, 1)  # a new video of a known object is recognized
+    given, new = accuracy["object", "1-NN"]
+    assert (given, new < 0.8) == (1, True)
+    assert f"Of new objects (splits by object): {100 * new:.1f} %." in result.headline
+    assert (
+        Impact.from_json(json.loads(json.dumps(asdict(result), default=asdict))).rows[-1].group
+        == "object"
+    )
+    by_object = leak_free_split(samples, by="object", train=0.5)
+    assert {row.group for row in impact(samples, by_object, features=features).rows} == {"video"}
+    one_each = [row | {"material": row["object"]} for row in rows]
+    one_each = Manifest.from_rows(one_each, Path())  # no material is in two objects
+    result = impact(one_each, by_frame(one_each), features=features)
+    assert ({row.group for row in result.rows}, result.notes[-1].code) == (
+        {"video"},
+        "impact-not-by",
+    )
+
+
 def test_a_leak_free_split_is_not_charged() -> None:
     manifest = videos(3, 6, 4)
     split = leak_free_split(manifest, train=0.66, by="video", seed=9)

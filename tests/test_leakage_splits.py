@@ -20,6 +20,7 @@ from palpate.leakage import audit, split, verify
 from palpate.leakage.groups import choose_group, components
 from palpate.leakage.noleak import RATIOS, load_record, record_split, verify_record
 from palpate.leakage.program import EXACT, RESOLUTION, Problem, draw, optimize
+from palpate.report.notes import sentence
 
 TOP = Path(__file__).resolve().parents[1]
 
@@ -280,7 +281,56 @@ def test_the_group_that_the_data_set_names_is_taken():
     ]
     named = Manifest.from_rows(rows, ".", {"group": "object"})
     assert split(named).rule["group"] == "object"
-    assert choose_group(Manifest.from_rows(rows, ".")) == ("video", None)
+    assert choose_group(Manifest.from_rows(rows, ".")) == ("object", None)
+
+
+def rows_of(samples):
+    names = ("video", "object", "session", "material")
+    return [{"id": f"{k}", **dict(zip(names, row, strict=True))} for k, row in enumerate(samples)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "group", "code"),
+    [
+        # videos of objects of sessions: the session is coarsest, where there are enough of them
+        ([(f"v{k}", f"o{k // 2}", f"s{k // 6}", "m") for k in range(24)], "session", None),
+        ([(f"v{k}", f"o{k // 2}", "s", "m") for k in range(24)], "object", "group-few"),
+        # a video of several objects is the coarser group; so is one that an object cuts across
+        ([(f"v{k // 3}", f"o{k}", None, "m") for k in range(24)], "video", None),
+        ([(f"v{k // 3}", f"o{k % 5}", None, "m") for k in range(24)], "video", None),
+        # one object of each material: no split by object has every material in both parts
+        (
+            [(f"v{k}", f"o{k // 6}", None, f"m{k // 6}") for k in range(24)],
+            "video",
+            "group-materials",
+        ),
+        # an object for some samples is no group
+        ([(f"v{k}", f"o{k // 6}" if k else None, None, "m") for k in range(24)], "video", None),
+    ],
+)
+def test_the_coarsest_known_group_is_kept_whole(rows, group, code):
+    column, note = choose_group(Manifest.from_rows(rows_of(rows), "."))
+    assert (column, note and note.code) == (group, code)
+    assert note is None or note.params["taken"] == group
+
+
+def test_a_split_says_which_question_it_answers_and_offers_the_other():
+    rows = rows_of((f"v{k // 4}", f"o{k // 12}", None, f"m{k // 12 % 2}") for k in range(120))
+    m = Manifest.from_rows(rows, ".")
+    for by, shared, other, words, headline in (
+        ("object", 0, "video", "for new objects. For new videos of known objects: by='video'", ""),
+        ("video", 9, "object", "for new videos of known objects: 9 of 9 test objects are in"
+         " train. For new objects: by='object'", ", not for new objects"),
+    ):  # fmt: skip
+        made = split(m, by=by, train=0.5)
+        (note,) = made.notes
+        assert (note.code, note.params["other"]) == ("question", other)
+        assert words in sentence(note)
+        assert split(m, by=other, train=0.5).digest != made.digest  # what it offers works
+        result = audit(m, split=made)
+        assert (result.verdict, result.shared["object"][0]) == ("none", shared)
+        asked = "new objects" if by == "object" else "new videos of known objects"
+        assert f"the split is for {asked}{headline}." in str(result).splitlines()[0]
 
 
 def test_what_cannot_be_split_says_why():

@@ -30,7 +30,7 @@ class Groups:
 
     by: Annotated[tuple[Column, ...], tyro.conf.arg(metavar="COLUMN ...")] = ()
     """Columns to keep whole; samples that share any of these stay together (default: what the data
-    set names, or the video)."""
+    set names, or the coarsest known: object, session, video, contact)."""
     near: Literal["vision", "tactile", "both"] | None = None
     """Keep near-duplicate images together as well."""
     nulls: Literal["raise", "single"] = "raise"

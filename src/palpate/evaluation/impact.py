@@ -10,6 +10,10 @@ compared), the shares, the number of train samples (larger train parts are thinn
 features and their reduction (fitted to each train part alone), the classifiers, and how the probe's
 penalty is chosen (on the train part, leaving out groups).
 
+Two questions: leak-free splits keep whole the group of the audit, and once more the coarsest known
+group (:func:`palpate.leakage.groups.nested_groups`), unless the given split does so. If objects are
+known, the second row says what is left for new objects.
+
 What can be compared: a material needs two groups, one for each part, and must occur in both parts
 of the given and of every leak-free split.
 
@@ -23,11 +27,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet
@@ -49,7 +54,7 @@ from palpate.evaluation.impact_scores import (
     tabulate,
     thin,
 )
-from palpate.leakage.groups import GROUPS, choose_group
+from palpate.leakage.groups import GROUPS, choose_group, nested_groups
 from palpate.leakage.splitting import split as leak_free_split
 from palpate.metrics.probe import fit_probe
 from palpate.report.results import Impact, ImpactRow
@@ -75,6 +80,7 @@ class _Design:
 
     Attributes:
         ids, rows: the samples, and their rows in the manifest.
+        at: their rows in the features.
         material, group: codes into ``materials`` and ``groups``, one per sample.
         splits: the given split, then the leak-free ones.
         notes: what was excluded, and what qualifies the result.
@@ -83,6 +89,7 @@ class _Design:
 
     ids: list[str]
     rows: Rows
+    at: Rows
     material: Codes
     group: Codes
     materials: list[str]
@@ -112,7 +119,8 @@ def impact(  # noqa: PLR0913
         manifest: the samples, with materials.
         split: the split in question; its train and test parts are compared.
         group: column that the leak-free splits keep whole and that intervals are made over;
-            ``auto`` takes what the data set has.
+            ``auto`` takes what the data set has. If a coarser one is known, there are rows of it,
+            too.
         features: ``pixels`` (tactile, tactile minus background, vision: those that the manifest
             has), or name -> features, as a :class:`FeatureSet` or an (n, d) array in the order of
             ``manifest.ids``.
@@ -125,9 +133,9 @@ def impact(  # noqa: PLR0913
         progress: called with what is done.
 
     Returns:
-        A row for each kind of features and classifier. The headline is about the first one: 1-NN on
-        tactile pixels (vision without tactile), or on the first of ``features``; the rule is fixed
-        so that nobody picks the largest number.
+        A row for each kind of features, classifier and group. The headline is about the first one:
+        1-NN on tactile pixels (vision without tactile), or on the first of ``features``; the rule
+        is fixed so that nobody picks the largest number.
 
     Raises:
         PalpateError: without two materials that can be compared, with nulls in the group column, or
@@ -136,21 +144,48 @@ def impact(  # noqa: PLR0913
     """
     _check(features, seeds, components)
     design = _design(manifest, split, group, seeds)
-    notes = list(design.notes)
+    coarser, more = _coarser(manifest, split, design, seeds)
+    notes = [*design.notes, *more]
     if isinstance(features, str):
         samples = manifest.take(design.ids)
         sources, more = pixel_sources(samples, size=size, cache=cache, progress=progress)
         notes += more
     else:
         sources = array_sources(features, manifest, design.ids, design.rows)
+    rows, facts = _measure(design, sources, components, balanced, progress)
+    settings = {
+        **design.settings,
+        "size": size if features == "pixels" else None,
+        "components": components,
+        "balanced": balanced,
+        "features": facts,
+        "interval": "leave-one-group-out jackknife over test groups, paired, t, 95 %",
+    }
+    headline = _headline(
+        rows[0], name or str(split.rule.get("name") or "the given split"), settings
+    )
+    if coarser is not None:
+        further, facts = _measure(coarser, sources, components, balanced, progress)
+        column, rows = coarser.settings["group"], rows + further
+        settings[f"by {column}"] = coarser.settings | {"features": facts}
+        headline += f" Of new {column}s (splits by {column}): {100 * further[0].clean:.1f} %."
+    digests = [parts.digest for parts in design.splits[1:]]
+    return Impact(rows, headline, design.settings["group"], digests, settings, notes)
+
+
+def _measure(
+    design: _Design, sources: Sequence[Source], components: int, balanced: bool, progress: Progress
+) -> tuple[list[ImpactRow], dict[str, Any]]:
+    """Rows for each kind of features and classifier, and facts on the features."""
     rows: list[ImpactRow] = []
     facts: dict[str, Any] = {}
-    total = len(sources) * len(design.splits)
-    for at, source in enumerate(sources):
+    column, total = design.settings["group"], len(sources) * len(design.splits)
+    for number, source in enumerate(sources):
         tables: dict[str, list[Table]] = {c: [] for c in CLASSIFIERS}
         fits: list[tuple[float, float]] = []
         for k, parts in enumerate(design.splits):
-            progress("classifying materials", at * len(design.splits) + k, total, source.name)
+            done = number * len(design.splits) + k
+            progress(f"classifying materials by {column}", done, total, source.name)
             by_classifier, penalty, explained = _classify(source, parts, design, components)
             fits.append((penalty, round(explained, 4)))
             for c in CLASSIFIERS:
@@ -164,20 +199,34 @@ def impact(  # noqa: PLR0913
             **{c: [round(accuracy(t, balanced), 5) for t in tables[c]] for c in CLASSIFIERS},
         }
         chance = 1 / len(design.materials)
-        rows += [_row(source.name, c, tables[c], chance, balanced) for c in CLASSIFIERS]
-    progress("classifying materials", total, total)
-    settings = {
-        **design.settings,
-        "size": size if features == "pixels" else None,
-        "components": components,
-        "balanced": balanced,
-        "features": facts,
-        "interval": "leave-one-group-out jackknife over test groups, paired, t, 95 %",
-    }
-    name = name or str(split.rule.get("name") or "the given split")
-    headline = _headline(rows[0], name, settings)
-    digests = [parts.digest for parts in design.splits[1:]]
-    return Impact(rows, headline, design.settings["group"], digests, settings, notes)
+        made = [_row(source.name, c, tables[c], chance, balanced) for c in CLASSIFIERS]
+        rows += [replace(row, group=column) for row in made]
+    progress(f"classifying materials by {column}", total, total)
+    return rows, facts
+
+
+def _coarser(
+    manifest: Manifest, split: Split, design: _Design, seeds: Sequence[int]
+) -> tuple[_Design | None, list[Note]]:
+    """The same by the coarsest group, if there is one and the given split shares it; and notes."""
+    pool = manifest.take(design.ids)
+    column, *finer = [*nested_groups(pool), ""]
+    parts = {i: split.parts[i] for i in design.ids}
+    given = pool.table.with_columns(part=pl.Series([*parts.values()]))
+    if design.settings["group"] not in finer or not _shares(given, column):
+        return None, []
+    try:
+        other = _design(pool, replace(split, parts=parts), column, seeds)
+    except PalpateError as error:
+        return None, [Note("impact-not-by", {"group": column, "reason": str(error)})]
+    place = {i: k for k, i in enumerate(design.ids)}
+    notes = [note for note in other.notes if note not in design.notes]
+    return replace(other, at=np.array([place[i] for i in other.ids])), notes
+
+
+def _shares(table: pl.DataFrame, column: str) -> bool:
+    """Whether a group of a column is in two parts."""
+    return table.select(column, "part").n_unique() > table[column].n_unique()
 
 
 def _check(features: Features, seeds: Sequence[int], components: int) -> None:
@@ -246,8 +295,8 @@ def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) 
     }
     settings["deviation"] = [round(p.rule["deviation"], 5) for p in plans]
     notes += _qualifications(settings, excluded, len(plans) - len(set(digests[1:])))
-    ids = [ids[k] for k in rows]
-    return _Design(ids, np.array(rows), material, owner, materials, groups, splits, notes, settings)
+    ids, places = [ids[k] for k in rows], (np.array(rows), np.arange(len(rows)))
+    return _Design(ids, *places, material, owner, materials, groups, splits, notes, settings)
 
 
 def _owners(pool: Manifest, column: str) -> list[str]:
@@ -341,10 +390,10 @@ def _classify(
     """Classify under one split: two tables, the probe's penalty, the share of variance kept."""
     shape = (len(design.groups), len(design.materials))
     size, seed = int(design.settings["train_samples"]), int(design.settings["seeds"][0])
-    group, material = design.group, design.material
+    at, group, material = design.at, design.group, design.material
     train = thin(parts.train, group[parts.train], material[parts.train], size, seed)
-    reduction = fit_reduction(source, train, components, seed)
-    x, z = reduction.apply(source, train), reduction.apply(source, parts.test)
+    reduction = fit_reduction(source, at[train], components, seed)
+    x, z = reduction.apply(source, at[train]), reduction.apply(source, at[parts.test])
     y, truth, owner = material[train], material[parts.test], group[parts.test]
     few = thin(np.arange(len(train)), group[train], y, min(size, PROBE_ROWS), seed)
     rows = train[few]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.leakage.groups import GROUPS
+from palpate.leakage.groups import GROUPS, shared_groups
 from palpate.leakage.inputs import (
     Data,
     Identity,
@@ -43,7 +43,7 @@ from palpate.leakage.signals import (
     signal_table,
     time_gap,
 )
-from palpate.report.results import MATRIX_ROWS, Audit, Impact, LeakPair
+from palpate.report.results import CANNOT_TELL, MATRIX_ROWS, Audit, Impact, LeakPair
 
 #: In place of a group where none is known and images alone are compared.
 NO_GROUP = "none"
@@ -175,7 +175,9 @@ def audit(  # noqa: PLR0913
         result = _compare(whole.part(parted, "train"), test_part, options, title, val=val)
         notes += _split_notes(whole, parted, val, result.group)
         result = replace(result, split=parted.digest)
-        if impact is not None:
+        if impact is not None and result.reason in ("untouched", "alike"):
+            notes.append(Note("impact-of-nothing"))
+        elif impact is not None:
             try:
                 result = replace(result, impact=impact(whole, parted, result.group, title))
             except PalpateError as error:  # the audit itself must not be lost
@@ -271,6 +273,7 @@ def _compare(
     gaps = nearest_in_video(a, b)
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
+    verdict, reason = _verdict(flags, bool(leaks.any()), named=not equal)
     timed = gaps.frames[gaps.frames >= 0]
     last = int(timed.max()) if timed.size else 0
     edges = [e for e in GAP_EDGES if e <= last] + [last + 1] if timed.size else []
@@ -302,8 +305,33 @@ def _compare(
             {"train": a, "val": b.clear() if val is None else val.table, "test": b}, group, leaks
         ),
         groups_in_all=len(groups[0] | groups[1]),
+        shared={c: n for c, n in shared_groups(a, b).items() if c not in equal},
+        verdict=verdict,
+        reason=reason,
         table=signal_table(test, train, flags, gaps),
     )
+
+
+def _verdict(flags: Sequence[Flags], leaks: bool, *, named: bool) -> tuple[str, str]:
+    """Whether the split leaks, and why that cannot be told.
+
+    Args:
+        flags: all signals.
+        leaks: whether any sample leaks.
+        named: whether equal names say something.
+    """
+    near = [f for f in flags if f.kind.startswith("near-duplicate")]
+    reasons = {note.code: note.params for note in near[-1].notes} if near else {}
+    files = [f for f in flags if f.kind == "identical bytes"]
+    if leaks:
+        return "leaks", ""
+    if "cannot-tell-untouched" in reasons:
+        return CANNOT_TELL, "untouched"
+    if reasons.get("cannot-tell-no-null", {}).get("threshold") is not None:
+        return CANNOT_TELL, "alike"
+    if not named and not any(np.isfinite(f.score).any() for f in (*near, *files)):
+        return CANNOT_TELL, "names"
+    return "none", ""
 
 
 def _notes(

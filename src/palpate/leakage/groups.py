@@ -8,6 +8,7 @@ smallest value of the first column in it, so that a group of one video has the v
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -26,43 +27,77 @@ Ints = NDArray[np.int64]
 
 
 def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, Note | None]:
-    """The column to keep whole: what the data set names, else the video.
+    """The column to keep whole: what the data set names, else the coarsest that is known.
 
-    Where most materials occur in too few videos, it is the contact.
+    Where most materials occur in too few groups, it is the next finer column.
 
     Returns:
-        The column, and a note that says why, unless it is simply the video.
+        The column, and a note that says why, unless it is simply the coarsest.
 
     Raises:
         PalpateError: if neither videos nor contacts nor objects are known.
     """
-    table = manifest.table
     named = manifest.facts.get("group")
-    candidates = [named] if named in GROUPS else []
-    known = [
-        group
-        for group in (*candidates, "video", "object", "contact")
-        if table.height and not table[group].null_count()
-    ]
-    if not known:
+    chain = list(dict.fromkeys([*_known(manifest, [str(named)]), *nested_groups(manifest)]))
+    if not chain:
         raise PalpateError(
             "A leak-free split needs the video, object or contact of every sample",
             "nulls in each of these columns",
             "Import a table that has one, or keep near-duplicates together",
             example={"near": "both"},
         )
-    first = known[0]
-    if first != "contact" and "contact" in known:
-        if table[first].n_unique() < parts:
-            return "contact", Note("group-few", {"group": first, "parts": parts})
-        materials = table.drop_nulls("material").group_by("material").agg(pl.col(first).n_unique())
-        enough = int((materials[first] >= parts).sum())
-        if 2 * enough < materials.height:
-            params = {"group": first, "parts": parts, "enough": enough}
-            return "contact", Note("group-materials", params | {"materials": materials.height})
-    if first == "video":
-        return first, None
-    return first, Note("group-of-data-set" if first == named else "group-instead", {"group": first})
+    lacks = [_lacks(manifest.table, column, parts) for column in chain[:-1]]
+    at = next((k for k, note in enumerate(lacks) if note is None), len(lacks))
+    if at:
+        return chain[at], replace(lacks[0], params=lacks[0].params | {"taken": chain[at]})
+    if chain[0] == named != "video":
+        return chain[0], Note("group-of-data-set", {"group": chain[0]})
+    return chain[0], None if "video" in chain else Note("group-instead", {"group": chain[0]})
+
+
+def nested_groups(manifest: Manifest) -> list[str]:
+    """Object, session, video and contact, coarsest first, as far as every sample has them.
+
+    Objects and sessions that cut across videos, or are no fewer than these, are no coarser groups.
+    """
+    known = _known(manifest, ["object", "session", "video", "contact"])
+    size = {c: manifest.table[c].n_unique() for c in known}
+    if "video" in known:
+        pairs = {
+            c: manifest.table.select("video", c).n_unique()
+            for c in ("object", "session")
+            if c in known
+        }
+        known = [c for c in known if c not in pairs or size[c] < size["video"] == pairs[c]]
+    coarse = [c for c in known if c in ("object", "session")]
+    return sorted(coarse, key=size.__getitem__) + [c for c in known if c not in coarse]
+
+
+def _known(manifest: Manifest, columns: Sequence[str]) -> list[str]:
+    table = manifest.table
+    return [c for c in columns if c in GROUPS and table.height and not table[c].null_count()]
+
+
+def _lacks(table: pl.DataFrame, column: str, parts: int) -> Note | None:
+    """Why a column cannot be the group: too few groups, or too few materials in enough of them."""
+    if table[column].n_unique() < parts:
+        return Note("group-few", {"group": column, "parts": parts})
+    materials = table.drop_nulls("material").group_by("material").agg(pl.col(column).n_unique())
+    enough = int((materials[column] >= parts).sum())
+    if 2 * enough >= materials.height:
+        return None
+    params = {"group": column, "parts": parts, "enough": enough}
+    return Note("group-materials", params | {"materials": materials.height})
+
+
+def shared_groups(train: pl.DataFrame, test: pl.DataFrame) -> dict[str, tuple[int, int]]:
+    """Column -> (test groups that are in train, test groups), of those that both parts know."""
+    shared: dict[str, tuple[int, int]] = {}
+    for column in ("video", "session", "object"):
+        base, queries = (set(t[column].drop_nulls()) for t in (train, test))
+        if base and queries:
+            shared[column] = len(base & queries), len(queries)
+    return shared
 
 
 def components(

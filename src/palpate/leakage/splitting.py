@@ -8,7 +8,7 @@ there are parts are named and go along.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
@@ -16,7 +16,14 @@ import numpy as np
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.leakage.groups import Ints, Nulls, choose_group, components
+from palpate.leakage.groups import (
+    Ints,
+    Nulls,
+    choose_group,
+    components,
+    nested_groups,
+    shared_groups,
+)
 from palpate.leakage.inputs import Data, read, require
 from palpate.leakage.noleak import HCT_GROUPS, published, require_hct
 from palpate.leakage.program import EXACT, RESOLUTION, Optimum, Problem, draw, optimize
@@ -58,7 +65,8 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         data: a manifest, a path (manifest, list, table, folder), several lists, or a data frame;
             with ``noleak="touch-and-go"`` None splits the videos of the record.
         by: one or several columns to keep whole; samples that share any of them stay together.
-            ``auto`` takes what the data set names, else the video, else what is known instead.
+            ``auto`` takes what the data set names, else the coarsest that is known: the object,
+            the session, the video, the contact.
         train: wanted share of the train part, in (0, 1).
         val: wanted share of the validation part, in [0, 1); test gets the remainder.
         seed: another seed gives another split of the same quality; several seeds give several.
@@ -127,7 +135,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
                 facts |= {"name": name, "folds": folds, "fold": fold, "shares": shares}
             where = {g: parts[k] for g, k in zip(names, assignment.tolist(), strict=True)}
             of = {i: where[g] for i, g in zip(manifest.ids, groups, strict=True)}
-            more = [*notes, *_notes(manifest, facts)]
+            more = [*notes, *_question(manifest, of), *_notes(manifest, facts)]
             splits.append(Split(of, dict(facts), manifest.digest, more))
     return splits[0] if isinstance(seed, int) and folds is None else splits
 
@@ -245,6 +253,21 @@ def _achieved(
         "rare": [columns[m] for m in np.flatnonzero(~problem.possible[:-1])],
         "missing": [f"{columns[m]}: {parts[p]}" for p, m in missing],
     }
+
+
+def _question(manifest: Manifest, parts: Mapping[str, str]) -> list[Note]:
+    """Whether the split is for new objects or for known ones, and what makes the other."""
+    if not {"train", "test"} <= set(parts.values()):
+        return []
+    split = Split(parts)
+    train, test = (manifest.part(split, part).table for part in ("train", "test"))
+    shared = shared_groups(train, test)
+    coarse = next((c for c in ("object", "session") if c in shared), None)
+    if coarse is None:
+        return []
+    known = "object" in shared and "video" in nested_groups(manifest)[1:]
+    other = coarse if shared[coarse][0] else "video" if known else None
+    return [Note("question", {"shared": shared, "other": other})]
 
 
 def _notes(manifest: Manifest, facts: dict[str, Any]) -> list[Note]:

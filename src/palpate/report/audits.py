@@ -75,6 +75,11 @@ def matrix_rows(audit: Audit) -> list[GroupRow]:
     return rows
 
 
+def impact_head(row: ImpactRow) -> list[str]:
+    """Return the features, the classifier, and by what the leak-free splits were made."""
+    return [row.features, row.classifier, *([f"by {row.group}"] if row.group else [])]
+
+
 def impact_cells(row: ImpactRow) -> dict[str, tuple[float, tuple[float, float] | None, str, str]]:
     """Return accuracy under both splits and cost, in percent: value, interval, and both as text."""
     cells = {

@@ -10,7 +10,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from palpate.core import SampleRef, plain
-from palpate.report.audits import impact_cells, matrix_parts, matrix_rows, pair_facts, pair_lists
+from palpate.report.audits import (
+    impact_cells,
+    impact_head,
+    matrix_parts,
+    matrix_rows,
+    pair_facts,
+    pair_lists,
+)
 from palpate.report.notes import (
     HINTS,
     HOW_TO_READ,
@@ -288,7 +295,7 @@ def _impact(impact: Impact) -> list[str]:
     head = ["accuracy of material, %", *(name.lower() for name in cells[0]), "chance"]
     rows = [
         [
-            esc(f"{r.features}, {r.classifier}"),
+            esc(", ".join(impact_head(r))),
             *(f"{value} {interval}".rstrip() for _, _, value, interval in row.values()),
             number(100 * r.chance, 1),
         ]

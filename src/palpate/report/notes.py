@@ -303,6 +303,37 @@ def _threshold_random_pairs(params: Mapping[str, Any], _: Style) -> str:
     )
 
 
+#: Column whose groups train and test share -> what the test part then asks for.
+QUESTIONS = {
+    "video": "new contacts of known videos",
+    "object": "new videos of known objects",
+    "session": "new videos of known sessions",
+}
+
+
+def question(shared: Mapping[str, Sequence[int]]) -> str:
+    """Return what a test part asks for, e.g. ``new objects``; '' where neither is known.
+
+    Args:
+        shared: column -> (test groups that are in train, test groups).
+    """
+    known = next((c for c in QUESTIONS if shared.get(c, (0, 0))[0]), "")
+    new = next((f"new {c}s" for c in ("object", "session") if c in shared), "")
+    return QUESTIONS.get(known, new)
+
+
+def _question(p: Mapping[str, Any], style: Style) -> str:
+    shared, other = p["shared"], p["other"]
+    line = f"This split is for {question(shared)}"
+    if other == "video":
+        line += f". For {QUESTIONS['object']}: {style:by=video}"
+    elif other:
+        count, of = shared[other]
+        line += f": {count} of {of} test {other}s are in train. For new {other}s: "
+        line += f"{style:{'by=' + other}}"
+    return line
+
+
 def _near_frames(params: Mapping[str, Any], _: Style) -> str:
     near = params["frames"]
     if not near:
@@ -328,16 +359,16 @@ LEAKAGE: dict[str, Sentence] = {
     ),
     "equal-names": _equal_names,
     "empty-files": "{count} files are empty (0 bytes) and were not compared",
-    "group-few": (
-        "There are fewer than {parts} {group}s: whole contacts are kept together instead, and"
-        " train and test share a {group}"
+    "group-few": lambda p, _: (
+        f"There are fewer than {p['parts']} {p['group']}s: whole {p.get('taken', 'contact')}s are "
+        f"kept together instead, and train and test share a {p['group']}"
     ),
     "group-instead": "The manifest knows no videos: the {group} is kept whole",
-    "group-materials": (
-        "Only {enough} of {materials} materials occur in {parts} or more {group}s, too few "
-        "for the {group} to be the group: whole contacts are"
-        " kept together instead. Train and test then share {group}s, so scores are optimistic"
-        " for new places"
+    "group-materials": lambda p, _: (
+        f"Only {p['enough']} of {p['materials']} materials occur in {p['parts']} or more "
+        f"{p['group']}s, too few for the {p['group']} to be the group: whole "
+        f"{p.get('taken', 'contact')}s are kept together instead. Train and test then share "
+        f"{p['group']}s, so scores are optimistic for new {p['group']}s"
     ),
     "group-near-only": "The manifest knows no videos: near-duplicates alone are kept together",
     "group-nulls": (
@@ -351,6 +382,11 @@ LEAKAGE: dict[str, Sentence] = {
         f"{p['count']} {p['modality']} images cannot be read and were not "
         f"compared{_few(p['files'])}"
     ),
+    "impact-not-by": "What known {group}s are worth could not be measured: {reason}",
+    "impact-of-nothing": (
+        "What leaking costs was not measured: without contact, or with images that are all alike, "
+        "a classifier tells recordings by the drift of the sensor, not materials"
+    ),
     "impact-failed": "What leaking costs could not be measured: {reason}",
     "median-backgrounds": _median_backgrounds,
     "missing-materials": _listed(
@@ -362,6 +398,7 @@ LEAKAGE: dict[str, Sentence] = {
         "were compared"
     ),
     "no-materials": "No sample has a material: only the sizes of the parts are balanced",
+    "question": _question,
     "rare-materials": _listed("In fewer than {parts} groups, so not in every part: {materials}"),
     "rows-skipped": _rows_skipped,
     "samples-in-no-part": "{count} of {of} samples of the manifest are in no part of the split",

@@ -28,6 +28,8 @@ RESULTS_FORMAT, AUDIT_FORMAT = "palpate-results/2", "palpate-audit/2"
 #: Every format that is read, newest first.
 RESULTS_FORMATS = (RESULTS_FORMAT, "palpate-results/1")
 AUDIT_FORMATS = (AUDIT_FORMAT, "palpate-audit/1")
+#: The verdict where a leak could not show.
+CANNOT_TELL = "cannot tell"
 #: Rows of the group-by-part matrix that an audit keeps.
 MATRIX_ROWS = 60
 #: Why two images are similar. Only ``content`` is a leak.
@@ -120,6 +122,7 @@ class ImpactRow:
         given_interval, clean_interval, cost_interval: 95 %, leaving out whole groups; None with
             fewer than two.
         chance: 1 / materials.
+        group: the column that the leak-free splits keep whole; '' in files of earlier versions.
     """
 
     features: str
@@ -131,6 +134,7 @@ class ImpactRow:
     clean_interval: tuple[float, float] | None
     cost_interval: tuple[float, float] | None
     chance: float
+    group: str = ""
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> ImpactRow:
@@ -190,6 +194,11 @@ class Audit:
         leaking_samples: test samples that any signal flags.
         matrix: rows ``{"group", "train", "val", "test", "leaking"}`` (counts of samples), shared
             groups with most test samples first; at most ``MATRIX_ROWS`` of ``groups_in_all``.
+        shared: column (video, session, object) that both parts know -> (test groups that are in
+            train, test groups): whether the test part asks for new videos, or for new objects.
+        verdict: ``leaks``, ``none``, or ``cannot tell``; '' in files of earlier versions.
+        reason: why that cannot be told: nothing was touched (``untouched``), all images are alike
+            (``alike``), or equal names mean nothing and there are no images (``names``).
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).
@@ -220,6 +229,9 @@ class Audit:
     leaking_samples: int = 0
     matrix: Sequence[Mapping[str, Any]] = ()
     groups_in_all: int = 0
+    shared: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    verdict: str = ""
+    reason: str = ""
     impact: Impact | None = None
     commands: Sequence[str] = ()
     others: Sequence[Audit] = ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from palpate.core import Score
-from palpate.report.notes import count, number, percent, plural, score_text
+from palpate.report.notes import count, number, percent, plural, question, score_text
 from palpate.report.results import Audit, Results, Signal
 from palpate.report.tables import Table, score_tables
 
@@ -108,16 +108,42 @@ def threshold_line(signal: Signal) -> str:
     return f"{line}. {count(above)} of {samples} ({share}) {verb} at or above it."
 
 
+#: Why it cannot be told whether a split leaks.
+UNTOLD = {
+    "untouched": "nothing was touched, so images cannot show what is new",
+    "alike": "images of different videos are all alike, so they cannot show what is new",
+    "names": "equal names of different roots mean nothing, and there are no images to compare",
+}
+
+
 def leak_line(audit: Audit) -> str:
-    """Return how many test samples any signal flags."""
+    """Return how many test samples any signal flags, and what they ask for."""
     n, total = audit.leaking_samples, plural(audit.test_samples, "test sample")
     if not n:
         several = len(audit.signals) != 1
         signals = f"any of the {len(audit.signals)} signals" if several else "the one signal"
-        return f"None of {total} leaks by {signals} checked."
+        line = f"None of {total} leaks by {signals} checked."
+        if audit.reason:
+            return f"Cannot be judged: {UNTOLD[audit.reason]}. {line}"
+        return " ".join(filter(None, [line, question_line(audit)]))
     return (
         f"{count(n)} of {total} {'leaks' if n == 1 else 'leak'} ({percent(audit.leaked_fraction)})."
     )
+
+
+def question_line(audit: Audit) -> str:
+    """Return what train and test share, and what the test part asks for; '' if nothing is known."""
+    asked = question(audit.shared)
+    if not asked or audit.against != "train":
+        return ""
+    things: list[str] = []
+    for column, (n, of) in audit.shared.items():
+        some = "no" if not n else "every" if n == of else "some"
+        things.append(f"{some} {column} shared" + (f" ({count(n)} of {count(of)})" if n else ""))
+    known = next((c for c in ("object", "session") if audit.shared.get(c, (0, 0))[0]), "")
+    other = f", not for new {known}s" if known else ""
+    things[0] = things[0].capitalize()
+    return f"{', '.join(things)}: the split is for {asked}{other}."
 
 
 def audit_line(audit: Audit) -> str:
