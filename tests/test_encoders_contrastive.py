@@ -18,6 +18,7 @@ from palpate.encoders.contrastive import (
     soft_targets,
     three_way,
     train_clip,
+    train_encoder,
     train_tactile,
 )
 from palpate.encoders.encoder_set import EncoderSet, encode_tactile, new_tactile
@@ -268,6 +269,16 @@ def test_training_can_go_on_from_another_encoder(world, clip, tmp_path):
         )
 
 
+def test_data_without_photos_train_against_words_alone(world, tmp_path):
+    bare = [{**row, "vision": None, "text": None} for row in world.table.iter_rows(named=True)]
+    bare = Manifest.from_rows(bare, world.root)
+    encoders = train_encoder(bare, by_video(world), preset=TINY, device="cpu")
+    assert encoders.clip.card["trained_on"] == "tactile images, not photos"
+    assert set(encoders.card["loss"][0]) >= {"tactile_text"}
+    assert not {"vision_text", "tactile_vision"} & set(encoders.card["loss"][0])
+    assert encoders.card["text_source"] == "caption"
+
+
 def test_fresh_clip_learns(world, tmp_path):
     course = replace(TINY.clip_course, epochs=40.0, batch=18, lr=1e-2)
     clip = train_clip(
@@ -294,7 +305,7 @@ def test_mistakes_are_explained(world, clip, tmp_path):
         ({"split": Split.from_ids(train=["nobody"])}, r"1 that are not, first .nobody"),
         ({"rows": changed(tactile=None)}, r"tactile image.*v0/2"),
         ({"rows": changed(tactile="gone.png")}, "1 bad-image"),
-        ({"rows": changed(text=None, material=None)}, r"text or a material.*v0/2"),
+        ({"rows": changed(vision=None)}, r"vision image.*v0/2"),  # photos for all or for none
         ({"device": "abacus"}, "`device` must be auto"),
     ):
         with pytest.raises(PalpateError, match=message):

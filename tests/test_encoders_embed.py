@@ -196,7 +196,7 @@ def test_mistakes_are_explained(world, encoders, tmp_path, cached):
     ]
 
 
-def test_texts_come_from_the_manifest_or_from_the_material(world):
+def test_texts_come_from_the_manifest_or_from_what_is_known(world):
     rows = world.table.to_dicts()
     assert texts_of(world) == ([r["text"] for r in rows], "manifest")
     assert texts_of(Manifest(world.table, world.root, {"text_source": "people"}))[1] == "people"
@@ -207,9 +207,11 @@ def test_texts_come_from_the_manifest_or_from_the_material(world):
     rows[0]["text"] = None
     mixed = texts_of(Manifest.from_rows(rows, world.root))
     assert mixed == ([captions[0], *[r["text"] for r in rows[1:]]], "manifest and caption")
-    rows[3].update(text="", material=None)
-    with pytest.raises(PalpateError, match=rows[3]["id"]):
-        texts_of(Manifest.from_rows(rows, world.root))
+    for known, source in (({"object": "cup"}, "object"), ({"video": "v"}, "video"), ({}, "id")):
+        row = {"id": "x/7"} | known
+        texts, made = texts_of(Manifest.from_rows([row], world.root))
+        assert row.get(source) in texts[0]
+        assert made == f"caption of the {source}"
 
 
 def test_embed_texts_in_any_order(encoders):

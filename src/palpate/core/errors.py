@@ -6,6 +6,7 @@ without a traceback and exits with status 2.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,8 +14,9 @@ from typing import Any
 
 from palpate.core.digest import plain
 
-#: Problems that a printed list shows.
+#: Lines of a printed list of problems, and how many of one kind it lists one by one.
 SHOWN_PROBLEMS = 40
+FEW_PROBLEMS = 3
 
 
 class PalpateError(Exception):
@@ -109,10 +111,20 @@ class Problem:
 
 
 def problem_lines(problems: Sequence[Problem]) -> list[str]:
-    """Return the first problems as lines of text, and how many more there are."""
-    lines = [f"  {problem}" for problem in problems[:SHOWN_PROBLEMS]]
-    more = len(problems) - SHOWN_PROBLEMS
-    return lines + [f"  ... and {more} more (JSON lists all)"] * (more > 0)
+    """Return problems as lines of text: of more than a few of one kind the first and their number.
+
+    Two are of one kind if their texts differ in quoted words, numbers, paths and values alone.
+    """
+    groups: dict[tuple[str, str], list[Problem]] = {}
+    for problem in problems:
+        bare = re.sub(r"'[^']*'|\S*[0-9/=.]\S*", "_", problem.text)
+        groups.setdefault((problem.kind, bare), []).append(problem)
+    lines: list[str] = []
+    for group in groups.values():
+        many = f"  {len(group):,} like {group[0]}"
+        lines += [many] if len(group) > FEW_PROBLEMS else [f"  {problem}" for problem in group]
+    more = len(lines) - SHOWN_PROBLEMS
+    return lines[:SHOWN_PROBLEMS] + [f"  ... and {more} more (JSON lists all)"] * (more > 0)
 
 
 class ProblemsError(PalpateError):

@@ -1,4 +1,4 @@
-"""Captions made from the name of a material, for data that has labels but no words.
+"""Captions made from the name of a material, or of what else is known, for data without words.
 
 ``caption`` draws three adjectives of the material and a template from (seed, sample id), so a
 sample has one caption whatever the order. The words are about touch alone: no color, no light. Such
@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from palpate.core import rng_for
 
+#: Column -> what a caption is of, for a sample without a text: the first of these that it has.
+NAMED = ("material", "object", "video", "id")
 #: What each of the Touch and Go materials feels like.
 ADJECTIVES: dict[str, tuple[str, ...]] = {
     "Concrete": ("hard", "rough", "gritty", "abrasive", "cold", "solid"),

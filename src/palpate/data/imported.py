@@ -19,6 +19,7 @@ from palpate.core import (
     plain,
     problem_lines,
 )
+from palpate.data.captions import NAMED
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 
 if TYPE_CHECKING:
@@ -145,11 +146,12 @@ def _understood(manifest: Manifest) -> dict[str, str]:
 
 
 def words_of(table: pl.DataFrame) -> str:
-    """What captions are made of for samples without a text, in words."""
+    """How many samples have no text, and what their captions will be made of, in words."""
     without = table.filter(pl.col("text").is_null())
-    counts = {c: without[c].count() for c in ("material", "object")}
-    made = [f"{n} made from the name of the {column}" for column, n in counts.items() if n]
-    return ", ".join(made[:1])
+    names = pl.coalesce(*(pl.when(pl.col(c).is_not_null()).then(pl.lit(c)) for c in NAMED))
+    counts = without.select(names.alias("of")).group_by("of", maintain_order=True).len().iter_rows()
+    made = ", ".join(f"{count} of the {'sample' if c == 'id' else c}" for c, count in counts)
+    return f"made from the name: {made}" if made else ""
 
 
 def readable(facts: Facts) -> dict[str, Any]:

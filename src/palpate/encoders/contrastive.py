@@ -42,6 +42,7 @@ from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     ClipEncoders,
     EncoderSet,
+    Modality,
     Preprocess,
     encode_tactile,
     load_clip,
@@ -94,7 +95,7 @@ def train_encoder(
         All three encoders, with a card.
 
     Raises:
-        PalpateError: if the train part is empty, or a sample of it lacks an image or words.
+        PalpateError: if the train part is empty, or a sample of it lacks an image.
     """
     if epochs is not None and not 0 < epochs < math.inf:
         fix = "Leave it out for the preset's length"
@@ -172,7 +173,7 @@ def info_nce(a: Tensor, b: Tensor, scale: Tensor | float, targets: Tensor | None
 def three_way(
     tactile: Tensor,
     text: Tensor,
-    vision: Tensor,
+    vision: Tensor | None,
     scale: Tensor | float,
     *,
     weights: Sequence[float] = (1.0, 1.0, 1.0),
@@ -183,7 +184,7 @@ def three_way(
     Args:
         tactile: (n, d), L2-normalized.
         text: the same.
-        vision: the same.
+        vision: the same, or None for data without photos: the first pair alone.
         scale: 1 / tau.
         weights: of tactile-text, vision-text, tactile-vision; the total is their weighted mean.
         text_targets: for the two text pairs, see :func:`info_nce`.
@@ -197,11 +198,11 @@ def three_way(
     if len(weights) != 3 or min(weights) < 0 or not sum(weights) > 0:
         must, got = "must be three numbers >= 0 with a positive sum", f"{tuple(weights)}"
         raise PalpateError(must, got, "", argument="weights", example={"weights": (1, 1, 1)})
-    pairs = {
-        "tactile_text": info_nce(tactile, text, scale, text_targets),
-        "vision_text": info_nce(vision, text, scale, text_targets),
-        "tactile_vision": info_nce(tactile, vision, scale),
-    }
+    pairs = {"tactile_text": info_nce(tactile, text, scale, text_targets)}
+    if vision is None:
+        return pairs["tactile_text"], {k: float(loss.detach()) for k, loss in pairs.items()}
+    pairs["vision_text"] = info_nce(vision, text, scale, text_targets)
+    pairs["tactile_vision"] = info_nce(tactile, vision, scale)
     weighted = [w * loss for w, loss in zip(weights, pairs.values(), strict=True)]
     total = torch.stack(weighted).sum() / sum(weights)
     return total, {name: float(loss.detach()) for name, loss in pairs.items()}
@@ -242,7 +243,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     """Train a tactile encoder against a frozen CLIP; run again to resume.
 
     Args:
-        manifest: samples with tactile and vision images, and a text or a material.
+        manifest: samples with tactile images, and photos for all or for none.
         split: only its part ``train`` is read; its digest goes into the card.
         clip: the frozen encoders; moved to ``device``.
         preset: size and course.
@@ -262,8 +263,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         All three encoders with a card.
 
     Raises:
-        PalpateError: if the train part is empty, or a sample lacks an image, or both text and
-            material.
+        PalpateError: if the train part is empty, or a sample lacks an image.
     """
     place = pick_device(device)
     train = train_part(manifest, split)
@@ -271,9 +271,10 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     frozen = EncoderSet(clip)
     texts, text_source = texts_of(train)
     images = cached_images(train, "tactile", preset.image, cache, progress)
-    text, vision = (
+    modalities: list[Modality] = ["text", *(["vision"] if _sides(train)[0] == "vision" else [])]
+    text, *photos = (
         torch.from_numpy(embed(train, frozen, m, cache=cache, progress=progress).features).to(place)
-        for m in ("text", "vision")
+        for m in modalities
     )
     tactile, preprocess = _first_weights(preset, clip.dim, images, seed, start)
     course = preset.tactile_course
@@ -289,8 +290,9 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         soft = soft_targets(numbers[rows]) if mode == "identical-text" else None
         scale = clamped_scale(module.log_scale)
         embedded = encode_tactile(module.tactile, pixels)
+        vision = photos[0][rows] if photos else None
         total, logs = three_way(
-            embedded, text[rows], vision[rows], scale, weights=weights, text_targets=soft
+            embedded, text[rows], vision, scale, weights=weights, text_targets=soft
         )
         return total, {**logs, "scale": float(scale.detach())}
 
@@ -373,8 +375,8 @@ def train_clip(
 ) -> ClipEncoders:
     """Train a fresh vision and text encoder on the train part of a split, by InfoNCE of that pair.
 
-    Arguments as :func:`train_tactile`; ``manifest`` needs photos and a text or a material. Run
-    again to resume.
+    Arguments as :func:`train_tactile`. Without photos the vision encoder is trained on the tactile
+    images, as the text encoder needs a partner; the card says so. Run again to resume.
 
     Returns:
         The CLIP, frozen, with a card.
@@ -389,7 +391,7 @@ def train_clip(
     if course is None:
         must, got = "must describe a fresh CLIP", f"{preset.name}, which takes {preset.pretrained}"
         raise PalpateError(must, got, "Pass a clip, or use the preset mini", argument="preset")
-    images = cached_images(train, "vision", preset.image, cache, progress)
+    images = cached_images(train, _sides(train)[0], preset.image, cache, progress)
     clip = new_clip(preset, texts, seed, _preprocess(preset, images))
     move(clip.model, place)
     clip.model.requires_grad_(True)
@@ -409,6 +411,7 @@ def train_clip(
         return info_nce(vision, text, scale, soft), {"scale": float(scale.detach())}
 
     facts = _facts(preset, train, split, texts, text_source, options) | {"targets": mode}
+    facts |= {} if _sides(train)[0] == "vision" else {"trained_on": "tactile images, not photos"}
     key, what = digest_json([facts, _stamps(train)]), "training vision and text"
     log = fit(clip.model, loss, len(train), options, folder, what=what, key=key, progress=progress)
     clip.model.eval().requires_grad_(False)
@@ -425,10 +428,15 @@ def train_part(manifest: Manifest, split: Split) -> Manifest:
     return train
 
 
+def _sides(train: Manifest) -> list[str]:
+    """The image columns that training uses: without a single photo, the tactile images alone."""
+    sides = ["vision", "tactile"]
+    return [side for side in sides if train.table[side].count()] or sides
+
+
 def _stamps(train: Manifest) -> list[str]:
     """What must not have changed on disk for a checkpoint to be continued."""
-    columns = [c for c in ("vision", "tactile") if not train.table[c].null_count()]
-    return [image_stamp(train, column) for column in columns]
+    return [image_stamp(train, column) for column in _sides(train)]
 
 
 def _numbers(texts: Sequence[str]) -> Tensor:

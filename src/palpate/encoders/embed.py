@@ -27,32 +27,28 @@ from palpate.core import (
     require_choice,
     short,
 )
-from palpate.data.captions import caption
+from palpate.data.captions import NAMED, caption
 from palpate.data.images import REFETCH, cached_images, file_stamp, load_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality, to_unit
 
 
 def texts_of(manifest: Manifest, *, seed: int = 0) -> tuple[list[str], str]:
-    """One text per sample: the manifest's, else a caption written from the material; deterministic.
+    """One text per sample: the manifest's, else a caption of its material, object, video or id.
 
     Returns:
-        n texts, and their source: ``manifest``, ``caption``, or ``manifest and caption``; the fact
-        ``text_source`` of the manifest replaces ``manifest``.
-
-    Raises:
-        PalpateError: if a sample has neither text nor material.
+        n texts, and their source: ``manifest``, ``caption`` (of the material), ``caption of the
+        object`` ..., joined by ``and``; the fact ``text_source`` replaces ``manifest``.
     """
     texts: list[str] = []
     sources: set[str] = set()
     default = str(manifest.facts.get("text_source") or "manifest")
-    columns = (manifest.ids, manifest.column("text"), manifest.column("material"))
-    for name, text, material in zip(*columns, strict=True):
-        if not text and not material:
-            must, got = "Every sample must have a text or a material here", f"neither for {name!r}"
-            raise PalpateError(must, got, "Fill one of the two columns")
-        texts.append(str(text) if text else caption(str(material), str(name), seed))
-        sources.add(default if text else "caption")
+    for row in manifest.table.select("text", *NAMED).iter_rows(named=True):
+        column = next(name for name in ("text", *NAMED) if row[name] or name == "id")
+        text = str(row[column])
+        texts.append(text if column == "text" else caption(text, str(row["id"]), seed))
+        made = "caption" if column == "material" else f"caption of the {column}"
+        sources.add(default if column == "text" else made)
     return texts, " and ".join(sorted(sources, key=lambda s: (s != default, s)))
 
 

@@ -50,7 +50,6 @@ from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import preset_named as diffusion_preset
 from palpate.diffusion.training import train_pipeline
 from palpate.encoders.contrastive import train_clip, train_tactile
-from palpate.encoders.embed import texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import Part, is_shipped, pick_device, shipped_folder
 from palpate.encoders.presets import preset as encoder_preset
@@ -241,7 +240,6 @@ class _Demo:
             options: dict[str, Any] = {"size": size, "overwrite": True, "progress": self.progress}
             options["skip_bad"] = self.options.skip_bad
             imported = import_dataset(source, folder, **options)
-            texts_of(imported.manifest)  # raises for samples with neither text nor material
             return {
                 "digest": imported.manifest.digest,
                 "dataset": imported.facts.get("dataset", source.name),
