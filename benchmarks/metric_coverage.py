@@ -10,8 +10,8 @@ or nothing under the null. ``paired``: generated and real frames are of the same
 effects they share with a correlation of 0.7 (as on a test set); ``unpaired``: of different videos.
 
 TMMD and I-TMMD are of videos whose class is drawn at random, CI- and D-TMMD of four classes with
-equally many videos each; lengths of 1 to 60 frames test E. Scenes are videos of one frame, whose ids
-alone are known. The truth is what infinitely many videos would give, from 200,000
+equally many videos each; lengths of 1 to 60 frames test E. Scenes are videos of one frame, whose
+ids alone are known. The truth is what infinitely many videos would give, from 200,000
 simulated ones (its error is below a hundredth of a replicate's standard deviation). I-, CI- and
 D-TMMD depend on the sizes of the videos by a known factor (:func:`share`), which the truth
 includes; E does not.
