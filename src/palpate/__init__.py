@@ -14,9 +14,10 @@ Every name is imported on first use: ``import palpate`` itself loads neither tor
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 __version__ = "0.1.0.dev0"
 
@@ -66,7 +67,7 @@ __all__ = [
     "validate",
 ]
 
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = partial(import_name, __name__, _MODULES)
 
 
 def __dir__() -> list[str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 if TYPE_CHECKING:
     from palpate.evaluation.probing import probe
@@ -12,4 +13,4 @@ if TYPE_CHECKING:
 
 __all__ = ["probe", "score"]
 
-__getattr__ = lazy_names(__name__, {"probe": "probing", "score": "scoring"})
+__getattr__ = partial(import_name, __name__, {"probe": "probing", "score": "scoring"})
