@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from palpate.data import Manifest, load, validate
     from palpate.diffusion import TactilePipeline, generate, train_generator
     from palpate.encoders import Encoder, train_encoder
-    from palpate.evaluation import probe, score
-    from palpate.leakage import audit, split
+    from palpate.evaluation import audit, probe, score
+    from palpate.leakage import split
     from palpate.sim import World
 
 #: Public name -> the room that holds it.
@@ -38,7 +38,7 @@ _MODULES = {
     "Split": "core",
     "TactilePipeline": "diffusion",
     "World": "sim",
-    "audit": "leakage",
+    "audit": "evaluation",
     "generate": "diffusion",
     "load": "data",
     "probe": "evaluation",

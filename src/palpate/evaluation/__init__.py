@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 from palpate._lazy import import_name
 
 if TYPE_CHECKING:
+    from palpate.evaluation.auditing import audit
     from palpate.evaluation.probing import probe
     from palpate.evaluation.scoring import score
 
-__all__ = ["probe", "score"]
+__all__ = ["audit", "probe", "score"]
 
-__getattr__ = partial(import_name, __name__, {"probe": "probing", "score": "scoring"})
+_MODULES = {"audit": "auditing", "probe": "probing", "score": "scoring"}
+
+__getattr__ = partial(import_name, __name__, _MODULES)
