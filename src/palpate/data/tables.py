@@ -199,9 +199,8 @@ def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[
         for cells in reader:
             last = reader.line_num
             quotes = sum(line.count('"') for line in lines[first - 1 : last])
-            if last > first and (
-                quotes % 2 or _rows_inside(lines[first:last], reader.dialect, cells)
-            ):
+            inner = lines[first:last]  # what a quoted cell took in
+            if inner and (quotes % 2 or _rows_inside(inner, reader.dialect, len(cells))):
                 swallowed = f"a quotation mark stays open up to line {last}"
                 problems.append(Problem(f"{path}:{first}", "open-quote", swallowed))
             elif any(cell.strip() for cell in cells):
