@@ -103,7 +103,7 @@ def test_atomic_writing_leaves_nothing_half(tmp_path):
         ("[1]", "must be a JSON object"),
         ('{"format": "x"}', "must have the format a/2"),
         ('{"format": "a/1"}', "must have the keys k"),
-        ('{"format": "a/2", "k": NaN}', "finite numbers"),
+        ('{"format": "a/2", "k": NaN}', "not JSON compliant"),
     ],
 )
 def test_records_that_cannot_be_read(tmp_path, text, words):

@@ -16,7 +16,7 @@ TOP = Path(__file__).resolve().parents[1]
 #: Public function -> its parameters in order; keywords behind the star.
 SIGNATURES = {
     "audit": (
-        "train_or_data test * split pretrain by near_frames identity images modalities "
+        "train_or_data test * split pretrain by near_frames images modalities "
         "false_positives encoder impact name worst cache threads root skip_bad progress"
     ),
     "generate": (

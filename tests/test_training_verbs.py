@@ -56,7 +56,7 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     assert not [p.name for p in tmp_path.iterdir() if p.name.endswith(".work")]
     # The same again does not overwrite.
     assert main(["train", "encoder", *common, "-o", "encoders"]) == 2
-    assert "--output must be absent or an empty folder" in capsys.readouterr().err
+    assert "must be absent or an empty folder" in capsys.readouterr().err
 
 
 def test_an_interrupted_training_ends_as_an_uninterrupted_one(data, tmp_path):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 
-from palpate.cli.verbs import OK, USER_ERROR, VERBS
+from palpate.cli.verbs import INTERRUPTED, OK, USER_ERROR, VERBS
 
 
 def usage(group: str = "") -> str:
@@ -37,22 +37,26 @@ def main(argv: list[str] | None = None) -> int:
         0 done; 1 a check failed (``audit --fail-over``); 2 a user's mistake, explained in one line;
         70 a bug in palpate; 130 stopped by Ctrl-C.
     """
-    from palpate.cli.streams import resilient_streams
+    try:
+        from palpate.cli.streams import resilient_streams
 
-    with resilient_streams():
-        try:
+        with resilient_streams():
             try:
                 return _run(sys.argv[1:] if argv is None else argv)
             finally:
                 sys.stdout.flush()
-        except (
-            OSError
-        ) as error:  # a full disk behind standard output; verbs explain their own files
-            sys.stderr.write(
-                f"palpate: standard output must be writable. Got {error.strerror}. "
-                "Free some space, or redirect it elsewhere.\n"
-            )
-            return USER_ERROR
+    except KeyboardInterrupt:  # also while the libraries load
+        sys.stderr.write(
+            "\npalpate: stopped. Run the same command again: with an output or a cache it "
+            "resumes.\n"
+        )
+        return INTERRUPTED
+    except OSError as error:  # a full disk behind standard output; verbs explain their own files
+        sys.stderr.write(
+            f"palpate: standard output must be writable. Got {error.strerror}. "
+            "Free some space, or redirect it elsewhere.\n"
+        )
+        return USER_ERROR
 
 
 def _run(args: list[str]) -> int:

@@ -20,7 +20,7 @@ from palpate.cli.terminal import (
     guard_output,
     require_extra,
 )
-from palpate.core import PalpateError, write_text
+from palpate.core import PalpateError, is_stream, write_text
 from palpate.report.results import Audit
 
 Modality = Literal["vision", "tactile"]
@@ -99,7 +99,9 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     _check(options)
     cache, temporary = options.cache, None
     written = options.outputs.output or options.outputs.page or options.outputs.table
-    if cache is None and written is not None:  # an interrupted run resumes from it
+    if (
+        cache is None and written is not None and not is_stream(written)
+    ):  # an interrupted run resumes from it
         cache = temporary = written.absolute().parent / f".{written.name}.work"
     with terminal.progress() as progress:
         result = audit(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
-from palpate.core import Note, PalpateError, read_record, short
+from palpate.core import Note, PalpateError, inside, read_record, short
 from palpate.report.results import AUDIT_FORMATS, RESULTS_FORMATS, Audit, Results
 
 TITLE = "palpate report"
@@ -27,6 +28,8 @@ class Options(Common):
     """The page to write (.html)."""
     title: str = TITLE
     """Heading of the page."""
+    images: tuple[Path, ...] = ()
+    """Folders whose images the page may show, next to those of the results."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -41,7 +44,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         guard_output(options.output, options.results, marks)
         guard_output(options.output.with_suffix(".json"), options.results)
         guard_output(options.output.with_suffix(".md"), options.results, marks)
-    merged = reduce(join, map(read, options.results), Results(title=options.title))
+    results = [read(path, options.images) for path in options.results]
+    merged = reduce(join, results, Results(title=options.title))
+    for note in merged.notes:
+        if note.code == "images-outside":
+            terminal.note(note)
     merged = replace(merged, notes=[*merged.notes, *_mismatch(merged)])
     with terminal.progress() as progress:
         files = write_report(merged, options.output, base=Path(), progress=progress)
@@ -50,8 +57,11 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     return paths
 
 
-def read(path: Path) -> Results:
+def read(path: Path, folders: Sequence[Path] = ()) -> Results:
     """Read one file of results or an audit, with image paths from the working directory.
+
+    Images outside its folder and ``folders`` are removed: a page of results from elsewhere must not
+    show what their author may not see.
 
     Raises:
         PalpateError: if it is missing, of another format, or incomplete.
@@ -62,11 +72,23 @@ def read(path: Path) -> Results:
             results = replace(Audit.from_json(data).to_results(), title="")
         else:
             results = Results.from_json(data)
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        got = f"a missing or unknown field ({error})"
+    except ValueError as error:
+        got = f"a missing, unknown or wrong field ({error})"
         fix = "Write it again with palpate"
         raise PalpateError(f"{path} must hold complete results", got, fix) from None
-    return results.with_paths(lambda name: os.path.normpath(path.parent / name))
+    outside: set[str] = set()
+
+    def place(name: str) -> str | None:
+        if any(
+            inside(root, str(path.parent.absolute() / name)) for root in (path.parent, *folders)
+        ):
+            return os.path.normpath(path.parent / name)
+        outside.add(name)
+        return None
+
+    results = results.with_paths(place)
+    note = Note("images-outside", {"count": len(outside), "file": str(path)})
+    return replace(results, notes=[*results.notes, note]) if outside else results
 
 
 def join(first: Results, second: Results) -> Results:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_output
-from palpate.core import PalpateError
+from palpate.core import PalpateError, is_stream
 
 Companion = Literal[
     "fid", "kid", "cmmd", "prdc", "ssim", "psnr", "ms-ssim", "contact", "lpips", "none"
@@ -150,7 +150,7 @@ def _check_outputs(options: Options) -> None:
 def _cache(options: Options) -> Path | None:
     output = options.output or options.latex
     images = options.reference.is_dir() or options.encoder
-    if options.cache or output is None or not images:
+    if options.cache or output is None or is_stream(output) or not images:
         return options.cache
     return output.absolute().parent / f".{output.name}.work"
 

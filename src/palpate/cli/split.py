@@ -17,7 +17,15 @@ from palpate.cli.terminal import (
     Terminal,
     guard_output,
 )
-from palpate.core import PalpateError, Split, atomic_folder, digest_file, write_json, write_text
+from palpate.core import (
+    PalpateError,
+    Split,
+    atomic_folder,
+    digest_file,
+    require_new_folder,
+    write_json,
+    write_text,
+)
 
 Column = Literal["video", "object", "session", "contact", "domain", "sensor"]
 #: Facts of the rule that are printed.
@@ -164,6 +172,9 @@ def _check(options: Options) -> None:
         )
     if options.output is not None and used not in (["--seeds"], ["--folds"]):
         guard_output(options.output, options.paths, (b'"format": "palpate-',))
+    for folder in (options.output if used in (["--seeds"], ["--folds"]) else None, options.lists):
+        if folder is not None:
+            require_new_folder(folder)
 
 
 def _facts(split: Split) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import tyro
 from rich.console import Console
 
-from palpate.cli.verbs import BUG, FAILED_CHECK, INTERRUPTED, OK, USER_ERROR, VERBS
+from palpate.cli.verbs import BUG, FAILED_CHECK, OK, USER_ERROR, VERBS
 from palpate.core import (
     MissingExtraError,
     Note,
@@ -47,6 +47,7 @@ from palpate.core import (
     ProblemsError,
     Progress,
     fact_lines,
+    is_stream,
     problem_lines,
     quiet,
 )
@@ -57,7 +58,7 @@ if TYPE_CHECKING:
 
 #: Verbs whose first arguments may stand without their option: ``palpate score a/ --reference b/``.
 LEADING = {"score": "--generated"}
-#: Verb and option (and value) of earlier versions -> how it is written now. '' is every verb, or
+#: Verb and option of earlier versions -> how it is written now. '' is every verb, or
 #: the verb itself.
 RENAMED: dict[tuple[str, str], str] = {
     ("encoder", ""): "palpate train encoder",
@@ -78,12 +79,6 @@ RENAMED: dict[tuple[str, str], str] = {
     ("validate", "--set"): "an option for each name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",
     ("score", "--controls"): "the default; --no-controls turns it off",
-    ("split", "--by touch"): "--by contact",
-    ("audit", "--by touch"): "--by contact",
-    ("split", "--nulls own"): "--nulls single",
-    ("world", "--touches-per-video"): "--contacts-per-video",
-    ("world", "--frames-per-touch"): "--frames-per-contact",
-    ("world", "--leak touch"): "--leak contact",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' is every verb.
@@ -92,11 +87,13 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "test"): "TEST",
     ("", "columns"): "--map",
     ("", "side"): "--as",
-    ("", "data"): "PATH",
-    ("", "source"): "PATH",
-    ("generate", "photos"): "PATH",
+    ("", "data"): "DATA",
+    ("", "source"): "SOURCE",
+    ("generate", "photos"): "PHOTO",
 }
 
+#: What would break a line of the terminal, or color it.
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 #: A flag without its negation: for options that are off by default.
 Switch = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 OutPath = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -223,10 +220,7 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
     """
     join_help_lines(options)
     leading = LEADING.get(name, "")
-    if leading and args and not args[0].startswith("-"):
-        if leading in args:
-            must = f"An argument of palpate {name} must come after its option"
-            raise PalpateError(must, args[0], f"E.g. {VERBS[name].example}")
+    if leading and args and not args[0].startswith("-") and leading not in args:
         args = [leading, *args]
     box, about = io.StringIO(), inspect.cleandoc(options.__doc__ or "")
     try:
@@ -243,36 +237,16 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
             raise
         _answer_renamed(name, args)
         words = " ".join(re.sub(r"[\u2500-\u257f]+", " ", box.getvalue()).split())
-        raise _parse_error(name, options, words) from None
-
-
-def _parse_error(name: str, options: type[Any], words: str) -> PalpateError:
-    """Return tyro's message about arguments as must, got, fix."""
-    fix = f"See: palpate {name} --help"
-    if unknown := re.search(r"Unrecognized options: (\S+)", words):
-        near = difflib.get_close_matches(unknown[1], _option_names(options), 1, 0.75)
-        fix = f"Did you mean: {near[0]}" if near else fix
-        kind = "An option" if unknown[1].startswith("-") else "An argument"
-        must = f"{kind} of palpate {name} must be one of its help"
-        return PalpateError(must, unknown[1].rstrip(","), fix)
-    choice = re.search(
-        r"invalid choice '(.*?)' for argument '(.*?)'. Expected one of \((.*?)\)", words
-    )
-    if choice:
-        choices = sorted(set(re.findall(r"'(.*?)'", choice[3])) - {"None"})
-        return PalpateError(f"{choice[2]} must be one of {', '.join(choices)}", choice[1], fix)
-    value = re.search(
-        r"Error parsing (\S+): no type matching (.+?) could .*? from \[(.*?)\]", words
-    )
-    if value:
-        return PalpateError(f"{value[1]} must be {value[2]}", value[3], fix)
-    if missing := re.search(r"Missing from palpate [a-z ]+: (.*)", words):
-        first = (part.strip().removeprefix("-o PATH, ") for part in missing[1].split("(required)"))
-        names = [part.split(" ")[0] for part in first if re.match(r"--\w|[A-Z]+ ", part)]
-        return PalpateError(f"{' and '.join(names)} must be given", "none", fix)
-    hints = r"For full helptext|Argument helptext|Full error|If your arguments"
-    got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
-    return PalpateError(f"The options of palpate {name} must be as its help says", got, fix)
+        if unknown := re.search(r"Unrecognized options: (\S+)", words):
+            near = difflib.get_close_matches(unknown[1], _option_names(options), 1, 0.75)
+            fix = f"Did you mean: {near[0]}" if near else f"See: palpate {name} --help"
+            kind = "An option" if unknown[1].startswith("-") else "An argument"
+            must = f"{kind} of palpate {name} must be one of its help"
+            raise PalpateError(must, unknown[1].rstrip(","), fix) from None
+        hints = r"For full helptext|Argument helptext|Full error|If your arguments"
+        got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
+        must = f"The options of palpate {name} must be as its help says"
+        raise PalpateError(must, got, f"See: palpate {name} --help") from None
 
 
 def join_help_lines(options: type[Any]) -> None:
@@ -284,8 +258,7 @@ def join_help_lines(options: type[Any]) -> None:
         hints = get_type_hints(cls, include_extras=True)
         for name in cls.__annotations__:
             default = cls.__dataclass_fields__[name].default
-            many = default is dataclasses.MISSING and "tuple" in str(hints[name])
-            if default is None or default is False or default == () or many:
+            if default is None or default is False or default == ():
                 cls.__annotations__[name] = _with_hint(hints[name], "")
             elif default is True:
                 cls.__annotations__[name] = _with_hint(hints[name], "(on by default)")
@@ -295,10 +268,7 @@ def join_help_lines(options: type[Any]) -> None:
                 field: Any = cls.__dataclass_fields__[ast.unparse(statement.target)]
                 text = " ".join(str(ast.literal_eval(doc.value)).split())
                 field.metadata = {**field.metadata, "help": text}
-    for field in dataclasses.fields(options):
-        group: Any = field.default_factory
-        if dataclasses.is_dataclass(field.default):
-            group = type(field.default)
+    for group in (field.default_factory for field in dataclasses.fields(options)):
         # The groups of `palpate world` are made by the verb and have no source.
         if dataclasses.is_dataclass(group) and group.__module__ != "types":
             join_help_lines(group)  # type: ignore[arg-type]
@@ -325,9 +295,7 @@ def _option_names(options: type[Any]) -> list[str]:
 
 def _answer_renamed(name: str, args: Sequence[str]) -> None:
     """Raise for an option of an earlier version, with its new name."""
-    words = [word for arg in args for word in arg.split("=", 1)]
-    values = (f"{option} {value}" for option, value in pairwise(words))
-    for option in (*(word for word in words if word.startswith("--")), *values):
+    for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
         if new := RENAMED.get((name, option)) or RENAMED.get(("", option)):
             must = f"{option} of palpate {name} is now {new}"
             raise PalpateError(must, option, f"See: palpate {name} --help")
@@ -398,6 +366,8 @@ def guard_output(
 
 def _require_writable(output: Path) -> None:
     """Make a temporary file next to ``output`` now, rather than fail when all is computed."""
+    if is_stream(output):
+        return
     try:
         if output.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -436,7 +406,7 @@ def _file_error(error: OSError) -> PalpateError:
 
 
 def _print_error(line: str) -> None:
-    sys.stderr.write(f"{line}\n")
+    sys.stderr.write(f"{_CONTROL.sub(lambda sign: ascii(sign[0])[1:-1], line)}\n")
 
 
 def _write_json(data: Any) -> None:
@@ -453,6 +423,7 @@ def run_verb(name: str, args: Sequence[str]) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PalpateWarning)  # results carry them as notes
+            _require_words(args)
             result, status = _call(name, args)
         if as_json:
             _write_json(result)
@@ -468,12 +439,6 @@ def run_verb(name: str, args: Sequence[str]) -> int:
         if as_json:
             _write_json(error.to_json())
         return USER_ERROR
-    except KeyboardInterrupt:
-        sys.stderr.write(
-            f"\npalpate {name}: stopped. Run the same command again: with an output or a cache it "
-            "resumes.\n"
-        )
-        return INTERRUPTED
     except Exception as bug:  # the traceback helps to report it
         traceback.print_exc()
         sys.stderr.write(
@@ -484,6 +449,14 @@ def run_verb(name: str, args: Sequence[str]) -> int:
             error = PalpateError("palpate must not fail", str(bug), fix)
             _write_json(error.to_json() | {"error": type(bug).__name__})
         return BUG
+
+
+def _require_words(args: Sequence[str]) -> None:
+    """Reject what no option takes: an empty variable of the shell, a path that is not UTF-8."""
+    for arg in args:
+        if not arg or re.search("[\ud800-\udfff]", arg):
+            must = "The arguments must be UTF-8 and not empty"
+            raise PalpateError(must, ascii(arg), "Rename the path, or check the shell's variables")
 
 
 def _call(name: str, args: Sequence[str]) -> tuple[Any, int]:

@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal
+from palpate.cli.terminal import Common, OutPath, Terminal, guard_output
 from palpate.core import PalpateError
 from palpate.sim import (
     DEFAULT,
     PRESETS,
-    SEEN_WARNING,
+    SEEN,
     WorldOptions,
     load_options,
     render_sheet,
@@ -84,13 +84,15 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Write the world and print what it holds."""
     world = world_options(options)
     if options.sheet:
-        render_sheet(world, options.sheet)
+        guard_output(options.sheet, [options.options] if options.options else [], (b"palpate",))
     if seen_by_mini(world):
-        terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
+        terminal.print_line(f"Seed {world.seed}: {SEEN}")
     with terminal.progress() as progress:
         record = write_world(options.output, world, workers=options.workers, progress=progress)
+    if options.sheet:
+        render_sheet(world, options.sheet)
     facts = {"folder": str(record.folder), "digest": record.digest, **record.counts}
-    facts |= {"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(world) else {}
+    facts |= {"seen_by_shipped_models": SEEN} if seen_by_mini(world) else {}
     leak = {f"leak: {k}": v for k, v in record.leak.items()}
     terminal.facts(f"World {options.output} (synthetic)", facts | leak)
     return facts | {"leak": record.leak}

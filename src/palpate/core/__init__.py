@@ -6,8 +6,6 @@ from palpate.core.digest import (
     digest_json,
     digest_lines,
     plain,
-    rng_for,
-    seed_for,
     short,
     to_numpy,
 )
@@ -25,14 +23,18 @@ from palpate.core.files import (
     atomic_folder,
     atomic_path,
     inside,
+    is_stream,
+    locked,
     read_json,
     read_record,
     reading_entry,
+    require_new_folder,
     write_json,
     write_text,
 )
 from palpate.core.notes import Note
 from palpate.core.progress import Progress, quiet, track
+from palpate.core.random import rng_for, seed_for
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
@@ -60,6 +62,8 @@ __all__ = [
     "digest_lines",
     "fact_lines",
     "inside",
+    "is_stream",
+    "locked",
     "plain",
     "problem_lines",
     "quiet",
@@ -68,6 +72,7 @@ __all__ = [
     "reading_entry",
     "require_choice",
     "require_comparable",
+    "require_new_folder",
     "rng_for",
     "seed_for",
     "short",

@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,16 @@ from palpate.core.errors import PalpateError
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+def is_stream(path: Path) -> bool:
+    """Whether there is something at ``path`` but neither a file nor a folder: a device, a pipe."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
 @contextmanager
 def atomic_path(path: Path) -> Generator[Path]:
     """Yield a temporary file to write to; rename it to ``path`` on success, else remove it.
+
+    A device or a pipe is written to and never replaced; a link stays, and its target is replaced.
 
     Raises:
         OSError: if the disk is full.
@@ -28,12 +35,12 @@ def atomic_path(path: Path) -> Generator[Path]:
     """
     path = Path(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
+        final = Path(os.path.realpath(path))
+        if final.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix
-        )
+        place = Path(tempfile.gettempdir()) if is_stream(final) else final.parent
+        place.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=place, prefix=f".{final.name}.", suffix=final.suffix)
     except OSError as error:  # name the user's path, not the temporary one
         reason = error.strerror or str(error)
         if error.errno in NO_ROOM:
@@ -45,7 +52,11 @@ def atomic_path(path: Path) -> Generator[Path]:
     part.chmod(0o644)
     try:
         yield part
-        part.replace(path)
+        if is_stream(final):
+            with open(part, "rb") as source, open(final, "wb") as target:
+                shutil.copyfileobj(source, target)
+        else:
+            part.replace(final)
     finally:
         part.unlink(missing_ok=True)
 
@@ -55,22 +66,79 @@ def atomic_folder(folder: Path) -> Generator[Path]:
     """Yield a temporary folder to fill; rename it to ``folder`` on success, else remove it.
 
     Raises:
-        PalpateError: if ``folder`` exists and is not empty.
+        PalpateError: if ``folder`` is not empty, is the current folder, or is written by another
+            process.
     """
     folder = Path(folder)
+    require_new_folder(folder)
+    part = folder.parent / f".{folder.name}.part"
+    with locked(part, folder):
+        try:
+            for stale in part.iterdir():  # of a run that was killed
+                shutil.rmtree(stale) if stale.is_dir() else stale.unlink()
+            yield part
+            if folder.exists():
+                folder.rmdir()
+            part.replace(folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def require_new_folder(folder: Path) -> None:
+    """Check that a folder to be made is absent or empty, and is not the current folder.
+
+    Raises:
+        PalpateError: saying which.
+    """
+    fix = "Choose another folder or remove it"
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        fix = "Choose another folder or remove it"
         raise PalpateError(f"{folder} must be absent or an empty folder", "something there", fix)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    part.chmod(0o755)
+    if folder.resolve() == Path.cwd():  # it is replaced when the new one is whole
+        fix = "Name a folder within it"
+        raise PalpateError(
+            "A folder to write must have a name", f"the current folder {folder}", fix
+        )
+
+
+@contextmanager
+def locked(folder: Path, output: Path | None = None) -> Generator[None]:
+    """Make ``folder`` and hold it for one process; the lock ends with the process, also if killed.
+
+    A folder that was made here and is empty at the end is removed.
+
+    Args:
+        folder: what to hold.
+        output: what the user named, for the error; default: ``folder``.
+
+    Raises:
+        PalpateError: if another process holds it, or it cannot be made.
+    """
+    made = not folder.exists()
     try:
-        yield part
-        if folder.exists():
-            folder.rmdir()
-        part.replace(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            raise
+        must, got = f"{output or folder} must be writable", error.strerror or str(error)
+        raise PalpateError(must, got, "Choose another path, or check its rights") from None
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        must, got = f"{output or folder} must be written by one run", "another run writes there"
+        raise PalpateError(must, got, "Wait for it, or choose another folder") from None
+    except (ImportError, OSError):  # Windows, a network disk without locks
+        pass
+    try:
+        yield
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        if made:
+            with suppress(OSError):
+                folder.rmdir()
+        os.close(handle)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -95,7 +163,10 @@ def read_json(path: Path, what: str) -> Any:
         PalpateError: if the file is missing or is not JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+        # No NaN and no infinity, which JSON has not, and no halves of characters.
+        json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
+        return value
     except FileNotFoundError:
         raise PalpateError(f"The {what} must exist", f"no file {path}", "Check the path") from None
     except IsADirectoryError:
@@ -132,10 +203,6 @@ def read_record(
     if missing := [name for name in keys if name not in record]:
         must = f"The {what} {path} must have the keys {', '.join(keys)}"
         raise PalpateError(must, f"no {', no '.join(missing)}", fix)
-    try:
-        json.dumps(record, allow_nan=False)
-    except ValueError as error:
-        raise PalpateError(f"The {what} {path} must hold finite numbers", str(error), fix) from None
     return record
 
 
@@ -154,6 +221,9 @@ def reading_entry(path: Path, key: str) -> Generator[None]:
 
 def inside(root: Path, relative: str) -> Path | None:
     """Return ``root / relative`` if that stays inside ``root`` (links resolved), else None."""
-    root = root.resolve()
-    path = (root / relative).resolve()
+    root = Path(os.path.realpath(root))  # unlike Path.resolve, not stopped by a loop of links
+    try:
+        path = Path(os.path.realpath(root / relative))
+    except ValueError:  # a zero character, half a character
+        return None
     return path if path.is_relative_to(root) else None

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from palpate.core.records import from_plain
+
 
 @dataclass(frozen=True)
 class Note:
@@ -32,4 +34,4 @@ class Note:
         """Return the inverse of :meth:`to_json`; a string, as format 1 had it, becomes ``text``."""
         if isinstance(data, str):
             return cls("text", {"text": data})
-        return cls(data["code"], data["params"])
+        return from_plain(cls, data)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from palpate.core.digest import plain, short
 from palpate.core.errors import PalpateError
 from palpate.core.notes import Note
+from palpate.core.records import from_plain
 
 #: Settings that must agree before two scores may share a column.
 COMPARABLE = (
@@ -127,14 +128,10 @@ class Score:
     def from_json(cls, data: Mapping[str, Any]) -> Score:
         """Return the inverse of :meth:`to_json`."""
         fields = dict(data)
-        for name in ("interval", "null"):
-            fields[name] = tuple(data[name]) if data.get(name) is not None else None
         sentence = fields.pop("note", "")  # format 1 had one string
-        notes = [*data.get("notes", ()), *([sentence] if sentence else [])]
-        fields["notes"] = tuple(map(Note.from_json, notes))
-        if not isinstance(fields.get("value"), int | float | None):
-            raise TypeError(f"the value of a score must be a number, got {fields['value']!r}")
-        return cls(**fields)
+        notes = [*(fields.get("notes") or ()), *([sentence] if sentence else [])]
+        score = from_plain(cls, fields | {"notes": notes})
+        return replace(score, notes=tuple(score.notes))
 
 
 def require_comparable(scores: Sequence[Score]) -> None:

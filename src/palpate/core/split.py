@@ -23,9 +23,22 @@ from palpate.core.digest import digest_lines, plain, short
 from palpate.core.errors import PalpateError
 from palpate.core.files import read_json, write_json
 from palpate.core.notes import Note
+from palpate.core.records import from_plain
 
 PARTS = ("train", "val", "test")
 FORMAT = "palpate-split/1"
+
+
+@dataclass(frozen=True)
+class _File:
+    """What a split file holds."""
+
+    format: str
+    digest: str
+    rule: Mapping[str, Any]
+    manifest: str | None
+    parts: Mapping[str, Sequence[str]]
+    notes: Sequence[Note] = ()
 
 
 @dataclass(frozen=True)
@@ -129,13 +142,12 @@ class Split:
             raise PalpateError(must, "another kind of file", fix)
         fix = "Write it again with: palpate split"
         try:
-            split = cls.from_ids(rule=data["rule"], manifest=data["manifest"], **data["parts"])
-            notes = [Note.from_json(note) for note in data.get("notes", ())]
-            digest = split.digest
-        except (AttributeError, KeyError, TypeError):
+            file = from_plain(_File, data)
+            split = cls.from_ids(rule=file.rule, manifest=file.manifest, **file.parts)
+        except (TypeError, ValueError):
             must = f"{path} must hold a rule and lists of ids by part"
             raise PalpateError(must, "an incomplete split file", fix) from None
-        if digest != data.get("digest"):
+        if split.digest != file.digest:
             must = f"The digest in {path} must match its content"
             raise PalpateError(must, "a split that was edited by hand", fix)
-        return replace(split, notes=notes)
+        return replace(split, notes=file.notes)

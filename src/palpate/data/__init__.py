@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import import_name
+from palpate._lazy import lazy_names
 
 if TYPE_CHECKING:
     from palpate.data.exporting import Exported, export_dataset
@@ -37,4 +36,4 @@ __all__ = [
     "validate",
 ]
 
-__getattr__ = partial(import_name, __name__, _MODULES)
+__getattr__ = lazy_names(__name__, _MODULES)

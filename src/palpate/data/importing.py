@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.core import PalpateError, Progress, Split, locked, quiet
 from palpate.data.formats import FORMATS, Format
 from palpate.data.formats.base import MISSING, WORLD, finished, import_scanned, world_facts
 from palpate.data.images import Check
@@ -61,11 +61,12 @@ def import_dataset(
         example = {"overwrite": True}
         raise PalpateError(must, str(output), fix, argument="output", example=example)
     common: dict[str, Any] = {"skip_bad": skip_bad, "check": check, "progress": progress}
-    if form.run is not None:
-        return form.run(source, output, **common, **options)
-    scan = form.scan(source, progress=progress, **options)
-    facts = {**form.facts.of_manifest(), "format": name}
-    return import_scanned(scan, source, output, facts, **common)
+    with locked(output):
+        if form.run is not None:
+            return form.run(source, output, **common, **options)
+        scan = form.scan(source, progress=progress, **options)
+        facts = {**form.facts.of_manifest(), "format": name}
+        return import_scanned(scan, source, output, facts, **common)
 
 
 def validate(

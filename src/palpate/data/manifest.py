@@ -191,7 +191,7 @@ class Manifest:
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row of the table as a reference with absolute image paths, for reports."""
-        full = {n: str(self.path(row[n]).resolve()) if row[n] else None for n in MODALITIES}
+        full = {n: os.path.realpath(self.path(row[n])) if row[n] else None for n in MODALITIES}
         return SampleRef(row["id"], row["video"], row["frame"], row["material"], **full)
 
     def problems(self, *, files: bool = True) -> list[Problem]:
@@ -266,8 +266,9 @@ class Manifest:
         written = meta.get("palpate.format")
         if written == FORMAT_2:
             table = table.rename({"touch": "contact"}, strict=False)
+        columns = list(table.schema.items())
         further = table.schema.dtypes()[len(SCHEMA) :]
-        known = table.columns[: len(SCHEMA)] == list(SCHEMA) and {pl.String}.issuperset(further)
+        known = columns[: len(SCHEMA)] == list(SCHEMA.items()) and {pl.String}.issuperset(further)
         if written not in (FORMAT, FORMAT_2) or not known:
             got = written or "a Parquet file of another program"
             raise PalpateError(f"The manifest {path} must have the format {FORMAT}", got, fix)

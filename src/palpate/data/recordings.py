@@ -431,7 +431,7 @@ class Recordings:
 
         @cache
         def folder(path: Path) -> str:
-            return Path(os.path.relpath(path.resolve(), root)).as_posix()
+            return Path(os.path.relpath(os.path.realpath(path), root)).as_posix()
 
         def relative(frames: Frames, path: Path | None) -> str | None:
             if path is None or (isinstance(frames, VideoFrames) and not self.extracted):

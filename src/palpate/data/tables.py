@@ -25,6 +25,7 @@ import polars as pl
 from palpate.core import PalpateError, Problem
 from palpate.data.mapping import text_of
 
+csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
 TABLES = (".csv", ".tsv", ".jsonl", ".json", ".parquet")
 #: A column of every table that was read: the line of each row.
 LINE = "palpate_line"
@@ -199,8 +200,7 @@ def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[
         for cells in reader:
             last = reader.line_num
             quotes = sum(line.count('"') for line in lines[first - 1 : last])
-            inner = lines[first:last]  # what a quoted cell took in
-            if inner and (quotes % 2 or _rows_inside(inner, reader.dialect, len(cells))):
+            if last > first and quotes % 2:  # the cell swallowed all lines after it
                 swallowed = f"a quotation mark stays open up to line {last}"
                 problems.append(Problem(f"{path}:{first}", "open-quote", swallowed))
             elif any(cell.strip() for cell in cells):
@@ -209,11 +209,6 @@ def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[
     except csv.Error as error:
         broken = f"{error}; is a quotation mark open? No row after it was read"
         problems.append(Problem(f"{path}:{first}", "bad-row", broken))
-
-
-def _rows_inside(lines: Sequence[str], dialect: Any, width: int) -> bool:
-    """Whether lines, but for the last, are rows of a table by themselves."""
-    return len(lines) > 1 and all(len(row) == width for row in csv.reader(lines[:-1], dialect))
 
 
 def _json(path: Path) -> Table:

@@ -48,7 +48,7 @@ class VideoReader:
         if not self.path.is_file():
             raise PalpateError("The video must exist", f"no file {self.path}", "Check the path")
         try:
-            self._container: Any = av.open(str(self.path))
+            self._container: Any = av.open(str(self.path), metadata_errors="replace")
         except self._errors as error:
             got = "an empty file (0 bytes)" if self.path.stat().st_size == 0 else _reason(error)
             raise self._broken(f"{got}: it is cut short, or no video") from None

@@ -17,7 +17,8 @@ from __future__ import annotations
 import hashlib
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -36,12 +37,15 @@ from palpate.core import (
     digest_file,
     digest_json,
     inside,
+    locked,
     quiet,
     read_json,
+    reading_entry,
     short,
     write_json,
 )
 from palpate.core.digest import canonical_json
+from palpate.core.records import from_plain
 from palpate.data.images import SUFFIXES, check_image, load_images, read_image, square
 from palpate.encoders.models import FIX_MODEL, find_model
 
@@ -223,21 +227,35 @@ def generate(  # noqa: PLR0913 - a public verb
     if bad and not skip_bad:
         raise ProblemsError(list(bad.values()), FIX_PHOTOS, example={"skip_bad": True})
     todo = [i for i in todo if i.id in conditions]
-    target.begin()
-    for start in range(0, len(todo), sampler.batch):
-        chunk = todo[start : start + sampler.batch]
-        files = [i.background for i in chunk if i.background]
-        images = model.sample(
-            np.stack([conditions[i.id] for i in chunk]),
-            [i.id for i in chunk],
-            seed=seed,
-            sampler=sampler,
-            background=load_images(files, model.size) if files else None,
-        )
-        for item, image in zip(chunk, images, strict=True):
-            target.keep(item.id, image, stamps[item.id])
-        progress("generating", start + len(chunk), len(todo))
-    return target.finish([i.id for i in inputs if i.id not in bad], list(bad.values()), len(todo))
+    with target.writing():
+        for start in range(0, len(todo), sampler.batch):
+            chunk = todo[start : start + sampler.batch]
+            files = [i.background for i in chunk if i.background]
+            images = model.sample(
+                np.stack([conditions[i.id] for i in chunk]),
+                [i.id for i in chunk],
+                seed=seed,
+                sampler=sampler,
+                background=load_images(files, model.size) if files else None,
+            )
+            for item, image in zip(chunk, images, strict=True):
+                target.keep(item.id, image, stamps[item.id])
+            progress("generating", start + len(chunk), len(todo))
+        ids = [i.id for i in inputs if i.id not in bad]
+        return target.finish(ids, list(bad.values()), len(todo))
+
+
+@dataclass(frozen=True)
+class _Index:
+    """What ``index.json`` holds."""
+
+    format: str
+    complete: bool
+    settings: Mapping[str, Any]
+    digest: str
+    images: Mapping[str, str]
+    skipped: Sequence[Problem]
+    notice: str = ""
 
 
 class _Target:
@@ -272,11 +290,14 @@ class _Target:
             return False
         return text == [sample_id, self.digest, stamp]
 
-    def begin(self) -> None:
-        """Mark the folder as unfinished."""
+    @contextmanager
+    def writing(self) -> Generator[None]:
+        """Hold the folder, and mark it as unfinished."""
         self.index["complete"] = False
-        if self.folder is not None:
-            write_json(self.folder / "index.json", self.index)
+        with nullcontext() if self.folder is None else locked(self.folder):
+            if self.folder is not None:
+                write_json(self.folder / "index.json", self.index)
+            yield
 
     def keep(self, sample_id: str, array: NDArray[np.uint8], stamp: str) -> None:
         """Keep one image, as a PNG that says what it is."""
@@ -441,6 +462,8 @@ def _read_index(folder: Path) -> dict[str, Any]:
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         must, fix = f"{folder} must hold generated images ({FORMAT})", "Choose another folder"
         raise PalpateError(must, "another kind of folder", fix)
+    with reading_entry(folder / "index.json", "The index"):
+        from_plain(_Index, index)
     return index
 
 

@@ -160,7 +160,12 @@ def _fetch(name: str, patterns: Sequence[str], what: str, fix: str) -> Path:
 
 
 def first_line(error: Exception) -> str:
-    """The first line of an error, or its kind if it has none."""
+    """The first line of an error, or its kind if it has none.
+
+    Not of torch's on a pickle, which recommends to load it all the same.
+    """
+    if "weights_only" in str(error) or isinstance(error, pickle.UnpicklingError):
+        return "a pickle that holds more than weights, which could run any program"
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 

@@ -113,7 +113,10 @@ def require_ids(ids: Sequence[str], source: str) -> None:
 
 
 def _read_npy(path: Path) -> Embeddings:
-    return Embeddings(np.load(path, mmap_mode="r", allow_pickle=False))
+    x = np.load(path, mmap_mode="r", allow_pickle=False)
+    if not isinstance(x, np.ndarray):
+        raise ValueError("an archive of arrays, which is named .npz")
+    return Embeddings(x)
 
 
 def _read_npz(path: Path) -> Embeddings:

@@ -14,6 +14,7 @@ ids only is an error: scores of some of the samples would pass for scores of all
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -268,7 +269,7 @@ def _read_path(path: Path, group: str) -> Samples:
             fix = "Pass one of these; pickles are never loaded"
             raise PalpateError(f"{path} must be {KINDS}", path.suffix or "no suffix", fix)
         return _of_embeddings(read_embeddings(path), str(path), path)
-    require_utf8("Paths of images", str(path.resolve()))
+    require_utf8("Paths of images", os.path.realpath(path))
     from palpate.data.manifest import Manifest
 
     if path.is_file() or (path / "manifest.parquet").is_file():
@@ -515,7 +516,7 @@ def _is_image_list(items: Sequence[Any]) -> bool:
 def _name_of(item: Source, k: int, count: int) -> str:
     if not isinstance(item, str | Path):
         return "generated" if count == 1 else f"generated {k + 1}"
-    path = Path(item).resolve()
+    path = Path(os.path.realpath(item))
     name = path.stem if path.is_file() else path.name
     name = path.parent.name if name in ("touches", "images") else name
     return name.encode(errors="surrogateescape").decode(errors="replace")

@@ -5,10 +5,9 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import import_name
+from palpate._lazy import lazy_names
 
 if TYPE_CHECKING:
     from palpate.leakage.auditing import audit
@@ -19,4 +18,4 @@ __all__ = ["audit", "split", "verify"]
 
 _MODULES = {"audit": "auditing", "split": "splitting", "verify": "verifying"}
 
-__getattr__ = partial(import_name, __name__, _MODULES)
+__getattr__ = lazy_names(__name__, _MODULES)

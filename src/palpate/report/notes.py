@@ -559,8 +559,8 @@ OTHER: dict[str, Sentence] = {
         "carries no more than the label, and class-aware scores (CI- and D-TMMD, material "
         "accuracy) favor such a generator"
     ),
-    "background-predicts-material": (
-        "The no-contact image alone predicts the material of {share:.0%} of the test samples, far "
+    "gel-names-material": (
+        "The no-contact image alone names the material in {share:.0%} of the test samples, far "
         "above chance: each video has its gel look, and the probe has learned that. Material "
         "accuracy under this split measures the video, not the contact"
     ),
@@ -580,6 +580,10 @@ OTHER: dict[str, Sentence] = {
         "No floor: that of TMMD is made of further real images, the train part of a split"
     ),
     "floor-unknown": "No floor: no such value of real images is known",
+    "images-outside": (
+        "{count} images that {file} names lie outside its folder and are not shown; their folders "
+        "can be allowed with {arg:images}"
+    ),
     "other-split": (
         "No audit on this page is of the split that these scores are on ({splits}): what the "
         "audits say of leaks does not apply to them"
@@ -591,8 +595,12 @@ SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | OTHER
 def sentence(note: Note, style: Style = PYTHON) -> str:
     """Return a note in words, without a full stop at the end."""
     template = SENTENCES.get(note.code)
-    if template is None:  # a note of another version of palpate
-        return ", ".join([note.code, *(f"{k} {v}" for k, v in note.params.items())])
-    if callable(template):
-        return template(note.params, style)
-    return template.format(arg=style, **note.params)
+    try:
+        if callable(template):
+            return template(note.params, style)
+        if template is not None:
+            return template.format(arg=style, **note.params)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+        pass
+    # A note of another version of palpate, or from a file that was edited.
+    return ", ".join([note.code, *(f"{k} {v}" for k, v in note.params.items())])

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, overload
 
 from palpate.core.digest import plain
 from palpate.core.errors import PalpateError
-from palpate.core.files import read_record, write_json
+from palpate.core.files import read_record, reading_entry, write_json
 from palpate.core.notes import Note
+from palpate.core.records import from_plain
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score
 
@@ -30,6 +31,8 @@ RESULTS_FORMATS = (RESULTS_FORMAT, "palpate-results/1")
 AUDIT_FORMATS = (AUDIT_FORMAT, "palpate-audit/1")
 #: The verdict where a leak could not show.
 CANNOT_TELL = "cannot tell"
+#: Keys of their JSON that are no fields.
+COMMAND_KEYS = ("format", "skipped", "failed")
 #: Rows of the group-by-part matrix that an audit keeps.
 MATRIX_ROWS = 60
 #: Why two images are similar. Only ``content`` is a leak.
@@ -51,13 +54,6 @@ class LeakPair:
     gap: int | None
     score: float | None = None
     cause: str = ""
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> LeakPair:
-        """The inverse of ``dataclasses.asdict``."""
-        fields: dict[str, Any] = dict(data)
-        fields |= {name: SampleRef(**data[name]) for name in ("test", "train")}
-        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -104,10 +100,8 @@ class Signal:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signal:
         """The inverse of ``dataclasses.asdict``; format 1 called ``matches`` ``found``."""
-        fields = {("matches" if name == "found" else name): value for name, value in data.items()}
-        fields["worst"] = [LeakPair.from_json(pair) for pair in data.get("worst", ())]
-        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
-        return cls(**fields)
+        renamed = {"found": "matches"}
+        return from_plain(cls, {renamed.get(name, name): value for name, value in data.items()})
 
 
 @dataclass(frozen=True)
@@ -136,13 +130,6 @@ class ImpactRow:
     chance: float
     group: str = ""
 
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> ImpactRow:
-        """The inverse of ``dataclasses.asdict``."""
-        fields: dict[str, Any] = dict(data)
-        fields |= {k: tuple(v) for k, v in data.items() if isinstance(v, list)}
-        return cls(**fields)
-
 
 @dataclass(frozen=True)
 class Impact:
@@ -163,14 +150,6 @@ class Impact:
     clean_splits: Sequence[str]
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[Note] = ()
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Impact:
-        """The inverse of ``dataclasses.asdict``."""
-        fields: dict[str, Any] = dict(data)
-        fields["rows"] = [ImpactRow.from_json(row) for row in data["rows"]]
-        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
-        return cls(**fields)
 
 
 @dataclass(frozen=True)
@@ -279,13 +258,7 @@ class Audit:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Audit:
         """The inverse of :meth:`to_json`; keys that a command adds are ignored."""
-        fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")}
-        fields["worst"] = [LeakPair.from_json(pair) for pair in data.get("worst", ())]
-        fields["signals"] = [Signal.from_json(signal) for signal in data.get("signals", ())]
-        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
-        fields["impact"] = Impact.from_json(data["impact"]) if data.get("impact") else None
-        fields["others"] = [cls.from_json(other) for other in data.get("others", ())]
-        return cls(**fields)
+        return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
     def save(self, path: str | Path) -> None:
         """Write the audit as JSON, atomically."""
@@ -298,7 +271,9 @@ class Audit:
         Raises:
             PalpateError: if it is missing, or no audit.
         """
-        return cls.from_json(read_record(Path(path), "audit file", form=AUDIT_FORMATS))
+        data = read_record(Path(path), "audit file", form=AUDIT_FORMATS)
+        with reading_entry(Path(path), "The audit"):
+            return cls.from_json(data)
 
 
 @dataclass(frozen=True)
@@ -306,7 +281,7 @@ class GalleryItem:
     """One row of the gallery: the photo, the real tactile image, the generated one."""
 
     sample: SampleRef
-    generated: str
+    generated: str | None
     background: str | None = None
 
 
@@ -429,8 +404,8 @@ class Results:
         start, end = base.resolve(), folder.resolve()
         return self.with_paths(lambda name: Path(os.path.relpath(start / name, end)).as_posix())
 
-    def with_paths(self, change: Callable[[str], str]) -> Results:
-        """The results with ``change`` applied to the path of every image."""
+    def with_paths(self, change: Callable[[str], str | None]) -> Results:
+        """The results with ``change`` applied to the path of every image; None removes it."""
 
         def path(name: str | None) -> str | None:
             return None if name is None else change(name)
@@ -450,7 +425,7 @@ class Results:
             replace(
                 row,
                 sample=sample(row.sample),
-                generated=change(row.generated),
+                generated=path(row.generated),
                 background=path(row.background),
             )
             for row in self.gallery
@@ -464,15 +439,7 @@ class Results:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Results:
         """The inverse of :meth:`to_json`; sentences of format 1 become notes of code ``text``."""
-        fields = {k: v for k, v in data.items() if k not in ("format", "skipped", "failed")}
-        fields["audits"] = [Audit.from_json(audit) for audit in data.get("audits", ())]
-        fields["scores"] = [Score.from_json(score) for score in data.get("scores", ())]
-        fields["notes"] = [Note.from_json(note) for note in data.get("notes", ())]
-        fields["gallery"] = [
-            GalleryItem(SampleRef(**row["sample"]), row["generated"], row.get("background"))
-            for row in data.get("gallery", ())
-        ]
-        return cls(**fields)
+        return from_plain(cls, {k: v for k, v in data.items() if k not in COMMAND_KEYS})
 
     def save(self, path: str | Path) -> None:
         """Write the results as JSON, atomically; image paths become relative to its folder."""
@@ -487,7 +454,9 @@ class Results:
             PalpateError: if it is missing, or holds no results.
         """
         path = Path(path)
-        results = cls.from_json(read_record(path, "results file", form=RESULTS_FORMATS))
+        data = read_record(path, "results file", form=RESULTS_FORMATS)
+        with reading_entry(path, "The results"):
+            results = cls.from_json(data)
         return results.with_paths(lambda name: os.path.normpath(path.parent / name))
 
 

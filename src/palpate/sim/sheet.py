@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, PngImagePlugin
 
-from palpate.core import PalpateError, atomic_path
+from palpate.core import atomic_path
 from palpate.sim.materials import MATERIALS
 from palpate.sim.options import WorldOptions
 from palpate.sim.plan import ObjectRef, VideoPlan, first_contact
@@ -24,10 +24,8 @@ def render_sheet(options: WorldOptions, path: str | Path) -> None:
     sheet.
 
     Raises:
-        PalpateError: if the path is a folder or cannot be written.
+        PalpateError: if the path cannot be written.
     """
-    if Path(path).is_dir():
-        raise PalpateError(f"{path} must be a file", "a folder", "Name a file such as sheet.png")
     size, names = options.size, options.names
     rows = (len(names) + 1) // 2
     width = _LABEL + 2 * SHOWN * size
@@ -44,5 +42,7 @@ def render_sheet(options: WorldOptions, path: str | Path) -> None:
             video = Video(options, plan)
             pair = np.concatenate([video.vision(frame), video.tactile(frame)], 1)
             sheet.paste(Image.fromarray(pair), (left + _LABEL + 2 * number * size, top))
+    about = PngImagePlugin.PngInfo()
+    about.add_text("Software", "palpate")
     with atomic_path(Path(path)) as part:
-        sheet.save(part, "PNG")
+        sheet.save(part, "PNG", pnginfo=about)

@@ -18,8 +18,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import shutil
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,8 +31,10 @@ from palpate.core import (
     atomic_folder,
     digest_json,
     digest_lines,
+    locked,
     quiet,
     read_json,
+    require_new_folder,
     write_json,
     write_text,
 )
@@ -43,7 +44,7 @@ from palpate.sim.leak import cut, leak_counts, leak_file
 from palpate.sim.materials import MATERIALS, Material, added_materials
 from palpate.sim.options import VERSION, WORLD_FORMAT, WorldOptions, read_world
 from palpate.sim.plan import VideoPlan, contact_rows, plan_world, written_frames
-from palpate.sim.presets import SEEN_WARNING, seen_by_mini
+from palpate.sim.presets import SEEN, seen_by_mini
 from palpate.sim.video import Video
 from palpate.sim.world import world_manifest, world_split
 
@@ -106,14 +107,15 @@ def write_world(
     folder = output.resolve()
     if (folder / "world.json").is_file():
         return _finished(output, options)
-    _require_free(output, folder)
+    require_new_folder(output)
     plans = plan_world(options)
     # Rejects a world that is too small before rendering.
     parts = cut(options, plans, list(contact_rows(options, plans)))
     key = digest_json([options.digest, added_materials(options.names)])
     part = folder.parent / f".{folder.name}.{key[:12]}.part"
     rendered = 0
-    with _locked(part, output):
+    with locked(part, output):
+        (part / WORK).mkdir(exist_ok=True)
         if not (folder / "world.json").is_file():  # else an equal run ended meanwhile
             rendered = _render(part, options, plans, workers, progress)
             _finish(part, options, plans, parts)
@@ -123,38 +125,6 @@ def write_world(
             shutil.rmtree(folder / WORK, ignore_errors=True)
     shutil.rmtree(part, ignore_errors=True)
     return dataclasses.replace(_finished(output, options), rendered=rendered)
-
-
-def _require_free(output: Path, folder: Path) -> None:
-    fix = "Choose another folder, or remove it"
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PalpateError(
-            f"{output} must be absent, empty or a finished world", "other content", fix
-        )
-    if folder == Path.cwd().resolve():  # it is replaced when the world is whole
-        must = f"{output} must not be the current folder"
-        raise PalpateError(must, str(folder), "Name a folder within it")
-
-
-@contextmanager
-def _locked(part: Path, output: Path) -> Generator[None]:
-    """Make ``part`` and hold its lock.
-
-    Raises:
-        PalpateError: if another process holds it.
-    """
-    (part / WORK).mkdir(parents=True, exist_ok=True)
-    with open(part / WORK / "lock", "a") as file:
-        try:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:  # Windows
-            pass
-        except BlockingIOError:
-            must, got = f"{output} must be written by one run", "another run is writing this world"
-            raise PalpateError(must, got, "Wait for it, or stop it") from None
-        yield
 
 
 def _finished(output: Path, options: WorldOptions) -> WorldRecord:
@@ -239,7 +209,7 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan], parts: Pa
         "format": WORLD_FORMAT,
         "version": VERSION,
         "note": NOTE,
-        **({"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(options) else {}),
+        **({"seen_by_shipped_models": SEEN} if seen_by_mini(options) else {}),
         "digest": digest_json(content),
         "options_digest": options.digest,
         "manifest_digest": manifest.digest,

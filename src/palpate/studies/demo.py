@@ -36,6 +36,7 @@ from palpate.core import (
     digest_file,
     digest_folder,
     digest_lines,
+    locked,
     quiet,
     read_json,
     write_json,
@@ -157,6 +158,11 @@ def run_demo(
         PalpateError: on bad data or options; finished stages stay.
     """
     demo = _Demo(options, Run(Path(folder), print_line), progress)
+    with locked(Path(folder)):
+        return _run(demo)
+
+
+def _run(demo: _Demo) -> DemoRun:
     manifest = demo.data()
     split, audits = demo.split(manifest)
     pretraining = None
@@ -169,7 +175,7 @@ def run_demo(
     generated = demo.generated(manifest, split, model)
     scores = demo.scores(manifest, split, generated, encoders)
     stages = demo.run.stages
-    return DemoRun(manifest, split, audits, generated, scores, stages, options, demo.models)
+    return DemoRun(manifest, split, audits, generated, scores, stages, demo.options, demo.models)
 
 
 class _Demo:

@@ -27,7 +27,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, rng_for, seed_for
+from palpate.core import (
+    PalpateError,
+    Progress,
+    atomic_path,
+    digest_json,
+    locked,
+    quiet,
+    require_new_folder,
+    rng_for,
+    seed_for,
+)
 
 #: (module, rows (batch,), generator, step) -> scalar loss, and numbers to log.
 LossFunction = Callable[[nn.Module, Tensor, torch.Generator, int], tuple[Tensor, dict[str, float]]]
@@ -283,19 +293,18 @@ def work_folder(output: Path | None) -> Generator[Path]:
     removed on success; a temporary folder where there is no output.
 
     Raises:
-        PalpateError: if the output exists already, before any work is done.
+        PalpateError: if the output exists already or is written by another run, before any work is
+            done.
     """
     if output is None:
         with tempfile.TemporaryDirectory(prefix="palpate-") as name:
             yield Path(name)
         return
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        must, fix = "must be absent or an empty folder", "Choose another, or remove it"
-        raise PalpateError(must, str(output), fix, argument="output")
+    require_new_folder(output)
     work = output.absolute().parent / f".{output.name}.work"
-    work.mkdir(parents=True, exist_ok=True)
     try:
-        yield work
+        with locked(work, output):
+            yield work
     except PalpateError:
         if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
             shutil.rmtree(work)

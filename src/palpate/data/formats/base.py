@@ -228,7 +228,7 @@ def _checked_paths(scan: Scan) -> list[Row]:
 
     @cache
     def leaves(folder: str) -> bool:
-        return not (root / folder).resolve().is_relative_to(root)
+        return inside(root, folder) is None
 
     @cache
     def checked(given: str) -> tuple[str, str]:

@@ -1,0 +1,72 @@
+"""Dataclasses from JSON, checked by the types of their fields."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import cache
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+#: JSON has numbers of any size; no count of ours is larger.
+LARGEST = 2**63
+
+
+def from_plain(cls: type[T], data: Any) -> T:
+    """Return the inverse of :func:`palpate.core.plain`, also for nested dataclasses.
+
+    A field whose class has a method ``from_json`` is read by it.
+
+    Raises:
+        ValueError: on a missing, unknown or wrong field, with its name.
+    """
+    hints = _hints(cls)
+    if not isinstance(data, Mapping):
+        raise ValueError(f"a {cls.__name__} that is no object")
+    if unknown := sorted(set(data) - set(hints)):
+        raise ValueError(f"unknown field {unknown[0]}")
+    values = {name: _value(hints[name], value, name) for name, value in data.items()}
+    try:
+        return cls(**values)
+    except TypeError as error:  # a field is missing
+        raise ValueError(str(error)) from None
+
+
+@cache
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
+
+
+def _value(hint: Any, value: Any, name: str) -> Any:
+    """``value`` as the type ``hint``."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return value
+    if origin in (Union, UnionType):
+        if value is None and type(None) in inner:
+            return None
+        (hint,) = (kind for kind in inner if kind is not type(None))
+        return _value(hint, value, name)
+    if dataclasses.is_dataclass(hint):
+        try:
+            return hint.from_json(value) if hasattr(hint, "from_json") else from_plain(hint, value)
+        except (AttributeError, TypeError):
+            raise ValueError(f"{name} that holds no object") from None
+    if origin is tuple and isinstance(value, list | tuple) and len(value) == len(inner):
+        return tuple(_value(kind, item, name) for kind, item in zip(inner, value, strict=True))
+    if origin is Sequence and isinstance(value, list | tuple):
+        return [_value(inner[0], item, name) for item in value]
+    if origin is Mapping and isinstance(value, Mapping):
+        return {key: _value(inner[1], item, name) for key, item in value.items()}
+    if _is(hint, value):
+        return value
+    raise ValueError(f"{name} of type {type(value).__name__}")
+
+
+def _is(hint: Any, value: Any) -> bool:
+    """Whether ``value`` is of a simple JSON type; an int is a float, a bool is no number."""
+    if hint in (int, float):
+        kinds = int if hint is int else int | float
+        return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) < LARGEST
+    return hint in (str, bool) and isinstance(value, hint)

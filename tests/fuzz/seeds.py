@@ -1,0 +1,177 @@
+"""Valid inputs of every verb and reader, as small as they can be, and the commands that read them.
+
+A command is a line; ``IN`` is the folder of inputs, ``OUT`` an empty one. Only the folders of
+inputs that the line names are copied for it.
+"""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from safetensors.numpy import save_file
+
+import palpate
+from data_fixtures import write_video
+from format_trees import TREES, gel, photo, put, write_csv
+from palpate.cli import main
+from palpate.data.manifest import Manifest
+
+MINI = Path(palpate.__file__).parent / "mini"
+#: How often a command is drawn, next to the others; those that load models are slow.
+COMMANDS: dict[str, int] = {
+    "import IN/touch-and-go -o OUT/m": 3,
+    "import IN/touch-and-go -o OUT/m --labels IN/touch-and-go/train.txt --max-per-contact 2": 1,
+    "import IN/hct -o OUT/m": 2,
+    "import IN/ssvtp -o OUT/m": 3,
+    "import IN/tarf -o OUT/m": 2,
+    "import IN/objectfolder-generation -o OUT/m": 2,
+    "import IN/objectfolder -o OUT/m": 2,
+    "import IN/ycb-slide -o OUT/m": 2,
+    "import IN/visgel -o OUT/m": 2,
+    "import IN/intervals/contacts.csv -o OUT/m": 3,
+    "import IN/pairs -o OUT/m": 2,
+    "import IN/hf --format hf --map vision=rgb tactile=gel material=kind -o OUT/m": 3,
+    "import IN/video -o OUT/m": 5,
+    "import IN/table/rows.csv -o OUT/m": 4,
+    "import IN/table/rows.tsv -o OUT/m --map frame=frame": 2,
+    "import IN/table/rows.jsonl -o OUT/m": 3,
+    "import IN/table/rows.json -o OUT/m": 3,
+    "import IN/table/rows.parquet -o OUT/m --skip-bad": 4,
+    "validate IN/touch-and-go": 2,
+    "validate IN/hct": 1,
+    "validate IN/table/rows.csv": 2,
+    "validate IN/pairs --json": 1,
+    "export IN/manifest --to csv -o OUT/table": 2,
+    "export IN/manifest --to jsonl -o OUT/table": 1,
+    "export IN/manifest --to parquet -o OUT/table --split IN/split/split.json": 2,
+    "export IN/manifest --to hf -o OUT/table": 1,
+    "audit IN/lists/train.txt IN/lists/test.txt -o OUT/a.json --table OUT/a.csv": 6,
+    "audit IN/table/rows.csv IN/table/rows.jsonl --fail-over 0.5 --threads 1": 2,
+    "audit IN/manifest --split IN/split/split.json -o OUT/a.json --page OUT/p.html --threads 1": 6,
+    "audit IN/manifest IN/manifest --no-images --table OUT/a.parquet": 2,
+    "audit IN/pairs/vision IN/pairs/tactile --threads 1 --json": 1,
+    "split IN/manifest -o OUT/s.json --train 0.5": 4,
+    "split IN/table/rows.csv -o OUT/s.json --by video --nulls single --train 0.5": 3,
+    "split IN/lists/train.txt IN/lists/test.txt -o OUT/f --folds 2": 2,
+    "split IN/touch-and-go -o OUT/s.json --lists OUT/lists --train 0.5": 1,
+    "split IN/manifest --verify IN/split/split.json": 2,
+    "score --generated IN/vectors/a.npy --reference IN/vectors/b.npy --permutations 9": 5,
+    "score --generated IN/vectors/a.npz --reference IN/vectors/b.npz -o OUT/s.json": 4,
+    "score --generated IN/vectors/a.safetensors --reference IN/vectors/b.safetensors": 4,
+    "score --generated IN/vectors/a.parquet --reference IN/vectors/b.parquet "
+    "--labels IN/vectors/labels.csv --latex OUT/t.tex --permutations 0": 4,
+    "score --generated IN/generated --reference IN/manifest -o OUT/s.json "
+    "--companions ssim psnr --permutations 0": 4,
+    "score --generated IN/manifest --reference IN/manifest --split IN/split/split.json "
+    "--encoder IN/models/encoders --permutations 9": 1,
+    "report IN/results/audit.json IN/results/scores.json -o OUT/page.html": 8,
+    "world -o OUT/w --preset tiny --size 16 --materials 2 --workers 1 --sheet OUT/s.png": 1,
+    "world -o OUT/w --options IN/world/world.json --workers 1": 1,
+    "probe IN/manifest --split IN/split/split.json --encoder IN/models/encoders -o OUT/s.json": 1,
+    "generate IN/pairs/vision/rec0/0.jpg -o OUT/t.png --model IN/models/generator --steps 1": 1,
+    "generate IN/manifest -o OUT/g --model IN/models/generator --steps 1 "
+    "--split IN/split/split.json": 1,
+    "train encoder IN/manifest --split IN/split/split.json --clip IN/models/encoders/clip "
+    "--epochs 0.1 --preset tiny -o OUT/e": 1,
+    "train generator IN/manifest --split IN/split/split.json --clip IN/models/encoders "
+    "--autoencoder IN/models/autoencoder --steps 1 --preset tiny -o OUT/g": 1,
+    "demo --data IN/pairs --preset tiny -o OUT/d --clip nowhere": 1,
+    "completion bash": 1,
+}
+
+
+def build(folder: Path) -> None:
+    """Write all inputs below ``folder``, the same bytes every time."""
+    for name, make in TREES.items():
+        source = make(folder / f".{name}").source
+        (source if source.is_dir() else source.parent).rename(folder / name)
+        shutil.rmtree(folder / f".{name}")
+    for make in (_videos, _tables, _vectors, _results):
+        make(folder)
+
+
+def _videos(folder: Path) -> None:
+    """Two recordings of twelve frames as video files, with a list of frames."""
+    frames: list[str] = []
+    for name in ("20220601_182052", "20220602_090000"):
+        for side in ("video", "gelsight"):
+            write_video(folder / "video" / "dataset" / name / f"{side}.mp4", 12)
+        frames += [f"{name}/{k:010d}.jpg,3" for k in (6, 7, 8)]
+    (folder / "video" / "label.txt").write_text("\n".join(frames))
+
+
+def _tables(folder: Path) -> None:
+    """Eight rows with images in every form of a table and as a manifest; frame lists."""
+    table = folder / "table"
+    rows: list[dict[str, Any]] = []
+    for k in range(8):
+        row = {
+            "id": f"s{k}",
+            "video": f"v{k // 2}",
+            "frame": k,
+            "material": ("Wood", "Rock")[k % 2],
+        }
+        for side, make in (("vision", photo), ("tactile", gel)):
+            row[side] = f"{side}/{k}.png"
+            put(table / row[side], make(k))
+        rows.append(row)
+    shutil.copytree(table, folder / "manifest")
+    Manifest.from_rows(rows, folder / "manifest").save(folder / "manifest" / "manifest.parquet")
+    cells = [list(map(str, row.values())) for row in rows]
+    write_csv(table / "rows.csv", list(rows[0]), cells)
+    lines = ["\t".join(line) for line in (list(rows[0]), *cells)]
+    (table / "rows.tsv").write_text("\n".join(lines))
+    (table / "rows.json").write_text(json.dumps(rows))
+    (table / "rows.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    pl.DataFrame(rows).write_parquet(table / "rows.parquet")
+    (folder / "lists").mkdir()
+    for part, videos, start in (("train", "abc", 0), ("test", "cd", 40)):
+        lines = [f"{v}/{k:010d}.jpg,{k % 3}" for v in videos for k in range(start, start + 3)]
+        (folder / "lists" / f"{part}.txt").write_text("\n".join(lines))
+
+
+def _vectors(folder: Path) -> None:
+    """Embeddings of twelve samples in every form, twice."""
+    place = folder / "vectors"
+    place.mkdir()
+    ids = [f"s{k}" for k in range(12)]
+    labels = ["Wood" if k % 2 else "Rock" for k in range(12)]
+    for seed, name in enumerate("ab"):
+        x = np.random.default_rng(seed).normal(size=(12, 4)).astype(np.float32)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        np.save(place / f"{name}.npy", x)
+        np.savez(place / f"{name}.npz", features=x, ids=np.array(ids), labels=np.array(labels))
+        metadata = {"ids": json.dumps(ids), "labels": json.dumps(labels)}
+        save_file({"features": x}, place / f"{name}.safetensors", metadata)
+        columns = {"id": ids, "features": x.tolist(), "material": labels}
+        pl.DataFrame(columns).write_parquet(place / f"{name}.parquet")
+    rows = [[i, label, f"v{k // 3}"] for k, (i, label) in enumerate(zip(ids, labels, strict=True))]
+    write_csv(place / "labels.csv", ("id", "material", "video"), rows)
+
+
+def _results(folder: Path) -> None:
+    """What the other verbs leave behind: a split, an audit, scores, a world, images, models."""
+    manifest, split = folder / "manifest", folder / "split" / "split.json"
+    models, results = folder / "models", folder / "results"
+    call("split", manifest, "-o", split, "--train", "0.5")
+    shutil.copytree(manifest, results)  # a report shows images next to the results alone
+    call("audit", results, "--split", split, "-o", results / "audit.json")
+    for name in ("encoders", "autoencoder", "generator"):
+        shutil.copytree(MINI / name, models / name)
+    call("generate", manifest, "-o", folder / "generated", "--steps", "1")
+    scored = ("--generated", folder / "generated", "--reference", results)
+    call("score", *scored, "--companions", "psnr", "-o", results / "scores.json")
+    options = ("--preset", "tiny", "--size", "16", "--materials", "2", "--workers", "1")
+    call("world", "-o", folder / "made", *options)
+    (folder / "world").mkdir()
+    (folder / "made" / "world.json").rename(folder / "world" / "world.json")
+    shutil.rmtree(folder / "made")
+
+
+def call(*args: str | Path) -> None:
+    """Run a command that must succeed."""
+    if status := main([*map(str, args), "-q"]):
+        raise RuntimeError(f"{args} ended with {status}")

@@ -1,0 +1,96 @@
+"""Cases shared among processes, which are replaced when they die or hang."""
+
+import contextlib
+import io
+import multiprocessing
+import os
+import resource
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from fuzz import cases, seeds
+
+
+def serve(pipe: Connection, seed: int, base: Path, work: Path) -> None:
+    """Run the cases whose numbers arrive, within the limit of memory."""
+    import torch  # noqa: F401  (its own size does not count)
+
+    sink = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 1)  # what C libraries print
+    os.dup2(sink, 2)
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    resource.setrlimit(resource.RLIMIT_DATA, (used + cases.BYTES,) * 2)
+    while True:
+        number = pipe.recv()
+        try:
+            pipe.send(cases.check(seed, number, base, work))
+        except Exception:
+            pipe.send(([], [f"the fuzzer itself: {traceback.format_exc()[-900:]}"]))
+
+
+class Worker:
+    """A process that runs cases, and is replaced when it dies or hangs."""
+
+    def __init__(self, *settings: object) -> None:
+        self.settings = settings
+        self.process: multiprocessing.process.BaseProcess | None = None
+
+    def check(self, number: int) -> tuple[list[str], list[str]]:
+        if self.process is None:
+            context = multiprocessing.get_context("spawn")
+            self.pipe, end = context.Pipe()
+            self.process = context.Process(target=serve, args=(end, *self.settings), daemon=True)
+            self.process.start()
+            end.close()
+            limit = 3 * cases.SECONDS  # with the start
+        else:
+            limit = cases.SECONDS
+        self.pipe.send(number)
+        try:
+            if self.pipe.poll(limit):
+                return self.pipe.recv()
+            problem = "hangs"
+        except (EOFError, OSError):
+            self.process.join()
+            problem = f"the process dies with {self.process.exitcode}"
+        self.stop()
+        return [], [problem]
+
+    def stop(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.join()
+            self.process = None
+
+
+def run(numbers: range, seed: int, workers: int = 2) -> Iterator[tuple[int, list[str], list[str]]]:
+    """Yield (number, arguments, failures) of each case as it ends."""
+    with tempfile.TemporaryDirectory(prefix="palpate-fuzz-") as place:
+        base, work = Path(place) / "base", Path(place) / "work"
+        with contextlib.redirect_stdout(io.StringIO()):
+            seeds.build(base)
+        todo, lock, done = iter(numbers), threading.Lock(), []
+
+        def follow() -> None:
+            worker = Worker(seed, base, work)
+            while (number := _next(todo, lock)) is not None:
+                done.append((number, *worker.check(number)))
+            worker.stop()
+
+        threads = [threading.Thread(target=follow) for _ in range(workers)]
+        for thread in threads:
+            thread.start()
+        while done or any(thread.is_alive() for thread in threads):
+            while done:
+                yield done.pop(0)
+            time.sleep(0.05)
+
+
+def _next(numbers: Iterator[int], lock: threading.Lock) -> int | None:
+    with lock:
+        return next(numbers, None)

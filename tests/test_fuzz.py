@@ -1,0 +1,24 @@
+"""Commands on valid inputs succeed; on thousands of broken ones they end as the fuzzer allows."""
+
+import pytest
+
+from fuzz import cases, seeds
+from fuzz.workers import run
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_every_command_of_the_fuzzer_works_on_whole_inputs(tmp_path):
+    seeds.build(tmp_path / "base")
+    for number, command in enumerate(seeds.COMMANDS):
+        folder = tmp_path / str(number)
+        args = cases.prepare(command, tmp_path / "base", folder)
+        status, _, err = cases.run(args, folder)
+        assert status in (0, 1), (command, err[-500:])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_2000_broken_inputs_end_in_one_line():
+    wrong = [(number, *rest) for number, *rest in run(range(2000), seed=0) if rest[-1]]
+    assert not wrong, wrong[:5]

@@ -1,0 +1,202 @@
+"""Inputs that once ended in a traceback, destroyed a file or showed too much: each a line, exit 2.
+
+The fuzzer (``tests/fuzz``) finds such inputs; here stay those that were found, one a row.
+"""
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from data_fixtures import write_image
+from palpate.cli import main
+from palpate.core import PalpateError, atomic_folder, atomic_path, locked
+from palpate.data.manifest import Manifest
+
+INDEX = '{"format": "palpate-generated/1", "complete": true, "settings": {}, "digest": "x", '
+RESULTS = '{"format": "palpate-results/2", "title": "t"%s}'
+
+
+def zip_named_npy(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("a", "b")
+
+
+def typed_manifest(path: Path) -> None:
+    """A manifest whose columns have other types than palpate writes."""
+    Manifest.from_rows([{"id": "a", "vision": "a.jpg"}], path.parent).save(path)
+    with open(path, "rb") as file:
+        metadata = pl.read_parquet_metadata(file)
+    table = pl.read_parquet(path).with_columns(pl.lit(1).alias("vision"))
+    table.write_parquet(path, metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "command", "words"),
+    [
+        ("a.npy", zip_named_npy, "score --generated a.npy --reference a.npy", "named .npz"),
+        *(
+            ("g/index.json", INDEX + f'"skipped": [], "images": {images}}}', command, words)
+            for command in ("score --generated g --reference g", "generate a.jpg -o g")
+            for images, words in (
+                ('{"a": 3}', "images of type int"),
+                ('{"a": Infinity}', "not JSON compliant"),
+                ('{"a": "\\ud800"}', "surrogates not allowed"),
+                ("3", "images of type int"),
+            )
+        ),
+        *(
+            ("r.json", RESULTS % fields, "report r.json -o p.html", words)
+            for fields, words in (
+                (', "facts": 3', "facts of type int"),
+                (', "scores": [{"metric": "m", "subject": "s"}]', "'value'"),
+                (', "scores": [{"metric": "m", "subject": "s", "value": "high"}]', "of type str"),
+                (', "audits": [3]', "audits that holds no object"),
+                (', "wrong": 3', "unknown field wrong"),
+            )
+        ),
+        (
+            "r.json",
+            '{"format": "palpate-results/2", "title": 3}',
+            "report r.json -o p.html",
+            "title",
+        ),
+        ("a.txt", "", "audit a.txt b\udcff.txt", "must be UTF-8"),
+        ("a.txt", "", ["audit", "a.txt", ""], "not empty"),
+        ("m/manifest.parquet", typed_manifest, "export m --to csv -o c", "must have the format"),
+        ("s.png", "my notes", "world -o w --preset tiny --sheet s.png", "of the kind"),
+    ],
+)
+def test_a_broken_input_is_one_line(name, content, command, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_image(tmp_path / "a.jpg", 1)
+    Path(name).parent.mkdir(exist_ok=True)
+    content(Path(name)) if callable(content) else Path(name).write_text(content)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    args = command.split() if isinstance(command, str) else command
+    assert main([*args, "-q"]) == 2
+    message, *listed = capsys.readouterr().err.splitlines()
+    assert words in message
+    assert all(line.startswith("  ") for line in listed)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_a_line_break_in_a_name_does_not_break_the_message(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["audit", "a\n\x1b[2J", "b"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_long_caption_is_read(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_image(tmp_path / "a.jpg", 1)
+    Path("rows.csv").write_text(f"id,vision,tactile,text\na,a.jpg,a.jpg,{'x' * 200_000}\n")
+    main(["import", "rows.csv", "-o", "m", "-q"])
+    assert "field limit" not in capsys.readouterr().err
+
+
+def test_a_device_is_written_to_and_stays(tmp_path):
+    device, out = tmp_path / "null", tmp_path / "out"
+    try:
+        os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+    except PermissionError:
+        pytest.skip("only root makes devices")
+    for k in range(2):
+        write_image(tmp_path / "a" / f"{k}.jpg", k)
+    folder = str(tmp_path / "a")
+    assert main(["audit", folder, folder, "-o", str(device), "-q"]) in (0, 1)
+    np.save(tmp_path / "x.npy", np.eye(4))
+    vectors = str(tmp_path / "x.npy")
+    args = ["score", "--generated", vectors, "--reference", vectors, "--permutations", "0"]
+    assert main([*args, "-o", str(device), "--latex", str(device), "-q"]) in (0, 2)
+    assert stat.S_ISCHR(device.stat().st_mode)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "null", "x.npy"]
+    assert not out.exists()
+
+
+def test_a_pipe_is_written_to_and_a_link_stays(tmp_path):
+    pipe, link, target = tmp_path / "pipe", tmp_path / "link", tmp_path / "target"
+    os.mkfifo(pipe)
+    with subprocess.Popen(["cat", str(pipe)], stdout=subprocess.PIPE) as reader:
+        with atomic_path(pipe) as part:
+            part.write_text("whole")
+        assert reader.communicate()[0] == b"whole"
+    link.symlink_to(target)
+    with atomic_path(link) as part:
+        part.write_text("whole")
+    assert (link.is_symlink(), target.read_text()) == (True, "whole")
+
+
+def test_two_runs_do_not_share_a_folder_and_a_killed_one_does_not_block(tmp_path):
+    folder = tmp_path / "out"
+    with atomic_folder(folder) as part:
+        (part / "first").touch()
+        with pytest.raises(PalpateError, match="another run"):
+            atomic_folder(folder).__enter__()
+    assert [p.name for p in folder.iterdir()] == ["first"]
+    code = "from palpate.core import locked; from pathlib import Path; import sys\n"
+    code += "with locked(Path(sys.argv[1])): print(flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", code, str(folder)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        with pytest.raises(PalpateError, match="another run"):
+            locked(folder).__enter__()
+        other.kill()
+        other.wait()
+    with locked(folder):
+        pass
+
+
+def test_what_a_killed_run_left_is_replaced(tmp_path):
+    (tmp_path / ".out.part").mkdir()
+    (tmp_path / ".out.part" / "half").touch()
+    with atomic_folder(tmp_path / "out") as part:
+        (part / "whole").touch()
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["whole"]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_current_folder_is_rejected_before_the_work(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for verb in ("export nowhere --to csv -o .", "split nowhere --folds 2 -o ."):
+        assert main(verb.split()) == 2
+    write_image(tmp_path / "m" / "a.jpg", 1)
+    Manifest.from_rows([{"id": "a", "vision": "a.jpg"}], Path("m")).save(Path("m/manifest.parquet"))
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    assert main(["export", "../m", "--to", "csv", "-o", "."]) == 2
+    assert "the current folder" in capsys.readouterr().err
+
+
+def test_a_report_shows_no_image_outside_the_folder_of_its_results(tmp_path, capsys):
+    write_image(tmp_path / "secret.jpg", 7)
+    write_image(tmp_path / "results" / "mine.jpg", 8)
+    sample = {"id": "a", "vision": "../secret.jpg", "tactile": "mine.jpg"}
+    gallery = json.dumps([{"sample": sample, "generated": str(tmp_path / "secret.jpg")}])
+    path = tmp_path / "results" / "r.json"
+    path.write_text(RESULTS % f', "gallery": {gallery}')
+    shown = []
+    for k, more in enumerate(([], ["--images", str(tmp_path)])):
+        page = tmp_path / f"page{k}.html"
+        assert main(["report", str(path), "-o", str(page), "-q", *more]) == 0
+        shown.append(page.read_text().count("data:image/"))
+    assert shown == [1, 3]
+
+
+def test_ctrl_c_at_any_time_is_no_traceback(tmp_path):
+    command = [sys.executable, "-m", "palpate", "world", "-o", str(tmp_path / "w")]
+    for seconds in (0.15, 0.3, 0.6, 1.2):
+        with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as run:
+            time.sleep(seconds)
+            run.send_signal(signal.SIGINT)
+            err = run.stderr.read().decode()
+        assert "Traceback" not in err, seconds
