@@ -16,8 +16,9 @@ TOP = Path(__file__).resolve().parents[1]
 #: Public function -> its parameters in order; keywords behind the star.
 SIGNATURES = {
     "audit": (
-        "train_or_data test * split pretrain by near_frames images modalities "
-        "false_positives encoder impact name worst cache threads root skip_bad progress"
+        "train_or_data test * split pretrain by near_frames identity images modalities "
+        "false_positives encoder impact name worst cache threads root reading ids_in_time "
+        "skip_bad progress"
     ),
     "generate": (
         "photos * model output split part seed guidance steps batch skip_bad device progress"
@@ -29,7 +30,9 @@ SIGNATURES = {
         "estimator backend normalize companions controls inception clip lpips "
         "permutations seed cache progress"
     ),
-    "split": ("data * by train val seed folds near noleak nulls tolerance cache skip_bad progress"),
+    "split": (
+        "data * by train val seed folds near noleak nulls tolerance cache reading skip_bad progress"
+    ),
     "train_encoder": "data split * preset clip output epochs targets seed device progress",
     "train_generator": (
         "data split clip * preset autoencoder output source background steps seed device progress"

@@ -154,7 +154,7 @@ def test_names_count_where_they_are_declared_or_the_roots_are_one_data_set(tmp_p
         )
     declared = Manifest.from_rows([row | {"id": "press 7"}], tmp_path / "1")
     assert "id" in shared_names(declared, replace(declared, root=tmp_path / "2"), "auto")
-    with pytest.raises(PalpateError, match="`identity` must be auto, names or images"):
+    with pytest.raises(PalpateError, match="`identity` must be one of auto, names, images"):
         audit(declared, declared, identity="paths")
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from palpate import __version__
+from palpate.cli.sources import Reading
 from palpate.cli.terminal import (
     FAILED_CHECK,
     Common,
@@ -34,6 +35,9 @@ class Comparison:
     """What train and test must not share; `auto`: the video, or what is known instead of it."""
     near_frames: int = 30
     """A gap of up to this many frames within a video is a leak by itself."""
+    ids_in_time: Switch = False
+    """The last number of an id or path is a time: samples without a video and frame are as near as
+    these numbers."""
     identity: Literal["auto", "names", "images"] = "auto"
     """What equal names in train and test mean: `names` the same thing, `images` nothing, so that
     bytes and images decide; `auto`: names where both have one root, are of one published data set,
@@ -74,10 +78,10 @@ class Options(Common):
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """TRAIN and TEST, or all samples with --split: lists (`video/frame.jpg,label` per line),
-    tables, manifests or folders."""
+    """TRAIN and TEST, or all samples with a split: lists (`video/frame.jpg,label` or `video start
+    end` per line), tables, JSON, manifests or folders. Images need not be at hand."""
     split: Path | None = None
-    """Split file of the samples."""
+    """Split file of the samples (default: the split that they come with)."""
     pretrain: Path | None = None
     """What an encoder was pretrained on: samples that the test part is compared with as well."""
     root: Path | None = None
@@ -88,6 +92,7 @@ class Options(Common):
     """Folder that keeps decoded images, so that another audit of them is quick."""
     threads: int | None = None
     """Threads that decode images (default: one per core)."""
+    reading: Reading = field(default_factory=Reading)
     comparison: Comparison = field(default_factory=Comparison)
     outputs: Outputs = field(default_factory=Outputs)
 
@@ -109,6 +114,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             split=options.split,
             pretrain=options.pretrain,
             root=options.root,
+            reading=options.reading.options(),
             skip_bad=options.skip_bad,
             cache=cache,
             threads=options.threads,
@@ -140,7 +146,7 @@ def _check(options: Options) -> None:
         PalpateError: on a number of paths that makes no audit, or an output in the way.
     """
     outputs = options.outputs
-    if len(options.paths) != (1 if options.split is not None else 2):
+    if len(options.paths) not in ((1,) if options.split is not None else (1, 2)):
         raise PalpateError(
             "An audit takes TRAIN and TEST, or all samples with a split",
             f"{len(options.paths)} path(s) {'with' if options.split else 'without'} a split",
@@ -176,18 +182,27 @@ def _check(options: Options) -> None:
 
 
 def _next_commands(options: Options, audit: Audit) -> list[str]:
-    """Commands that answer the finding."""
-    source = shlex.join(map(str, options.paths))
-    if not audit.leaked_fraction or not (options.split or all(p.is_file() for p in options.paths)):
+    """Commands that answer the finding, on the same data."""
+    paths = options.paths
+    joined = len(paths) == 1 or (all(p.is_file() for p in paths) and not audit.identical_samples)
+    codes = {note.code for note in audit.notes}
+    if not audit.leaked_fraction or not joined or "equal-names" in codes:
         return []
-    near = any(s.flagged for s in audit.signals if s.kind.startswith("near-duplicate"))
+    source = shlex.join([*map(str, paths), *options.reading.arguments()])
+    checked = {s.kind: s for s in audit.signals if s.checked and s.kind.startswith("near-dup")}
+    sides = [kind.split()[-1] for kind, s in checked.items() if s.flagged or audit.group == "none"]
+    near = f" --near {'both' if len(sides) == 2 else sides[0]}" if sides else ""
+    if audit.group == "none" and not near:
+        return []
     by = "" if options.comparison.by == "auto" else f" --by {options.comparison.by}"
-    commands = [f"palpate split {source}{by}{' --near both' if near else ''} -o noleak.json"]
-    if options.split:
+    if "group-nulls" in codes:
+        by = f" --by {audit.group} --nulls single"
+    commands = [f"palpate split {source}{by}{near} -o noleak.json"]
+    if len(paths) == 1:
         commands.append(f"palpate audit {source} --split noleak.json")
-        if not options.comparison.impact:
-            split = shlex.quote(str(options.split))
-            commands.append(f"palpate audit {source} --split {split} --impact")
+        if not options.comparison.impact and checked and len(audit.materials) > 1:
+            split = f" --split {shlex.quote(str(options.split))}" if options.split else ""
+            commands.append(f"palpate audit {source}{split} --impact")
     return commands
 
 

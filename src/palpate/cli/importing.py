@@ -154,11 +154,11 @@ def format_options(options: SourceOptions) -> dict[str, Any]:
     """The options of formats that were given, as keywords."""
     groups = (options.table, options.formats)
     given = {field.name: getattr(group, field.name) for group in groups for field in fields(group)}
-    given |= {"columns": _columns(options.table.columns)}
+    given |= {"columns": columns_of(options.table.columns)}
     return {name: value for name, value in given.items() if value not in (None, False, (), {})}
 
 
-def _columns(items: Sequence[Sequence[str]]) -> dict[str, str]:
+def columns_of(items: Sequence[Sequence[str]]) -> dict[str, str]:
     """``COLUMN=EXPRESSION`` items as a dictionary.
 
     Raises:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from palpate.cli.sources import Reading
 from palpate.cli.terminal import (
     FAILED_CHECK,
     Common,
@@ -81,6 +82,7 @@ class Options(Common):
     skip_bad: Switch = False
     """Skip bad rows of lists and tables, and list them."""
     together: Groups = field(default_factory=Groups)
+    reading: Reading = field(default_factory=Reading)
 
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
@@ -92,6 +94,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     by = options.together.by or "auto"
     common: dict[str, Any] = {"by": by, "near": options.together.near, "cache": options.cache}
     with terminal.progress() as progress:
+        common |= {"reading": options.reading.options()}
         common |= {"skip_bad": options.skip_bad, "progress": progress}
         if options.verify is not None:
             verified = verify(data, options.verify, **common)
@@ -202,7 +205,7 @@ def _write_lists(data: Any, split: Split, options: Options) -> list[str]:
     from palpate.data.importing import write_lists
     from palpate.leakage.inputs import read
 
-    manifest, _ = read(data, options.skip_bad)
+    manifest = read(data, options.skip_bad).manifest
     bare = all(manifest.table[c].null_count() == len(manifest) for c in ("vision", "tactile"))
     frames = bare and not manifest.table["frame"].null_count() and "format" not in manifest.facts
     with atomic_folder(options.lists) as part:

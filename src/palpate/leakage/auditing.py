@@ -11,7 +11,7 @@ that no metadata reveals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import Note, PalpateError, Progress, Split, quiet
+from palpate.core import Note, PalpateError, Progress, Split, quiet, require_choice
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.groups import GROUPS, shared_groups
 from palpate.leakage.inputs import (
@@ -37,6 +37,7 @@ from palpate.leakage.signals import (
     Gaps,
     identical_bytes,
     identical_samples,
+    in_time,
     leaking,
     nearest_in_video,
     shared_group,
@@ -68,6 +69,7 @@ class _Options:
     false_positives: float
     encoder: Embed | None
     worst: int
+    ids_in_time: bool
     cache: Path | None
     threads: int | None
     progress: Progress
@@ -92,6 +94,8 @@ def audit(  # noqa: PLR0913
     cache: str | Path | None = None,
     threads: int | None = None,
     root: str | Path | None = None,
+    reading: Mapping[str, Any] | None = None,
+    ids_in_time: bool = False,
     skip_bad: bool = False,
     progress: Progress = quiet,
 ) -> Audit:
@@ -101,7 +105,8 @@ def audit(  # noqa: PLR0913
         train_or_data: the train samples, or with ``split`` all samples: a manifest, a path (list of
             ``video/frame.jpg,label`` lines, table, manifest, folder), or a polars or pandas frame.
         test: the test samples, likewise.
-        split: a split of ``train_or_data``, instead of ``test``.
+        split: a split of ``train_or_data``, instead of ``test``; default: the one that the source
+            states.
         pretrain: what an encoder was pretrained on, which the test part is compared with as well;
             its audit is in ``others``.
         by: what train and test must not share: a column, or ``auto`` for the video or what is known
@@ -120,6 +125,11 @@ def audit(  # noqa: PLR0913
         cache: folder that keeps decoded images.
         threads: that decode images; default: the number of cores, 16 at most.
         root: where the paths of tables start; default: the folder of the table.
+        reading: how sources are read, as in :func:`palpate.load`: ``columns``, ``names``,
+            ``classes``, ``side``, and the templates ``vision`` and ``tactile``, also of paths in
+            lists whose images are not at hand.
+        ids_in_time: the last number of an id or path is a time: gaps of samples without a video and
+            frame are differences of these.
         skip_bad: skip bad rows of lists and tables, and note them.
         progress: callback.
 
@@ -131,26 +141,9 @@ def audit(  # noqa: PLR0913
             empty part.
         ProblemsError: with every bad row of all inputs, unless ``skip_bad``.
     """
-    if (test is None) == (split is None):
-        raise PalpateError(
-            "An audit takes train and test samples, or samples with a split",
-            "both" if split is not None else "neither test samples nor a split",
-            "Pass one of them",
-        )
-    require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", by)
-    require(near_frames >= 0, "near_frames", "must be at least 0", near_frames, 30)
-    require(worst >= 0, "worst", "must be at least 0", worst, 12)
-    known = identity in ("auto", "names", "images")
-    require(known, "identity", "must be auto, names or images", identity, "names")
-    known = set(modalities) <= set(MODALITIES)
-    require(known, "modalities", "must be among vision, tactile", list(modalities), ["vision"])
-    rate = false_positives
-    require(0 < rate <= 0.1, "false_positives", "must lie in (0, 0.1]", rate, 0.001)
-    require(not (impact and test is not None), "impact", "needs samples with a split", "no split")
-    sources = [x for x in (train_or_data, test, pretrain) if x is not None]
-    parts, notes = read_all(sources, skip_bad, progress, root)
-    if by == "contact":
-        parts = number_contacts(parts)
+    if test is not None and split is not None:
+        must = "An audit takes train and test samples, or samples with a split"
+        raise PalpateError(must, "both", "Pass one of them")
     options = _Options(
         by,
         near_frames,
@@ -160,11 +153,24 @@ def audit(  # noqa: PLR0913
         false_positives,
         encoder,
         worst,
+        ids_in_time,
         None if cache is None else Path(cache),
         threads,
         progress,
     )
-    if split is None:
+    _check(options)
+    require(not (impact and test is not None), "impact", "needs samples with a split", "no split")
+    sources = [x for x in (train_or_data, test, pretrain) if x is not None]
+    read = read_all(sources, skip_bad, progress, root, reading)
+    parts, notes = (
+        [source.manifest for source in read],
+        [n for source in read for n in source.notes],
+    )
+    if test is None and split is None:
+        split = _stated(read[0].splits)
+    if by == "contact":
+        parts = number_contacts(parts)
+    if test is not None:
         title = name or f"{_name(train_or_data, 'train')} / {_name(test, 'test')}"
         result = _compare(parts[0], parts[1], options, title)
         test_part = parts[1]
@@ -187,6 +193,39 @@ def audit(  # noqa: PLR0913
         against = _compare(parts[-1], test_part, options, title, against="pretraining")
         result = replace(result, others=[against])
     return replace(result, notes=[*result.notes, *notes])
+
+
+def _check(options: _Options) -> None:
+    by, rate = options.by, options.false_positives
+    require(by in (*GROUPS, "auto"), "by", f"must be auto or one of {', '.join(GROUPS)}", by)
+    frames, worst = options.near_frames, options.worst
+    require(frames >= 0, "near_frames", "must be at least 0", frames, 30)
+    require(worst >= 0, "worst", "must be at least 0", worst, 12)
+    require_choice("identity", options.identity, ("auto", "names", "images"))
+    known = set(options.modalities) <= set(MODALITIES)
+    must = "must be among vision, tactile"
+    require(known, "modalities", must, list(options.modalities), ["vision"])
+    require(0 < rate <= 0.1, "false_positives", "must lie in (0, 0.1]", rate, 0.001)
+
+
+def _stated(splits: Mapping[str, Split]) -> Split:
+    """The split that a source states.
+
+    Raises:
+        PalpateError: unless there is one.
+    """
+    if len(splits) != 1:
+        raise PalpateError(
+            "An audit takes train and test samples, or samples with a split",
+            f"neither test samples nor a split; the source states {len(splits)}{_few(splits)}",
+            "Pass test samples, or a split",
+            example={"split": "split.json"},
+        )
+    return next(iter(splits.values()))
+
+
+def _few(names: Collection[str]) -> str:
+    return f" ({', '.join(sorted(names))})" if names else ""
 
 
 def _name(source: Any, default: str) -> str:
@@ -241,7 +280,9 @@ def _group(train: Manifest, test: Manifest, options: _Options) -> str:
                 f"The {part} part must hold samples", "none", "Check the split or list file"
             )
     group = known_group(train, test) if options.by == "auto" else options.by
-    if group == NO_GROUP and options.images and _with_images(train, test):
+    listed = all("path" in part.table.columns for part in (train, test))
+    images = options.images and _with_images(train, test)
+    if group == NO_GROUP and (images or listed or options.ids_in_time):
         return group
     if group == NO_GROUP or not (_known(train, group) and _known(test, group)):
         raise PalpateError(
@@ -270,7 +311,7 @@ def _compare(
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])
     in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
-    gaps = nearest_in_video(a, b)
+    gaps = nearest_in_video(*(in_time(t) if options.ids_in_time else t for t in (a, b)))
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
     verdict, reason = _verdict(flags, bool(leaks.any()), named=not equal)
@@ -329,8 +370,11 @@ def _verdict(flags: Sequence[Flags], leaks: bool, *, named: bool) -> tuple[str, 
         return CANNOT_TELL, "untouched"
     if reasons.get("cannot-tell-no-null", {}).get("threshold") is not None:
         return CANNOT_TELL, "alike"
-    if not named and not any(np.isfinite(f.score).any() for f in (*near, *files)):
-        return CANNOT_TELL, "names"
+    if not any(np.isfinite(f.score).any() for f in (*near, *files)):
+        if not named:
+            return CANNOT_TELL, "names"
+        if {f.kind for f in flags} <= {"identical sample", "identical bytes"}:
+            return CANNOT_TELL, "ids"
     return "none", ""
 
 

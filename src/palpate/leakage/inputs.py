@@ -7,21 +7,23 @@ of tables, in which somebody declared them. Elsewhere bytes and images decide.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import polars as pl
 
-from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, quiet
+from palpate.core import Note, PalpateError, Problem, ProblemsError, Progress, Split, quiet
 from palpate.data.formats import FORMATS
 from palpate.data.listing import number_together, read_categories, read_lists
-from palpate.data.manifest import Manifest
-from palpate.data.reading import is_list, read_samples
+from palpate.data.manifest import MODALITIES, SCHEMA, Manifest
+from palpate.data.naming import name_together, read_names
+from palpate.data.reading import is_list, is_manifest, read_samples
 
 #: A manifest, a path, several frame lists that are joined, or a polars or pandas frame.
 Data = Any
+FIX = "Correct the lines, or skip the bad ones"
 #: Problems that a note names.
 SHOWN = 40
 #: What equal names mean: the same thing, or nothing, or (auto) what the sources say.
@@ -43,46 +45,90 @@ def require(ok: bool, argument: str, must: str, got: Any, example: Any = None) -
         raise PalpateError(must, repr(got), "", argument=argument, example=shown)
 
 
+@dataclass(frozen=True)
+class Source:
+    """What a source holds: samples, the splits that it states by name, and notes."""
+
+    manifest: Manifest
+    splits: Mapping[str, Split]
+    notes: list[Note]
+
+
 def read(
-    data: Data, skip_bad: bool = False, progress: Progress = quiet, root: str | Path | None = None
-) -> tuple[Manifest, list[Note]]:
-    """The samples, with a note on rows that were skipped.
+    data: Data,
+    skip_bad: bool = False,
+    progress: Progress = quiet,
+    root: str | Path | None = None,
+    reading: Mapping[str, Any] | None = None,
+) -> Source:
+    """Read samples.
+
+    Args:
+        data: what names them.
+        skip_bad: skip bad rows, and note them.
+        progress: callback.
+        root: where the paths of tables start.
+        reading: further options of sources, as of :func:`palpate.load`.
 
     Raises:
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
+    options = {name: value for name, value in (reading or {}).items() if value}
     paths = data if isinstance(data, (list, tuple)) else ()
     if len(paths) > 1 and all(isinstance(path, (str, Path)) for path in paths):
-        manifest, skipped = _join([Path(path) for path in paths], skip_bad)
-    else:
-        source = paths[0] if len(paths) == 1 and not isinstance(paths[0], dict) else data
-        manifest, skipped = read_samples(source, skip_bad=skip_bad, root=root, progress=progress)
+        manifest, skipped = _join([Path(path) for path in paths], skip_bad, options)
+        return Source(manifest, {}, _notes(skipped))
+    source = paths[0] if len(paths) == 1 and not isinstance(paths[0], dict) else data
+    path = Path(source) if isinstance(source, (str, Path)) else None
+    plain = path is None or not path.is_file() or is_manifest(path) or is_list(path)
+    named = None if plain or path is None else read_names(path, **options)
+    if named is not None:
+        manifest, skipped, split = named
+        if skipped and not skip_bad:
+            raise ProblemsError(skipped, FIX, example={"skip_bad": True})
+        splits = {} if split is None else {str(split.rule["name"]): split}
+        columns = {*manifest.filled().columns} | {*manifest.table.columns[len(SCHEMA) :]}
+        bare = "path" in columns and columns.isdisjoint(MODALITIES)
+        notes = [Note("names-only", {"name": path.name})] if bare else []
+        return Source(manifest, splits, [*_notes(skipped), *notes])
+    manifest, skipped = read_samples(
+        source, skip_bad=skip_bad, root=root, progress=progress, **options
+    )
+    stated = sorted(path.glob("splits/*.json")) if path is not None and path.is_dir() else []
+    return Source(manifest, {p.stem: Split.load(p) for p in stated}, _notes(skipped))
+
+
+def _notes(skipped: Sequence[Problem]) -> list[Note]:
     shown = [str(problem) for problem in skipped[:SHOWN]]
-    notes = [Note("rows-skipped", {"count": len(skipped), "problems": shown})] if skipped else []
-    return manifest, notes
+    return [Note("rows-skipped", {"count": len(skipped), "problems": shown})] if skipped else []
 
 
 def read_all(
-    sources: Sequence[Data], skip_bad: bool, progress: Progress, root: str | Path | None
-) -> tuple[list[Manifest], list[Note]]:
-    """Several sources; the problems of all are raised together."""
-    manifests: list[Manifest] = []
+    sources: Sequence[Data],
+    skip_bad: bool,
+    progress: Progress,
+    root: str | Path | None,
+    reading: Mapping[str, Any] | None = None,
+) -> list[Source]:
+    """Several sources; the problems of all are raised together, and their names read together."""
+    parts: list[Source] = []
     problems: list[Problem] = []
-    notes: list[Note] = []
     for source, name in zip(sources, ("train_or_data", "test", "pretrain"), strict=False):
         try:
-            manifest, more = read(source, skip_bad, progress, root)
+            parts.append(read(source, skip_bad, progress, root, reading))
         except ProblemsError as error:
             problems += error.problems
         except PalpateError as error:
             error.argument = name if error.argument == "source" else error.argument
             raise
-        else:
-            manifests.append(manifest)
-            notes += more
     if problems:
-        raise ProblemsError(problems, "Correct the lines, or skip the bad ones")
-    return manifests, notes
+        raise ProblemsError(problems, FIX)
+    named, template = name_together([part.manifest for part in parts])
+    notes = [Note("names-read", {"template": template})] if template else []
+    return [
+        replace(part, manifest=manifest, notes=[*part.notes, *(notes if k == 0 else [])])
+        for k, (part, manifest) in enumerate(zip(parts, named, strict=True))
+    ]
 
 
 def number_contacts(manifests: list[Manifest]) -> list[Manifest]:
@@ -107,8 +153,9 @@ def shared_names(train: Manifest, test: Manifest, identity: Identity) -> tuple[s
 def _declares(manifest: Manifest, column: str) -> bool:
     """Whether the names of a column are from a table, and not from the paths of files."""
     facts, table = manifest.facts, manifest.table
+    by_path = "source" in facts or any(fact.startswith("template_") for fact in facts)
     layout = facts.get("layout", "table")
-    if "source" in facts or facts.get("format") not in DECLARING or not layout.startswith("table"):
+    if by_path or facts.get("format") not in DECLARING or not layout.startswith("table"):
         return False
     stems = [pl.col(c).str.replace(r"\.[^./]+$", "") == pl.col("id") for c in ("tactile", "vision")]
     return column != "id" or not table.select(pl.any_horizontal(*stems).any()).item()
@@ -148,15 +195,20 @@ def _prefixed(column: str, names: pl.Series, part: str) -> pl.Expr:
     return pl.when(name.is_in(names.implode())).then(renamed).otherwise(name).alias(column)
 
 
-def _join(paths: list[Path], skip_bad: bool) -> tuple[Manifest, list[Problem]]:
-    """Several frame lists as one manifest."""
+def _join(
+    paths: list[Path], skip_bad: bool, reading: Mapping[str, Any]
+) -> tuple[Manifest, list[Problem]]:
+    """Several lists as one manifest."""
     for path in paths:
-        if not path.is_file() or not is_list(path):
+        if not path.is_file() or is_manifest(path):
             raise PalpateError(
-                "Several paths must all be frame lists",
+                "Several paths must all be lists",
                 f"{path}, which is none" if path.exists() else f"no file {path}",
                 "Name one manifest, or lists alone",
             )
+    if not all(map(is_list, paths)):
+        parts = read_all(paths, skip_bad, quiet, None, reading)
+        return Manifest.join(*(part.manifest for part in parts)), []
     table = paths[0].parent / "category_reference.txt"
     joined = read_lists(
         paths,

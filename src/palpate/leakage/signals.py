@@ -67,6 +67,18 @@ def nearest_in_video(train: pl.DataFrame, test: pl.DataFrame) -> Gaps:
     return Gaps(row, gap)
 
 
+def in_time(table: pl.DataFrame) -> pl.DataFrame:
+    """The table where the last number of an id is the frame, and the others are the video."""
+    number = r"^(.*?)(\d{1,18})(\D*)$"
+    both = pl.col("video").is_not_null() & pl.col("frame").is_not_null()
+    frame = pl.col("id").str.extract(number, 2).cast(pl.Int64)
+    video = pl.col("id").str.replace(number, "${1}#${3}")
+    return table.with_columns(
+        video=pl.when(both).then("video").otherwise(video),
+        frame=pl.when(both).then("frame").otherwise(frame),
+    )
+
+
 @dataclass(frozen=True)
 class Flags:
     """One signal over all test samples, in their order.

@@ -24,7 +24,7 @@ from palpate.leakage.groups import (
     nested_groups,
     shared_groups,
 )
-from palpate.leakage.inputs import Data, read, require
+from palpate.leakage.inputs import Data, read, read_all, require
 from palpate.leakage.noleak import HCT_GROUPS, published, require_hct
 from palpate.leakage.program import EXACT, RESOLUTION, Optimum, Problem, draw, optimize
 
@@ -56,6 +56,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
     nulls: Nulls = "raise",
     tolerance: float = 0.0,
     cache: str | Path | None = None,
+    reading: Mapping[str, Any] | None = None,
     skip_bad: bool = False,
     progress: Progress = quiet,
 ) -> Split | list[Split]:
@@ -79,6 +80,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         tolerance: how far the largest deviation may be above the smallest possible one, for splits
             that differ more.
         cache: folder that keeps decoded images for ``near``.
+        reading: how the source is read, as in :func:`palpate.leakage.audit`.
         skip_bad: skip bad rows of lists and tables, and note them.
         progress: callback.
 
@@ -95,9 +97,11 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
     _check(train, val, folds, tolerance, noleak)
     seeds = [seed] if isinstance(seed, int) else list(seed)
     if noleak == "touch-and-go":
-        manifest, notes = (None, []) if data is None else read(data, skip_bad, progress)
+        source = None if data is None else read(data, skip_bad, progress)
+        manifest, notes = (source.manifest, source.notes) if source else (None, [])
         return published(manifest, train, val, seeds[0], notes)
-    manifest, notes = read(data, skip_bad, progress)
+    (source,) = read_all([data], skip_bad, progress, None, reading)
+    manifest, notes = source.manifest, source.notes
     rule: dict[str, Any] = {"name": "NoLeak"}
     if noleak == "hct":
         by, rule = HCT_GROUPS, {"name": "HCT-NoLeak", "session_gap": require_hct(manifest)}

@@ -7,7 +7,7 @@ no signal of the audit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from palpate.core import Note, Progress, Split, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage.auditing import audit
 from palpate.leakage.groups import GROUPS, choose_group, components
-from palpate.leakage.inputs import Data, read
+from palpate.leakage.inputs import Data, read_all
 from palpate.leakage.noleak import load_record, record_split
 from palpate.leakage.splitting import near_links
 from palpate.report.results import Audit
@@ -71,6 +71,7 @@ def verify(
     by: str | Sequence[str] = "auto",
     near: Any = None,
     cache: str | Path | None = None,
+    reading: Mapping[str, Any] | None = None,
     skip_bad: bool = False,
     progress: Progress = quiet,
 ) -> Verification:
@@ -82,6 +83,7 @@ def verify(
         by: columns that no two parts may share; ``auto``: those of its rule.
         near: near-duplicates that no two parts may share, as in :func:`palpate.leakage.split`.
         cache: folder that keeps decoded images for ``near``.
+        reading: how the source is read, as in :func:`palpate.leakage.audit`.
         skip_bad: skip bad rows of lists and tables, and note them.
         progress: callback.
 
@@ -89,7 +91,8 @@ def verify(
         PalpateError: on an unknown column, or a split file that cannot be read.
     """
     split = split if isinstance(split, Split) else Split.load(Path(split))
-    manifest, notes = read(data, skip_bad, progress)
+    (source,) = read_all([data], skip_bad, progress, None, reading)
+    manifest, notes = source.manifest, source.notes
     columns = _columns(split, manifest) if by == "auto" else [by] if isinstance(by, str) else by
     links, _ = near_links(manifest, near, cache, progress)
     known = [c for c in columns if manifest.table[c].null_count() < len(manifest)]

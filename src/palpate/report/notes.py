@@ -392,6 +392,10 @@ LEAKAGE: dict[str, Sentence] = {
     "missing-materials": _listed(
         "Could be in every part, but not together with the others: {materials}"
     ),
+    "names-only": "No image that {name} names is there: its names alone were compared",
+    "names-read": lambda p, style: (
+        f"Paths were read as {p['template']}; {style:tactile=TEMPLATE} reads them another way"
+    ),
     "near-frames": _near_frames,
     "no-group": (
         "Neither videos nor objects, sessions or contacts are known: only samples and images "

@@ -177,7 +177,8 @@ class Audit:
             train, test groups): whether the test part asks for new videos, or for new objects.
         verdict: ``leaks``, ``none``, or ``cannot tell``; '' in files of earlier versions.
         reason: why that cannot be told: nothing was touched (``untouched``), all images are alike
-            (``alike``), or equal names mean nothing and there are no images (``names``).
+            (``alike``), or there are no images and equal names mean nothing (``names``), or ids
+            alone are known (``ids``).
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).

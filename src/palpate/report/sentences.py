@@ -112,6 +112,7 @@ def threshold_line(signal: Signal) -> str:
 UNTOLD = {
     "untouched": "nothing was touched, so images cannot show what is new",
     "alike": "images of different videos are all alike, so they cannot show what is new",
+    "ids": "ids alone could be compared, since no video, object or image is known",
     "names": "equal names of different roots mean nothing, and there are no images to compare",
 }
 

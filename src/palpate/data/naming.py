@@ -1,0 +1,299 @@
+"""Lists of samples whose images are not at hand: what their names alone say.
+
+=====================================================  =============================================
+source                                                 samples
+=====================================================  =============================================
+lines ``video start end [label]``, or a table of such  each frame from start to end, both included
+JSON ``{"train": [[object, contact], ...], ...}``      one an item; a name instead of a number is a
+                                                       video, and the second its frame
+JSON or a table with paths of images                   one a row; nested keys are columns like
+                                                       ``image.path``
+=====================================================  =============================================
+
+A path says more by a template (:mod:`palpate.data.templates`); without one the paths of all lists
+together suggest it, so that one list alone cannot hide what varies between them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from palpate.core import PalpateError, Problem, Split
+from palpate.data.detection import ROLES, template_of
+from palpate.data.formats import hct
+from palpate.data.formats.intervals import NAMES as INTERVAL_NAMES
+from palpate.data.formats.intervals import NEEDED, ORDER
+from palpate.data.images import SUFFIXES
+from palpate.data.manifest import SCHEMA, Manifest
+from palpate.data.mapping import compile_maps
+from palpate.data.rows import PART_NAMES, manifest_rows, read_classes
+from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
+from palpate.data.templates import Template
+
+#: ``video start end [label]``, separated by spaces, tabs, commas or semicolons.
+INTERVAL = re.compile(r"\s*([^\s,;]+)[\s,;]+(\d{1,9})[\s,;]+(\d{1,9})(?:[\s,;]+([^\s,;]+))?\s*")
+#: Frames that the intervals of one list may have together.
+MOST_FRAMES = 20_000_000
+#: Published lists: name -> pattern of a path, whose groups are columns.
+HCT = (
+    r"(?:.*/)?(?P<video>data\d+/[^/]+-\d+\.\d+)/(?:vision|tactile)/(?P<frame>\d{1,18})-[\d.]+\.\w+"
+)
+KNOWN = {
+    "HCT": HCT,
+    "SSVTP": r"(?:.*/)?images_(?:rgb|tac)/image_(?P<frame>\d{1,18})_(?:rgb|tac)\.\w+",
+}
+#: The column of the paths that a list names.
+PATH = "path"
+#: What a list is read by.
+OPTIONS = ("columns", "names", "classes", "vision", "tactile")
+
+
+def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Split | None] | None:
+    """Read a list of samples whose images are not at hand.
+
+    Args:
+        path: a file.
+        options: ``columns`` (manifest column -> map expression), ``names`` of the columns of a
+            table without a header, ``classes``, and the templates ``vision`` or ``tactile`` of its
+            paths.
+
+    Returns:
+        The samples, without images unless they are there; what is wrong with the list; and the
+        split that it states. None if it is no such list.
+
+    Raises:
+        PalpateError: if an option does not fit the list.
+    """
+    if path.suffix.lower() not in TABLES or _is_interval(path):
+        return _intervals(path) if _is_interval(path) else None
+    records = _records(path)
+    header = header_of(path) if records is None else list(records.names)
+    low = [name.lower() for name in header]
+    if all(set(INTERVAL_NAMES[name]) & set(low) for name in NEEDED):
+        return _intervals(path) if not any(path.parent.glob("*/*")) else None
+    names = options.get("names")
+    table = records or open_table(path, names and [name.strip() for name in names.split(",")])
+    return _paths(path, table, records is not None, options)
+
+
+def name_together(manifests: Sequence[Manifest]) -> tuple[list[Manifest], str]:
+    """Fill what the paths of several lists say of their samples.
+
+    Returns:
+        The manifests, those without a column of paths as they are, and the template or name of a
+        published list, or ''.
+    """
+    tables = [m.table for m in manifests]
+    unread = [t for t in tables if PATH in t.columns and not t["video"].count()]
+    paths = [path for table in unread for path in table[PATH].to_list()]
+    if not paths:
+        return list(manifests), ""
+    known = next(
+        (name for name, p in KNOWN.items() if all(re.fullmatch(p, path) for path in paths)), ""
+    )
+    text = known or template_of(paths)
+    pattern = re.compile(KNOWN[known]) if known else Template.parse(text).pattern
+    named = [
+        replace(m, table=_filled(m.table, pattern)) if any(m.table is t for t in unread) else m
+        for m in manifests
+    ]
+    if known == "HCT":
+        sessions = hct.sessions_of({v for m in named for v in m.table["video"].drop_nulls()}, 60.0)
+        session = pl.col("video").replace_strict(sessions, default=None, return_dtype=pl.String)
+        named = [replace(m, table=m.table.with_columns(session=session)) for m in named]
+    return named, text
+
+
+def _filled(table: pl.DataFrame, pattern: re.Pattern[str]) -> pl.DataFrame:
+    """The table with the groups of a pattern of its paths in the columns that are empty."""
+    matches = [pattern.fullmatch(path) for path in table[PATH].to_list()]
+    columns: list[pl.Series] = []
+    for name in pattern.groupindex:
+        if name in SCHEMA and not table[name].count():
+            values = pl.Series(name, [m and m[name] for m in matches], pl.String)
+            columns.append(values.cast(SCHEMA[name], strict=False))
+    return table.with_columns(columns)
+
+
+def _is_interval(path: Path) -> bool:
+    """Whether the first line that is not empty is an interval."""
+    with open(path, "rb") as file:
+        head = decoded(file.read(1 << 12))
+    line = next((line for line in lines_of(head) if line.strip()), "")
+    return INTERVAL.fullmatch(line) is not None
+
+
+def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
+    """Every frame of every interval."""
+    lines, header = lines_of(decoded(path.read_bytes())), header_of(path)
+    order = list(range(4))
+    if header and not _is_interval(path):
+        low, lines[0] = [name.lower() for name in header], ""
+        words = [*NEEDED, "material"]
+        order = [next((k for k, n in enumerate(low) if n in INTERVAL_NAMES[w]), 9) for w in words]
+    rows: list[tuple[str, int, int, str | None]] = []
+    problems: list[Problem] = []
+    for number, line in enumerate(lines, 1):
+        cells = re.split(r"[\s,;]+", line.strip())
+        video, first, last, label = (cells[k] if k < len(cells) else None for k in order)
+        whole = all(re.fullmatch(r"\d{1,18}", cell or "") for cell in (first, last))
+        if video and whole and int(first or 0) <= int(last or 0):
+            rows.append((video, int(first or 0), int(last or 0), label))
+        elif line.strip():
+            text = f"{line!r} is not {' '.join(ORDER)} with a start up to the end"
+            problems.append(Problem(f"{path}:{number}", "bad-interval", text))
+    if (count := sum(last - first + 1 for _, first, last, _ in rows)) > MOST_FRAMES:
+        must, got = f"{path} must have at most {MOST_FRAMES:,} frames", f"{count:,}"
+        raise PalpateError(must, got, "Check the ends of the intervals")
+    schema = {"video": pl.String, "first": pl.Int64, "last": pl.Int64, "material": pl.String}
+    table = pl.DataFrame(rows, schema, orient="row").with_columns(
+        contact=pl.format("{}#{}-{}", "video", "first", "last"),
+        frame=pl.int_ranges("first", pl.col("last") + 1),
+    )
+    frames = table.explode("frame").unique(["video", "frame"], maintain_order=True)
+    frames = frames.with_columns(id=pl.format("{}/{}", "video", "frame"))
+    return _manifest(path, frames, declared=True), problems, None
+
+
+def _records(path: Path) -> Table | None:
+    """The objects of a JSON file that nests them, or sorts them by part; None for other files."""
+    if path.suffix.lower() not in (".json", ".jsonl"):
+        return None
+    text = decoded(path.read_bytes())
+    try:
+        lines = path.suffix.lower() == ".jsonl"
+        data = [json.loads(s) for s in text.split("\n") if s.strip()] if lines else json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    rows = [dict(_flat(item)) for item in _items(data)]
+    return table_of(rows, str(path)) if rows else None
+
+
+def _items(data: Any, split: str | None = None) -> Iterator[dict[str, Any]]:
+    """The objects, pairs or paths in nested lists, with the part whose key they are under."""
+    if isinstance(data, Mapping):
+        lists = {key: value for key, value in data.items() if isinstance(value, (list, Mapping))}
+        below = [item for value in lists.values() for item in value if isinstance(value, list)]
+        if split is None and lists and len(lists) == len(data) and not _scalars(below):
+            for key, value in lists.items():
+                yield from _items(value, PART_NAMES.get(str(key).lower()))
+        elif set(map(str.lower, map(str, data))) <= PART_NAMES.keys():
+            for key, value in data.items():
+                yield from _items(value, PART_NAMES[str(key).lower()])
+        else:
+            yield dict(data) | ({"split": split} if split else {})
+    elif isinstance(data, list) and _scalars(data) and len(data) >= 2:
+        group = "object" if str(data[0]).isdecimal() else "video"
+        row = {group: data[0], "id": "/".join(map(str, data)), "split": split}
+        yield row | ({"frame": data[1]} if group == "video" else {})
+    elif isinstance(data, list):
+        for item in data:
+            yield from _items(item, split)
+    elif isinstance(data, str):
+        yield {PATH: data, "split": split}
+
+
+def _scalars(items: Sequence[Any]) -> bool:
+    return bool(items) and all(isinstance(item, (str, int)) for item in items)
+
+
+def _flat(item: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Cells of nested objects under names like ``image.path``; lists are left out."""
+    for key, value in item.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            yield f"{prefix}{key}", value
+
+
+def _paths(
+    path: Path, table: Table, nested: bool, options: Mapping[str, Any]
+) -> tuple[Manifest, list[Problem], Split | None] | None:
+    """One sample a row, named by its columns and by the path of its image."""
+    maps = dict(options.get("columns", {}))
+    compiled = compile_maps(maps, table.names, [*SCHEMA, "split"])
+    columns = list(dict.fromkeys([*compiled.columns, *_path_columns(table.names)]))
+    frame = table.read(columns)
+    cells = compiled.apply(frame)
+    side, paths = _named_images(frame, cells, options)
+    there = {p for p in paths or () if p and (path.parent / p).is_file()} if paths else set[str]()
+    stated = {"id", "video", "object"} & cells.keys()
+    plain = there or (not paths and "split" not in cells)
+    if not (paths or stated) or (plain and not nested):
+        return None
+    cells = {name: values for name, values in cells.items() if name not in ("background", PATH)}
+    classes = None if options.get("classes") is None else read_classes(Path(options["classes"]))
+    for name in ("vision", "tactile") if not there else ():
+        cells.pop(name, None)
+    rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
+    template = Template.parse(options[side], side) if side and options.get(side) else None
+    for k, row in rows:
+        if paths and paths[k]:
+            row[PATH] = paths[k]
+            fields = template.match(paths[k]) if template else {}
+            if fields is None:
+                text = f"{paths[k]!r} is not like the template {template and template.text}"
+                table.problems.append(Problem(table.where(k), "no-match", text))
+            row |= {n: v for n, v in (fields or {}).items() if n in SCHEMA and n not in row}
+        if "frame" in row:
+            row["frame"] = int(row["frame"])
+        row.setdefault("id", _id(row, table.where(k)))
+    samples = pl.DataFrame([row for _, row in rows], infer_schema_length=None)
+    doubled = samples.filter(pl.col("id").is_duplicated())["id"].unique()
+    if len(doubled):
+        samples = samples.unique("id", keep="first", maintain_order=True)
+        text = f"{len(doubled)} ids occur twice or more, first {doubled.sort()[0]!r}"
+        table.problems.append(Problem(str(path), "duplicate-id", text))
+    manifest = _manifest(path, samples, declared=bool(stated) and not nested)
+    split = None
+    if "split" in samples.columns:
+        stated_split = samples.drop_nulls("split")
+        parts = dict(zip(stated_split["id"], stated_split["split"], strict=True))
+        split = Split(parts, {"name": path.stem, "method": "official"}, manifest.digest)
+    return manifest, table.problems, split
+
+
+def _id(row: Mapping[str, Any], place: str) -> str:
+    if "video" in row and "frame" in row:
+        return f"{row['video']}/{row['frame']}"
+    return str(row.get(PATH, place)).rpartition(".")[0] or place
+
+
+def _path_columns(names: Sequence[str]) -> list[str]:
+    """Columns that may hold paths: tactile by their name first, then photos, then others."""
+    words = {name: set(re.findall("[a-z]+", name.lower())) for name in names}
+    order = [
+        next((k for k, r in enumerate(("tactile", "vision")) if w & set(ROLES[r])), 2)
+        for w in words.values()
+    ]
+    return [name for _, name in sorted(zip(order, words, strict=True), key=lambda pair: pair[0])]
+
+
+def _named_images(
+    frame: pl.DataFrame, cells: Mapping[str, Sequence[str | None]], options: Mapping[str, Any]
+) -> tuple[str, Sequence[str | None] | None]:
+    """The side that a template is given for, and the column of paths of images."""
+    side = next((s for s in ("tactile", "vision") if options.get(s)), "")
+    columns = {name: cells[name] for name in (side, "tactile", "vision") if name in cells}
+    columns |= {n: frame[n].to_list() for n in _path_columns(frame.columns) if n not in columns}
+    for values in columns.values():
+        some = [str(value).lower() for value in values[:100] if value is not None]
+        if some and all(value.endswith(SUFFIXES) for value in some):
+            return side, values
+    return side, None
+
+
+def _manifest(path: Path, samples: pl.DataFrame, *, declared: bool) -> Manifest:
+    """A manifest of rows without a root of their own."""
+    empty = (pl.lit(None, kind).alias(c) for c, kind in SCHEMA.items() if c not in samples.columns)
+    more = [PATH] if PATH in samples.columns else []
+    table = samples.with_columns(empty).with_columns(pl.col(c).cast(k) for c, k in SCHEMA.items())
+    facts = {"dataset": path.stem} if declared else {"source": path.name}
+    return Manifest(table.select([*SCHEMA, *more]), path.parent, facts)

@@ -1,0 +1,129 @@
+"""Lists without images: read as they are, audited, and the next commands run on the same lists."""
+
+import json
+import shlex
+
+import pytest
+
+from palpate.cli import main
+from palpate.core import PalpateError
+from palpate.data.naming import name_together, read_names
+
+
+def rows_of(kind, numbers):
+    """The lines of a list of samples by number; ten numbers are a recording."""
+    if kind == "ssvtp":
+        lines = [f"images_rgb/image_{k}_rgb.jpg,images_tac/image_{k}_tac.jpg,soft" for k in numbers]
+        return "url,tactile,caption\n" + "\n".join(lines)
+    if kind == "intervals":
+        return "\n".join(f"video{k // 10} {100 * k} {100 * k + 9} wood" for k in numbers)
+    if kind == "interval table":
+        lines = [f"wood;video{k // 10};{100 * k};{100 * k + 9}" for k in numbers]
+        return "label;video;start;end\n" + "\n".join(lines)
+    hct = [f"hct/data1/{k // 10}-17{k // 10:03d}.70/tactile/{k}-0.02.jpg" for k in numbers]
+    if kind == "nested":
+        items = [{"tactile": {"path": path, "size": [1, 2]}, "talk": [{}]} for path in hct]
+        return json.dumps({"data": {"items": items}})
+    if kind == "json lines":
+        return "\n".join(json.dumps({"gel": path}) for path in hct)
+    own = [f"rig/cup{k // 10}/touch/{k:04d}.png" for k in numbers]
+    return "photo,gel\n" + "\n".join(f"{path.replace('touch', 'photo')},{path}" for path in own)
+
+
+KINDS = {
+    # suffix, options, video and frame of the first test sample, leaking samples of how many
+    "ssvtp": (".csv", ("--ids-in-time", "--near-frames", "1"), (None, 35), (1, 10)),
+    "intervals": (".txt", (), ("video3", 3500), (50, 100)),
+    "interval table": (".csv", (), ("video3", 3500), (50, 100)),
+    "nested": (".json", (), ("data1/3-17003.70", 35), (5, 10)),
+    "json lines": (".jsonl", (), ("data1/3-17003.70", 35), (5, 10)),
+    "own": (".csv", ("--tactile", "rig/{video}/touch/{frame}.png"), ("cup3", 35), (5, 10)),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_list_without_images_is_audited_and_answered(kind, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    suffix, options, (video, frame), (leaking, of) = KINDS[kind]
+    for part, numbers in (("train", range(35)), ("test", range(35, 45))):
+        (tmp_path / f"{part}{suffix}").write_text(rows_of(kind, numbers))
+    paths = [f"train{suffix}", f"test{suffix}"]
+    assert main(["audit", *paths, *options, "--table", "t.csv", "--json"]) == 1
+    data = json.loads(capsys.readouterr().out)
+    assert (data["leaking_samples"], data["test_samples"]) == (leaking, of)
+    assert data["identical_samples"] == 0
+    samples = name_together([read_names(tmp_path / f"test{suffix}")[0]])[0][0].table
+    if kind != "own":
+        assert (samples["video"][0], samples["frame"][0]) == (video, frame)
+    assert bool(data["commands"]) == (kind != "ssvtp")  # nothing says what belongs together
+    for command in data["commands"]:
+        assert main([*shlex.split(command)[1:], "--json"]) == 0, command
+        assert json.loads(capsys.readouterr().out)
+
+
+def test_a_list_that_states_its_parts_is_audited_alone(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    parts = {"train": range(8), "val": range(8, 9), "test": range(9, 10)}
+    pairs = {part: [[obj, k] for obj in range(1, 6) for k in ks] for part, ks in parts.items()}
+    (tmp_path / "split.json").write_text(json.dumps(pairs))
+    assert main(["audit", "split.json", "--json"]) == 1
+    data = json.loads(capsys.readouterr().out)
+    numbers = data["group"], data["train_samples"], data["test_samples"], data["groups_shared"]
+    assert numbers == ("object", 40, 5, 5)
+    for command in data["commands"]:
+        assert main([*shlex.split(command)[1:], "--json"]) == 0, command
+        answer = json.loads(capsys.readouterr().out)
+    assert (answer["leaking_samples"], answer["shared"]) == (0, {"object": [0, 1]})
+    scenes = {part: [["office_40_30", str(k)] for k in ks] for part, ks in parts.items()}
+    (tmp_path / "scenes.json").write_text(json.dumps(scenes))
+    assert main(["audit", "scenes.json", "--json"]) == 1
+    data = json.loads(capsys.readouterr().out)
+    assert (data["group"], data["gap_min"]) == ("video", 2)
+    (tmp_path / "t.csv").write_text("id,video,split\n1,a,train\n2,b,test\n3,c,\n")
+    assert main(["audit", "t.csv", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["test_samples"] == 1
+    (tmp_path / "t.csv").write_text("id,video\n1,a\n2,b\n")
+    assert main(["audit", "t.csv"]) == 2
+    assert "the source states 0" in capsys.readouterr().err
+
+
+def test_ids_alone_cannot_show_a_leak(tmp_path, capsys):
+    for part, numbers in (("train", range(8)), ("test", range(8, 10))):
+        (tmp_path / f"{part}.csv").write_text(rows_of("ssvtp", numbers))
+    paths = [str(tmp_path / f"{part}.csv") for part in ("train", "test")]
+    assert main(["audit", *paths, "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert (data["verdict"], data["reason"]) == ("cannot tell", "ids")
+
+
+def test_what_one_list_hides_the_other_shows(tmp_path):
+    """All test paths are of one recording, which only the train paths show to be one."""
+    for part, numbers in (("train", range(35)), ("test", range(35, 38))):
+        (tmp_path / f"{part}.csv").write_text(rows_of("own", numbers))
+    lists = [read_names(tmp_path / f"{part}.csv")[0] for part in ("train", "test")]
+    named, template = name_together(lists)
+    assert template == "rig/{video}/touch/{frame:d}.png"
+    rows = named[1].table.select("video", "frame").rows()
+    assert rows == [("cup3", 35), ("cup3", 36), ("cup3", 37)]
+
+
+def test_bad_lines_and_wrong_options_are_named(tmp_path, capsys):
+    path = tmp_path / "l.txt"
+    path.write_text("v 1 5\nv 9 7\nv one 3\n\nv 20 22 wood\n")
+    manifest, problems, _ = read_names(path)
+    assert (len(manifest), [p.where[-2:] for p in problems]) == (8, [":2", ":3"])
+    path.write_text("v 0 999999999\n")
+    with pytest.raises(PalpateError, match="at most 20,000,000 frames"):
+        read_names(path)
+    table = tmp_path / "t.csv"
+    table.write_text(rows_of("own", range(3)) + "\nelse/where.png,else/where.png")
+    _, problems, _ = read_names(table, tactile="rig/{video}/touch/{frame}.png")
+    assert [p.kind for p in problems] == ["no-match"]
+    table.write_text("id,tactile\n1,a/1.png\n1,a/2.png\n")
+    _, problems, _ = read_names(table)
+    assert [p.kind for p in problems] == ["duplicate-id"]
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "1.png").write_bytes(b"")
+    assert read_names(table) is None  # its images are there
+    assert main(["audit", str(table), str(table), "--map", "nothing"]) == 2
+    assert "COLUMN=EXPRESSION" in capsys.readouterr().err
