@@ -90,7 +90,7 @@ def test_mistakes_are_one_line_and_write_nothing(place, capsys):
         (["gone.jpg", "-o", "t.png"], "gone.jpg: no such file"),
         (["photo.jpg", "gone.jpg", "lost.jpg", "-o", "t"], "2 problems"),
         (["cut.jpg", "-o", "t.png"], "cut.jpg"),
-        (["photo.jpg", "photos/../photo.jpg", "-o", "t"], "PHOTO must differ in name"),
+        (["photo.jpg", "photos/../photo.jpg", "-o", "t"], "PATH must differ in name"),
         ([model, "-o", "t"], "a saved model"),
         (["photo.jpg", "-o", "t.jpg"], "--output must be a .png or a folder"),
         (["photo.jpg", "photos/a.jpg", "-o", "t.png"], "2 photos"),

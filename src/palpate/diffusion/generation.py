@@ -428,11 +428,14 @@ def _is_single(output: Path | None, paths: Sequence[Path]) -> bool:
 def _require_readable(paths: Sequence[Path]) -> None:
     reasons = ((path, check_image(path)) for path in paths)
     if bad := [Problem(str(path), "bad-image", reason) for path, reason in reasons if reason]:
+        if len(paths) == 1:
+            must, got = "must be an image that can be read", f"{paths[0]}: {bad[0].text}"
+            raise PalpateError(must, got, "Check the path", argument="photos")
         raise ProblemsError(bad, FIX_PHOTOS, example={"skip_bad": True})
 
 
 def _settings(pipeline: TactilePipeline, sampler: SamplerOptions, seed: int) -> dict[str, Any]:
-    """All that an image depends on beside its photo; the batch is no part of it."""
+    """All that an image depends on next to its photo; the batch is no part of it."""
     return {
         "pipeline": pipeline.digest,
         "split": pipeline.training.get("split"),
