@@ -61,7 +61,7 @@ def test_audit_and_split_load_no_torch(tmp_path, small_manifest):
     code = """
 import sys
 from palpate.cli import main
-assert main(["audit", "train.txt", "test.txt"]) == 0
+assert main(["audit", "train.txt", "test.txt"]) == 1  # they leak
 assert main(["split", "manifest.parquet", "-o", "s.json"]) == 0
 assert "torch" not in sys.modules
 """
