@@ -27,7 +27,8 @@ class TableOptions:
     """Folders of images, tables, interval lists, Hugging Face data sets."""
 
     vision: str | None = None
-    """Where the photos of a folder are: `"{object}/press_{contact}/photo/{frame}.jpg"`. Fields are
+    """Where the photos of a folder are: `"{object}/press_{contact}/photo/{frame}.jpg"`; videos or
+    stacks of frames (.npy) likewise: `"{object}_{video}.mov"`. Fields are
     columns and join the sides; `{frame:d}` takes digits, `{video:**}` folders of any depth, `*` and
     `**` what does not matter. Without a template the folder is searched for its layout.
     """
@@ -52,9 +53,11 @@ class TableOptions:
     half_open: Switch = False
     """The end of an interval is the first frame after the contact."""
     every: int | None = None
-    """Take every N-th frame of an interval."""
+    """Take every N-th frame of an interval; of videos without a list: of whole videos, instead of
+    the frames in contact.
+    """
     sensor: str | None = None
-    """Name of the tactile sensor, for interval lists."""
+    """Name of the tactile sensor, for videos."""
     config: str | None = None
     """Configuration of a Hugging Face data set."""
     revision: str | None = None
@@ -90,11 +93,11 @@ class FormatOptions:
     size: int | None = None
     """Shorter side of frames that are extracted from videos (default: as they are)."""
     max_per_contact: int | None = None
-    """Keep at most this many evenly spaced frames of each contact (Touch and Go)."""
-    seed: int | None = None
-    """With `--max-per-contact`: 0 takes the middle of each stretch, others a random place (Touch
-    and Go).
+    """Keep at most this many evenly spaced frames of each contact (Touch and Go, your own
+    videos).
     """
+    seed: int | None = None
+    """With `--max-per-contact`: 0 takes the middle of each stretch, others a random place."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,8 +118,8 @@ class SourceOptions(Common):
 class Options(SourceOptions):
     """Turn a data set on disk into a manifest.
 
-    Reads any known data set, a folder of images, a table, an interval list, or a Hugging Face data
-    set. Eight layouts with their commands: docs/your-data.md.
+    Reads any known data set, a folder of images or videos, a table, an interval list, or a Hugging
+    Face data set. Eight layouts with their commands: docs/your-data.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional]

@@ -10,6 +10,7 @@ from typing import Any
 from palpate.core import PalpateError, Progress, Split, locked, quiet
 from palpate.data.formats import FORMATS, Format
 from palpate.data.formats.base import MISSING, WORLD, finished, import_scanned, world_facts
+from palpate.data.formats.videos import is_templated
 from palpate.data.images import Check
 from palpate.data.imported import Imported, Validation
 from palpate.data.listing import write_table
@@ -121,7 +122,7 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
 def recognized(
     source: Path, name: str = "auto", options: Mapping[str, Any] | None = None
 ) -> tuple[str, Format]:
-    """The named format, or the first that the source looks like; templates are of ``pairs``.
+    """The named format, or the first that the source looks like; templates are of pairs or videos.
 
     Raises:
         PalpateError: if there is no source, no such format, or none that fits.
@@ -133,9 +134,10 @@ def recognized(
         fix = "Check the path; a data set on the hub needs the format hf"
         raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")
     if name == "auto":
-        templated = any((options or {}).get(column) for column in IMAGE_COLUMNS)
+        given = {c: text for c in IMAGE_COLUMNS if (text := (options or {}).get(c))}
         looks = (n for n, form in FORMATS.items() if form.detect(source))
-        name = "pairs" if templated else next(looks, "")
+        templated = "videos" if given and is_templated(source, given) else "pairs"
+        name = templated if given else next(looks, "")
     if not name:
         known = "; ".join(f"{n}: {form.looks_for}" for n, form in FORMATS.items())
         must = f"must look like a known data set ({known})"

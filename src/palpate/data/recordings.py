@@ -119,6 +119,7 @@ class Recordings:
         typical_of: contacts without such a frame -> their recording.
         extracted: whether frames of videos are files by now.
         moved: image -> its copy below ``out``, where some recordings are videos and others folders.
+        modalities: those that every recording has.
     """
 
     root: Path
@@ -136,6 +137,7 @@ class Recordings:
     typical_of: dict[str, str] = field(default_factory=dict)
     extracted: bool = False
     moved: dict[Path, Path] = field(default_factory=dict)
+    modalities: tuple[str, ...] = MODALITIES
 
     def open(self, rows: Sequence[Row], progress: Progress) -> list[Row]:
         """Open both modalities of every recording in use; keep the rows that have both images."""
@@ -161,7 +163,7 @@ class Recordings:
         if name not in self.videos:
             return "missing-video", f"the recording {name!r} is not in the data set"
         opened: dict[str, Frames] = {}
-        for modality in MODALITIES:
+        for modality in self.modalities:
             source: Path | None = getattr(self.videos[name], modality)
             if source is None:
                 return "missing-video", f"the recording {name!r} has no {modality} frames"
@@ -246,7 +248,7 @@ class Recordings:
     def _folder_images(self, row: Row) -> list[tuple[str, Path]]:
         """(modality, image) of a row and its background, without those of videos."""
         frames = self.frames[row.video]
-        folders = [m for m in MODALITIES if isinstance(frames[m], FolderFrames)]
+        folders = [m for m in self.modalities if isinstance(frames[m], FolderFrames)]
         images = [(m, frames[m].path(row.frame)) for m in folders]
         if "tactile" in folders and row.contact in self.backgrounds:
             images.append(("tactile", self.backgrounds[row.contact]))
@@ -312,7 +314,7 @@ class Recordings:
     def layout(self, rows: Iterable[Row]) -> str:
         """``raw`` if the frames are those of videos, ``extracted`` if of folders, or ``mixed``."""
         videos = {row.video for row in rows}
-        raw = {self._is_video(video, m) for video in videos for m in MODALITIES}
+        raw = {self._is_video(video, m) for video in videos for m in self.modalities}
         return "mixed" if len(raw) > 1 else "raw" if True in raw else "extracted"
 
     def _is_video(self, video: str, modality: str) -> bool:
@@ -320,7 +322,7 @@ class Recordings:
 
     def _videos_of(self, row: Row) -> list[str]:
         """The modalities of a row that are video files."""
-        return [m for m in MODALITIES if self._is_video(row.video, m)]
+        return [m for m in self.modalities if self._is_video(row.video, m)]
 
     def _jobs(self, rows: Sequence[Row]) -> list[_Job]:
         """The frames of videos that rows and backgrounds need, then the typical frames needed."""
@@ -446,7 +448,9 @@ class Recordings:
             values = {**vars(row), "sensor": sensor}
             del values["where"]
             values |= {m: relative(f, f.path(row.frame)) for m, f in opened.items()}
-            values["background"] = relative(opened["tactile"], self.backgrounds.get(row.contact))
+            background = self.backgrounds.get(row.contact)
+            if background is not None:
+                values["background"] = relative(opened["tactile"], background)
             values |= {name: table.get((row.video, row.frame)) for name, table in tables.items()}
             cells.append(values)
         return cells

@@ -12,6 +12,7 @@ from palpate.data.formats import (
     ssvtp,
     tarf,
     touch_and_go,
+    videos,
     visgel,
     ycb_slide,
 )
@@ -29,6 +30,7 @@ FORMATS: dict[str, Format] = {
     "intervals": intervals.FORMAT,
     "hf": huggingface.FORMAT,
     "pairs": pairs.FORMAT,
+    "videos": videos.FORMAT,
 }
 
 __all__ = ["FORMATS", "Facts", "Format", "Row", "Scan"]

@@ -187,7 +187,7 @@ def _read_folder(
     for place in outside:
         text = "a link to a folder outside the root, which is not followed"
         result.suspect(place, "outside-root", text)
-    texts = given or _templates(files, result.base, side)
+    texts = given or templates_of(files, result.base, side)
     templates = {side: Template.parse(text, side) for side, text in texts.items()}
     matches = {s: _distinct(result, found) for s, found in assign(files, templates).items()}
     for side_, template in templates.items():
@@ -207,7 +207,7 @@ def _read_folder(
         result.suspect(result.base, "no-background", "images without a background", without)
     fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
     _add_ids(rows, fields)
-    _name_apart(rows, fields)
+    name_apart(rows, fields)
     places = [row[order[0]] for row in rows]
     names = dict.fromkeys((*fields, *order, "id"))
     table = pl.DataFrame(
@@ -224,15 +224,16 @@ def _read_folder(
     result.rows += [(places[k], row) for k, row in numbered]
 
 
-def _templates(files: Sequence[str], folder: Path, side: Side | None) -> dict[str, str]:
-    """The templates that the names of the images suggest.
+def templates_of(
+    files: Sequence[str], folder: Path, side: Side | None, what: str = "images"
+) -> dict[str, str]:
+    """The templates that the names of the images (or videos) suggest.
 
     Raises:
         PalpateError: with commands to choose from, if they do not say what the images show.
     """
     if not files:
-        suffixes = ", ".join(SUFFIXES)
-        raise PalpateError(f"{folder} must hold images ({suffixes})", "none", "Check the path")
+        raise PalpateError(f"{folder} must hold {what}", "none", "Check the path")
     if side is not None:
         return {side: template_of(files)}
     layout = detect_layout(files, folder.resolve().name)
@@ -243,7 +244,7 @@ def _templates(files: Sequence[str], folder: Path, side: Side | None) -> dict[st
     if second:
         choices = [{"vision": first, "tactile": second[0]}, {"vision": second[0], "tactile": first}]
         choices.append({"tactile": template_of(files)})
-    must = f"The names of the images in {folder} must say what they show"
+    must = f"The names of the {what} in {folder} must say what they show"
     got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
     raise PalpateError(must, got, "Choose one of these", choices=choices)
 
@@ -266,7 +267,7 @@ def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
     return False
 
 
-def _name_apart(rows: Sequence[Cells], fields: Sequence[str]) -> None:
+def name_apart(rows: Sequence[Cells], fields: Sequence[str]) -> None:
     """Name a video or contact by the fields before it, too, where its name alone means several."""
     for column, outer in (("video", ("object", "session")), ("contact", ("video", "object"))):
         before = fields[: fields.index(column)] if column in fields else ()

@@ -1,0 +1,368 @@
+"""Anyone's videos or stacks of frames: path templates say which file is what.
+
+::
+
+    root/
+      {object}_{video}.mov                        tactile videos alone, or
+      {object}/{video}/camera.mp4  gel.mp4        both sides, in step; or
+      {object}/rgb.npy  gel.npy                   stacks (n, h, w, 3), read from the disk piece by
+                                                  piece; or
+      {object}.jpg  {object}_{video}.mov          one photo for many tactile videos
+
+A template (:mod:`palpate.data.templates`) for each side is given, or found from the names of the
+files. Fields become columns, and equal fields join the sides. A video is named by its field
+``video`` (and the object around it), else by all fields. An image may serve a whole video: a photo
+as ``vision``, the untouched gel as ``background``.
+
+A frame is its position in both files, so it is valid up to the shorter one. The samples are the
+frames in contact (:mod:`palpate.data.contacts`), or every n-th frame of the whole video, in contact
+or not. A contact is ``video#000k``; its background is the gel before it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from palpate.core import PalpateError, Problem, Progress, Split, quiet
+from palpate.data.contacts import Contacts, find_contacts
+from palpate.data.formats.base import Cells, Facts, Format, Scan, few
+from palpate.data.formats.layout import require_folder
+from palpate.data.formats.pairs import Side, name_apart, templates_of
+from palpate.data.formats.touch_and_go import extracted, require_frame_options
+from palpate.data.frames import MOVING, ImageFormat
+from palpate.data.images import SUFFIXES, Check, in_threads
+from palpate.data.imported import Imported, removing_on_error
+from palpate.data.manifest import SCHEMA, Manifest
+from palpate.data.recordings import Recordings, Row, VideoFiles, thin
+from palpate.data.rows import PART_NAMES
+from palpate.data.streams import Finding, findings
+from palpate.data.templates import FIX, Fields, Template, assign, join, walk
+
+ORDER = ("tactile", "vision", "background")
+FACTS = Facts(
+    name="your own videos", samples="the frames in contact, or every n-th", group="the column video"
+)
+LOOKS_FOR = f"a folder of videos or stacks ({', '.join(MOVING)})"
+
+
+@dataclass(frozen=True)
+class _Video:
+    """A recording: side -> its video or stack, side -> an image for all frames, its fields."""
+
+    name: str
+    moving: dict[str, str]
+    still: dict[str, str]
+    fields: Fields
+
+    @property
+    def where(self) -> str:
+        """The file that names it."""
+        return next(iter(self.moving.values()))
+
+
+def detect(source: Path) -> bool:
+    """Whether this is a folder with videos or stacks below it."""
+    files = (name for _, _, names in islice(os.walk(source), 500) for name in names)
+    return any(name.lower().endswith(MOVING) for name in files)
+
+
+def is_templated(source: Path, templates: Mapping[str, str]) -> bool:
+    """Whether a template is of a video or stack, or matches one below a folder."""
+    if any(text.lower().endswith(MOVING) for text in templates.values()):
+        return True
+    parsed = {side: Template.parse(text, side) for side, text in templates.items()}
+    files, _ = walk(source, MOVING) if source.is_dir() else ([], [])
+    return any(assign(files, parsed).values())
+
+
+def scan(
+    source: Path,
+    *,
+    vision: str | None = None,
+    tactile: str | None = None,
+    background: str | None = None,
+    side: Side | None = None,
+    every: int | None = None,
+    max_per_contact: int | None = None,
+    seed: int = 0,
+    check: Check = "decode",
+    progress: Progress = quiet,
+) -> Scan:
+    """Check a folder of videos without writing anything.
+
+    Args:
+        source: the folder.
+        vision: template of the videos (or photos) of the scene; without any template the names are
+            searched.
+        tactile: template of the tactile videos.
+        background: template of images of the untouched gel.
+        side: what the videos show, if all show one thing.
+        every: take every n-th frame of whole videos, in contact or not.
+        max_per_contact: keep that many evenly spaced frames of a contact.
+        seed: with ``max_per_contact``: 0 takes the middle of each stretch, others a random place.
+        check: ``decode`` decodes all; otherwise no contacts are found, and all frames are listed.
+        progress: progress callback.
+
+    Raises:
+        PalpateError: if the source is no folder, a template cannot be read or matches nothing, or
+            an option is out of range.
+    """
+    given = {"vision": vision, "tactile": tactile, "background": background}
+    videos, result = _videos(require_folder(source, FACTS.name), given, side)
+    decoded = check == "decode"
+    _require_amounts(videos, every if decoded else 1, max_per_contact)
+    work = _opened(result, videos, result.base, progress, "jpg", None, [])
+    contacts = _contacts(work, progress) if decoded else {}
+    rows = thin(_rows(work, videos, contacts, every if decoded else 1), max_per_contact, seed)
+    for row, cell in zip(rows, _cells(work, rows, videos, None), strict=True):
+        result.rows.append((row.where, cell | dict.fromkeys(ORDER)))
+    return result
+
+
+def run(  # noqa: PLR0913 (a public verb)
+    source: Path,
+    out: Path,
+    *,
+    vision: str | None = None,
+    tactile: str | None = None,
+    background: str | None = None,
+    side: Side | None = None,
+    every: int | None = None,
+    max_per_contact: int | None = None,
+    seed: int = 0,
+    sensor: str | None = None,
+    skip_bad: bool = False,
+    image_format: ImageFormat = "jpg",
+    size: int | None = None,
+    check: Check = "decode",
+    progress: Progress = quiet,
+) -> Imported:
+    """Import a folder of videos; options as in :func:`scan`.
+
+    Frames go to ``out/images/<video>/{vision,tactile}/`` as ``image_format``, their shorter side
+    reduced to ``size`` pixels; after an interruption the same call continues. ``sensor`` names the
+    tactile sensor; ``skip_bad`` skips and lists bad videos.
+
+    Raises:
+        PalpateError: as :func:`scan`.
+        ProblemsError: with everything bad, unless ``skip_bad``; nothing is left behind.
+    """
+    require_frame_options(image_format, size)
+    given = {"vision": vision, "tactile": tactile, "background": background}
+    videos, result = _videos(require_folder(source, FACTS.name), given, side)
+    _require_amounts(videos, every, max_per_contact)
+    with removing_on_error(out) as created:
+        work = _opened(result, videos, Path(out), progress, image_format, size, created)
+        contacts = _contacts(work, progress)
+        rows = thin(_rows(work, videos, contacts, every), max_per_contact, seed)
+        rows = extracted(work, rows, result.base, skip_bad=skip_bad, progress=progress)
+        _copy_images(work, rows, videos)
+        cells = _cells(work, rows, videos, sensor)
+        parts = {cell["id"]: PART_NAMES[cell.pop("split")] for cell in cells if "split" in cell}
+        facts = {**FACTS.of_manifest(), "format": "videos", **result.facts}
+        facts["frames"] = "in contact" if every is None else f"every {every} of whole videos"
+        manifest = Manifest.from_rows(cells, work.out.resolve(), facts, result.more)
+        rule = {"method": "official", "column": "split"}
+        splits = {"Orig": Split(parts, rule, manifest.digest)} if parts else {}
+        imported = Imported(manifest, work.problems, splits, 0, work.suspicious)
+        return imported.save(out, created)
+
+
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, run)
+
+
+def _videos(
+    root: Path, given: Mapping[str, str | None], side: Side | None
+) -> tuple[dict[str, _Video], Scan]:
+    """The recordings by name, and a scan without rows that holds what was wrong or odd."""
+    result = Scan(root, {"layout": "videos", "dataset": root.resolve().stem, "text_source": "none"})
+    texts = {column: text for column, text in given.items() if text is not None}
+    moving, outside = walk(root, MOVING)
+    texts = texts or _searched(moving, root, side)
+    files = walk(root, (*MOVING, *SUFFIXES))[0]
+    templates = {
+        column: Template.parse(texts[column], column) for column in ORDER if column in texts
+    }
+    matches = assign(files, templates)
+    for column, template in templates.items():
+        kinds = {path.lower().endswith(MOVING) for path, _ in matches[column]}
+        images = column == "background" or (column == "vision" and "tactile" in templates)
+        if kinds not in ({True}, {False}) or (kinds == {False} and not images):
+            got = f"{template.text}, which matches none of {few(moving)}"
+            got = f"{template.text}, which matches images, too" if len(kinds) == 2 else got
+            raise PalpateError("must match videos", got, FIX, argument=column)
+        if "frame" in template.fields:
+            got, fix = f"{template.text} with the field frame", "Name it video"
+            raise PalpateError("must say which video, not frame", got, fix, argument=column)
+    rows, result.problems = join(matches)
+    used = {path for found in matches.values() for path, _ in found}
+    result.suspect(root, "unmatched", "videos of no template", (f for f in moving if f not in used))
+    text = "links to folders outside the root, which are not followed"
+    result.suspect(root, "outside-root", text, outside)
+    result.facts |= {f"template_{column}": template.text for column, template in templates.items()}
+    fields = tuple(dict.fromkeys(name for t in templates.values() for name in t.fields))
+    result.more = tuple(name for name in fields if name not in (*SCHEMA, "split"))
+    name_apart(rows, fields)
+    return _named(rows, fields, result), result
+
+
+def _searched(moving: list[str], root: Path, side: Side | None) -> dict[str, str]:
+    """The templates that the names of the videos suggest; what varies most closely is the video."""
+    texts = templates_of(moving, root, side, "videos")
+    known = any("{video" in text for text in texts.values())
+    names = [n for n in ("{frame:d}", "{name}", "{sample}") if any(n in t for t in texts.values())]
+    for name, field in zip(names, ["{take}" if known else "{video}"], strict=False):
+        texts = {column: text.replace(name, field) for column, text in texts.items()}
+    return texts
+
+
+def _named(rows: list[Fields], fields: tuple[str, ...], result: Scan) -> dict[str, _Video]:
+    """The recordings by name: the field ``video``, if it tells them apart, else all fields."""
+    names = [row.get("video", "") for row in rows]
+    if "" in names or len(set(names)) < len(names):
+        names = ["/".join(row[name] for name in fields if name in row) for row in rows]
+    videos: dict[str, _Video] = {}
+    for name, row in zip(names, rows, strict=True):
+        paths = {column: row[column] for column in ORDER if column in row}
+        moving = {c: path for c, path in paths.items() if path.lower().endswith(MOVING)}
+        still = {c: path for c, path in paths.items() if c not in moving}
+        own = {field: row[field] for field in fields if field in row}
+        name = name or Path(next(iter(moving.values()))).stem
+        video = _Video(name, moving, still, own)
+        if len(set(paths.values())) < len(paths):
+            text = f"its {' and its '.join(paths)} are one file"
+            result.problem(video.where, "same-image", text)
+        elif (before := videos.setdefault(name, video)) is not video:
+            text = f"the video {name!r} is {before.where} already"
+            result.problem(video.where, "duplicate-id", text)
+        elif own.get("split", "train").lower() not in PART_NAMES:
+            result.problem(video.where, "unknown-part", f"the split {own['split']!r} is unknown")
+    return videos
+
+
+def _require_amounts(
+    videos: Mapping[str, _Video], every: int | None, max_per_contact: int | None
+) -> None:
+    for name, value in (("every", every), ("max_per_contact", max_per_contact)):
+        if value is not None and value < 1:
+            raise PalpateError("must be at least 1", str(value), "", argument=name)
+    if every is not None and max_per_contact is not None:
+        must, got = "must come without every", str(max_per_contact)
+        raise PalpateError(must, got, "Choose one", argument="max_per_contact")
+    if every is None and videos and not any("tactile" in v.moving for v in videos.values()):
+        must, got = "must be given", "videos without touch, in which no contact is found"
+        raise PalpateError(must, got, "", argument="every", example={"every": 10})
+
+
+def _opened(
+    result: Scan, videos: Mapping[str, _Video], out: Path, progress: Progress, *settings: Any
+) -> Recordings:
+    """The recordings with their files open."""
+    files = {
+        name: VideoFiles(name, **{c: _path(result, video.moving.get(c)) for c in ORDER[:2]})
+        for name, video in videos.items()
+    }
+    sides = tuple(c for c in ("vision", "tactile") if any(c in v.moving for v in videos.values()))
+    work = Recordings(result.base, out, files, {}, *settings, modalities=sides)
+    work.problems, work.suspicious = result.problems, result.suspicious
+    work.open([Row(v.where, name, name, 0, name, "") for name, v in videos.items()], progress)
+    return work
+
+
+def _path(result: Scan, path: str | None) -> Path | None:
+    return None if path is None else result.base / path
+
+
+def _contacts(work: Recordings, progress: Progress) -> dict[str, Contacts | None]:
+    """Recording -> its contacts, None without touch; what looks wrong is reported."""
+
+    def find(video: str) -> tuple[Contacts | None, list[Finding]] | str:
+        try:
+            streams = {m: frames.stream() for m, frames in work.frames[video].items()}
+        except PalpateError as error:
+            return error.got
+        images = {m: stream[0] for m, stream in streams.items() if stream is not None}
+        seconds = {m: stream[1] for m, stream in streams.items() if stream is not None}
+        contacts = find_contacts(images["tactile"]) if "tactile" in images else None
+        return contacts, findings(images, {m: t for m, t in seconds.items() if t is not None})
+
+    contacts: dict[str, Contacts | None] = {}
+    for video, found in in_threads(find, sorted(work.frames), "finding contacts", progress):
+        if isinstance(found, str):
+            work.problems.append(Problem(video, "bad-video", found))
+            continue
+        contacts[video] = found[0]
+        work.suspicious += [Problem(video, *problem) for problem in found[1]]
+        if found[0] is not None and not found[0].runs:
+            work.suspicious.append(Problem(video, "no-contact", "no contact was found in it"))
+    return contacts
+
+
+def _rows(
+    work: Recordings,
+    videos: Mapping[str, _Video],
+    contacts: Mapping[str, Contacts | None],
+    every: int | None,
+) -> list[Row]:
+    """A row for each frame to take; those in no contact have their video's name for one."""
+    rows: list[Row] = []
+    for name, video in videos.items():
+        if name not in work.frames or (contacts and name not in contacts):
+            continue
+        found = contacts.get(name)
+        contact_of = dict.fromkeys(range(min(map(len, work.frames[name].values()))), name)
+        chosen = {} if found is None else {name: found.reference}
+        for k, (first, last) in enumerate(found.runs if found else (), 1):
+            contact = video.fields.get("contact", f"{name}#{k:04d}")
+            chosen.setdefault(contact, found.backgrounds[k - 1] if found else 0)
+            inside = (frame for frame in range(first, last + 1) if frame in contact_of)
+            contact_of |= dict.fromkeys(inside, contact)
+        if "background" not in video.still:
+            work.background_frames |= chosen
+            work.backgrounds |= {c: work.frames[name]["tactile"].path(k) for c, k in chosen.items()}
+        frames = (
+            sorted(contact_of)[::every]
+            if every
+            else [k for k, c in contact_of.items() if c != name]
+        )
+        rows += [Row(video.where, f"{name}/{k:010d}", name, k, contact_of[k], "") for k in frames]
+    return rows
+
+
+def _copy_images(work: Recordings, rows: list[Row], videos: Mapping[str, _Video]) -> None:
+    """Copy the images that serve whole videos below ``out``, so that one root holds all."""
+    for name in dict.fromkeys(row.video for row in rows):
+        for column, path in videos[name].still.items():
+            target = work.out / _place(name, column, path)
+            if not target.is_file():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                work.created.append(target)
+                shutil.copyfile(work.root / path, target)
+
+
+def _place(video: str, column: str, path: str) -> str:
+    return f"images/{video}/{column}/{Path(path).name}"
+
+
+def _cells(
+    work: Recordings, rows: list[Row], videos: Mapping[str, _Video], sensor: str | None
+) -> list[Cells]:
+    """Manifest cells of the rows."""
+    cells: list[dict[str, Any]] = work.cells(rows, work.out.resolve(), sensor)
+    for cell in cells:
+        video = videos[cell["video"]]
+        cell["contact"] = None if cell["contact"] == video.name else cell["contact"]
+        kept = {**video.fields, **{n: cell[n] for n in ("id", "video", "frame", "contact")}}
+        cell |= {"material": None, **kept}
+        cell |= {c: _place(video.name, c, path) for c, path in video.still.items()}
+        if sensor is not None:
+            cell["sensor"] = sensor
+        if "split" in cell:
+            cell["split"] = cell["split"].lower()
+    return cells
