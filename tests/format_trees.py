@@ -343,6 +343,21 @@ def make_ssvtp(folder: Path) -> Tree:
     return Tree(root, 9)
 
 
+def make_videos(folder: Path) -> Tree:
+    """Six recordings as stacks of three frames, of which the first is taken."""
+    root = folder / "mine"
+    for v in range(6):
+        (root / f"v{v}").mkdir(parents=True)
+        for side, first in (("rgb", 10 * v), ("gel", 100 + 10 * v)):
+            np.save(root / f"v{v}" / f"{side}.npy", [picture(first + k) for k in range(3)])
+    last = "v5/gel.npy"
+
+    def cut(source: Path) -> None:
+        (source / last).write_bytes((source / last).read_bytes()[:-1000])
+
+    return Tree(root, 6, {"every": 3}, remove=lambda source: (source / last).unlink(), cut=cut)
+
+
 TREES: dict[str, Callable[[Path], Tree]] = {
     "touch-and-go": make_touch_and_go,
     "hct": make_hct,
@@ -354,6 +369,7 @@ TREES: dict[str, Callable[[Path], Tree]] = {
     "visgel": make_visgel,
     "intervals": make_intervals,
     "hf": make_hf,
+    "videos": make_videos,
     "pairs": make_pairs,
 }
 

@@ -26,7 +26,8 @@ from palpate.data.video import VideoReader
 ImageFormat = Literal["jpg", "png"]
 IMAGE_FORMATS: tuple[str, ...] = ("jpg", "png")
 #: Files that hold many frames.
-MOVING = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", SUFFIX)
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
+MOVING = (*VIDEOS, SUFFIX)
 #: Frames of a manifest have 64 bits; longer file names are no frame numbers.
 DIGITS = 18
 

@@ -29,8 +29,8 @@ FORMATS: dict[str, Format] = {
     "visgel": visgel.FORMAT,
     "intervals": intervals.FORMAT,
     "hf": huggingface.FORMAT,
-    "pairs": pairs.FORMAT,
     "videos": videos.FORMAT,
+    "pairs": pairs.FORMAT,
 }
 
 __all__ = ["FORMATS", "Facts", "Format", "Row", "Scan"]

@@ -23,7 +23,7 @@ from __future__ import annotations
 import contextlib
 import os
 import posixpath
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Literal
@@ -34,6 +34,7 @@ from palpate.core import PalpateError, Progress, quiet
 from palpate.data.detection import ROLES, detect_layout, template_of
 from palpate.data.formats.base import Cells, Facts, Format, Scan, few
 from palpate.data.formats.layout import require_folder
+from palpate.data.frames import VIDEOS
 from palpate.data.images import SUFFIXES
 from palpate.data.manifest import SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps
@@ -183,7 +184,11 @@ def _read_folder(
     classes: Mapping[int, str] | None,
 ) -> None:
     """Add the images of a folder, by its templates; map expressions go first."""
-    files, outside = walk(result.base, SUFFIXES)
+    files, outside = walk(result.base, (*SUFFIXES, *VIDEOS))
+    videos = [path for path in files if path.lower().endswith(VIDEOS)]
+    text = "videos, which are read with a template of their own"
+    result.suspect(result.base, "unmatched", text, videos)
+    files = [path for path in files if path.lower().endswith(SUFFIXES)]
     for place in outside:
         text = "a link to a folder outside the root, which is not followed"
         result.suspect(place, "outside-root", text)
@@ -225,9 +230,20 @@ def _read_folder(
 
 
 def templates_of(
-    files: Sequence[str], folder: Path, side: Side | None, what: str = "images"
+    files: Sequence[str],
+    folder: Path,
+    side: Side | None,
+    what: str = "images",
+    renamed: Callable[[Mapping[str, str]], dict[str, str]] = dict,
 ) -> dict[str, str]:
-    """The templates that the names of the images (or videos) suggest.
+    """The templates that the names of files suggest.
+
+    Args:
+        files: paths below the folder.
+        folder: their folder.
+        side: what they show, if all show one thing.
+        what: what the files are.
+        renamed: changes the names of fields.
 
     Raises:
         PalpateError: with commands to choose from, if they do not say what the images show.
@@ -235,10 +251,10 @@ def templates_of(
     if not files:
         raise PalpateError(f"{folder} must hold {what}", "none", "Check the path")
     if side is not None:
-        return {side: template_of(files)}
+        return renamed({side: template_of(files)})
     layout = detect_layout(files, folder.resolve().name)
     if layout.certain and _fit(files, layout.templates):
-        return layout.templates
+        return renamed(layout.templates)
     (first, *second) = layout.templates.values()
     choices = [{"tactile": template_of(files)}, {"vision": template_of(files)}]
     if second:
@@ -246,7 +262,7 @@ def templates_of(
         choices.append({"tactile": template_of(files)})
     must = f"The names of the {what} in {folder} must say what they show"
     got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
-    raise PalpateError(must, got, "Choose one of these", choices=choices)
+    raise PalpateError(must, got, "Choose one of these", choices=[*map(renamed, choices)])
 
 
 def _distinct(result: Scan, matches: Matches) -> Matches:

@@ -31,6 +31,7 @@ from typing import Any
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet
 from palpate.data.contacts import Contacts, find_contacts
+from palpate.data.formats import touch_and_go
 from palpate.data.formats.base import Cells, Facts, Format, Scan, few
 from palpate.data.formats.layout import require_folder
 from palpate.data.formats.pairs import Side, name_apart, templates_of
@@ -67,9 +68,12 @@ class _Video:
 
 
 def detect(source: Path) -> bool:
-    """Whether this is a folder with videos or stacks below it."""
-    files = (name for _, _, names in islice(os.walk(source), 500) for name in names)
-    return any(name.lower().endswith(MOVING) for name in files)
+    """Whether this is a folder with videos or stacks below it, and without images."""
+    if not source.is_dir() or touch_and_go.detect(source):
+        return False
+    files = [name for _, _, names in islice(os.walk(source), 500) for name in names]
+    images = any(name.lower().endswith(SUFFIXES) for name in files)
+    return not images and any(name.lower().endswith(MOVING) for name in files)
 
 
 def is_templated(source: Path, templates: Mapping[str, str]) -> bool:
@@ -119,7 +123,8 @@ def scan(
     _require_amounts(videos, every if decoded else 1, max_per_contact)
     work = _opened(result, videos, result.base, progress, "jpg", None, [])
     contacts = _contacts(work, progress) if decoded else {}
-    rows = thin(_rows(work, videos, contacts, every if decoded else 1), max_per_contact, seed)
+    rows = _rows(work, videos, contacts, every if decoded else 1)
+    rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
     for row, cell in zip(rows, _cells(work, rows, videos, None), strict=True):
         result.rows.append((row.where, cell | dict.fromkeys(ORDER)))
     return result
@@ -160,7 +165,8 @@ def run(  # noqa: PLR0913 (a public verb)
     with removing_on_error(out) as created:
         work = _opened(result, videos, Path(out), progress, image_format, size, created)
         contacts = _contacts(work, progress)
-        rows = thin(_rows(work, videos, contacts, every), max_per_contact, seed)
+        rows = _rows(work, videos, contacts, every)
+        rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
         rows = extracted(work, rows, result.base, skip_bad=skip_bad, progress=progress)
         _copy_images(work, rows, videos)
         cells = _cells(work, rows, videos, sensor)
@@ -184,7 +190,7 @@ def _videos(
     result = Scan(root, {"layout": "videos", "dataset": root.resolve().stem, "text_source": "none"})
     texts = {column: text for column, text in given.items() if text is not None}
     moving, outside = walk(root, MOVING)
-    texts = texts or _searched(moving, root, side)
+    texts = texts or templates_of(moving, root, side, "videos", _naming_videos)
     files = walk(root, (*MOVING, *SUFFIXES))[0]
     templates = {
         column: Template.parse(texts[column], column) for column in ORDER if column in texts
@@ -212,14 +218,11 @@ def _videos(
     return _named(rows, fields, result), result
 
 
-def _searched(moving: list[str], root: Path, side: Side | None) -> dict[str, str]:
-    """The templates that the names of the videos suggest; what varies most closely is the video."""
-    texts = templates_of(moving, root, side, "videos")
-    known = any("{video" in text for text in texts.values())
+def _naming_videos(texts: Mapping[str, str]) -> dict[str, str]:
+    """Templates whose number or name is that of a video, and not of a frame."""
+    field = "{take}" if any("{video" in text for text in texts.values()) else "{video}"
     names = [n for n in ("{frame:d}", "{name}", "{sample}") if any(n in t for t in texts.values())]
-    for name, field in zip(names, ["{take}" if known else "{video}"], strict=False):
-        texts = {column: text.replace(name, field) for column, text in texts.items()}
-    return texts
+    return {c: text.replace(names[0], field) if names else text for c, text in texts.items()}
 
 
 def _named(rows: list[Fields], fields: tuple[str, ...], result: Scan) -> dict[str, _Video]:
