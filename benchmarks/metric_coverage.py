@@ -10,7 +10,8 @@ or nothing under the null. ``paired``: generated and real frames are of the same
 effects they share with a correlation of 0.7 (as on a test set); ``unpaired``: of different videos.
 
 TMMD and I-TMMD are of videos whose class is drawn at random, CI- and D-TMMD of four classes with
-equally many videos each. The truth is what infinitely many videos would give, from 200,000
+equally many videos each; lengths of 1 to 60 frames test E. Scenes are videos of one frame, whose
+ids alone are known. The truth is what infinitely many videos would give, from 200,000
 simulated ones (its error is below a hundredth of a replicate's standard deviation). I-, CI- and
 D-TMMD depend on the sizes of the videos by a known factor (:func:`share`), which the truth
 includes; E does not.
@@ -33,7 +34,7 @@ WIDTH, CLASSES = 16, 4
 CLASS, VIDEO, FRAME = 0.30, 0.26, 0.26  # standard deviations of the effects
 SHIFT = 0.36  # TMMD about 1.2
 FIDELITY = 0.7  # correlation of the effects of a video, generated and real
-FRAMES = (3, 8)
+FRAMES, UNEQUAL = (3, 8), (1, 60)  # fewest and most frames of a video
 SECOND = 0.8  # shift of the second generator, relative to the first
 COVERAGE, REJECTION = (0.92, 0.99), (0.03, 0.08)
 TRUTH_VIDEOS = 200_000
@@ -130,24 +131,24 @@ def feature_set(rows, video, labels, prefix):
     return FeatureSet(ids, rows, [str(c) for c in labels[video]], groups)
 
 
-def draw_pair(model, rng, videos, paired, shift):
+def draw_pair(model, rng, videos, paired, shift, lengths=FRAMES):
     """Generated and real sets, their classes drawn at random; and the sizes of the videos."""
     labels = rng.integers(len(model.classes), size=(2, videos))
     effects = model.videos(rng, videos), model.videos(rng, videos)
     if paired:
         labels[0] = labels[1]
         effects = FIDELITY * effects[1] + np.sqrt(1 - FIDELITY**2) * effects[0], effects[1]
-    sizes = rng.integers(FRAMES[0], FRAMES[1] + 1, size=(2, videos))
+    sizes = rng.integers(lengths[0], lengths[1] + 1, size=(2, videos))
     made = model.frames(rng, effects[0], labels[0], sizes[0], shift)
     real = model.frames(rng, effects[1], labels[1], sizes[1])
     prefix = "v" if paired else "g"
     return feature_set(*made, labels[0], prefix), feature_set(*real, labels[1], "v"), sizes
 
 
-def draw_classes(model, rng, videos):
+def draw_classes(model, rng, videos, lengths=FRAMES):
     """One set with equally many videos in each class; labels and sizes of the videos."""
     labels = np.arange(videos) % len(model.classes)
-    sizes = rng.integers(FRAMES[0], FRAMES[1] + 1, size=videos)
+    sizes = rng.integers(lengths[0], lengths[1] + 1, size=videos)
     rows, video = model.frames(rng, model.videos(rng, videos), labels, sizes)
     return feature_set(rows, video, labels, "v"), labels, sizes
 
@@ -239,7 +240,7 @@ def scenes_table(model, truth, scenes, replicates, seed, report):
         "",
         "One generated and one real image of each scene, paired by id. The default excludes the "
         'pairs of one scene; `preset="paper"` is the formula, which counts them: it lies below the '
-        "truth. The last columns under the null err on the wide side, as above.",
+        "truth. Under the null, intervals err on the wide side: use the p-value.",
         "",
         HEAD.replace("videos", "scenes, preset"),
         RULE,
@@ -248,7 +249,7 @@ def scenes_table(model, truth, scenes, replicates, seed, report):
     ]
 
 
-def tally_halves(model, truth, videos, replicates, seed, frames=0):
+def tally_halves(model, truth, videos, replicates, seed, frames=0, lengths=FRAMES):
     """I-, CI- and D-TMMD and what does not depend on sizes, by groups."""
     names = ("I-TMMD", "I-TMMD: E", "CI-TMMD", "CI-TMMD: E")
     names += ("D: mean inter-class", "D: E_ratio", "D-TMMD", "D: mean inter-class, frames")
@@ -262,11 +263,11 @@ def tally_halves(model, truth, videos, replicates, seed, frames=0):
 
     for r in range(replicates):
         rng = rng_for(seed, "metric coverage", f"halves {videos} {r}")
-        made, _, sizes = draw_pair(model, rng, videos, False, 0.0)
+        made, _, sizes = draw_pair(model, rng, videos, False, 0.0, lengths)
         i = i_tmmd(made)
         add("I-TMMD", i, share(sizes[0]) * truth.mixture)
         add("I-TMMD: E", i, truth.mixture, "E")
-        made, labels, sizes = draw_classes(model, rng, videos)
+        made, labels, sizes = draw_classes(model, rng, videos, lengths)
         shares = [share(sizes[labels == c]) for c in range(len(model.classes))]
         intra = (np.array(shares) * truth.within).mean()
         ci, d = ci_tmmd(made), d_tmmd(made)
@@ -354,6 +355,9 @@ def tables(videos, replicates, frames, seed, report):
         by_frame = tallies.pop("D: mean inter-class, frames")
         flat.append(coverage_row("D: mean inter-class", str(count), by_frame))
         halves += [coverage_row(name, str(count), tally) for name, tally in tallies.items()]
+        unequal = tally_halves(model, truth, count, replicates, seed, lengths=UNEQUAL)
+        design = f"{count}, of {UNEQUAL[0]} to {UNEQUAL[1]} frames"
+        halves += [coverage_row(n, design, t) for n, t in unequal.items() if t.rows and "E" in n]
         tally, ratio = tally_difference(model, truth, count, replicates // 2, seed)
         row = coverage_row("difference of TMMD", f"{count}, paired", tally)
         widths.append(f"{row} {ratio:.1f} |")

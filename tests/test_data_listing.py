@@ -191,6 +191,14 @@ def test_words_for_frames(tmp_path):
     assert places(table.skipped) == [(f"{path}:{k}", kind) for k, kind in kinds]
 
 
+@pytest.mark.parametrize("stray", ['v/3.jpg,"soft', '"v/3.jpg,soft', 'v/3.jpg,soft"'])
+def test_a_stray_quote_costs_at_most_its_own_caption(tmp_path, stray):
+    lines = [f'v/{k}.jpg,"hard, cold"' if k != 3 else stray for k in range(9)]
+    table = read_frame_table(write(tmp_path / "captions.csv", "\n".join(lines)))
+    assert set(table.values) | {("v", 3)} == {("v", k) for k in range(9)}
+    assert len(table.values) + len(table.skipped) == 9
+
+
 def test_listing_loads_neither_pillow_nor_av():
     code = "import sys, palpate.data.listing; "
     code += "sys.exit(any(m in sys.modules for m in ('PIL', 'av', 'torch')))"

@@ -117,6 +117,12 @@ FINE = b'{"vision": "v/0.jpg"}'
             {2: "bad-frame", 3: "bad-encoding", 4: "bad-encoding", 5: "bad-frame"},
         ),
         ("p.csv", b'vision,frame\nv/1.jpg,1\n"v/2.jpg,1\nv/3.jpg,1\n', {3: "open-quote"}),
+        # Two stray quotes make one cell of the rows between them.
+        (
+            "p.csv",
+            b'vision,text\nv/0.jpg,a\nv/1.jpg,"b\nv/2.jpg,c\nv/3.jpg,d\nv/4.jpg,e"\nv/5.jpg,"f\n,g"\n',
+            {3: "open-quote"},
+        ),
         ("p.json", b"\xef\xbb\xbf[" + FINE + b", 7]", {2: "bad-row"}),
         ("p.json", b"[" + FINE + b" " + FINE + b"]", {1: "bad-row"}),
     ],

@@ -13,6 +13,7 @@ from scipy import stats
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
 from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, mmd2, tmmd
 from palpate.metrics.mmd import half_of, sample_units
+from palpate.metrics.tactile import i_tmmd_of, reference_free
 from palpate.report.notes import sentence
 from test_metrics_mmd import loop_mmd, unit_rows
 
@@ -127,22 +128,35 @@ def test_group_halves_are_the_average_over_all_halvings(estimator, videos, frame
     assert got.seed is None
 
 
-@given(seed=st.integers(0, 10**5), frames=st.sampled_from([(2, 3), (1, 4, 2), (5, 1, 1)]))
-@settings(max_examples=20, deadline=None)
-def test_the_excess_is_within_minus_between(seed, frames):
+@pytest.mark.parametrize("backend", ["blocked", "moments", "rows"])
+@given(seed=st.integers(0, 10**5), frames=st.sampled_from([(2, 3), (1, 4, 2), (5, 3, 1)]))
+@settings(max_examples=10, deadline=None)
+def test_the_excess_is_within_minus_between_where_videos_weigh_the_same(backend, seed, frames):
+    with pytest.MonkeyPatch.context() as patch:
+        if backend == "rows":  # more items than sums of items with items are kept for
+            patch.setattr("palpate.metrics.kernels.MOST_ITEMS", 0)
+        check_excess("blocked" if backend == "rows" else backend, seed, frames)
+
+
+def check_excess(backend, seed, frames):
     s = world(seed, classes=1, videos=5, frames=frames)
-    within, between = [], []
+    within, between, size = [], [], {g: s.groups.count(g) for g in s.groups}
     for i, j in itertools.permutations(range(len(s.ids)), 2):
         k = np.exp(-((s.features[i] - s.features[j]) ** 2).sum() / 200)
-        (within if s.groups[i] == s.groups[j] else between).append(k)
-    score = i_tmmd(s)
-    assert score.details["E"] == pytest.approx(
-        1000 * (np.mean(within) - np.mean(between)), abs=1e-9
-    )
+        weight = 1 / size[s.groups[i]] / size[s.groups[j]]
+        (within if s.groups[i] == s.groups[j] else between).append((k, weight))
+    score = i_tmmd(s, backend=backend)
+    w, b = (np.prod(p, axis=1).sum() / np.sum(p, axis=0)[1] for p in (within, between))
+    excess, bound = score.details["E"], score.details["E_bound"]
+    assert (bound > 0) == (backend == "moments")
+    assert excess == pytest.approx(1000 * (w - b), abs=1e-9 + bound)
     half = len(s.ids) / 2
-    assert score.value == pytest.approx(
-        score.details["E"] * len(within) / (half * (half - 1)), abs=1e-9
-    )
+    assert score.value == pytest.approx(excess * len(within) / (half * (half - 1)), abs=1e-9)
+    # Every leave-one-out value has the same weights.
+    one = s.groups[0]
+    rest = i_tmmd(s.take([i for i, g in zip(s.ids, s.groups, strict=True) if g != one]))
+    first = reference_free(i_tmmd_of, s, {"backend": backend}).excess[0]
+    assert first == pytest.approx(rest.details["E"], abs=1e-9 + bound)
 
 
 @pytest.mark.parametrize("halves", ["random", "ordered"])

@@ -14,9 +14,10 @@ Every name is imported on first use: ``import palpate`` itself loads neither tor
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 __version__ = "0.1.0.dev0"
 
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from palpate.data import Manifest, load, validate
     from palpate.diffusion import TactilePipeline, generate, train_generator
     from palpate.encoders import Encoder, train_encoder
-    from palpate.evaluation import probe, score
-    from palpate.leakage import audit, split
+    from palpate.evaluation import audit, probe, score
+    from palpate.leakage import split
     from palpate.sim import World
 
 #: Public name -> the room that holds it.
@@ -37,7 +38,7 @@ _MODULES = {
     "Split": "core",
     "TactilePipeline": "diffusion",
     "World": "sim",
-    "audit": "leakage",
+    "audit": "evaluation",
     "generate": "diffusion",
     "load": "data",
     "probe": "evaluation",
@@ -66,7 +67,7 @@ __all__ = [
     "validate",
 ]
 
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = partial(import_name, __name__, _MODULES)
 
 
 def __dir__() -> list[str]:

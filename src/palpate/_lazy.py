@@ -2,23 +2,23 @@
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 
-def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a package.
+def import_name(package: str, modules: Mapping[str, str], name: str) -> Any:
+    """Import a public name of a package: its ``__getattr__``, with the first two given.
 
     Args:
         package: its ``__name__``.
         modules: public name -> the module below the package that defines it.
+        name: the name.
+
+    Raises:
+        AttributeError: if the package has no such name.
     """
-
-    def import_name(name: str) -> Any:
-        if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
-        setattr(sys.modules[package], name, value)
-        return value
-
-    return import_name
+    if name not in modules:
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+    setattr(sys.modules[package], name, value)
+    return value

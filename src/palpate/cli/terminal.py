@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 #: Verbs whose first arguments may stand without their option: ``palpate score a/ --reference b/``.
 LEADING = {"score": "--generated"}
-#: Verb and option of earlier versions -> how it is written now. '' is every verb, or
+#: Verb and option (and value) of earlier versions -> how it is written now. '' is every verb, or
 #: the verb itself.
 RENAMED: dict[tuple[str, str], str] = {
     ("encoder", ""): "palpate train encoder",
@@ -79,6 +79,12 @@ RENAMED: dict[tuple[str, str], str] = {
     ("validate", "--set"): "an option for each name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",
     ("score", "--controls"): "the default; --no-controls turns it off",
+    ("split", "--by touch"): "--by contact",
+    ("audit", "--by touch"): "--by contact",
+    ("split", "--nulls own"): "--nulls single",
+    ("world", "--touches-per-video"): "--contacts-per-video",
+    ("world", "--frames-per-touch"): "--frames-per-contact",
+    ("world", "--leak touch"): "--leak contact",
 }
 #: Verb and argument of its function -> how the command line writes it, where that is not the
 #: argument's own name ("--sigma"). '' is every verb.
@@ -87,9 +93,9 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "test"): "TEST",
     ("", "columns"): "--map",
     ("", "side"): "--as",
-    ("", "data"): "DATA",
-    ("", "source"): "SOURCE",
-    ("generate", "photos"): "PHOTO",
+    ("", "data"): "PATH",
+    ("", "source"): "PATH",
+    ("generate", "photos"): "PATH",
 }
 
 #: What would break a line of the terminal, or color it.
@@ -220,7 +226,10 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
     """
     join_help_lines(options)
     leading = LEADING.get(name, "")
-    if leading and args and not args[0].startswith("-") and leading not in args:
+    if leading and args and not args[0].startswith("-"):
+        if leading in args:
+            must = f"An argument of palpate {name} must come after its option"
+            raise PalpateError(must, args[0], f"E.g. {VERBS[name].example}")
         args = [leading, *args]
     box, about = io.StringIO(), inspect.cleandoc(options.__doc__ or "")
     try:
@@ -237,16 +246,36 @@ def parse(name: str, options: type[Any], args: Sequence[str]) -> Any:
             raise
         _answer_renamed(name, args)
         words = " ".join(re.sub(r"[\u2500-\u257f]+", " ", box.getvalue()).split())
-        if unknown := re.search(r"Unrecognized options: (\S+)", words):
-            near = difflib.get_close_matches(unknown[1], _option_names(options), 1, 0.75)
-            fix = f"Did you mean: {near[0]}" if near else f"See: palpate {name} --help"
-            kind = "An option" if unknown[1].startswith("-") else "An argument"
-            must = f"{kind} of palpate {name} must be one of its help"
-            raise PalpateError(must, unknown[1].rstrip(","), fix) from None
-        hints = r"For full helptext|Argument helptext|Full error|If your arguments"
-        got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
-        must = f"The options of palpate {name} must be as its help says"
-        raise PalpateError(must, got, f"See: palpate {name} --help") from None
+        raise _parse_error(name, options, words) from None
+
+
+def _parse_error(name: str, options: type[Any], words: str) -> PalpateError:
+    """Return tyro's message about arguments as must, got, fix."""
+    fix = f"See: palpate {name} --help"
+    if unknown := re.search(r"Unrecognized options: (\S+)", words):
+        near = difflib.get_close_matches(unknown[1], _option_names(options), 1, 0.75)
+        fix = f"Did you mean: {near[0]}" if near else fix
+        kind = "An option" if unknown[1].startswith("-") else "An argument"
+        must = f"{kind} of palpate {name} must be one of its help"
+        return PalpateError(must, unknown[1].rstrip(","), fix)
+    choice = re.search(
+        r"invalid choice '(.*?)' for argument '(.*?)'. Expected one of \((.*?)\)", words
+    )
+    if choice:
+        choices = sorted(set(re.findall(r"'(.*?)'", choice[3])) - {"None"})
+        return PalpateError(f"{choice[2]} must be one of {', '.join(choices)}", choice[1], fix)
+    value = re.search(
+        r"Error parsing (\S+): no type matching (.+?) could .*? from \[(.*?)\]", words
+    )
+    if value:
+        return PalpateError(f"{value[1]} must be {value[2]}", value[3], fix)
+    if missing := re.search(r"Missing from palpate [a-z ]+: (.*)", words):
+        first = (part.strip().removeprefix("-o PATH, ") for part in missing[1].split("(required)"))
+        names = [part.split(" ")[0] for part in first if re.match(r"--\w|[A-Z]+ ", part)]
+        return PalpateError(f"{' and '.join(names)} must be given", "none", fix)
+    hints = r"For full helptext|Argument helptext|Full error|If your arguments"
+    got = re.split(hints, words)[0].strip() or "arguments that cannot be parsed"
+    return PalpateError(f"The options of palpate {name} must be as its help says", got, fix)
 
 
 def join_help_lines(options: type[Any]) -> None:
@@ -258,7 +287,8 @@ def join_help_lines(options: type[Any]) -> None:
         hints = get_type_hints(cls, include_extras=True)
         for name in cls.__annotations__:
             default = cls.__dataclass_fields__[name].default
-            if default is None or default is False or default == ():
+            many = default is dataclasses.MISSING and "tuple" in str(hints[name])
+            if default is None or default is False or default == () or many:
                 cls.__annotations__[name] = _with_hint(hints[name], "")
             elif default is True:
                 cls.__annotations__[name] = _with_hint(hints[name], "(on by default)")
@@ -268,7 +298,10 @@ def join_help_lines(options: type[Any]) -> None:
                 field: Any = cls.__dataclass_fields__[ast.unparse(statement.target)]
                 text = " ".join(str(ast.literal_eval(doc.value)).split())
                 field.metadata = {**field.metadata, "help": text}
-    for group in (field.default_factory for field in dataclasses.fields(options)):
+    for field in dataclasses.fields(options):
+        group: Any = field.default_factory
+        if dataclasses.is_dataclass(field.default):
+            group = type(field.default)
         # The groups of `palpate world` are made by the verb and have no source.
         if dataclasses.is_dataclass(group) and group.__module__ != "types":
             join_help_lines(group)  # type: ignore[arg-type]
@@ -295,7 +328,9 @@ def _option_names(options: type[Any]) -> list[str]:
 
 def _answer_renamed(name: str, args: Sequence[str]) -> None:
     """Raise for an option of an earlier version, with its new name."""
-    for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
+    words = [word for arg in args for word in arg.split("=", 1)]
+    values = (f"{option} {value}" for option, value in pairwise(words))
+    for option in (*(word for word in words if word.startswith("--")), *values):
         if new := RENAMED.get((name, option)) or RENAMED.get(("", option)):
             must = f"{option} of palpate {name} is now {new}"
             raise PalpateError(must, option, f"See: palpate {name} --help")

@@ -14,7 +14,7 @@ from palpate.core import PalpateError
 from palpate.sim import (
     DEFAULT,
     PRESETS,
-    SEEN,
+    SEEN_WARNING,
     WorldOptions,
     load_options,
     render_sheet,
@@ -86,13 +86,13 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if options.sheet:
         guard_output(options.sheet, [options.options] if options.options else [], (b"palpate",))
     if seen_by_mini(world):
-        terminal.print_line(f"Seed {world.seed}: {SEEN}")
+        terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
     with terminal.progress() as progress:
         record = write_world(options.output, world, workers=options.workers, progress=progress)
     if options.sheet:
         render_sheet(world, options.sheet)
     facts = {"folder": str(record.folder), "digest": record.digest, **record.counts}
-    facts |= {"seen_by_shipped_models": SEEN} if seen_by_mini(world) else {}
+    facts |= {"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(world) else {}
     leak = {f"leak: {k}": v for k, v in record.leak.items()}
     terminal.facts(f"World {options.output} (synthetic)", facts | leak)
     return facts | {"leak": record.leak}

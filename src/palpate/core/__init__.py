@@ -6,6 +6,8 @@ from palpate.core.digest import (
     digest_json,
     digest_lines,
     plain,
+    rng_for,
+    seed_for,
     short,
     to_numpy,
 )
@@ -34,7 +36,6 @@ from palpate.core.files import (
 )
 from palpate.core.notes import Note
 from palpate.core.progress import Progress, quiet, track
-from palpate.core.random import rng_for, seed_for
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score, columns, require_comparable
 from palpate.core.split import PARTS, Split

@@ -1,4 +1,7 @@
-"""JSON values, and digests: SHA-256 over canonical forms, so that equal content has one name."""
+"""JSON values, digests and seeds: SHA-256 over canonical forms.
+
+Equal content has one name, and a random draw depends on (seed, purpose, sample), never on order.
+"""
 
 from __future__ import annotations
 
@@ -97,3 +100,14 @@ def digest_folder(folder: Path, pattern: str = "**/*") -> str:
 def short(digest: str) -> str:
     """Return the first 12 digits: enough for people and folder names."""
     return digest[:12]
+
+
+def seed_for(seed: int, *names: str | int) -> int:
+    """Return a 63-bit seed that depends on ``seed`` and ``names`` alone, on every machine."""
+    text = "\x1f".join([str(int(seed)), *map(str, names)])
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 1
+
+
+def rng_for(seed: int, *names: str | int) -> np.random.Generator:
+    """Return a NumPy generator for (seed, names), e.g. ``rng_for(0, "noise", sample_id)``."""
+    return np.random.default_rng(seed_for(seed, *names))

@@ -20,8 +20,9 @@ from palpate.core.errors import PalpateError
 def worker_pool(
     workers: int, initializer: Callable[..., None] | None = None, arguments: tuple[Any, ...] = ()
 ) -> Generator[ProcessPoolExecutor]:
-    """A pool of spawned processes with one thread each; a forked copy of a process with threads may
-    hang.
+    """A pool of worker processes with one thread each.
+
+    They are spawned: a fork of a process with threads can deadlock.
 
     Args:
         workers: how many.
@@ -47,15 +48,13 @@ def _start_worker(initializer: Callable[..., None] | None, arguments: tuple[Any,
     # Ignore SIGINT in workers; the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    follow_parent()
+    exit_with_parent()
     if initializer is not None:
         initializer(*arguments)
 
 
-def follow_parent() -> None:
-    """End this process when its parent ends, also when that is killed; no effect without a
-    parent.
-    """
+def exit_with_parent() -> None:
+    """Exit when the parent process ends, even by SIGKILL; no effect without a parent."""
     parent = multiprocessing.parent_process()
     if parent is not None:
 

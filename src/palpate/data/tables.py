@@ -200,7 +200,8 @@ def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[
         for cells in reader:
             last = reader.line_num
             quotes = sum(line.count('"') for line in lines[first - 1 : last])
-            if last > first and quotes % 2:  # the cell swallowed all lines after it
+            inner = lines[first:last]  # what a quoted cell took in
+            if inner and (quotes % 2 or _rows_inside(inner, reader.dialect, len(cells))):
                 swallowed = f"a quotation mark stays open up to line {last}"
                 problems.append(Problem(f"{path}:{first}", "open-quote", swallowed))
             elif any(cell.strip() for cell in cells):
@@ -209,6 +210,11 @@ def _csv_rows(path: Path, text: str, problems: list[Problem]) -> Iterator[tuple[
     except csv.Error as error:
         broken = f"{error}; is a quotation mark open? No row after it was read"
         problems.append(Problem(f"{path}:{first}", "bad-row", broken))
+
+
+def _rows_inside(lines: Sequence[str], dialect: Any, width: int) -> bool:
+    """Whether lines, but for the last, are rows of a table by themselves."""
+    return len(lines) > 1 and all(len(row) == width for row in csv.reader(lines[:-1], dialect))
 
 
 def _json(path: Path) -> Table:

@@ -5,9 +5,10 @@ Names are imported on first use; importing this package does not load torch.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 if TYPE_CHECKING:
     from palpate.diffusion.generation import Generated, generate
@@ -22,4 +23,4 @@ _MODULES = {
     "train_generator": "training",
 }
 
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = partial(import_name, __name__, _MODULES)

@@ -11,9 +11,9 @@ embeddings). The unconditional token of classifier-free guidance is all zeros, o
 this is part of the checkpoint.
 
 With ``UNetOptions.modulate`` the token is also added, through two layers, to the embedding of the
-time step, which shifts every residual block: beyond the paper, cheap, and learned much sooner by a
-small network than attention to one token. The variant "w/ BG" concatenates the latent of the
-no-contact image to the noisy latent along channels.
+time step, which shifts every residual block. That is not in the paper; a small network trains
+faster with it than with cross-attention to one token. The paper's variant with background ("w/ BG")
+concatenates the latent of the no-contact image to the noisy latent along channels.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class Schedule:
     """The forward process z_t = sqrt(a_t) z + sqrt(1 - a_t) eps, and what the network predicts.
 
     Attributes:
-        beta_start, beta_end: of the schedule linear in sqrt(beta).
+        beta_start, beta_end: first and last beta; sqrt(beta) is linear between them
+            (diffusers' ``scaled_linear``).
         steps: T.
         prediction: ``epsilon`` (the paper) or ``v_prediction``.
         min_snr: g of the min-SNR weight, or None for Eq. 1's uniform weight.

@@ -5,9 +5,10 @@ Names are imported on first use; importing this package does not load torch.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 if TYPE_CHECKING:
     from palpate.encoders.contrastive import train_encoder
@@ -17,4 +18,4 @@ if TYPE_CHECKING:
 __all__ = ["Encoder", "EncoderSet", "train_encoder"]
 _MODULES = {"Encoder": "encoder", "EncoderSet": "encoder_set", "train_encoder": "contrastive"}
 
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = partial(import_name, __name__, _MODULES)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 if TYPE_CHECKING:
+    from palpate.evaluation.auditing import audit
     from palpate.evaluation.probing import probe
     from palpate.evaluation.scoring import score
 
-__all__ = ["probe", "score"]
+__all__ = ["audit", "probe", "score"]
 
-__getattr__ = lazy_names(__name__, {"probe": "probing", "score": "scoring"})
+_MODULES = {"audit": "auditing", "probe": "probing", "score": "scoring"}
+
+__getattr__ = partial(import_name, __name__, _MODULES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any, cast
 
@@ -72,3 +73,11 @@ def audit(
         progress=progress,
         **options,
     )
+
+
+# In the order of leakage.audit, with the types of the two that differ.
+_SIGNATURE = inspect.signature(audit_leakage)
+_TYPED = inspect.signature(audit).parameters
+audit.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
+    parameters=[_TYPED.get(name, p) for name, p in _SIGNATURE.parameters.items()]
+)

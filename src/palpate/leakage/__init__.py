@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 if TYPE_CHECKING:
     from palpate.leakage.auditing import audit
@@ -18,4 +19,4 @@ __all__ = ["audit", "split", "verify"]
 
 _MODULES = {"audit": "auditing", "split": "splitting", "verify": "verifying"}
 
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = partial(import_name, __name__, _MODULES)

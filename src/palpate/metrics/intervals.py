@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,8 @@ class Totals:
         same: (S, S) the part of ``sums`` from pairs inside one unit.
         pairs: (S, S) ordered pairs inside one unit, a sample with itself included.
         diagonal: (S,) sum of k(x_i, x_i).
+        squares: (S,) sum of squared weights: what i = j adds to ``pairs``.
+        even: as :class:`PairSums`.
     """
 
     n: Array
@@ -51,12 +54,16 @@ class Totals:
     same: Array
     pairs: Array
     diagonal: Array
+    squares: Array
+    even: Totals | None = None
 
     def merge(self, to: Index, segments: int) -> Totals:
         """Segments joined: segment s becomes ``to[s]``; -1 drops it."""
         m = one_hot(to, segments)
+        n, diagonal, squares = (a @ m for a in (self.n, self.diagonal, self.squares))
         sums, same, pairs = (m.T @ a @ m for a in (self.sums, self.same, self.pairs))
-        return Totals(self.n @ m, sums, same, pairs, self.diagonal @ m)
+        even = self.even and self.even.merge(to, segments)
+        return Totals(n, sums, same, pairs, diagonal, squares, even)
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,9 @@ class PairSums:
         block: (P, P) sums of items with items, or None where there would be too many.
         backend: ``"blocked"`` or ``"moments"``.
         bound: what the remainders of ``rows`` and ``same`` by moments cannot exceed; None if exact.
+        squares: (P,) sum of squared weights of the samples of an item.
+        weighings: the same sums with weights on the samples; see :meth:`weighed`.
+        even: one of these, after :meth:`merge`: where units weigh the same.
     """
 
     n: Array
@@ -84,6 +94,13 @@ class PairSums:
     block: Array | None = None
     backend: str = "blocked"
     bound: PairSums | None = field(default=None, repr=False)
+    squares: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    weighings: Sequence[PairSums] = field(default=(), repr=False)
+    even: PairSums | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if len(self.squares) != len(self.n):  # weights of 1
+            object.__setattr__(self, "squares", self.n)
 
     @classmethod
     def from_block(
@@ -104,8 +121,12 @@ class PairSums:
         """The different units, in the order of :meth:`leave_one_out`."""
         return np.unique(self.unit)
 
-    def merge(self, to: Index, segments: int) -> PairSums:
-        """Segments joined: segment s becomes ``to[s]``; -1 drops it and its items."""
+    def merge(self, to: Index, segments: int, weighing: int | None = None) -> PairSums:
+        """Segments joined: segment s becomes ``to[s]``; -1 drops it and its items.
+
+        ``weighing``: which of ``weighings`` is ``even`` from here on.
+        """
+        chosen = self.weighings[weighing] if weighing is not None and self.weighings else None
         m, keep = one_hot(to, segments), to[self.segment] >= 0
         return PairSums(
             self.n[keep],
@@ -116,37 +137,67 @@ class PairSums:
             self.unit[keep],
             None if self.block is None else self.block[np.ix_(keep, keep)],
             self.backend,
-            None if self.bound is None else self.bound.merge(to, segments),
+            self.bound and self.bound.merge(to, segments),
+            self.squares[keep],
+            even=chosen and chosen.merge(to, segments),
         )
 
-    def _part(self, at: Index | slice) -> tuple[Array, Array, Array, Array]:
-        """(n, sums, same, diagonal) of some items against all segments, by segment of the item."""
+    def weighed(self, weight: Array, rows: Array | None = None) -> PairSums:
+        """The sums with a weight on every sample: ``n`` adds weights, the rest products of two.
+
+        Args:
+            weight: (P,) of the samples of each item; equal for the items of a unit that are in one
+                set, inside of which alone the sums of a unit with itself are then right.
+            rows: (P, S) sums of each item with the weighted samples of segments; else from
+                ``block``.
+        """
+        if rows is None:
+            assert self.block is not None  # the caller has one of the two
+            rows = (self.block * weight) @ one_hot(self.segment, self.segments)
+        column = weight[:, None]
+        return replace(
+            self,
+            n=weight * self.n,
+            rows=column * rows,
+            same=column**2 * self.same,
+            diagonal=weight * self.diagonal,
+            squares=weight**2 * self.n,
+            block=None,
+            bound=self.bound and self.bound.weighed(weight),
+        )
+
+    def _part(self, at: Index | slice) -> tuple[Array, Array, Array, Array, Array]:
+        """(n, sums, same, diagonal, squares) of some items against all segments, by segment."""
         m = one_hot(self.segment[at], self.segments)
-        return self.n[at] @ m, m.T @ self.rows[at], m.T @ self.same[at], self.diagonal[at] @ m
+        n, diagonal, squares = (a[at] @ m for a in (self.n, self.diagonal, self.squares))
+        return n, m.T @ self.rows[at], m.T @ self.same[at], diagonal, squares
 
     @cached_property
     def totals(self) -> Totals:
         """Sums over all items."""
-        n, sums, same, diagonal = self._part(slice(None))
+        n, sums, same, *more = self._part(slice(None))
         cell = np.searchsorted(self.units, self.unit) * self.segments + self.segment
         count = np.bincount(cell, weights=self.n, minlength=len(self.units) * self.segments)
         count = count.reshape(-1, self.segments).astype(np.float64)
-        return Totals(n, sums, same, count.T @ count, diagonal)
+        return Totals(n, sums, same, count.T @ count, *more, self.even and self.even.totals)
 
     def leave_one_out(self) -> Iterator[Totals]:
         """The totals without each unit in turn: ``sums - C - C' + B``.
 
         C are the sums of the unit with all samples, B those of the unit with itself.
         """
-        full = self.totals
-        for at in split_by(self.unit):
-            n, with_all, inside, diagonal = self._part(at)
+        full, parts = self.totals, split_by(self.unit)
+        evens = self.even.leave_one_out() if self.even else repeat(None)
+        for at, even in zip(parts, evens, strict=False):
+            n, with_all, inside, diagonal, squares = self._part(at)
             yield Totals(
                 full.n - n,
                 full.sums - with_all - with_all.T + inside,
                 full.same - inside,
                 full.pairs - np.outer(n, n),
                 full.diagonal - diagonal,
+                full.squares - squares,
+                even,
             )
 
 

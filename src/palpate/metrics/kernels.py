@@ -28,7 +28,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -265,7 +265,7 @@ class Sweep:
     spread: Array
 
 
-def kernel_sums(
+def kernel_sums(  # noqa: PLR0913
     parts: Sequence[Any],
     segment: Index,
     unit: Index,
@@ -277,6 +277,7 @@ def kernel_sums(
     tolerance: float = 1e-4,
     block: int = 1024,
     spread: Sequence[Index] = (),
+    weights: Sequence[Array] = (),
 ) -> Sweep:
     """Sums of k by item and segment.
 
@@ -292,6 +293,8 @@ def kernel_sums(
         tolerance: largest ``bound`` that ``auto`` takes moments with.
         block: most rows of a block.
         spread: sets of segments whose :func:`centered_squares` are computed.
+        weights: (N,) each, the same for samples of one (segment, unit): of
+            ``PairSums.weighings``.
 
     Raises:
         PalpateError: if moments are requested for another kernel, or for too many items.
@@ -315,6 +318,9 @@ def kernel_sums(
         sigma = float(kernel.bandwidth or 0)
         number = number.reshape(-1)
         sweep = _moments(parts, items, number, segments=segments, sigma=sigma, spread=spread)
+        one_of = np.unique(number, return_index=True)[1]
+        weighings = [sweep.sums.weighed(w[one_of]) for w in weights]
+        sweep = replace(sweep, sums=replace(sweep.sums, weighings=weighings))
         remainder = bound(sweep.sums)
         if backend == "moments" or remainder <= tolerance:
             return sweep
@@ -325,6 +331,7 @@ def kernel_sums(
         warnings.warn(text, PalpateWarning, stacklevel=4)
     x = parts[0] if len(parts) == 1 else array_namespace(parts[0]).concat(list(parts), axis=0)
     options: dict[str, Any] = {"segments": segments, "kernel": kernel, "spread": spread}
+    options |= {"weights": weights}
     return blocked_sums(x, segment, unit, block=block, **options)
 
 
@@ -357,6 +364,7 @@ def blocked_sums(
     kernel: Kernel,
     block: int = 1024,
     spread: Sequence[Index] = (),
+    weights: Sequence[Array] = (),
 ) -> Sweep:
     """As :func:`kernel_sums` by blocks, of the rows ``x`` (N, d)."""
     order = np.lexsort((unit, segment))
@@ -367,7 +375,10 @@ def blocked_sums(
     blocks = _slices(n, max(1, min(block, max(SMALL_BLOCK, -(-n // 8)))))
     by_item = _Cells(item, len(first), blocks, pairs.z) if joined else None
     by_segment = _Cells(segment, segments, blocks, pairs.z) if spread or not joined else None
-    rows = np.zeros((n if by_segment else 0, segments))
+    weights = [w[order] for w in weights]
+    of_rows = [np.ones(n), *([] if joined else weights)]
+    columns = [by_segment.weighed(w, blocks) for w in of_rows] if by_segment else []
+    rows = np.zeros((len(columns), n, segments))
 
     def sums_of(pair: tuple[int, int]) -> tuple[Any, ...]:
         i, j = pair
@@ -375,8 +386,7 @@ def blocked_sums(
         items = by_item.sums(k, i, j) if by_item else None
         if by_segment is None:
             return items, None, None, None
-        indicators = by_segment.indicators
-        across, down = host(k @ indicators[j]), host(k.T @ indicators[i])
+        across, down = ([host(v @ c[at]) for c in columns] for v, at in ((k, j), (k.T, i)))
         return items, across, down, by_segment.sums(k * k, i, j)
 
     todo = [(i, j) for i in range(len(blocks)) for j in range(i, len(blocks))]
@@ -384,26 +394,30 @@ def blocked_sums(
         if by_item:
             by_item.add(sums[0], i, j)
         if by_segment:
-            rows[blocks[i], by_segment.present[j]] += sums[1]
-            if i != j:
-                rows[blocks[j], by_segment.present[i]] += sums[2]
+            for k, (across, down) in enumerate(zip(sums[1], sums[2], strict=True)):
+                rows[k][blocks[i], by_segment.present[j]] += across
+                if i != j:
+                    rows[k][blocks[j], by_segment.present[i]] += down
             by_segment.add(sums[3], i, j)
     squares = by_segment.total if by_segment else np.zeros((0, 0))
     centered = [
         centered_squares(
-            float(squares[np.ix_(s, s)].sum()), rows[np.isin(segment, s)][:, s].sum(axis=1)
+            float(squares[np.ix_(s, s)].sum()), rows[0][np.isin(segment, s)][:, s].sum(axis=1)
         )
         for s in spread
     ]
     if by_item:
-        weights = (np.ones(n), pairs.diagonal())
-        size, diagonal = (np.bincount(item, w, len(first)).astype(np.float64) for w in weights)
+        each = (np.ones(n), pairs.diagonal())
+        size, diagonal = (np.bincount(item, v, len(first)).astype(np.float64) for v in each)
         of_items = PairSums.from_block(
             by_item.total, size, diagonal, segment[first], unit[first], segments=segments
         )
+        weighings = [of_items.weighed(w[first]) for w in weights]
     else:
-        same = _same_unit(pairs, segment, unit, np.zeros_like(rows), block)
-        of_items = PairSums(np.ones(n), rows, same, pairs.diagonal(), segment, unit)
+        same = _same_unit(pairs, segment, unit, np.zeros((n, segments)), block)
+        of_items = PairSums(np.ones(n), rows[0], same, pairs.diagonal(), segment, unit)
+        weighings = [of_items.weighed(w, r) for w, r in zip(weights, rows[1:], strict=True)]
+    of_items = replace(of_items, weighings=weighings)
     return Sweep(of_items, np.array(centered).reshape(-1, 3))
 
 
@@ -478,6 +492,12 @@ class _Cells:
         indicators = (cell[b][:, None] == p for b, p in zip(blocks, self.present, strict=True))
         self.indicators = [like(m.astype(np.float64), wide) for m in indicators]
         self.total = np.zeros((cells, cells))
+
+    def weighed(self, weight: Array, blocks: Sequence[slice]) -> list[Any]:
+        """The indicators times (n,) weights of the rows."""
+        return [
+            m * like(weight[b][:, None], m) for m, b in zip(self.indicators, blocks, strict=True)
+        ]
 
     def sums(self, k: Any, i: int, j: int) -> Array:
         """The sums of a block of values."""

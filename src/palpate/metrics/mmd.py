@@ -18,17 +18,19 @@ On unit-norm features with sigma = 10 the value is about 9.9 ||mean(X) - mean(Y)
 
 **Two halves of a set.** Random halves carry no signal: the average of the unbiased dist^2 over all
 halvings is 0 for every data set, since a pair within a half and a pair across are both just pairs.
-Halves of whole groups do: with W the sum of k over pairs inside groups, b the mean of k over pairs
-between groups and s_g the group sizes, a balanced half (m = n/2) holds half of the pairs inside
-groups, so that the average is
+Halves of whole groups do. The **between-group excess** ``E = w - b`` is the mean of k over pairs
+i != j inside groups less that over pairs between groups; 2E is the dist^2 of two random groups. A
+sample weighs 1 / s_g, the size of its group, and a pair the product of two: groups weigh the same,
+whatever their sizes (but one with few pairs less in w). With all pairs weighing the same, long
+videos decide alone: E then spreads half as much again where a few are far longer than others.
 
-* unbiased: ``I = (W - b sum s_g(s_g-1)) / (m(m-1))``, which is ``sum s_g(s_g-1) / (m(m-1))`` times
-  the between-group excess ``E = w - b``, w the mean of k over pairs i != j inside groups. 2E is the
-  dist^2 of two random groups; I falls as the number of groups grows, E does not.
-* biased: ``I = (W - b sum s_g^2) / m^2`` (W with the diagonal).
+With s_g the group sizes and balanced halves (m = n/2), which hold half of the pairs inside groups:
 
-These closed forms need no seed, and equal the mean over all halvings exactly when groups are equal
-in size and even in number.
+* unbiased: ``I = E sum s_g(s_g-1) / (m(m-1))``; I falls as the number of groups grows, E does not.
+* biased: ``I = [E sum s_g(s_g-1) + n (d - b)] / m^2``, d the mean of k(x, x).
+
+These closed forms need no seed. They are the mean over all halvings into equally many groups where
+groups are equal in size and even in number; else they stand for halves that cannot be drawn.
 
 **Presets** fix all options of a column of the paper's table at once:
 
@@ -466,12 +468,10 @@ def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple
         or fewer than 4 samples.
     """
     whole = whole_sets(t)
-    total, inside, pairs = (np.diagonal(a) for a in (whole.sums, whole.same, whole.pairs))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        between = (total - inside) / (whole.n**2 - pairs)
-        excess = inside / (pairs - whole.n) - between  # E = w - b
-        spread = whole.diagonal / whole.n - between
-    bad = ~np.isfinite(excess) | (whole.n < 4)
+    within, between, own = _even_means(whole.even or whole)
+    excess, spread = within - between, own - between  # E = w - b
+    pairs = np.diagonal(whole.pairs)  # whole numbers, unlike sums of weights
+    bad = ~np.isfinite(excess) | (whole.n < 4) | (pairs == whole.n) | (pairs == whole.n**2)
     excess, spread = (np.where(bad, np.nan, plan.scale * a) for a in (excess, spread))
     if plan.halves == "group":
         if design is None or len(design.of_excess) != len(whole.n):
@@ -480,17 +480,24 @@ def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple
     return _between_halves(mmd_matrix(t, _estimator(plan), plan.scale)), excess
 
 
-def halves_bound(remainder: Totals, plan: Plan) -> Array:
-    """(K,) what :func:`self_distances` may be off by, where sums may be off by ``remainder``."""
-    if plan.halves != "group":
-        return _between_halves(mmd_bound(remainder, _estimator(plan), plan.scale))
-    t = whole_sets(remainder)
+def _even_means(t: Totals) -> tuple[Array, Array, Array]:
+    """(K,) means of k over pairs i != j inside groups, between groups, and of k(x, x)."""
     total, inside, pairs = (np.diagonal(a) for a in (t.sums, t.same, t.pairs))
-    m = t.n / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         between = (total - inside) / (t.n**2 - pairs)
-        below = m**2 if plan.estimator == "biased" else m * (m - 1)
-        return plan.scale * (inside + pairs * between) / below
+        return inside / (pairs - t.squares), between, t.diagonal / t.n
+
+
+def halves_bound(sums: PairSums, plan: Plan) -> Array:
+    """(K,) what :func:`self_distances` may be off by; zeros where sums are exact."""
+    remainder = (sums.even or sums).bound if plan.halves == "group" else sums.bound
+    if remainder is None:
+        return np.zeros(sums.segments // 2)
+    if plan.halves != "group":
+        return _between_halves(mmd_bound(remainder.totals, _estimator(plan), plan.scale))
+    within, between, _ = _even_means(whole_sets(remainder.totals))
+    design = design_of(sums.totals, plan)
+    return plan.scale * (design.of_excess * (within + between) + design.of_spread * between)
 
 
 def _estimator(plan: Plan) -> str:

@@ -113,14 +113,14 @@ class Table:
 
     def set_halves(self) -> PairSums:
         """Segments 0, 1: the halves of the generated set."""
-        return self.sums.merge(np.append(np.arange(self.sums.segments - 1) % 2, -1), 2)
+        return self.sums.merge(np.append(np.arange(self.sums.segments - 1) % 2, -1), 2, 0)
 
     def class_halves(self, kept: Index) -> PairSums:
         """Segments 2k, 2k + 1: the halves of class number ``kept[k]``."""
         to = np.full(self.sums.segments, -1, dtype=np.intp)
         for k, c in enumerate(kept):
             to[4 * c : 4 * c + 4] = [2 * k, 2 * k, 2 * k + 1, 2 * k + 1]
-        return self.sums.merge(to, 2 * len(kept))
+        return self.sums.merge(to, 2 * len(kept), 1)
 
     def whole_classes(self) -> PairSums:
         """Segment c: class number c, whole."""
@@ -192,9 +192,21 @@ def build_table(
         bound=bound,
         block=plan.block,
         spread=[np.arange(reference_segment), *of_class],
+        weights=_even_weights(units, segment, len(generated.ids)) if grouped else (),
     )
     copies = copies_across(*parts) if reference is not None else 0
     return Table(sweep.sums, classes, unit, unit_names, kernel, sweep.spread, copies)
+
+
+def _even_weights(unit: Index, segment: Index, generated: int) -> list[Array]:
+    """(N,) weights with which units weigh the same in the generated set, and in each class."""
+    weights: list[Array] = []
+    for of_class in (np.zeros_like(segment), segment // 4):
+        key = np.stack([unit, of_class])[:, :generated]
+        _, at, size = np.unique(key, axis=1, return_inverse=True, return_counts=True)
+        real = np.zeros(len(unit) - generated)
+        weights.append(np.append(1 / size[at.reshape(-1)], real))
+    return weights
 
 
 def _segments(generated: FeatureSet, plan: Plan) -> tuple[list[str], Index]:
@@ -215,8 +227,8 @@ def _bound(table: Table, plan: Plan) -> float:
     bounds = [largest_bound(table.whole_classes(), plan.estimator, plan.scale)]
     if reference.any():
         bounds.append(largest_bound(table.tmmd(), plan.estimator, plan.scale))
-    if halves.bound is not None and np.isfinite(self_distances(halves.totals, plan)[0][0]):
-        bounds.append(float(halves_bound(halves.bound.totals, plan)[0]))
+    if np.isfinite(self_distances(halves.totals, plan)[0][0]):
+        bounds.append(float(halves_bound(halves, plan)[0]))
     return max(b if np.isfinite(b) else np.inf for b in bounds)
 
 
@@ -615,7 +627,7 @@ def _mean_of_halves(
     sd = float(np.sqrt((sds**2).sum())) / len(sds)
     dispersion = float(dispersion_of(whole, plan).mean())
     center = dispersion if plan.estimator == "biased" else 0.0
-    bounds = _halves_bound(sums, plan)
+    bounds = halves_bound(sums, plan)
     details |= {"z": (est.values[0] - center) / sd if sd > 0 else None, "dispersion": dispersion}
     details |= {"units": len(sums.units), "E": None, "E_interval": None, "E_bound": None}
     if table.grouped:
@@ -667,13 +679,6 @@ def _design(design: Design, sizes: Array, plan: Plan) -> Array:
         return np.concatenate([design.of_excess, design.of_spread])
     with np.errstate(divide="ignore"):
         return (1 / sizes).sum(axis=1) if plan.estimator == "biased" else np.zeros(0)
-
-
-def _halves_bound(sums: PairSums, plan: Plan) -> Array:
-    """(K,) bounds of the distances between halves; zeros where sums are exact."""
-    if sums.bound is None:
-        return np.zeros(sums.segments // 2)
-    return halves_bound(sums.bound.totals, plan)
 
 
 def unfit(sums: PairSums, segments: list[int], plan: Plan) -> str:
@@ -804,7 +809,7 @@ def _d_bound(sums: PairSums, matrix: Array, plan: Plan) -> float:
     if sums.bound is None:
         return 0.0
     remainder = mmd_bound(whole_sets(sums.bound.totals), plan.estimator, plan.scale)
-    np.fill_diagonal(remainder, _halves_bound(sums, plan))
+    np.fill_diagonal(remainder, halves_bound(sums, plan))
     inner, below = np.diagonal(matrix), denominators(matrix, plan.denominator)
     up, down = np.diagonal(remainder), denominators(remainder, plan.denominator)
     if plan.aggregate == "ratio_of_means":

@@ -6,9 +6,10 @@ library.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 from palpate.report.results import Audit, Results
 
 if TYPE_CHECKING:
@@ -18,4 +19,4 @@ if TYPE_CHECKING:
 __all__ = ["Audit", "Results", "summary_lines", "write_report"]
 _MODULES = {"summary_lines": "sentences", "write_report": "page"}
 
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = partial(import_name, __name__, _MODULES)

@@ -563,8 +563,8 @@ OTHER: dict[str, Sentence] = {
         "carries no more than the label, and class-aware scores (CI- and D-TMMD, material "
         "accuracy) favor such a generator"
     ),
-    "gel-names-material": (
-        "The no-contact image alone names the material in {share:.0%} of the test samples, far "
+    "background-predicts-material": (
+        "The no-contact image alone predicts the material of {share:.0%} of the test samples, far "
         "above chance: each video has its gel look, and the probe has learned that. Material "
         "accuracy under this split measures the video, not the contact"
     ),

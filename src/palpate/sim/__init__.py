@@ -10,7 +10,7 @@ compared with real data.
 from palpate.sim.materials import MATERIALS, Material, Surface
 from palpate.sim.options import VERSION, WorldOptions, load_options
 from palpate.sim.plan import VideoPlan, plan_world
-from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN, seen_by_mini
+from palpate.sim.presets import DEFAULT, MINI_SEEDS, PRESETS, SEEN_WARNING, seen_by_mini
 from palpate.sim.sheet import render_sheet
 from palpate.sim.tile import Tile
 from palpate.sim.video import Video
@@ -22,7 +22,7 @@ __all__ = [
     "MATERIALS",
     "MINI_SEEDS",
     "PRESETS",
-    "SEEN",
+    "SEEN_WARNING",
     "VERSION",
     "Material",
     "Surface",

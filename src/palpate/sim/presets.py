@@ -7,16 +7,26 @@ from typing import Any
 from palpate.sim.options import WorldOptions
 
 #: Seeds of the worlds that the shipped mini models were trained on. No preset, test or benchmark of
-#: a score uses one: a model has seen what it would be judged on.
+#: a score uses one: a model would be scored on its training data.
 MINI_SEEDS = range(900_000, 900_100)
-#: The remark on a world of such a seed.
-SEEN = "Shipped mini models may have been trained on this world: their scores on it mean nothing."
+#: The warning on a world of such a seed.
+SEEN_WARNING = (
+    "Shipped mini models may have been trained on this world: their scores on it mean nothing."
+)
 
-_SPARSE: dict[str, Any] = {"free_written": "background"}
-_FEW = ("Wood", "Brick", "Leather", "Grass")
-_TINY: dict[str, Any] = {"materials": _FEW, "contacts_per_video": 2, "frames_per_contact": 2}
-_PRETRAIN: dict[str, Any] = {"contacts_per_video": 5, "frames_per_contact": 2, **_SPARSE}
-_SMALL: dict[str, Any] = {"two_videos": 0.25, "frames_per_contact": 4, **_SPARSE}
+_BACKGROUND_FRAMES_ONLY: dict[str, Any] = {"free_written": "background"}
+_FOUR_MATERIALS = ("Wood", "Brick", "Leather", "Grass")
+_TINY: dict[str, Any] = {
+    "materials": _FOUR_MATERIALS,
+    "contacts_per_video": 2,
+    "frames_per_contact": 2,
+}
+_PRETRAIN: dict[str, Any] = {
+    "contacts_per_video": 5,
+    "frames_per_contact": 2,
+    **_BACKGROUND_FRAMES_ONLY,
+}
+_SMALL: dict[str, Any] = {"two_videos": 0.25, "frames_per_contact": 4, **_BACKGROUND_FRAMES_ONLY}
 
 #: Cost of ``palpate world --preset NAME --workers 1`` on one shared Intel Xeon core,
 #: 2026-11-21: tiny 32 contact frames, 1 s, 1 MB; demo 1,200, 9 s, 24 MB; pretrain 4,000, 23 s, 49

@@ -44,7 +44,7 @@ from palpate.sim.leak import cut, leak_counts, leak_file
 from palpate.sim.materials import MATERIALS, Material, added_materials
 from palpate.sim.options import VERSION, WORLD_FORMAT, WorldOptions, read_world
 from palpate.sim.plan import VideoPlan, contact_rows, plan_world, written_frames
-from palpate.sim.presets import SEEN, seen_by_mini
+from palpate.sim.presets import SEEN_WARNING, seen_by_mini
 from palpate.sim.video import Video
 from palpate.sim.world import world_manifest, world_split
 
@@ -209,7 +209,7 @@ def _finish(part: Path, options: WorldOptions, plans: list[VideoPlan], parts: Pa
         "format": WORLD_FORMAT,
         "version": VERSION,
         "note": NOTE,
-        **({"seen_by_shipped_models": SEEN} if seen_by_mini(options) else {}),
+        **({"seen_by_shipped_models": SEEN_WARNING} if seen_by_mini(options) else {}),
         "digest": digest_json(content),
         "options_digest": options.digest,
         "manifest_digest": manifest.digest,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 
 from palpate.core import Note, Score, rng_for
@@ -11,12 +10,12 @@ from palpate.data.manifest import Manifest
 from palpate.diffusion.generation import Generated
 from palpate.encoders.models import is_shipped
 from palpate.evaluation.controls import BACKGROUND
-from palpate.report.results import Audit, GalleryItem, Results
+from palpate.report.results import GalleryItem, Results
 from palpate.studies.demo import DemoRun
 
-#: Rows of the gallery; more would be folded away.
+#: Rows of the gallery; further ones would be collapsed.
 GALLERY = 40
-#: Rows per contact: its frames are similar.
+#: Rows per contact, whose frames are nearly equal.
 PER_CONTACT = 2
 
 
@@ -25,7 +24,7 @@ def results_of(run: DemoRun, command: str) -> Results:
     dataset = str(run.stages["data"].facts["dataset"])
     return Results(
         title=f"From photo to tactile image on {dataset}",
-        facts=[_leak_fact(run.audits), _distance_fact(run), _material_fact(run)],
+        facts=[_leak_fact(run), _distance_fact(run), _material_fact(run)],
         audits=run.audits,
         scores=run.scores,
         gallery=gallery(run.manifest, run.generated, run.options.seed),
@@ -35,20 +34,21 @@ def results_of(run: DemoRun, command: str) -> Results:
     )
 
 
-def _leak_fact(audits: Sequence[Audit]) -> str:
-    clean = next(a for a in audits if a.name.startswith("NoLeak"))
-    fact = f"NoLeak (whole {clean.group}s kept together) leaks {clean.leaked_fraction:.1%}"
-    own = next((a for a in audits if not a.name.startswith("NoLeak")), None)
-    by_video = next((a for a in audits if a.name.endswith("seen by video")), None)
-    if own is not None:
+def _leak_fact(run: DemoRun) -> str:
+    audits = {(a.split == run.split.digest, a.group): a for a in run.audits}
+    noleak = audits[True, str(run.split.rule["group"])]
+    by_video = audits.get((True, "video"), noleak)
+    original = next((a for (ours, _), a in audits.items() if not ours), None)
+    fact = f"NoLeak (whole {noleak.group}s kept together) leaks {noleak.leaked_fraction:.1%}"
+    if original is not None:
         gap = ""
-        if own.gap_median is not None:
-            gap = f", a median of {own.gap_median:g} frames from the nearest train frame"
-        share = f"{own.leaked_fraction:.1%} of the test samples of the data set's own split"
+        if original.gap_median is not None:
+            gap = f", a median of {original.gap_median:g} frames from the nearest train frame"
+        share = f"{original.leaked_fraction:.1%} of the test samples of the data set's own split"
         return f"Leak: {share} share a video with train{gap}; {fact}."
-    if by_video is not None:
+    if by_video is not noleak:
         share = f"{by_video.leaked_fraction:.1%} of its test samples share a video with train"
-        return f"Leak: {fact} by {clean.group}, but {share}: there are too few videos."
+        return f"Leak: {fact} by {noleak.group}, but {share}: there are too few videos."
     return f"Leak: {fact}."
 
 
@@ -68,30 +68,34 @@ def _with_interval(score: Score | None) -> str:
 
 def _distance_fact(run: DemoRun) -> str:
     source = "photos and no-contact images" if run.options.background else "photos alone"
-    gel = _score(run, "TMMD", BACKGROUND, "grouped")
-    versus = f", the no-contact image {_with_interval(gel)}" if gel is not None else ""
+    background = _score(run, "TMMD", BACKGROUND, "grouped")
+    versus = (
+        f", the no-contact image {_with_interval(background)}" if background is not None else ""
+    )
     value = _with_interval(_score(run, "TMMD", "generated", "grouped"))
     start = f"Distance: {len(run.generated.ids)} tactile images generated from {source}"
     return f"{start} have TMMD (grouped) {value} to the real ones{versus} (lower is better)."
 
 
 def _material_fact(run: DemoRun) -> str:
-    made, real, gel = (
+    generated, real, background = (
         _score(run, "material accuracy", name) for name in ("generated", "real", BACKGROUND)
     )
-    if made is None or real is None:
+    if generated is None or real is None:
         materials = run.manifest.table["material"].drop_nulls().n_unique()
         return f"Material: {materials} materials, too few for a probe."
-    more = f", of the no-contact image {gel:.1%}" if gel is not None else ""
-    more += f"; chance is {made.details['chance']:.1%}"
+    more = f", of the no-contact image {background:.1%}" if background is not None else ""
+    more += f"; chance is {generated.details['chance']:.1%}"
     start = "Material: a probe fitted to real train images is right on"
-    return f"{start} {real:.1%} of the real test images and {made:.1%} of the generated ones{more}."
+    shares = f"{real:.1%} of the real test images and {generated:.1%} of the generated ones"
+    return f"{start} {shares}{more}."
 
 
 def gallery(manifest: Manifest, generated: Generated, seed: int) -> list[GalleryItem]:
     """Test samples in turn from every material, one per contact first; chosen by seed alone."""
     rows = {row["id"]: row for row in manifest.take(generated.ids).table.iter_rows(named=True)}
     order = sorted(rows, key=lambda i: rng_for(seed, "gallery", i).random())
+    # Rank: n-th sample of its contact, n-th such sample of its material, material.
     counts: Counter[tuple[str | int | None, ...]] = Counter()
     rank: dict[str, tuple[int, int, str]] = {}
     for i in order:
@@ -103,8 +107,8 @@ def gallery(manifest: Manifest, generated: Generated, seed: int) -> list[Gallery
     items: list[GalleryItem] = []
     for i in order[:GALLERY]:
         background = rows[i]["background"]
-        gel = str(manifest.path(background).resolve()) if background else None
-        items.append(GalleryItem(manifest.ref(rows[i]), str(generated.path(i).resolve()), gel))
+        path = str(manifest.path(background).resolve()) if background else None
+        items.append(GalleryItem(manifest.ref(rows[i]), str(generated.path(i).resolve()), path))
     return items
 
 
@@ -121,9 +125,9 @@ def _notes(run: DemoRun) -> list[Note]:
     notes += run.split.notes
     if run.manifest.table["text"].null_count():
         notes.append(Note("template-texts"))
-    gel = _score(run, "material accuracy", BACKGROUND)
-    if gel is not None and float(gel) > 2 * gel.details["chance"]:
-        notes.append(Note("gel-names-material", {"share": gel.value}))
+    background = _score(run, "material accuracy", BACKGROUND)
+    if background is not None and float(background) > 2 * background.details["chance"]:
+        notes.append(Note("background-predicts-material", {"share": background.value}))
     if skipped := run.stages["data"].facts.get("skipped"):
         notes.append(Note("files-skipped", {"problems": skipped}))
     return notes

@@ -32,7 +32,7 @@ class Stage:
 
     Attributes:
         folder: its files.
-        digest: of its name and inputs; later stages have it among theirs.
+        digest: SHA-256 of its name and inputs; it is one of the inputs of later stages.
         facts: what the builder returned.
         seconds: how long the last call of the builder took.
         reused: True if it existed already.
@@ -77,10 +77,10 @@ class Run:
         """
         digest = digest_json([FORMAT, __version__, name, inputs])
         final = self.folder / name
-        done = _record(final / "stage.json")
-        if done.get("digest") == digest:
-            self.print_line(f"{name}: already done ({done['seconds']:.0f} s then)")
-            stage = Stage(final, digest, done["facts"], done["seconds"], reused=True)
+        record = _record(final / "stage.json")
+        if record.get("digest") == digest:
+            self.print_line(f"{name}: already done ({record['seconds']:.0f} s then)")
+            stage = Stage(final, digest, record["facts"], record["seconds"], reused=True)
         else:
             self.print_line(f"{name}: ...")
             stage = _build(final, digest, inputs, build)
@@ -95,30 +95,30 @@ def _build(
     inputs: Mapping[str, Any],
     build: Callable[[Path], Mapping[str, Any] | None],
 ) -> Stage:
-    part = final.with_name(f"{final.name}.partial")
-    begun = final.with_name(f"{final.name}.partial.json")
-    if _record(begun).get("digest") != digest:
-        shutil.rmtree(part, ignore_errors=True)
+    partial = final.with_name(f"{final.name}.partial")
+    partial_record = final.with_name(f"{final.name}.partial.json")
+    if _record(partial_record).get("digest") != digest:
+        shutil.rmtree(partial, ignore_errors=True)
     try:
-        part.mkdir(parents=True, exist_ok=True)
+        partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         must = f"The run folder {final.parent} must be writable"
         raise PalpateError(must, str(error), "Choose another folder") from None
     record = {"digest": digest, "inputs": json.loads(canonical_json(inputs))}
-    write_json(begun, record)
+    write_json(partial_record, record)
     start = time.monotonic()
     try:
-        facts = dict(build(part) or {})
+        facts = dict(build(partial) or {})
     except PalpateError:
-        if not any(part.iterdir()):  # no work to resume from
-            part.rmdir()
-            begun.unlink()
+        if not any(partial.iterdir()):  # no work to resume from
+            partial.rmdir()
+            partial_record.unlink()
         raise
     seconds = round(time.monotonic() - start, 2)
-    write_json(part / "stage.json", {**record, "facts": facts, "seconds": seconds})
+    write_json(partial / "stage.json", {**record, "facts": facts, "seconds": seconds})
     shutil.rmtree(final, ignore_errors=True)
-    part.replace(final)
-    begun.unlink()
+    partial.replace(final)
+    partial_record.unlink()
     return Stage(final, digest, facts, seconds, reused=False)
 
 
