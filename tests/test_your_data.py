@@ -1,0 +1,227 @@
+"""Anyone's data: the commands of docs/your-data.md, folders without templates, and all verbs."""
+
+import re
+import shlex
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_fixtures import write_image
+from palpate.cli import main
+from palpate.core import PalpateError
+from palpate.data import Manifest, import_dataset, load
+from palpate.data.detection import detect_layout
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "your-data.md"
+SECTIONS = re.findall(
+    r"^### (.*?)\n(.*?)(?=^##)", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE
+)
+
+
+def blocks(text, kind):
+    return re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
+
+
+def make_tree(paths, table=""):
+    for k, path in enumerate(paths):
+        if path.endswith(".csv"):
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            Path(path).write_text(table)
+        else:
+            write_image(Path(path), k)
+
+
+@pytest.mark.parametrize(("title", "text"), SECTIONS, ids=[title for title, _ in SECTIONS])
+def test_the_commands_of_the_page_run_and_use_every_file(
+    title, text, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tree,), (command,) = blocks(text, "text"), blocks(text, "sh")
+    paths = tree.split()
+    make_tree(paths, *blocks(text, "csv"))
+    words = shlex.split(command.replace("\\\n", " "))
+    assert main([*words[1:], "-q"]) == 0, capsys.readouterr().err
+    table = Manifest.load(Path("m")).require_valid().table
+    used = {v for c in ("vision", "tactile", "background") for v in table[c].drop_nulls()}
+    assert used == {p.removeprefix("own/") for p in paths if not p.endswith(".csv")}
+    assert table["id"].n_unique() == len(table)
+
+
+FOLDERS = {
+    "side by side": ["{o}/press_{c}/photo/{f:04}.jpg", "{o}/press_{c}/touch/{f:04}.jpg"],
+    "interleaved": ["{o}/{c}{f}_rgb.png", "{o}/{c}{f}_tac.png"],
+    "roles on top": ["Camera/{o}/{c}/{f}.jpg", "GelSight/{o}/{c}/frame_{f}.jpg"],
+    "ends of names": ["{o}/x{c}{f}.png", "{o}/x{c}{f}_tactile.png"],
+    "a folder a sample": ["{o}_{c}_{f}/rgb.png", "{o}_{c}_{f}/gelsight.png"],
+    "roles twice": ["all_rgb/x_{k}_rgb.jpg", "all_tac/x_{k}_tac.jpg"],
+    "parts and materials": ["train/Wood/{o}_{k}_photo.jpg", "train/Wood/{o}_{k}_touch.jpg"],
+    "tactile alone": ["gelsight/{o}/{c}/{f}.png"],
+}
+WHICH = {
+    "ends that say nothing": ["{o}_{c}{f}.png", "{o}_{c}{f}_real.png"],
+    "folders that say nothing": ["left/{o}/{c}{f}.png", "right/{o}/{c}{f}.png"],
+    "one silent side": ["{o}/{c}{f}.png"],
+}
+
+
+def files_of(sides):
+    places = list(product(("cup", "big_mug"), (1, 2), range(3)))
+    return [s.format(o=o, c=c, f=f, k=k) for k, (o, c, f) in enumerate(places) for s in sides]
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_folder_whose_names_say_what_is_where_needs_no_template(name, tmp_path, capsys):
+    files = files_of(FOLDERS[name])
+    make_tree([str(tmp_path / "own" / file) for file in files])
+    assert main(["import", str(tmp_path / "own"), "-o", str(tmp_path / "m"), "-q"]) == 0
+    assert capsys.readouterr().out.count("\nexample ") == 3
+    table = Manifest.load(tmp_path / "m").table
+    assert len(table) == 12
+    for side, column in zip(reversed(FOLDERS[name]), ("tactile", "vision"), strict=False):
+        assert sorted(table[column]) == sorted(files_of([side]))
+
+
+@pytest.mark.parametrize("name", WHICH)
+def test_a_folder_whose_names_do_not_say_answers_with_commands(name, tmp_path, capsys):
+    make_tree([str(tmp_path / "own" / file) for file in files_of(WHICH[name])])
+    command = ["import", str(tmp_path / "own"), "-o", str(tmp_path / "m"), "-q"]
+    assert main(command) == 2
+    assert not (tmp_path / "m").exists()
+    answers = re.findall("(?m)^  palpate .*$", capsys.readouterr().err)
+    assert 2 <= len(answers) <= 3
+    for answer in answers:
+        assert main([*shlex.split(answer)[1:], "--overwrite"]) == 0
+        assert len(Manifest.load(tmp_path / "m")) in (6, 12, 24)
+
+
+def test_lists_without_two_sides_are_read_as_photos(tmp_path):
+    make_tree([str(tmp_path / "own" / file) for file in files_of(WHICH["one silent side"])])
+    assert load(tmp_path / "own").table["vision"].count() == 12
+    templated = load(tmp_path / "own", tactile="{object}/{frame}.png").table
+    assert (templated["tactile"].count(), templated["object"].n_unique()) == (12, 2)
+
+
+def test_fields_beyond_the_columns_are_kept_with_the_digest(tmp_path):
+    make_tree([str(tmp_path / "own" / f"{o}/{s}/{k}.png") for o, s, k in product("ab", "lr", "12")])
+    template = {"tactile": "{object}/{finger}/{frame}.png"}
+    manifest = import_dataset(tmp_path / "own", tmp_path / "m", **template).manifest
+    again = Manifest.load(tmp_path / "m")
+    assert (again.digest, again.column("finger")) == (manifest.digest, list("llrrllrr"))
+    renamed = {"tactile": "{object}/{side}/{frame}.png"}
+    assert load(tmp_path / "own", **renamed).digest != manifest.digest
+    assert "finger" in Manifest.join(again, again.prefixed("x/")).table.columns
+
+
+PLACES = ("rgb/1", "rgb/2", "rgb/3", "tac/1", "tac/2")
+
+
+@pytest.mark.parametrize(
+    ("templates", "words"),
+    [
+        ({"vision": "*/nothing/{frame}.png"}, "matches none of"),
+        ({"vision": "rgb/{frame}.png", "tactile": "tac/*.png"}, "must share a field"),
+        ({"vision": "rgb/{frame}.png", "tactile": "rgb/{frame}.png"}, "same-image"),
+        ({"vision": "rgb/{frame}.png", "tactile": "tac/{frame}.png"}, "1 unpaired"),
+        ({"vision": "/etc/{frame}.png"}, "path below the folder"),
+    ],
+)
+def test_templates_that_lose_something_are_errors(tmp_path, templates, words):
+    make_tree([str(tmp_path / f"own/{p}.png") for p in PLACES])
+    with pytest.raises(PalpateError, match=words):
+        import_dataset(tmp_path / "own", tmp_path / "m", **templates)
+    assert not (tmp_path / "m").exists()
+
+
+def test_images_of_no_template_and_replacements_without_a_match_are_reported(tmp_path):
+    make_tree([str(tmp_path / f"own/{p}.png") for p in ("rgb/1", "tac/1", "other/5")])
+    templates = {"vision": "rgb/{frame}.png", "tactile": "tac/{frame}.png"}
+    maps = {"columns": {"object": "replace(path, 'cup', 'mug')"}}
+    imported = import_dataset(tmp_path / "own", tmp_path / "m", **templates, **maps)
+    kinds = {problem.kind: problem.text for problem in imported.suspicious}
+    assert kinds["unmatched"] == "images of no template: 1: other/5.png"
+    assert "1 of 1 rows" in kinds["no-match"]
+
+
+def test_a_hundred_thousand_names_are_understood_quickly():
+    files = [
+        f"{o}/{c}/{s}/{f}.png"
+        for o, c, s, f in product(range(50), range(10), ("rgb", "tac"), range(100))
+    ]
+    assert detect_layout(files, "own").templates == {
+        "vision": "{object}/{video}/rgb/{frame:d}.png",
+        "tactile": "{object}/{video}/tac/{frame:d}.png",
+    }
+
+
+# --- All verbs
+
+
+def texture(path, o, c, f):
+    """Stripes of an object under a blob that moves with the contact and the frame."""
+    rng = np.random.default_rng([o, c, f])
+    y, x = np.mgrid[:32, :32]
+    tactile = int("tac" in path.name or "touch" in str(path) or "real" in path.name)
+    wave = 60 * np.sin((x * (1 + o % 4) + y * (o % 3)) / 4 + tactile)
+    blob = 80 * np.exp(-((x - 8 * c - f) ** 2 + (y - 5 * c) ** 2) / 40)
+    image = np.clip(100 + wave + blob + rng.normal(0, 8, (32, 32)), 0, 255).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).convert("RGB").save(path)
+
+
+PHOTO, TOUCH = "{o}/press_{c}/photo/{f}.png", "{o}/press_{c}/touch/{f}.png"
+#: Name -> files, arguments of the import.
+STRANGERS = {
+    "side by side": ((PHOTO, TOUCH), []),
+    "interleaved": (("{o}/{c}{f}_rgb.png", "{o}/{c}{f}_tac.png"), []),
+    "suffix pairs": (
+        ("{o}_{c}{f}.png", "{o}_{c}{f}_real.png"),
+        ["--vision", "{object}_{frame}.png", "--tactile", "{object}_{frame}_real.png"],
+    ),
+    "one-sided": (("touch/{o}/{c}/{f}.png",), []),
+    "table": (
+        (PHOTO, TOUCH),
+        ["--map", "vision=image", "tactile=gel", "video=clip", "material=kind"],
+    ),
+}
+
+
+def write_stranger(root, sides, as_table):
+    lines = ["clip,kind,image,gel"]
+    for o, c, f in product(range(6), range(2), range(4)):
+        paths = [side.format(o=f"thing{o}", c=c, f=f) for side in sides]
+        for path in paths:
+            texture(root / path, o, c, f)
+        lines.append(f"{o},oak bark {o % 2},{','.join(paths)}")
+    if as_table:
+        (root / "list.csv").write_text("\n".join(lines))
+    return root / "list.csv" if as_table else root
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STRANGERS)
+def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, monkeypatch, capsys):
+    sides, options = STRANGERS[name]
+    source = write_stranger(tmp_path / "own", sides, name == "table")
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        assert main([*map(str, words), "-q"]) == 0, capsys.readouterr().err
+
+    run("import", source, "-o", "m", *options)
+    run("split", "m", "-o", "s.json")
+    run("audit", "m", "--split", "s.json")
+    encoder = ("m", "--split", "s.json", "--preset", "tiny", "--device", "cpu", "-o", "e")
+    run("train", "encoder", *encoder)
+    if len(sides) == 1:
+        run("score", source / "touch" / "thing1", "--reference", "m", "--encoder", "e")
+        return
+    generator = ("m", "--split", "s.json", "--clip", "e", "--preset", "tiny", "--steps", "2")
+    run("train", "generator", *generator, "--device", "cpu", "-o", "g")
+    run("generate", "m", "--model", "g", "--split", "s.json", "--device", "cpu", "-o", "made")
+    score = ("made", "--reference", "m", "--split", "s.json", "--encoder", "e", "-o", "score.json")
+    run("score", *score)
+    run("report", "score.json", "-o", "page.html")
+    assert (tmp_path / "page.html").stat().st_size > 10_000
