@@ -43,6 +43,42 @@ def page_of(results, folder, **options):
     return write_report(results, folder / "page.html", **options).page.read_text(encoding="utf-8")
 
 
+def test_pairs_without_photos_show_the_contact_and_no_empty_boxes(tmp_path):
+    """A disc of three gray levels on a strong gradient: invisible as it is, plain as a contact."""
+    y, x = np.mgrid[:64, :64]
+    gel = np.stack([60 + 2 * x, 160 - y, 80 + y], -1).astype(np.uint8)
+    disc = np.hypot(y - 40, x - 20) < 9
+    for name, image in (("gel", gel), ("a", gel + 3 * disc[..., None].astype(np.uint8))):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+
+    def pair(vision=None, background=None):
+        refs = [SampleRef(k, vision=vision, tactile="a.png", background=background) for k in "tr"]
+        return LeakPair(*refs, None, 0.9)
+
+    both = small_audit([pair(background="gel.png"), pair()])
+    html = page_of(Results("T", audits=[both]), tmp_path)
+    assert 'class="lost"' not in html
+    assert "Contact: the tactile image minus its background" in Tree(html).text
+    alts = [a["alt"] for a in Tree(html).all("img")]
+    assert alts == 2 * [
+        f"{s} {k}: {s[0].lower() if s == 'Test' else 'r'}"
+        for k in ("tactile image", "contact")
+        for s in ("Test", "Train")
+    ]
+    tactile, _, contact, _, _, _, alone, _ = (im.astype(float) for im in shown_images(html))
+    for image, clear in ((tactile, False), (contact, True), (alone, True)):
+        inside, around = image[disc].mean(), image[~disc & (np.hypot(y - 40, x - 20) < 13)].mean()
+        assert (inside - around > 30) == clear
+    photos = page_of(Results("T", audits=[small_audit([pair(vision="gel.png")])]), tmp_path)
+    assert [a["alt"].split(":")[0] for a in Tree(photos).all("img")][::2] == [
+        "Test photo",
+        "Test tactile image",
+    ]
+    none = LeakPair(SampleRef("t", video="v"), SampleRef("r", video="v"), 3)
+    bare = page_of(Results("T", audits=[small_audit([none])]), tmp_path)
+    assert ('class="lost"' in bare, 'class="shots' in bare) == (False, False)
+
+
 def shown_images(html):
     data = (a["src"].partition(",")[2] for a in Tree(html).all("img"))
     return [np.asarray(Image.open(io.BytesIO(base64.b64decode(d)))) for d in data]

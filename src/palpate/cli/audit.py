@@ -84,8 +84,6 @@ class Options(Common):
     """Split file of the samples (default: the split that they come with)."""
     pretrain: Path | None = None
     """What an encoder was pretrained on: samples that the test part is compared with as well."""
-    root: Path | None = None
-    """Folder that the paths of tables are relative to (default: the folder of the table)."""
     skip_bad: Switch = False
     """Skip bad rows of lists and tables, and list them."""
     cache: Path | None = None
@@ -113,7 +111,6 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
             *options.paths,
             split=options.split,
             pretrain=options.pretrain,
-            root=options.root,
             reading=options.reading.options(),
             skip_bad=options.skip_bad,
             cache=cache,

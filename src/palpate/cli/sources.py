@@ -25,6 +25,8 @@ class Reading:
     """Template of the paths of tactile images, likewise."""
     side: Annotated[Literal["vision", "tactile"] | None, tyro.conf.arg(name="as")] = None
     """What the images of a folder show, if all show one thing."""
+    root: Path | None = None
+    """Folder that the paths of tables are relative to (default: the folder of the table)."""
     classes: Path | None = None
     """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers."""
     names: str | None = None
@@ -38,7 +40,7 @@ class Reading:
     def arguments(self) -> list[str]:
         """As they were written on the command line."""
         words = [word for group in self.columns for word in ("--map", *group)]
-        for name in ("vision", "tactile", "side", "classes", "names"):
+        for name in ("vision", "tactile", "side", "root", "classes", "names"):
             if (value := getattr(self, name)) is not None:
                 words += [f"--{'as' if name == 'side' else name}", str(value)]
         return words

@@ -15,3 +15,4 @@ class SampleRef:
     material: str | None = None
     vision: str | None = None
     tactile: str | None = None
+    background: str | None = None

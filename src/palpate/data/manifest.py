@@ -191,7 +191,7 @@ class Manifest:
 
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row of the table as a reference with absolute image paths, for reports."""
-        full = {n: os.path.realpath(self.path(row[n])) if row[n] else None for n in MODALITIES}
+        full = {n: os.path.realpath(self.path(row[n])) if row[n] else None for n in IMAGE_COLUMNS}
         return SampleRef(row["id"], row["video"], row["frame"], row["material"], **full)
 
     def problems(self, *, files: bool = True) -> list[Problem]:

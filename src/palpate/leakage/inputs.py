@@ -74,6 +74,7 @@ def read(
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
     options = {name: value for name, value in (reading or {}).items() if value}
+    root = options.pop("root", root)
     paths = data if isinstance(data, (list, tuple)) else ()
     if len(paths) > 1 and all(isinstance(path, (str, Path)) for path in paths):
         manifest, skipped = _join([Path(path) for path in paths], skip_bad, options)

@@ -32,6 +32,12 @@ def pair_lists(audit: Audit) -> list[PairList]:
     return lists
 
 
+def with_contact(audit: Audit) -> bool:
+    """Return whether any pair has tactile images alone, of which the contact is shown."""
+    pairs = [pair for pair_list in pair_lists(audit) for pair in pair_list.pairs]
+    return any((p.test.tactile or p.train.tactile) and not p.has_photos for p in pairs)
+
+
 def pair_facts(pair: LeakPair, kind: str) -> list[str]:
     """Return what is known of a pair: gap, score, kind (the signal that flags it) and cause."""
     videos = {pair.test.video, pair.train.video}

@@ -176,13 +176,19 @@ def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
 
 
 def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
-    """Photos above, tactile images below; test on the left."""
+    """Photos above, tactile images below, test left; without photos, tactile images and contact."""
     samples = (("Test", pair.test), (head, pair.train))
+    kinds = ("photo", "tactile image") if pair.has_photos else ("tactile image", "contact")
     return [
-        Wanted(path, f"{name} {kind}: {where(s)}", f"{name} {kind}")
-        for kind in ("photo", "tactile image")
+        Wanted(
+            s.vision if kind == "photo" else s.tactile,
+            f"{name} {kind}: {where(s)}",
+            f"{name} {kind}",
+            s.background or "" if kind == "contact" else None,
+        )
+        for kind in kinds
         for name, s in samples
-        for path in [s.vision if kind == "photo" else s.tactile]
+        if pair.has_photos or pair.test.tactile or pair.train.tactile
     ]
 
 

@@ -55,6 +55,11 @@ class LeakPair:
     score: float | None = None
     cause: str = ""
 
+    @property
+    def has_photos(self) -> bool:
+        """Whether either sample has a photo."""
+        return bool(self.test.vision or self.train.vision)
+
 
 @dataclass(frozen=True)
 class Signal:
@@ -412,7 +417,8 @@ class Results:
             return None if name is None else change(name)
 
         def sample(ref: SampleRef) -> SampleRef:
-            return replace(ref, vision=path(ref.vision), tactile=path(ref.tactile))
+            names = ("vision", "tactile", "background")
+            return replace(ref, **{name: path(getattr(ref, name)) for name in names})
 
         def pairs(rows: Sequence[LeakPair]) -> list[LeakPair]:
             return [replace(p, test=sample(p.test), train=sample(p.train)) for p in rows]

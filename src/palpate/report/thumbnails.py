@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, ImageFilter, ImageOps
 
 from palpate.core import Progress, quiet, track
 
@@ -30,11 +30,19 @@ ROW_MARKUP = 1_500
 
 
 class Wanted(NamedTuple):
-    """An image to show: its path (None = there is none), what it is in words, its column's name."""
+    """An image to show.
+
+    Attributes:
+        path: None if there is none.
+        alt: what it is in words.
+        label: its column's name.
+        less: image to subtract, amplified; '' for what varies slowly over the image itself.
+    """
 
     path: str | None
     alt: str
     label: str
+    less: str | None = None
 
 
 class Thumbnail(NamedTuple):
@@ -85,7 +93,7 @@ def fit(
     for side, quality in SIZES:
         fitting, used = {}, 0
         for key, wanted in track(list(rows.items()), f"images of {side} px", progress):
-            images = [(w, thumbnail(base, w.path, side, quality)) for w in wanted]
+            images = [(w, thumbnail(base, w.path, side, quality, w.less)) for w in wanted]
             used += ROW_MARKUP + sum(len(image.uri) for _, image in images)
             if used > budget:
                 break
@@ -96,8 +104,10 @@ def fit(
 
 
 @lru_cache(maxsize=4096)
-def thumbnail(base: Path, name: str | None, side: int, quality: int) -> Thumbnail:
-    """Return one image with at most ``side`` pixels a side."""
+def thumbnail(
+    base: Path, name: str | None, side: int, quality: int, less: str | None = None
+) -> Thumbnail:
+    """Return one image with at most ``side`` pixels a side; ``less`` as in :class:`Wanted`."""
     if name is None:
         return Thumbnail(problem="not recorded")
     try:
@@ -106,6 +116,8 @@ def thumbnail(base: Path, name: str | None, side: int, quality: int) -> Thumbnai
             file.draft("RGB", (2 * side, 2 * side))
             image = to_rgb(file)
         image.thumbnail((side, side), Image.Resampling.LANCZOS)
+        if less is not None:
+            image = amplified(image, base / less if less else None)
         data = io.BytesIO()
         if kind := "png" if tiny and side >= KEEP_ALL else "":
             image.save(data, kind, optimize=True)
@@ -118,6 +130,23 @@ def thumbnail(base: Path, name: str | None, side: int, quality: int) -> Thumbnai
         return Thumbnail(problem="file unreadable")
     uri = f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}"
     return Thumbnail(uri, image.width, image.height, tiny)
+
+
+def amplified(image: Image.Image, background: Path | None) -> Image.Image:
+    """Return what differs from the background, its strongest hundredth 110 gray levels from 128.
+
+    Without a background what varies slowly over the image takes its place. Differences of less than
+    two gray levels are amplified like those of two.
+    """
+    if background is None:
+        ground = image.filter(ImageFilter.GaussianBlur(max(image.size) / 12))
+    else:
+        with Image.open(background) as file:
+            ground = to_rgb(file).resize(image.size)
+    contact = np.asarray(image, np.float32) - np.asarray(ground, np.float32)
+    contact -= np.median(contact, axis=(0, 1))
+    gain = 110 / max(float(np.quantile(np.abs(contact), 0.99)), 2.0)
+    return Image.fromarray(np.clip(128 + gain * contact, 0, 255).round().astype(np.uint8))
 
 
 def to_rgb(image: Image.Image) -> Image.Image:
