@@ -17,12 +17,8 @@ TOP = Path(__file__).resolve().parents[1]
 SIGNATURES = {
     "audit": (
         "train_or_data test * split pretrain by near_frames identity images modalities "
-<<<<<<< ours
         "false_positives encoder impact name worst cache threads root reading ids_in_time "
         "skip_bad progress"
-=======
-        "false_positives encoder impact name worst cache threads root skip_bad progress"
->>>>>>> theirs
     ),
     "generate": (
         "photos * model output split part seed guidance steps batch skip_bad device progress"
