@@ -27,6 +27,11 @@ VERBS: dict[str, Verb] = {
         "List what is missing, invalid or suspicious in a data set",
         "palpate validate touch_and_go/",
     ),
+    "background": Verb(
+        "background",
+        "Propose the gel before each contact as background of samples that have none",
+        "palpate background tag/ -o tag_bg/",
+    ),
     "export": Verb(
         "export",
         "Write a manifest as a Hugging Face data set or a table",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from palpate._lazy import import_name
 
 if TYPE_CHECKING:
+    from palpate.data.backgrounds import Backgrounds, propose_backgrounds
     from palpate.data.exporting import Exported, export_dataset
     from palpate.data.imported import Imported, Validation
     from palpate.data.importing import import_dataset, validate
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 #: Public name -> its module, imported on first use, so that ``import palpate.data`` is free.
 _MODULES = {
+    "Backgrounds": "backgrounds",
     "Exported": "exporting",
     "Imported": "imported",
     "Manifest": "manifest",
@@ -23,10 +25,12 @@ _MODULES = {
     "export_dataset": "exporting",
     "import_dataset": "importing",
     "load": "reading",
+    "propose_backgrounds": "backgrounds",
     "validate": "importing",
 }
 
 __all__ = [
+    "Backgrounds",
     "Exported",
     "Imported",
     "Manifest",
@@ -34,6 +38,7 @@ __all__ = [
     "export_dataset",
     "import_dataset",
     "load",
+    "propose_backgrounds",
     "validate",
 ]
 
