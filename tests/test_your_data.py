@@ -14,6 +14,7 @@ from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.data import Manifest, import_dataset, load
 from palpate.data.detection import detect_layout
+from palpate.data.templates import Template, assign, join
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "your-data.md"
 SECTIONS = re.findall(
@@ -143,6 +144,48 @@ def test_images_of_no_template_and_replacements_without_a_match_are_reported(tmp
     kinds = {problem.kind: problem.text for problem in imported.suspicious}
     assert kinds["unmatched"] == "images of no template: 1: other/5.png"
     assert "1 of 1 rows" in kinds["no-match"]
+
+
+@pytest.mark.parametrize(
+    ("names", "tactile"),
+    [
+        # Role words inside names, beside what varies.
+        (
+            ["2023_{o}_RGB_{c}{f:02}.png", "2023_{o}_GelSight_{c}{f:02}.png"],
+            "2023_{object}_GelSight",
+        ),
+        (
+            ["Object{c}Press{f}Rgb.png", "Object{c}Press{f}Tactile.png"],
+            "Object{object}Press{contact}",
+        ),
+        (
+            ["obj{c}_press2_{f}_rgb.png", "obj{c}_press2_{f}_gel.png"],
+            "obj{object}_press2_{frame:d}_gel",
+        ),
+        # One side has the word, the other any word, none, or a weak one in its place.
+        (["{o}/{c}/frames/{f}.png", "{o}/{c}/gelsight/{f}.png"], "{object}/{video}/gelsight/"),
+        (["images/{o}_{c}{f}.png", "gelsight_images/{o}_{c}{f}.png"], "gelsight_images/{object}_"),
+        (["touch_{c}/image_{f}.png", "touch_{c}/touch_{f}.png"], "touch_{contact}/touch_{frame:d}"),
+        # Two sensors beside one camera.
+        (
+            ["t_{c}/camera0/{f}.png", "t_{c}/digit_l/{f}.png", "t_{c}/digit_r/{f}.png"],
+            "{video}/digit_{sensor}/{frame:d}",
+        ),
+        # What stands for something in a template.
+        (["{{{o}}}/rgb/{f}.png", "{{{o}}}/tac/{f}.png"], "{video}/tac/{frame:d}"),
+    ],
+)
+def test_templates_of_names(names, tactile):
+    layout = detect_layout(sorted(set(files_of(names))), "own")
+    assert layout.certain
+    assert layout.templates["tactile"].startswith(tactile)
+    rows, problems = join(
+        assign(
+            sorted(set(files_of(names))),
+            {s: Template.parse(t) for s, t in layout.templates.items()},
+        )
+    )
+    assert (len(rows) > 0, problems) == (True, [])
 
 
 def test_a_hundred_thousand_names_are_understood_quickly():

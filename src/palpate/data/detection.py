@@ -38,9 +38,12 @@ _MEANING = {
     "material": ("material", "mat", "class", "category"),
     "session": ("session", "day", "date"),
     "sensor": ("sensor", "gelsight", "digit", "gel"),
+    "frame": ("frame", "img", "image"),
 }
 _MEANING_OF = {word: column for column, words in _MEANING.items() for word in words}
 _MATERIALS = {name.lower() for name in ADJECTIVES}
+#: The frames of a manifest have 64 bits, so a longer number is none.
+DIGITS = 18
 _TOKEN = re.compile(r"[A-Za-z]+|[0-9]+|[^A-Za-z0-9]")
 
 
@@ -68,14 +71,13 @@ def detect_layout(files: Sequence[str], folder: str) -> Layout:
     sides = _by_role(stems)
     if not sides and (roles := {_ROLE_OF[w] for w in _words(folder) if w in _ROLE_OF}):
         sides = {min(roles): list(files)} if len(roles) == 1 else {}
-    if sides and set(sides) != {"background"}:
-        order = [side for side in ROLES if side in sides]
-        return Layout({side: template_of(sides[side]) for side in order})
-    halves = _by_recurrence(stems)
-    if halves is None:
-        return Layout({"tactile": template_of(files)}, certain=False)
-    vision, tactile = map(template_of, halves)
-    return Layout({"vision": vision, "tactile": tactile}, certain=False)
+    certain = bool(sides) and set(sides) != {"background"}
+    if not certain:
+        halves = _by_recurrence(stems) or ([], list(files))
+        sides = {side: half for side, half in zip(ROLES, halves, strict=False) if half}
+    several = any(map(_several, sides.values()))
+    order = [side for side in ROLES if side in sides]
+    return Layout({side: template_of(sides[side], several) for side in order}, certain)
 
 
 def _words(text: str) -> list[str]:
@@ -102,19 +104,31 @@ def _by_role(stems: dict[str, str]) -> dict[str, list[str]]:
             _WEAK[word] for word in shared if word in _WEAK
         }
         return {min(roles): list(stems)} if len(roles) == 1 else {}
-    if plain and len(said := sides.keys() & {"vision", "tactile"}) == 1:
-        (known,) = said
-        bare = {_without_role(stems[path], known) for path in sides[known]}
-        if 2 * sum(stems[path] in bare for path in plain) < len(plain):
+    if plain and len(named := sides.keys() & {"vision", "tactile"}) == 1:
+        (known,) = named
+        partners = set[object]().union(*(_partners(stems[path], known) for path in sides[known]))
+        places = {key[0] for key in partners if isinstance(key, tuple)}
+        if 2 * sum(_has_partner(stems[path], partners, places) for path in plain) < len(plain):
             return {}
         sides["tactile" if known == "vision" else "vision"] = plain
     return dict(sides)
 
 
-def _without_role(stem: str, role: str) -> str:
-    """A path without the words of a role and the sign before each."""
-    words = "|".join(ROLES[role])
-    return re.sub(rf"(?i)[_\-. ]?(?<![A-Za-z])(?:{words})(?![A-Za-z])", "", stem)
+def _partners(stem: str, role: str) -> list[object]:
+    """Paths without a word of a role: with any word in its place, or with none."""
+    tokens, words = _TOKEN.findall(stem), {*ROLES[role], *(w for w in _WEAK if _WEAK[w] == role)}
+    places = [k for k, token in enumerate(tokens) if token.lower() in words]
+    word = rf"(?:{'|'.join(words)})(?![A-Za-z])"
+    bare = re.sub(rf"(?i)[_\-. ]{word}|(?<![A-Za-z]){word}[_\-. ]?", "", stem)
+    return [bare, *((k, *tokens[:k], "", *tokens[k + 1 :]) for k in places)]
+
+
+def _has_partner(stem: str, partners: set[object], places: set[object]) -> bool:
+    tokens = _TOKEN.findall(stem)
+    inside = [k for k in places if isinstance(k, int) and k < len(tokens)]
+    return stem in partners or any(
+        (k, *tokens[:k], "", *tokens[k + 1 :]) in partners for k in inside
+    )
 
 
 def _by_recurrence(stems: dict[str, str]) -> tuple[list[str], list[str]] | None:
@@ -138,8 +152,19 @@ def _by_recurrence(stems: dict[str, str]) -> tuple[list[str], list[str]] | None:
     return [path for path in stems if path not in set(longer)], longer
 
 
-def template_of(files: Sequence[str]) -> str:
-    """The template of the paths of one side."""
+def _several(files: Sequence[str]) -> bool:
+    """Whether a folder holds several of the files."""
+    return len({path.rpartition("/")[0] for path in files}) < len(files)
+
+
+def template_of(files: Sequence[str], several: bool | None = None) -> str:
+    """The template of the paths of one side.
+
+    Args:
+        files: the paths.
+        several: whether a folder holds several images of a side; default: of this one.
+    """
+    several = _several(files) if several is None else several
     places = [path.split("/") for path in files]
     folders = [place[:-1] for place in places]
     names = [posixpath.splitext(place[-1]) for place in places]
@@ -147,7 +172,6 @@ def template_of(files: Sequence[str]) -> str:
     fields: set[str] = set()
     pieces = _folders(folders, fields)
     free = [k for k, piece in enumerate(pieces) if piece is None]
-    several = len(set(map(tuple, folders))) < len(files)
     for k in reversed(free):
         default = "object" if fields & {"video", "contact"} else "video" if several else "sample"
         pieces[k] = f"{{{_new(fields, default, 'object', f'folder_{k + 1}')}}}"
@@ -208,18 +232,51 @@ def _stem(stems: Sequence[str], fields: set[str]) -> str:
     before, middles, after = _affixes(stems)
     if not middles:
         return "{frame:d}" if re.fullmatch("[0-9]{1,18}", before) else before
-    column = _column(before, middles)
-    if column and column not in fields and not all(map(str.isdecimal, middles)):
-        return f"{before}{{{column}}}{after}"
-    if all(re.fullmatch("[0-9]{1,18}", middle) for middle in middles):
-        return f"{before}{{frame:d}}{after}"
+    if aligned := _aligned(list(dict.fromkeys(stems)), fields):
+        return aligned
     numbered = [re.fullmatch(r"(.*?)([_\-. ]?)([0-9]{1,18})", middle) for middle in middles]
-    heads = {match[1] for match in numbered if match}
+    heads = [match[1] for match in numbered if match]
     signs = {match[2] for match in numbered if match}
-    if all(numbered) and len(signs) == 1 and "" not in heads and 2 * len(heads) <= len(stems):
+    if all(numbered) and len(signs) == 1 and "" not in heads and 2 * len(set(heads)) <= len(stems):
+        first, some, last = _affixes(heads)
         kind = "video" if any(re.search("[0-9]", head) for head in heads) else "object"
-        return f"{before}{{{_new(fields, kind, 'name')}}}{min(signs)}{{frame:d}}{after}"
+        head = f"{first}{{{_new(fields, kind, 'name')}}}{last}" if some else first
+        return f"{before}{head}{min(signs)}{{frame:d}}{after}"
     return f"{before}{{name}}{after}"
+
+
+def _aligned(stems: Sequence[str], fields: set[str]) -> str:
+    """The piece of names with the same words, numbers and signs in a row; else an empty text."""
+    lists = [_TOKEN.findall(stem) for stem in stems]
+    if len(set(map(len, lists))) > 1:
+        return ""
+    columns = [dict.fromkeys(tokens) for tokens in zip(*lists, strict=True)]
+    varying = [k for k, values in enumerate(columns) if len(values) > 1]
+    kinds = {k: {token.isdecimal() for token in columns[k]} for k in varying}
+    if any(len(kinds[k]) > 1 or not all(map(str.isalnum, columns[k])) for k in varying):
+        return ""
+    pieces: list[str] = []
+    word = ""
+    for k, values in enumerate(columns):
+        token = next(iter(values))
+        if k not in kinds:
+            pieces.append(_literal(token))
+            word = token if token.isalpha() else "" if token.isdecimal() else word
+            continue
+        number = kinds[k] == {True} and max(map(len, values)) <= DIGITS
+        column = _column(word, list(values))
+        if number and (k == varying[-1] or column == "frame") and column in ("", "frame", *fields):
+            pieces.append(f"{{{_new(fields, 'frame', 'number')}:d}}")
+        else:
+            names = (
+                column,
+                "video" if number else "object",
+                "name",
+                *map("name_{}".format, range(k)),
+            )
+            pieces.append(f"{{{_new(fields, *filter(None, names))}}}")
+        word = ""
+    return "".join(pieces)
 
 
 def _affixes(values: Sequence[str]) -> tuple[str, list[str], str]:

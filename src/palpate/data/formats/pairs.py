@@ -255,13 +255,16 @@ def templates_of(
     layout = detect_layout(files, folder.resolve().name)
     if layout.certain and _fit(files, layout.templates):
         return renamed(layout.templates)
-    (first, *second) = layout.templates.values()
-    choices = [{"tactile": template_of(files)}, {"vision": template_of(files)}]
-    if second:
-        choices = [{"vision": first, "tactile": second[0]}, {"vision": second[0], "tactile": first}]
-        choices.append({"tactile": template_of(files)})
-    must = f"The names of the {what} in {folder} must say what they show"
+    every = template_of(files)
+    choices = [{"tactile": every}, {"vision": every}]
     got = f"{few(files)}, without a word like {ROLES['vision'][0]} or {ROLES['tactile'][0]}"
+    if len(layout.templates) > 1:
+        first, second = list(layout.templates.values())[:2]
+        choices = [{"vision": first, "tactile": second}, {"vision": second, "tactile": first}]
+        choices = [layout.templates, {"tactile": second}] if layout.certain else choices
+        choices.append({"vision": first} if layout.certain else {"tactile": every})
+        got = f"{few(files)}, of which few share their names" if layout.certain else got
+    must = f"The names of the {what} in {folder} must say what they show"
     raise PalpateError(must, got, "Choose one of these", choices=[*map(renamed, choices)])
 
 
