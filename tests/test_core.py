@@ -304,3 +304,21 @@ def test_a_rejected_input_leaves_no_partial_folder(tmp_path):
     with pytest.raises(PalpateError):
         Run(tmp_path).stage("a", {}, reject)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_scores_are_sorted_by_value_and_an_undefined_one_compares_with_none():
+    low, high, undefined = (Score("TMMD", "a", value) for value in (1.0, 2.0, None))
+    assert max([low, high]) is high
+    assert min([high, low]) is low
+    assert low < 1.5 < high
+    assert not low < undefined
+    assert not low > undefined
+
+
+def test_a_split_is_loaded_from_a_split_or_a_file_and_nothing_else(tmp_path):
+    split = Split.from_ids(train=["a"], test=["b"])
+    split.save(tmp_path / "s.json")
+    assert Split.load(split) is split
+    assert Split.load(tmp_path / "s.json") == split
+    with pytest.raises(PalpateError, match="must be a split or its file"):
+        Split.load({"a": "train"})

@@ -85,6 +85,14 @@ class Score:
         """Return the value; NaN where it is undefined."""
         return math.nan if self.value is None else float(self.value)
 
+    def __lt__(self, other: Score | float) -> bool:
+        """Compare values; False where one is undefined. So scores can be sorted."""
+        return float(self) < float(other)
+
+    def __gt__(self, other: Score | float) -> bool:
+        """Compare values; False where one is undefined."""
+        return float(self) > float(other)
+
     def __format__(self, spec: str) -> str:
         """Return the value in a number format; without one, the three lines of :meth:`__str__`."""
         return format(float(self), spec) if spec else str(self)

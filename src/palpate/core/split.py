@@ -130,12 +130,17 @@ class Split:
         write_json(Path(path), plain(data | ({"notes": self.notes} if self.notes else {})))
 
     @classmethod
-    def load(cls, path: str | Path) -> Split:
-        """Read a split file and check its digest.
+    def load(cls, path: str | Path | Split) -> Split:
+        """Read a split file and check its digest; a split is returned as it is.
 
         Raises:
             PalpateError: if the file is missing, of another format, or was edited.
         """
+        if isinstance(path, Split):
+            return path
+        if not isinstance(path, str | Path):
+            must, got = "must be a split or its file", type(path).__name__
+            raise PalpateError(must, got, "E.g. palpate.split(...)", argument="split")
         data = read_json(Path(path), "split file")
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             must, fix = f"{path} must be a split file ({FORMAT})", "Write one with: palpate split"

@@ -97,7 +97,7 @@ def export_dataset(
         MissingExtraError: for ``hf``, if ``datasets`` is not installed.
     """
     manifest = manifest if isinstance(manifest, Manifest) else Manifest.load(Path(manifest))
-    split = Split.load(Path(split)) if isinstance(split, (str, Path)) else split
+    split = None if split is None else Split.load(split)
     if split is not None:
         manifest.take(list(split.parts))
     output = Path(output)

@@ -107,7 +107,14 @@ class Manifest:
         return self.table["id"].to_list()
 
     def column(self, name: str) -> list[Any]:
-        """One column as a list, in row order."""
+        """One column as a list, in row order.
+
+        Raises:
+            PalpateError: if there is no such column.
+        """
+        if name not in self.table.columns:
+            must = f"A column must be one of {', '.join(self.table.columns)}"
+            raise PalpateError(must, repr(name), "Choose one of these")
         return self.table[name].to_list()
 
     @cached_property

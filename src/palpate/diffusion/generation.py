@@ -382,8 +382,7 @@ def _manifest(photos: Any, split: Split | str | Path | None, part: str) -> Manif
     manifest = _whole_manifest(photos)
     if manifest is None or split is None:
         return manifest
-    split = split if isinstance(split, Split) else Split.load(Path(split))
-    return manifest.part(split, part)
+    return manifest.part(Split.load(split), part)
 
 
 def _whole_manifest(photos: Any) -> Manifest | None:

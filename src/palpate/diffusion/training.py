@@ -51,7 +51,7 @@ from palpate.diffusion.denoiser import (
 )
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_named
-from palpate.encoders.contrastive import load_manifest, split_of, train_part
+from palpate.encoders.contrastive import load_manifest, train_part
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, pick_device
@@ -106,7 +106,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
     if autoencoder is None and chosen.autoencoder is None:
         must, fix = f"must be given for the preset {chosen.name}", "Pass a hub id or a folder"
         raise PalpateError(must, "none", fix, argument="autoencoder")
-    manifest, split = load_manifest(data), split_of(split)
+    manifest, split = load_manifest(data), Split.load(split)
     encoders = clip if isinstance(clip, EncoderSet) else EncoderSet(load_clip(clip))
     output = None if output is None else Path(output)
     with work_folder(output) as work:

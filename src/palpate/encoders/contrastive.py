@@ -101,7 +101,7 @@ def train_encoder(
         fix = "Leave it out for the preset's length"
         raise PalpateError("must be a positive number", str(epochs), fix, argument="epochs")
     chosen = preset_of(preset)
-    manifest, split = load_manifest(data), split_of(split)
+    manifest, split = load_manifest(data), Split.load(split)
     output = None if output is None else Path(output)
     with work_folder(output) as work:
         common: dict[str, Any] = {"seed": seed, "targets": targets, "cache": work / "cache"}
@@ -134,11 +134,6 @@ def load_manifest(data: Manifest | str | Path) -> Manifest:
     from palpate.data import load
 
     return load(data)
-
-
-def split_of(split: Split | str | Path) -> Split:
-    """A split as it is, or read from its file."""
-    return split if isinstance(split, Split) else Split.load(Path(split))
 
 
 def preset_of(name: str | EncoderPreset) -> EncoderPreset:

@@ -59,7 +59,7 @@ def probe(
     from palpate.encoders.embed import embed
 
     manifest = Manifest.load(Path(data)) if isinstance(data, str | Path) else data
-    split = Split.load(Path(split)) if isinstance(split, str | Path) else split
+    split = Split.load(split)
     encoders = load_encoders(encoder, progress)
     if modality not in ("vision", "tactile"):
         fix = "Choose one of the two"

@@ -286,7 +286,7 @@ def score(  # noqa: PLR0913
         >>> results["TMMD", "generated"].n
         40
     """
-    split = split if isinstance(split, Split | None) else Split.load(Path(split))
+    split = None if split is None else Split.load(split)
     requested: Any = [companions] if isinstance(companions, str) else companions
     family = Family(
         presets=_names(presets, PRESETS, "presets") or (),

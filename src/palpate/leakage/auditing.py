@@ -175,7 +175,7 @@ def audit(  # noqa: PLR0913
         result = _compare(parts[0], parts[1], options, title)
         test_part = parts[1]
     else:
-        whole, parted = parts[0], split if isinstance(split, Split) else Split.load(Path(split))
+        whole, parted = parts[0], Split.load(split)
         test_part, val = whole.part(parted, "test"), whole.part(parted, "val")
         title = name or str(parted.rule.get("name") or _name(split, "split"))
         result = _compare(whole.part(parted, "train"), test_part, options, title, val=val)

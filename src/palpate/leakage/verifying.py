@@ -90,7 +90,7 @@ def verify(
     Raises:
         PalpateError: on an unknown column, or a split file that cannot be read.
     """
-    split = split if isinstance(split, Split) else Split.load(Path(split))
+    split = Split.load(split)
     (source,) = read_all([data], skip_bad, progress, None, reading)
     manifest, notes = source.manifest, source.notes
     columns = _columns(split, manifest) if by == "auto" else [by] if isinstance(by, str) else by
