@@ -1,0 +1,35 @@
+"""Captions: what each touch feels like in words, by a vision-language model, and their check."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from palpate._lazy import lazy_names
+
+if TYPE_CHECKING:
+    from palpate.captions.captioning import Captions, Estimate, StoppedError, caption
+    from palpate.captions.checking import check_captions, mask_captions
+    from palpate.captions.prompts import Prompt
+
+#: Public name -> its module, imported on first use.
+_MODULES = {
+    "Captions": "captioning",
+    "Estimate": "captioning",
+    "Prompt": "prompts",
+    "StoppedError": "captioning",
+    "caption": "captioning",
+    "check_captions": "checking",
+    "mask_captions": "checking",
+}
+
+__all__ = [
+    "Captions",
+    "Estimate",
+    "Prompt",
+    "StoppedError",
+    "caption",
+    "check_captions",
+    "mask_captions",
+]
+
+__getattr__ = lazy_names(__name__, _MODULES)

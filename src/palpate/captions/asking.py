@@ -1,0 +1,259 @@
+"""Ask a model about many photos at once; every answer is kept, and no question is asked twice."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+from palpate.captions.photos import QUALITY, SIDE, Crop, file_digest, prepared
+from palpate.captions.prompts import Description, Prompt
+from palpate.captions.replies import Describer, RejectedError, Reply, ReplyLog, Request
+from palpate.captions.units import Units
+from palpate.core import PalpateError, Problem, Progress, digest_json
+from palpate.data.images import in_threads
+from palpate.data.manifest import Manifest
+
+#: How often a model is asked until its reply can be used; from the second time on it samples.
+ATTEMPTS = 3
+AGAIN_TEMPERATURE = 0.5
+#: So many requests that the server does not take, and no answer, are no matter of single photos.
+ALL_REJECTED = 3
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is the same for all photos of a run.
+
+    Attributes:
+        model: its name, as it was requested.
+        prompt: what is asked.
+        crop: part of the photo that is sent as well.
+        max_tokens: longest reply.
+        seed: of the first try.
+        body: further fields of every request to a server.
+    """
+
+    model: str
+    prompt: Prompt
+    crop: Crop | None
+    max_tokens: int
+    seed: int
+    body: Mapping[str, Any]
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Everything next to model and prompt that a reply depends on."""
+        sent = {"side": SIDE, "quality": QUALITY, "crop": self.crop}
+        return {"max_tokens": self.max_tokens, "seed": self.seed, "body": dict(self.body), **sent}
+
+    def key(self, image: str) -> str:
+        """Key of the reply about an image file with this digest."""
+        return digest_json([self.model, self.prompt.digest, image, self.parameters])
+
+
+@dataclass(frozen=True)
+class Pending:
+    """A photo to ask about: the key of its reply, the sample's id, the file."""
+
+    key: str
+    sample: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class Photos:
+    """The photos of all units, and the keys of the replies about them.
+
+    Attributes:
+        samples: id of the described sample of every unit.
+        paths: its photo; None without one.
+        keys: key of the reply; None without a photo that can be read.
+    """
+
+    samples: Sequence[str]
+    paths: Sequence[Path | None]
+    keys: Sequence[str | None]
+
+    @classmethod
+    def of(
+        cls, manifest: Manifest, units: Units, question: Question, progress: Progress
+    ) -> Photos:
+        """Read the photos' bytes."""
+        ids, vision = manifest.ids, manifest.column("vision")
+        paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
+        distinct = list(dict.fromkeys(path for path in paths if path is not None))
+        digests = dict(in_threads(file_digest, distinct, "reading photos", progress))
+        found = [None if path is None else digests[path] for path in paths]
+        keys = [None if digest is None else question.key(digest) for digest in found]
+        samples = ["" if row is None else ids[row] for row in units.described]
+        return cls(samples, paths, keys)
+
+    def __len__(self) -> int:
+        """The number of photos."""
+        return sum(path is not None for path in self.paths)
+
+    @property
+    def first(self) -> Path:
+        """One of the photos."""
+        return next(path for path in self.paths if path is not None)
+
+    def pending(
+        self, replies: Mapping[str, Reply], prompt: Prompt, *, again: bool = False
+    ) -> list[Pending]:
+        """Photos without a reply, each once; with ``again`` also those without a usable one."""
+
+        def open_(key: str) -> bool:
+            if key not in replies:
+                return True
+            reply = replies[key]
+            return again and prompt.read(reply.raw, refused=reply.refused).text is None
+
+        asked: dict[str, Pending] = {}
+        for key, sample, path in zip(self.keys, self.samples, self.paths, strict=True):
+            if key is not None and path is not None and key not in asked and open_(key):
+                asked[key] = Pending(key, sample, path)
+        return list(asked.values())
+
+    def answered(self, replies: Mapping[str, Reply]) -> int:
+        """How many photos have a reply."""
+        return sum(key in replies for key in self.keys)
+
+    def unreadable(self) -> list[Problem]:
+        """Photos whose files cannot be read."""
+        pairs = zip(self.paths, self.keys, strict=True)
+        paths = dict.fromkeys(path for path, key in pairs if path is not None and key is None)
+        return [Problem(str(path), "bad-image", "cannot be read") for path in paths]
+
+    def descriptions(
+        self, replies: Mapping[str, Reply], prompt: Prompt, problems: Iterable[Problem]
+    ) -> list[Description]:
+        """What the replies say of every unit."""
+        kinds = {problem.where: problem.kind for problem in problems}
+        result: list[Description] = []
+        for path, key in zip(self.paths, self.keys, strict=True):
+            if key is not None and key in replies:
+                reply = replies[key]
+                description = prompt.read(reply.raw, refused=reply.refused)
+                if description.text is None and reply.finish == "length":
+                    description = replace(description, flags=("truncated",))
+            else:
+                kind = "no-photo" if path is None else kinds[str(path)]
+                description = Description(None, flags=(kind,))
+            result.append(description)
+        return result
+
+
+def ask_all(
+    pending: list[Pending],
+    question: Question,
+    describer: Describer,
+    log: ReplyLog,
+    threads: int,
+    progress: Progress,
+) -> list[Problem]:
+    """Ask about all photos; replies go to the log as they arrive.
+
+    Returns:
+        The photos that cannot be read or that the server does not take.
+
+    Raises:
+        PalpateError: if the server fails, or takes no request at all.
+    """
+
+    def work(photo: Pending) -> Problem | None:
+        try:
+            images = prepared(photo.path, question.crop)
+        except PalpateError as error:
+            return Problem(str(photo.path), "bad-image", error.got)
+        try:
+            reply = _ask(images, question, describer)
+        except RejectedError as error:
+            return Problem(str(photo.path), "rejected", str(error))
+        log.append(photo.key, photo.sample, question.prompt.name, reply)
+        return None
+
+    problems: list[Problem] = []
+    answered = rejected = 0
+    progress("describing", 0, len(pending))
+    for done, result in enumerate(in_daemons(work, pending, threads), 1):
+        if isinstance(result, BaseException):
+            raise result
+        if result is None:
+            answered += 1
+        else:
+            problems.append(result)
+            rejected += result.kind == "rejected"
+            if rejected >= ALL_REJECTED and not answered:
+                must, fix = "must take the requests", "Check the model and the further fields"
+                raise PalpateError(must, result.text, fix, argument="server")
+        progress("describing", done, len(pending))
+    return sorted(problems, key=lambda problem: problem.where)
+
+
+def _ask(images: tuple[bytes, ...], question: Question, describer: Describer) -> Reply:
+    """The first reply that can be used, or the last one; tokens and seconds are of all tries."""
+    request = Request(images, question.prompt, question.max_tokens, 0.0, question.seed)
+    reply, tokens, seconds = None, (0, 0), 0.0
+    for tries in range(1, ATTEMPTS + 1):
+        answer = describer.describe(request)
+        tokens = (tokens[0] + answer.tokens[0], tokens[1] + answer.tokens[1])
+        seconds = round(seconds + answer.seconds, 3)
+        reply = replace(answer, tries=tries, tokens=tokens, seconds=seconds)
+        if question.prompt.read(reply.raw, refused=reply.refused).answered:
+            break
+        room = request.max_tokens * (2 if reply.finish == "length" else 1)
+        request = replace(
+            request, max_tokens=room, temperature=AGAIN_TEMPERATURE, seed=request.seed + 1
+        )
+    assert reply is not None
+    return reply
+
+
+def in_daemons(
+    function: Callable[[T], R], items: Iterable[T], threads: int
+) -> Iterator[R | BaseException]:
+    """Yield results, or what was raised, as they finish; a caller that leaves waits for nothing.
+
+    Other than :func:`palpate.data.images.in_threads`, which waits for its threads: a request may
+    hang for minutes.
+    """
+    lock, stop, source = threading.Lock(), threading.Event(), iter(items)
+    results: SimpleQueue[R | BaseException | _End] = SimpleQueue()
+
+    def work() -> None:
+        while not stop.is_set():
+            with lock:
+                item = next(source, _END)
+            if isinstance(item, _End):
+                break
+            try:
+                results.put(function(item))
+            except BaseException as error:  # noqa: BLE001 (raised by the caller)
+                results.put(error)
+        results.put(_END)
+
+    for _ in range(threads):
+        threading.Thread(target=work, daemon=True).start()
+    running = threads
+    try:
+        while running:
+            result = results.get()
+            if isinstance(result, _End):
+                running -= 1
+            else:
+                yield result
+    finally:
+        stop.set()
+
+
+class _End:
+    """The end of the items."""
+
+
+_END = _End()

@@ -1,0 +1,384 @@
+"""``palpate.caption``: descriptions of touches, as a table that an import joins.
+
+The output folder holds ``captions.parquet`` (id, text, adjectives, flags; one row a sample),
+``record.json`` (what made them) and, where a model was asked, ``replies.jsonl``. The table depends
+on the samples and the replies alone, never on the order in which these arrived.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from palpate import __version__
+from palpate.captions.asking import Photos, Question, ask_all
+from palpate.captions.photos import checked_crop, sent_size
+from palpate.captions.prompts import Description, Prompt
+from palpate.captions.replies import Describer, Reply, ReplyLog, read_replies
+from palpate.captions.server import Server
+from palpate.captions.templates import template_texts
+from palpate.captions.units import Per, Units, units_of
+from palpate.core import (
+    Note,
+    PalpateError,
+    Problem,
+    Progress,
+    fact_lines,
+    plain,
+    problem_lines,
+    quiet,
+    short,
+    write_json,
+)
+from palpate.data.manifest import Manifest
+from palpate.data.reading import load
+from palpate.data.texts import TABLE, TEXTS_FORMAT, texts_digest, write_texts
+
+LIST = pl.List(pl.String)
+RECORD, REPLIES = "record.json", "replies.jsonl"
+#: Before anything is measured: seconds and tokens of a reply, and pixels a side of what becomes one
+#: token of an image (Qwen's rule; other models take up to twice as many).
+SECONDS, TOKENS, PATCH = 3.0, 60, 28
+
+
+class StoppedError(PalpateError):
+    """The server stopped answering when part of the captions was there.
+
+    Attributes:
+        answered, total: photos that have a reply, and all.
+    """
+
+    def __init__(self, cause: PalpateError, answered: int, total: int, output: Path) -> None:
+        self.answered, self.total = answered, total
+        got = f"{cause.got}; {answered:,} of {total:,} photos are described and kept in {output}"
+        super().__init__(cause.must, got, cause.fix, argument=cause.argument)
+
+
+@dataclass(frozen=True)
+class Captions:
+    """Captions that were written.
+
+    Attributes:
+        table: one row a sample: ``id``, ``text`` (null without one), ``adjectives``, ``flags``.
+        record: what made them; the same as ``record.json``.
+        path: the table's file.
+        problems: photos that could not be read, or that the server does not take.
+        notes: what a reader must know.
+    """
+
+    table: pl.DataFrame
+    record: Mapping[str, Any]
+    path: Path
+    problems: Sequence[Problem] = ()
+    notes: Sequence[Note] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Record, path, problems and notes as a JSON object."""
+        return {
+            **self.record,
+            "path": str(self.path),
+            "problems": plain(self.problems),
+            "notes": [note.to_json() for note in self.notes],
+        }
+
+    def __str__(self) -> str:
+        counts = self.record["counts"]
+        rows = {
+            "table": str(self.path),
+            "digest": self.record["digest"],
+            "model": self.record["model"],
+            "prompt": (self.record["prompt"] or {}).get("name"),
+            "photos": counts["photos"],
+            "samples": counts["samples"],
+            "with text": counts["texts"],
+            "different texts": counts["different"],
+            "flags": counts["flags"],
+            "tokens": self.record["tokens"],
+        }
+        rows = {name: value for name, value in rows.items() if value}
+        lines = [f"Captions per {self.record['per']}", *fact_lines(rows)]
+        lines += [f"Without a caption: {len(self.problems)}"] * bool(self.problems)
+        return "\n".join([*lines, *problem_lines(self.problems)])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What captions will take. Print it.
+
+    Attributes:
+        photos: all of them; ``requests`` are those without a reply so far.
+        tokens: of the requests and of the replies.
+        seconds: in all, with the requested number of requests at once.
+        price: in all, if prices were given.
+        measured: replies that the estimate is taken from; 0 means assumptions.
+    """
+
+    photos: int
+    requests: int
+    tokens: tuple[int, int]
+    seconds: float
+    price: float | None
+    measured: int
+
+    def to_json(self) -> dict[str, Any]:
+        """The estimate as a JSON object."""
+        return plain(self)
+
+    def __str__(self) -> str:
+        assumed = f"assumed: a reply takes {SECONDS:g} s and {TOKENS} tokens, an image a token "
+        assumed += f"for every {PATCH} x {PATCH} pixels"
+        minutes = self.seconds / 60
+        rows = {
+            "photos": f"{self.photos:,}",
+            "requests": f"{self.requests:,} ({self.photos - self.requests:,} are answered)",
+            "tokens": f"{self.tokens[0]:,} in, {self.tokens[1]:,} out",
+            "time": f"{minutes / 60:.1f} h" if minutes > 90 else f"{minutes:.1f} min",
+            "price": None if self.price is None else f"{self.price:.2f}",
+            "from": f"{self.measured:,} replies so far" if self.measured else assumed,
+        }
+        kept = {name: value for name, value in rows.items() if value is not None}
+        return "\n".join(["Nothing was sent", *fact_lines(kept)])
+
+
+def caption(  # noqa: PLR0913 (a public verb)
+    data: Any,
+    output: str | Path,
+    *,
+    server: str | None = None,
+    model: str | None = None,
+    local: str | None = None,
+    template: str | None = None,
+    prompt: str | Path | Prompt = "touch-adjectives/1",
+    per: Per = "contact",
+    crop: Sequence[float] | None = None,
+    concurrency: int = 8,
+    timeout: float = 120.0,
+    max_tokens: int = 300,
+    seed: int = 0,
+    body: Mapping[str, Any] | None = None,
+    key_variable: str | None = None,
+    again: bool = False,
+    prices: Sequence[float] | None = None,
+    dry_run: bool = False,
+    progress: Progress = quiet,
+) -> Captions | Estimate:
+    """Describe what each touch feels like, by a vision-language model or from columns.
+
+    Run again, it asks only about photos without a reply; a killed run loses what was in flight.
+
+    Args:
+        data: a manifest, its file or folder, or anything that :func:`palpate.load` reads.
+        output: folder for the table, the record and the replies.
+        server: base URL of an OpenAI-compatible API (vLLM, SGLang, Ollama, llama.cpp, LM Studio,
+            hosted).
+        model: its model; None for the only one that it has.
+        local: folder or hub id of a model for this process instead of a server.
+        template: text with columns in braces (``"{material} of {object}"``), or ``""`` for
+            adjectives of the material, instead of a model.
+        prompt: name of a prompt that ships, a prompt file, or a :class:`Prompt`.
+        per: ``contact``: its middle frame is described, and all of its frames have that caption;
+            or ``frame``, or ``object``.
+        crop: left, top, right, bottom of a second image, in shares of the photo: where the sensor
+            touches.
+        concurrency: requests at once.
+        timeout: longest silence of the server, in seconds.
+        max_tokens: longest reply.
+        seed: of the model's sampling, where it has any, and of templates.
+        body: further fields of every request; None as a value removes one.
+        key_variable: environment variable that holds the server's key; by default
+            ``PALPATE_CAPTION_KEY``, if it is set.
+        again: ask again where the reply was a refusal or could not be used.
+        prices: of a million tokens in and out, for the estimate.
+        dry_run: send nothing, return an :class:`Estimate`.
+        progress: progress callback.
+
+    Raises:
+        PalpateError: on bad arguments, samples without photos, a server that does not answer or
+            takes no key, model or request, or another run that writes to the folder.
+        StoppedError: if the server stops in the middle; what it answered stays.
+    """
+    _require_one(server=server, local=local, template=template)
+    if concurrency < 1:
+        raise PalpateError("must be at least 1", str(concurrency), "", argument="concurrency")
+    manifest, output = load(data, progress=progress), Path(output)
+    units = units_of(manifest, per)
+    if template is not None:
+        texts = template_texts(template, manifest, units, seed)
+        descriptions = [Description(text, flags=() if text else ("no-column",)) for text in texts]
+        made = {"model": None, "template": template or "adjectives of the material", "prompt": None}
+        return _write(manifest, units, descriptions, output, {"per": per, "seed": seed, **made})
+    if not manifest.table["vision"].count():
+        must, fix = "must have vision images", "Map the column vision to the photos"
+        raise PalpateError(must, "samples without any", fix, argument="data")
+    asked = prompt if isinstance(prompt, Prompt) else Prompt.load(prompt)
+    area = checked_crop(crop)
+    with closing(_describer(server, model, local, key_variable, body, timeout, concurrency)) as who:
+        question = Question(who.model, asked, area, max_tokens, seed, body or {})
+        if dry_run:
+            replies, _ = read_replies(output / REPLIES)
+            photos = Photos.of(manifest, units, question, progress)
+            threads = who.threads or concurrency
+            return _estimate(photos, question, replies, threads, prices)
+        with closing(ReplyLog(output / REPLIES)) as log:
+            photos = Photos.of(manifest, units, question, progress)
+            pending = photos.pending(log.replies, question.prompt, again=again)
+            threads = min(who.threads or concurrency, len(pending))
+            try:
+                problems = ask_all(pending, question, who, log, threads, progress)
+            except PalpateError as error:
+                if not log.appended:
+                    raise
+                raise StoppedError(error, photos.answered(log.replies), len(photos), output) from None
+            made = _made(question, photos, log.replies, server) | {"per": per}
+            problems = [*photos.unreadable(), *problems]
+            descriptions = photos.descriptions(log.replies, question.prompt, problems)
+            return _write(manifest, units, descriptions, output, made, problems)
+
+
+def _require_one(**sources: str | None) -> None:
+    given = [name for name, value in sources.items() if value is not None]
+    if len(given) != 1:
+        must = f"Captions come from one of {', '.join(sources)}"
+        example = {"server": "http://localhost:8000/v1"}
+        raise PalpateError(must, " and ".join(given) or "none", "", example=example)
+
+
+def _describer(
+    server: str | None,
+    model: str | None,
+    local: str | None,
+    key_variable: str | None,
+    body: Mapping[str, Any] | None,
+    timeout: float,
+    concurrency: int,
+) -> Describer:
+    if server is not None:
+        return Server(
+            server,
+            model,
+            key_variable=key_variable,
+            body=body,
+            timeout=timeout,
+            connections=concurrency,
+        )
+    from palpate.captions.local import Local
+
+    assert local is not None
+    return Local(local)
+
+
+def _made(
+    question: Question, photos: Photos, replies: Mapping[str, Reply], server: str | None
+) -> dict[str, Any]:
+    """What the record says of the model and of its replies."""
+    prompt = question.prompt
+    answers = [replies[key] for key in sorted(set(photos.keys) & set(replies))]
+    return {
+        "model": question.model,
+        "server": server,
+        "answered_as": dict(Counter(reply.model for reply in answers).most_common()),
+        "fingerprints": sorted({r.fingerprint for r in answers if r.fingerprint}),
+        "prompt": {"name": prompt.name, "digest": prompt.digest, "text": prompt.body},
+        "schema": prompt.schema,
+        "parameters": question.parameters,
+        "replies": len(answers),
+        "tokens": {
+            "in": sum(reply.tokens[0] for reply in answers),
+            "out": sum(reply.tokens[1] for reply in answers),
+        },
+    }
+
+
+def _estimate(
+    photos: Photos,
+    question: Question,
+    replies: Mapping[str, Reply],
+    threads: int,
+    prices: Sequence[float] | None,
+) -> Estimate:
+    """What is left to ask, by the replies so far or by assumptions."""
+    count = len(photos.pending(replies, question.prompt))
+    known = [replies[key] for key in set(photos.keys) & set(replies)]
+    if known:
+        inward, outward = (sum(r.tokens[k] for r in known) / len(known) for k in (0, 1))
+        seconds = sum(reply.seconds for reply in known) / len(known)
+    else:
+        sizes = sent_size(photos.first, question.crop)
+        patches = sum(ceil(width / PATCH) * ceil(height / PATCH) for width, height in sizes)
+        inward, outward, seconds = len(question.prompt.body) / 4 + patches, TOKENS, SECONDS
+    tokens = (round(count * inward), round(count * outward))
+    price = None
+    if prices is not None:
+        price = sum(n * each for n, each in zip(tokens, prices, strict=True)) / 1e6
+    return Estimate(len(photos), count, tokens, count * seconds / threads, price, len(known))
+
+
+def _write(
+    manifest: Manifest,
+    units: Units,
+    descriptions: Sequence[Description],
+    output: Path,
+    made: Mapping[str, Any],
+    problems: Sequence[Problem] = (),
+) -> Captions:
+    """Write the table and the record: every sample has the caption of its unit."""
+    rows = [descriptions[k] for k in units.of]
+    table = pl.DataFrame(
+        {
+            "id": manifest.ids,
+            "text": [row.text for row in rows],
+            "adjectives": [list(row.adjectives) for row in rows],
+            "flags": [list(row.flags) for row in rows],
+        },
+        schema={"id": pl.String, "text": pl.String, **dict.fromkeys(("adjectives", "flags"), LIST)},
+    )
+    digest, flags = texts_digest(table), Counter(f for d in descriptions for f in d.flags)
+    texts = [d.text for d in descriptions if d.text]
+    record = {
+        "format": TEXTS_FORMAT,
+        "digest": digest,
+        "manifest": manifest.digest,
+        "data": dict(manifest.facts),
+        **made,
+        "counts": {
+            "samples": len(manifest),
+            "photos": len(descriptions),
+            "texts": len(texts),
+            "different": len(set(texts)),
+            "flags": dict(sorted(flags.items())),
+        },
+        "palpate": __version__,
+    }
+    prompt = (made["prompt"] or {}).get("name")
+    source = [made["model"] or f"template {made['template']!r}", prompt, f"per {made['per']}"]
+    source = ", ".join([*filter(None, source), f"captions {short(digest)}"])
+    path = output / TABLE
+    write_texts(table, path, manifest.digest, source)
+    write_json(output / RECORD, record)
+    return Captions(table, record, path, problems, _notes(manifest, units, made))
+
+
+def _notes(manifest: Manifest, units: Units, made: Mapping[str, Any]) -> list[Note]:
+    notes: list[Note] = []
+    if units.alone:
+        params = {"count": units.alone, "of": len(manifest), "per": made["per"]}
+        notes.append(Note("captions-alone", params))
+    if made["model"] is None:
+        notes.append(Note("captions-of-columns", {"template": made["template"]}))
+    others = [name for name in made.get("answered_as", ()) if not _same(name, made["model"])]
+    if others:
+        notes.append(Note("captions-other-model", {"models": others, "model": made["model"]}))
+    return notes
+
+
+def _same(served: str, requested: str) -> bool:
+    """Whether a server's name of a model may be the requested one: a version of it, or its path."""
+    one, two = (name.lower().rstrip("/").rpartition("/")[2] for name in (served, requested))
+    return one.startswith(two) or two.startswith(one)

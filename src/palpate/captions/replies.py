@@ -1,0 +1,178 @@
+"""Requests to a model, its replies, and the log that keeps them.
+
+The log is ``replies.jsonl``: one JSON object a line for every finished request, appended as it
+arrives and never changed::
+
+    {"key": "<sha256>", "id": "video/frame", "prompt": "touch-adjectives/1", "model": "...",
+     "raw": "{...}", "refused": false, "finish": "stop", "tokens": [812, 31], "seconds": 1.42,
+     "tries": 1, "fingerprint": null}
+
+``key`` is SHA-256 over the model, the digest of the prompt, the bytes of the image file and the
+parameters. Whoever asks the same again finds the answer; a killed run loses what was in flight. A
+last line without its end was cut by a kill or a full disk and is dropped.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Protocol
+
+from palpate.captions.prompts import Prompt
+from palpate.core import PalpateError
+
+
+@dataclass(frozen=True)
+class Request:
+    """One question to a model.
+
+    Attributes:
+        images: JPEG files: the photo and, if a crop was requested, that part of it.
+        prompt: what is asked.
+        max_tokens: longest reply.
+        temperature, seed: of the sampling.
+    """
+
+    images: tuple[bytes, ...]
+    prompt: Prompt
+    max_tokens: int
+    temperature: float
+    seed: int
+
+    @property
+    def text(self) -> str:
+        """What the model reads."""
+        return self.prompt.body if len(self.images) == 1 else f"{self.prompt.body}\n\n{CROP}"
+
+
+#: Added to the prompt where a crop follows the photo.
+CROP = "The second image is the part of the photo where the sensor touches the surface."
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a model answered.
+
+    Attributes:
+        raw: the text as it came.
+        model: the model as the server names it.
+        refused: the server itself calls the reply a refusal.
+        finish: why it ended: ``stop``, or ``length`` where it was cut.
+        tokens: of the request and of the reply.
+        seconds: from request to reply.
+        tries: how often the model was asked until it could be used.
+        fingerprint: of the server's configuration, if it says so.
+    """
+
+    raw: str
+    model: str
+    refused: bool = False
+    finish: str = "stop"
+    tokens: tuple[int, int] = (0, 0)
+    seconds: float = 0.0
+    tries: int = 1
+    fingerprint: str | None = None
+
+
+class Describer(Protocol):
+    """Anything that describes an image: a server, or a model in this process.
+
+    Attributes:
+        model: its name, part of the key of every reply.
+        threads: most requests at once that it can take; 0 for any number.
+    """
+
+    model: str
+    threads: int
+
+    def describe(self, request: Request) -> Reply:
+        """Answer a request; called from several threads.
+
+        Raises:
+            RejectedError: if this one request cannot be answered.
+            PalpateError: if none can.
+        """
+        ...
+
+    def close(self) -> None:
+        """Free what it holds."""
+        ...
+
+
+class RejectedError(Exception):
+    """The server does not take this one request (too large, no valid image ...)."""
+
+
+def read_replies(path: Path) -> tuple[dict[str, Reply], int]:
+    """Read a log; of two replies to one key the later counts.
+
+    Returns:
+        The replies by key, and the bytes of whole lines.
+
+    Raises:
+        PalpateError: if it is another program's file.
+    """
+    replies: dict[str, Reply] = {}
+    end = 0
+    if not path.exists():
+        return replies, end
+    with open(path, "rb") as file:
+        for number, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                break
+            end += len(line)
+            try:
+                row = json.loads(line)
+                fields = {name: row[name] for name in Reply.__dataclass_fields__}
+                fields["tokens"] = (int(row["tokens"][0]), int(row["tokens"][1]))
+                replies[row["key"]] = Reply(**fields)
+            except (ValueError, TypeError, LookupError):
+                must, got = f"{path} must hold replies only", f"another line {number}"
+                fix = "Choose another folder, or remove the line"
+                raise PalpateError(must, got, fix) from None
+    return replies, end
+
+
+class ReplyLog:
+    """The replies of an output folder, by key; one run at a time writes to it.
+
+    Raises:
+        PalpateError: if the file is another program's, or another run writes to it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = open(path, "ab")  # noqa: SIM115 (closed by close)
+        self._lock = threading.Lock()
+        self.appended = 0
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self.replies, end = read_replies(path)
+            self._file.truncate(end)
+        except BlockingIOError:
+            self._file.close()
+            must, got = f"{path.parent} must not be written by another run", "one that goes on now"
+            fix = "Wait for it, or choose another folder"
+            raise PalpateError(must, got, fix) from None
+        except PalpateError:
+            self._file.close()
+            raise
+
+    def append(self, key: str, sample: str, prompt: str, reply: Reply) -> None:
+        """Keep a reply, on disk before anything else happens; does nothing once closed."""
+        row = {"key": key, "id": sample, "prompt": prompt, **asdict(reply)}
+        line = json.dumps(row, ensure_ascii=False).encode("utf-8", "replace") + b"\n"
+        with self._lock:
+            if not self._file.closed:
+                self._file.write(line)
+                self._file.flush()
+                self.replies[key] = reply
+                self.appended += 1
+
+    def close(self) -> None:
+        """End writing; the lock is free again."""
+        with self._lock:
+            self._file.close()

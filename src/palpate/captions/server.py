@@ -1,0 +1,277 @@
+"""Any server that speaks the OpenAI-compatible protocol: ``POST URL/chat/completions``.
+
+Structured output is requested by the top-level ``response_format`` alone, which vLLM, SGLang,
+Ollama, llama.cpp, LM Studio and hosted models share; servers may ignore it, so replies are read as
+if none did. Busy or failing servers (429, 5xx, broken connections, time-outs) are asked again after
+``Retry-After`` or a doubling pause. The key comes from an environment variable and is in no file,
+log or error.
+"""
+
+from __future__ import annotations
+
+import base64
+import email.utils
+import json
+import os
+import re
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from palpate.captions.replies import RejectedError, Reply, Request
+from palpate.core import MissingExtraError, PalpateError
+
+#: Where the key is looked for unless another variable is named.
+KEY_VARIABLE = "PALPATE_CAPTION_KEY"
+#: Longest pause before another try, in seconds.
+LONGEST_PAUSE = 60.0
+#: Longest wait that a server may ask for, in seconds.
+LONGEST_WAIT = 600.0
+NEXT = "Check that it runs and its address, then run the same command again"
+#: Statuses after which the same request may well succeed.
+BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)
+
+
+class GoneError(PalpateError):
+    """The server stopped answering."""
+
+
+class Server:
+    """A model behind an OpenAI-compatible endpoint.
+
+    Args:
+        url: the API's base, mostly ending in ``/v1``.
+        model: its name there; None for the only one that the server has.
+        key_variable: environment variable that holds the key; None looks into ``KEY_VARIABLE``.
+        body: further fields of every request; null removes a default one.
+        timeout: longest silence of the server, in seconds.
+        tries: how often a request is sent to a busy or failing server.
+        pause: seconds before the second try; doubles with every further one.
+        connections: requests at once.
+
+    Raises:
+        MissingExtraError: without httpx2.
+        PalpateError: if the URL is none, the variable is not set, or the model is unknown.
+    """
+
+    threads = 0
+
+    def __init__(
+        self,
+        url: str,
+        model: str | None = None,
+        *,
+        key_variable: str | None = None,
+        body: Mapping[str, Any] | None = None,
+        timeout: float = 120.0,
+        tries: int = 6,
+        pause: float = 1.0,
+        connections: int = 8,
+    ) -> None:
+        try:
+            import httpx2
+        except ImportError:
+            raise MissingExtraError("httpx2", "caption", "Asking a server for captions") from None
+        self._errors = httpx2.TransportError
+        self._refused = httpx2.ConnectError
+        self._answered = False
+        self.url = _checked_url(url)
+        self._variable = key_variable or KEY_VARIABLE
+        self._key = _key(self._variable, required=key_variable is not None)
+        self._tries, self._pause, self._body = tries, pause, dict(body or {})
+        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
+        limits = httpx2.Limits(
+            max_connections=connections, max_keepalive_connections=connections, keepalive_expiry=60
+        )
+        self._client = httpx2.Client(headers=headers, timeout=timeout, limits=limits)
+        self.model = model or self._only_model()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._client.close()
+
+    def describe(self, request: Request) -> Reply:
+        """Ask the server; see :class:`palpate.captions.replies.Describer`."""
+        start = time.perf_counter()
+        answer = self._answer(self._payload(request))
+        try:
+            choice = answer["choices"][0]
+            message, usage = choice["message"], answer.get("usage") or {}
+            tokens = (int(usage.get("prompt_tokens") or 0), int(usage.get("completion_tokens") or 0))
+            return Reply(
+                raw=_text_of(message.get("content")) or str(message.get("refusal") or ""),
+                model=str(answer.get("model") or self.model),
+                refused=bool(message.get("refusal")) or choice.get("finish_reason") == "content_filter",
+                finish=str(choice.get("finish_reason") or "stop"),
+                tokens=tokens,
+                seconds=round(time.perf_counter() - start, 3),
+                fingerprint=answer.get("system_fingerprint"),
+            )
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            got = f"{type(error).__name__} at {str(error)[:80]}"
+            raise RejectedError(f"the reply is no chat completion ({got})") from None
+
+    def _payload(self, request: Request) -> dict[str, Any]:
+        images = [
+            {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{base64.b64encode(image).decode()}"}}
+            for image in request.images
+        ]
+        content = [{"type": "text", "text": request.text}, *images]
+        schema = {"name": "description", "schema": request.prompt.schema, "strict": True}
+        body: dict[str, Any] = {
+            "model": self.model,
+            "messages": [{"role": "user", "content": content}],
+            "response_format": {"type": "json_schema", "json_schema": schema},
+            "max_tokens": request.max_tokens,
+            "temperature": request.temperature,
+            "seed": request.seed,
+        }
+        return {k: v for k, v in (body | self._body).items() if v is not None}
+
+    def _answer(self, payload: Mapping[str, Any]) -> dict[str, Any]:
+        """The JSON of the reply, after as many tries as it takes.
+
+        Raises:
+            GoneError: if the server does not answer any more.
+            RejectedError, PalpateError: as :meth:`describe`.
+        """
+        reason, wait = "", 0.0
+        for k in range(self._tries):
+            time.sleep(wait)
+            wait = min(LONGEST_PAUSE, self._pause * 2**k)
+            try:
+                response = self._client.post(f"{self.url}/chat/completions", json=payload)
+            except self._errors as error:
+                reason = self._reason(error)
+                if isinstance(error, self._refused) and not self._answered:
+                    break  # nobody is there, and nobody was
+                continue
+            self._answered = True
+            text = self._scrubbed(response.text)
+            if response.status_code in BUSY:
+                reason = f"status {response.status_code}: {_message(text)}"
+                wait = _retry_after(response.headers.get("Retry-After", ""), wait)
+                if wait > LONGEST_WAIT:
+                    reason += f" (it asks to wait {wait:.0f} s)"
+                    break
+                continue
+            if response.status_code != 200:
+                raise self._refusal(response.status_code, text)
+            try:
+                return json.loads(text)
+            except ValueError:
+                reason = f"no JSON: {text[:80]!r}"
+        raise GoneError("must be a server that answers", f"{self.url}: {reason}", NEXT, argument="server")
+
+    def _refusal(self, status: int, text: str) -> Exception:
+        """What a status other than 200 means."""
+        got = f"status {status}: {_message(text)}"
+        if status in (401, 403):
+            where = f"the environment variable {self._variable}"
+            fix = f"Put a key into {where}" if self._key is None else f"Check the key in {where}"
+            must = "must be a server that accepts the key"
+            return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
+        if status == 404:
+            if models := self._models():
+                fix = f"It has {_few(models)}"
+                return PalpateError(f"must be a model of {self.url}", self.model, fix, argument="model")
+            must, fix = "must be an OpenAI-compatible API", "Give its base: http://HOST:PORT/v1"
+            return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
+        if 300 <= status < 400:
+            must, fix = "must be an API that does not redirect", "Give the address it redirects to"
+            return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
+        return RejectedError(got)
+
+    def _models(self) -> list[str]:
+        """Names of the server's models; empty if it does not list them."""
+        try:
+            listed = self._client.get(f"{self.url}/models").json()["data"]
+            return [str(model["id"]) for model in listed]
+        except (self._errors, LookupError, TypeError, ValueError):
+            return []
+
+    def _only_model(self) -> str:
+        """The server's model, if it has one.
+
+        Raises:
+            PalpateError: if there is none, or a choice.
+        """
+        try:
+            response = self._client.get(f"{self.url}/models")
+        except self._errors as error:
+            must, got = "must be a server that answers", f"{self.url}: {self._reason(error)}"
+            raise GoneError(must, got, NEXT, argument="server") from None
+        if response.status_code in (401, 403):
+            raise self._refusal(response.status_code, self._scrubbed(response.text))
+        models = self._models()
+        if len(models) != 1:
+            got = f"{len(models)} models" if models else "no list of models"
+            fix = f"Choose one of {_few(models)}" if models else "Name it"
+            raise PalpateError(f"must be named for {self.url}", got, fix, argument="model")
+        return models[0]
+
+    def _reason(self, error: Exception) -> str:
+        """What broke the connection, in words; the library's may repeat a header."""
+        return f"{type(error).__name__} {self._scrubbed(str(error))}".strip()
+
+    def _scrubbed(self, text: str) -> str:
+        """A reply without the key, which some servers repeat in their errors."""
+        return text.replace(self._key, "***") if self._key else text
+
+
+def _checked_url(url: str) -> str:
+    """The base of the API, without a slash at its end.
+
+    Raises:
+        PalpateError: if it is no http(s) URL, or holds a password or a query, which would be kept.
+    """
+    match = re.fullmatch(r"https?://[\w.\-\[\]:]+?(:(?P<port>\d{1,5}))?(/[^?#\s]*)?", url)
+    if match is None or int(match["port"] or 0) > 65535:
+        must = "must be http://HOST:PORT or https://HOST and a path, without password or query"
+        shown = re.sub(r"//[^/]*@", "//***@", url.partition("?")[0])
+        fix = "Most servers: http://localhost:8000/v1"
+        raise PalpateError(must, repr(shown), fix, argument="server")
+    return url.rstrip("/").removesuffix("/chat/completions")
+
+
+def _key(variable: str, *, required: bool) -> str | None:
+    key = os.environ.get(variable, "").strip()
+    if (required and not key) or not re.fullmatch(r"[\x21-\x7e]*", key):
+        must = "must name an environment variable that holds the key"
+        got = f"{variable}, {'with signs that no key has' if key else 'which is not set'}"
+        raise PalpateError(must, got, f"export {variable}=...", argument="key_variable")
+    return key or None
+
+
+def _retry_after(value: str, default: float) -> float:
+    """Seconds that the server asks to wait: a number, or a date."""
+    try:
+        return max(0.0, float(value))
+    except ValueError:
+        pass
+    try:
+        return max(0.0, email.utils.parsedate_to_datetime(value).timestamp() - time.time())
+    except (TypeError, ValueError):
+        return default
+
+
+def _message(text: str) -> str:
+    """What an error reply says, in one short line."""
+    try:
+        error = json.loads(text)
+        error = error.get("error", error.get("detail", error))
+        text = error["message"] if isinstance(error, dict) else error
+    except (ValueError, LookupError, AttributeError):
+        pass
+    return " ".join(str(text).split())[:200] or "no message"
+
+
+def _text_of(content: Any) -> str:
+    """The text of a message: a text, or a list of parts."""
+    if isinstance(content, list):
+        return "".join(str(part.get("text") or "") for part in content)
+    return str(content or "")
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:8]) + " ..." * (len(names) > 8)

@@ -1,0 +1,112 @@
+"""Texts for the samples of a manifest, from a table: the captions that ``palpate caption`` writes,
+or any table with the columns ``id`` and ``text``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import polars as pl
+
+from palpate.core import PalpateError, Problem, ProblemsError, Split, digest_lines, short
+from palpate.data.imported import Imported
+from palpate.data.manifest import Manifest, write_parquet
+from palpate.data.tables import open_table
+
+TEXTS_FORMAT = "palpate-captions/1"
+#: The table in the folder that ``palpate caption`` writes.
+TABLE = "captions.parquet"
+
+
+@dataclass(frozen=True)
+class Texts:
+    """Texts by sample id.
+
+    Attributes:
+        of: id -> text, only where there is one.
+        ids: all ids of the table.
+        source: where they come from, with a digest: kept in manifests and in models.
+        manifest: digest of the manifest that they were made for, if the table says so.
+    """
+
+    of: dict[str, str]
+    ids: frozenset[str]
+    source: str
+    manifest: str | None
+
+
+def texts_digest(table: pl.DataFrame) -> str:
+    """SHA-256 of ids and texts, independent of the order of rows."""
+    pairs = table.select("id", pl.col("text").fill_null("")).sort("id").iter_rows()
+    return digest_lines(f"{name}\t{text}" for name, text in pairs)
+
+
+def write_texts(table: pl.DataFrame, path: Path, manifest: str, source: str) -> None:
+    """Write a table of texts, with the digest of its manifest and where the texts come from."""
+    facts = {"format": TEXTS_FORMAT, "digest": texts_digest(table)}
+    facts |= {"manifest": manifest, "source": source}
+    write_parquet(table, path, {f"palpate.{name}": value for name, value in facts.items()})
+
+
+def read_texts(path: Path) -> Texts:
+    """Read a table of texts, or the folder that holds it.
+
+    Raises:
+        PalpateError: if it is missing, or lacks the columns ``id`` and ``text``.
+        ProblemsError: with every bad row.
+    """
+    path = Path(path)
+    path = path / TABLE if path.is_dir() else path
+    table = open_table(path)
+    if missing := [name for name in ("id", "text") if name not in table.names]:
+        must, got = "must be a table with the columns id and text", f"{path} without {missing[0]}"
+        raise PalpateError(must, got, "Rename the columns", argument="text")
+    rows = table.read(["id", "text"])
+    again = rows.filter(pl.col("id").is_duplicated() | pl.col("id").is_null())
+    for line, name in again.select("palpate_line", "id").iter_rows():
+        text = "the id is empty" if name is None else f"the id {name!r} is there twice"
+        table.problems.append(Problem(f"{path}:{line}", "bad-id", text))
+    if table.problems:
+        raise ProblemsError(table.problems, "Correct the table of texts")
+    pairs = dict(rows.select("id", "text").iter_rows())
+    texts = {name: text for name, text in pairs.items() if text is not None}
+    metadata: dict[str, str] = {}
+    if path.suffix.lower() == ".parquet":
+        with open(path, "rb") as file:
+            metadata = pl.read_parquet_metadata(file)
+    source = metadata.get("palpate.source") or f"{path.name}, captions {short(texts_digest(rows))}"
+    return Texts(texts, frozenset(pairs), source, metadata.get("palpate.manifest"))
+
+
+def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
+    """The same samples with texts from a table; samples without one there keep theirs.
+
+    Raises:
+        PalpateError: if the table has a text for none of the samples.
+    """
+    manifest = imported.manifest
+    old, ids = manifest.column("text"), manifest.ids
+    new = [texts.of.get(name, text) for name, text in zip(ids, old, strict=True)]
+    absent = [name for name in ids if name not in texts.of]
+    if len(absent) == len(ids):
+        got = f"{where}, with ids as {min(texts.ids, default='')!r} instead of {ids[0]!r}"
+        must, fix = "must be texts of these samples", "Use the texts made for this data set"
+        raise PalpateError(must, got, fix, argument="text")
+    suspicious = list(imported.suspicious)
+    if absent:
+        text = f"{len(absent)} of {len(ids)} samples have no text there, first {absent[0]!r}"
+        suspicious.append(Problem(str(where), "no-text", text))
+    facts = {**manifest.facts, "text_source": texts.source}
+    joined = Manifest(
+        manifest.table.with_columns(text=pl.Series(new, dtype=pl.String)), manifest.root, facts
+    )
+    splits = {name: replace(s, manifest=joined.digest) for name, s in imported.splits.items()}
+    return replace(imported, manifest=joined, splits=splits, suspicious=suspicious)
+
+
+def reimported(folder: Path) -> Imported:
+    """An import that is there already, with its splits."""
+    folder = folder if folder.is_dir() else folder.parent
+    splits = {path.stem: Split.load(path) for path in sorted((folder / "splits").glob("*.json"))}
+    return Imported(Manifest.load(folder), splits=splits)
