@@ -22,6 +22,7 @@ from palpate._lazy import import_name
 __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
+    from palpate.captions import caption
     from palpate.core import Score, Split
     from palpate.data import Manifest, load, validate
     from palpate.diffusion import TactilePipeline, generate, train_generator
@@ -39,6 +40,7 @@ _MODULES = {
     "TactilePipeline": "diffusion",
     "World": "sim",
     "audit": "evaluation",
+    "caption": "captions",
     "generate": "diffusion",
     "load": "data",
     "probe": "evaluation",
@@ -57,6 +59,7 @@ __all__ = [
     "TactilePipeline",
     "World",
     "audit",
+    "caption",
     "generate",
     "load",
     "probe",

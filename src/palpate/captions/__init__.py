@@ -8,7 +8,8 @@ from palpate._lazy import lazy_names
 
 if TYPE_CHECKING:
     from palpate.captions.captioning import Captions, Estimate, StoppedError, caption
-    from palpate.captions.checking import check_captions, mask_captions
+    from palpate.captions.checking import check_captions
+    from palpate.captions.masking import mask_captions
     from palpate.captions.prompts import Prompt
 
 #: Public name -> its module, imported on first use.
@@ -19,7 +20,7 @@ _MODULES = {
     "StoppedError": "captioning",
     "caption": "captioning",
     "check_captions": "checking",
-    "mask_captions": "checking",
+    "mask_captions": "masking",
 }
 
 __all__ = [

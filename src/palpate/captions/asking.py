@@ -81,9 +81,7 @@ class Photos:
     keys: Sequence[str | None]
 
     @classmethod
-    def of(
-        cls, manifest: Manifest, units: Units, question: Question, progress: Progress
-    ) -> Photos:
+    def of(cls, manifest: Manifest, units: Units, question: Question, progress: Progress) -> Photos:
         """Read the photos' bytes."""
         ids, vision = manifest.ids, manifest.column("vision")
         paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
@@ -154,6 +152,7 @@ def ask_all(
     question: Question,
     describer: Describer,
     log: ReplyLog,
+    *,
     threads: int,
     progress: Progress,
 ) -> list[Problem]:
@@ -234,7 +233,7 @@ def in_daemons(
                 break
             try:
                 results.put(function(item))
-            except BaseException as error:  # noqa: BLE001 (raised by the caller)
+            except BaseException as error:
                 results.put(error)
         results.put(_END)
 

@@ -19,11 +19,11 @@ import polars as pl
 
 from palpate import __version__
 from palpate.captions.asking import Photos, Question, ask_all
+from palpate.captions.columns import template_texts
 from palpate.captions.photos import checked_crop, sent_size
 from palpate.captions.prompts import Description, Prompt
 from palpate.captions.replies import Describer, Reply, ReplyLog, read_replies
 from palpate.captions.server import Server
-from palpate.captions.templates import template_texts
 from palpate.captions.units import Per, Units, units_of
 from palpate.core import (
     Note,
@@ -31,6 +31,7 @@ from palpate.core import (
     Problem,
     Progress,
     fact_lines,
+    locked,
     plain,
     problem_lines,
     quiet,
@@ -95,12 +96,13 @@ class Captions:
             "digest": self.record["digest"],
             "model": self.record["model"],
             "prompt": (self.record["prompt"] or {}).get("name"),
+            "template": self.record.get("template"),
             "photos": counts["photos"],
             "samples": counts["samples"],
             "with text": counts["texts"],
             "different texts": counts["different"],
             "flags": counts["flags"],
-            "tokens": self.record["tokens"],
+            "tokens": self.record.get("tokens"),
         }
         rows = {name: value for name, value in rows.items() if value}
         lines = [f"Captions per {self.record['per']}", *fact_lines(rows)]
@@ -219,27 +221,31 @@ def caption(  # noqa: PLR0913 (a public verb)
         raise PalpateError(must, "samples without any", fix, argument="data")
     asked = prompt if isinstance(prompt, Prompt) else Prompt.load(prompt)
     area = checked_crop(crop)
-    with closing(_describer(server, model, local, key_variable, body, timeout, concurrency)) as who:
+    options = {"key_variable": key_variable, "body": body, "timeout": timeout}
+    options["connections"] = concurrency
+    with closing(_describer(server, model, local, **options)) as who:
         question = Question(who.model, asked, area, max_tokens, seed, body or {})
         if dry_run:
             replies, _ = read_replies(output / REPLIES)
             photos = Photos.of(manifest, units, question, progress)
             threads = who.threads or concurrency
             return _estimate(photos, question, replies, threads, prices)
-        with closing(ReplyLog(output / REPLIES)) as log:
+        with locked(output), closing(ReplyLog(output / REPLIES)) as log:
             photos = Photos.of(manifest, units, question, progress)
             pending = photos.pending(log.replies, question.prompt, again=again)
             threads = min(who.threads or concurrency, len(pending))
             try:
-                problems = ask_all(pending, question, who, log, threads, progress)
+                problems = ask_all(pending, question, who, log, threads=threads, progress=progress)
             except PalpateError as error:
                 if not log.appended:
                     raise
-                raise StoppedError(error, photos.answered(log.replies), len(photos), output) from None
+                raise StoppedError(
+                    error, photos.answered(log.replies), len(photos), output
+                ) from None
             made = _made(question, photos, log.replies, server) | {"per": per}
             problems = [*photos.unreadable(), *problems]
             descriptions = photos.descriptions(log.replies, question.prompt, problems)
-            return _write(manifest, units, descriptions, output, made, problems)
+            return _write(manifest, units, descriptions, output, made, problems=problems)
 
 
 def _require_one(**sources: str | None) -> None:
@@ -251,23 +257,10 @@ def _require_one(**sources: str | None) -> None:
 
 
 def _describer(
-    server: str | None,
-    model: str | None,
-    local: str | None,
-    key_variable: str | None,
-    body: Mapping[str, Any] | None,
-    timeout: float,
-    concurrency: int,
+    server: str | None, model: str | None, local: str | None, **options: Any
 ) -> Describer:
     if server is not None:
-        return Server(
-            server,
-            model,
-            key_variable=key_variable,
-            body=body,
-            timeout=timeout,
-            connections=concurrency,
-        )
+        return Server(server, model, **options)
     from palpate.captions.local import Local
 
     assert local is not None
@@ -326,6 +319,7 @@ def _write(
     descriptions: Sequence[Description],
     output: Path,
     made: Mapping[str, Any],
+    *,
     problems: Sequence[Problem] = (),
 ) -> Captions:
     """Write the table and the record: every sample has the caption of its unit."""
@@ -360,7 +354,7 @@ def _write(
     source = [made["model"] or f"template {made['template']!r}", prompt, f"per {made['per']}"]
     source = ", ".join([*filter(None, source), f"captions {short(digest)}"])
     path = output / TABLE
-    write_texts(table, path, manifest.digest, source)
+    write_texts(table, path, source)
     write_json(output / RECORD, record)
     return Captions(table, record, path, problems, _notes(manifest, units, made))
 

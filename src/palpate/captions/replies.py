@@ -14,12 +14,12 @@ last line without its end was cut by a kill or a full disk and is dropped.
 
 from __future__ import annotations
 
-import fcntl
 import json
+import os
 import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import BinaryIO, Protocol
 
 from palpate.captions.prompts import Prompt
 from palpate.core import PalpateError
@@ -137,42 +137,40 @@ def read_replies(path: Path) -> tuple[dict[str, Reply], int]:
 
 
 class ReplyLog:
-    """The replies of an output folder, by key; one run at a time writes to it.
+    """The replies of an output folder, by key. The file begins with the first reply.
+
+    Attributes:
+        replies: by key.
+        appended: how many were added.
 
     Raises:
-        PalpateError: if the file is another program's, or another run writes to it.
+        PalpateError: if the file is another program's.
     """
 
     def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = open(path, "ab")  # noqa: SIM115 (closed by close)
-        self._lock = threading.Lock()
+        self.replies, end = read_replies(path)
         self.appended = 0
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self.replies, end = read_replies(path)
-            self._file.truncate(end)
-        except BlockingIOError:
-            self._file.close()
-            must, got = f"{path.parent} must not be written by another run", "one that goes on now"
-            fix = "Wait for it, or choose another folder"
-            raise PalpateError(must, got, fix) from None
-        except PalpateError:
-            self._file.close()
-            raise
+        self._path, self._lock, self._open = path, threading.Lock(), True
+        self._file: BinaryIO | None = None
+        if path.exists() and path.stat().st_size > end:
+            os.truncate(path, end)
 
     def append(self, key: str, sample: str, prompt: str, reply: Reply) -> None:
         """Keep a reply, on disk before anything else happens; does nothing once closed."""
         row = {"key": key, "id": sample, "prompt": prompt, **asdict(reply)}
         line = json.dumps(row, ensure_ascii=False).encode("utf-8", "replace") + b"\n"
         with self._lock:
-            if not self._file.closed:
-                self._file.write(line)
-                self._file.flush()
-                self.replies[key] = reply
-                self.appended += 1
+            if not self._open:
+                return
+            self._file = self._file or open(self._path, "ab")  # noqa: SIM115 (closed by close)
+            self._file.write(line)
+            self._file.flush()
+            self.replies[key] = reply
+            self.appended += 1
 
     def close(self) -> None:
-        """End writing; the lock is free again."""
+        """End writing."""
         with self._lock:
-            self._file.close()
+            self._open = False
+            if self._file is not None:
+                self._file.close()

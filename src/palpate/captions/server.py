@@ -27,13 +27,8 @@ KEY_VARIABLE = "PALPATE_CAPTION_KEY"
 LONGEST_PAUSE = 60.0
 #: Longest wait that a server may ask for, in seconds.
 LONGEST_WAIT = 600.0
-NEXT = "Check that it runs and its address, then run the same command again"
 #: Statuses after which the same request may well succeed.
 BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)
-
-
-class GoneError(PalpateError):
-    """The server stopped answering."""
 
 
 class Server:
@@ -97,13 +92,15 @@ class Server:
         try:
             choice = answer["choices"][0]
             message, usage = choice["message"], answer.get("usage") or {}
-            tokens = (int(usage.get("prompt_tokens") or 0), int(usage.get("completion_tokens") or 0))
+            refusal, finish = message.get("refusal"), str(choice.get("finish_reason") or "stop")
+            names = ("prompt_tokens", "completion_tokens")
+            inward, outward = (int(usage.get(name) or 0) for name in names)
             return Reply(
-                raw=_text_of(message.get("content")) or str(message.get("refusal") or ""),
+                raw=_text_of(message.get("content")) or str(refusal or ""),
                 model=str(answer.get("model") or self.model),
-                refused=bool(message.get("refusal")) or choice.get("finish_reason") == "content_filter",
-                finish=str(choice.get("finish_reason") or "stop"),
-                tokens=tokens,
+                refused=bool(refusal) or finish == "content_filter",
+                finish=finish,
+                tokens=(inward, outward),
                 seconds=round(time.perf_counter() - start, 3),
                 fingerprint=answer.get("system_fingerprint"),
             )
@@ -112,10 +109,9 @@ class Server:
             raise RejectedError(f"the reply is no chat completion ({got})") from None
 
     def _payload(self, request: Request) -> dict[str, Any]:
-        images = [
-            {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{base64.b64encode(image).decode()}"}}
-            for image in request.images
-        ]
+        data = [base64.b64encode(image).decode() for image in request.images]
+        urls = [{"url": f"data:image/jpeg;base64,{text}"} for text in data]
+        images = [{"type": "image_url", "image_url": url} for url in urls]
         content = [{"type": "text", "text": request.text}, *images]
         schema = {"name": "description", "schema": request.prompt.schema, "strict": True}
         body: dict[str, Any] = {
@@ -132,8 +128,8 @@ class Server:
         """The JSON of the reply, after as many tries as it takes.
 
         Raises:
-            GoneError: if the server does not answer any more.
-            RejectedError, PalpateError: as :meth:`describe`.
+            RejectedError: if the server does not take this request.
+            PalpateError: if it does not answer any more, or takes no request.
         """
         reason, wait = "", 0.0
         for k in range(self._tries):
@@ -161,7 +157,13 @@ class Server:
                 return json.loads(text)
             except ValueError:
                 reason = f"no JSON: {text[:80]!r}"
-        raise GoneError("must be a server that answers", f"{self.url}: {reason}", NEXT, argument="server")
+        raise self._gone(reason)
+
+    def _gone(self, reason: str) -> PalpateError:
+        """Nobody is there any more, or was."""
+        must, got = "must be a server that answers", f"{self.url}: {reason}"
+        fix = "Check its address and that it runs, then run the same command again"
+        return PalpateError(must, got, fix, argument="server")
 
     def _refusal(self, status: int, text: str) -> Exception:
         """What a status other than 200 means."""
@@ -173,8 +175,8 @@ class Server:
             return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
         if status == 404:
             if models := self._models():
-                fix = f"It has {_few(models)}"
-                return PalpateError(f"must be a model of {self.url}", self.model, fix, argument="model")
+                must, fix = f"must be a model of {self.url}", f"It has {_few(models)}"
+                return PalpateError(must, self.model, fix, argument="model")
             must, fix = "must be an OpenAI-compatible API", "Give its base: http://HOST:PORT/v1"
             return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
         if 300 <= status < 400:
@@ -199,8 +201,7 @@ class Server:
         try:
             response = self._client.get(f"{self.url}/models")
         except self._errors as error:
-            must, got = "must be a server that answers", f"{self.url}: {self._reason(error)}"
-            raise GoneError(must, got, NEXT, argument="server") from None
+            raise self._gone(self._reason(error)) from None
         if response.status_code in (401, 403):
             raise self._refusal(response.status_code, self._scrubbed(response.text))
         models = self._models()

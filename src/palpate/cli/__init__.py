@@ -71,7 +71,8 @@ def _run(args: list[str]) -> int:
     if " ".join(args[:2]) in VERBS:
         args = [" ".join(args[:2]), *args[2:]]
     group = f"{args[0]} "
-    if any(name.startswith(group) for name in VERBS) and args[1:] in ([], ["-h"], ["--help"]):
+    grouped = args[0] not in VERBS and any(name.startswith(group) for name in VERBS)
+    if grouped and args[1:] in ([], ["-h"], ["--help"]):
         sys.stdout.write(usage(group))
         return OK if args[1:] else USER_ERROR
     from palpate.cli.terminal import run_verb

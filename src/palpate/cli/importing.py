@@ -132,6 +132,9 @@ class Options(SourceOptions):
     """Skip and list bad rows and files, instead of an error."""
     overwrite: Switch = False
     """Replace the manifest of an earlier import."""
+    text: Path | None = None
+    """Join texts by id: the folder of palpate caption, or a table with the columns id and text. The
+    source may then also be an import."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -146,6 +149,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
             check=options.check,
             skip_bad=options.skip_bad,
             overwrite=options.overwrite,
+            text=options.text,
             progress=progress,
             **format_options(options),
         )

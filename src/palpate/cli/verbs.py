@@ -37,6 +37,16 @@ VERBS: dict[str, Verb] = {
         "Write a manifest as a Hugging Face data set or a table",
         "palpate export tag/ --to hf -o tag_hf/",
     ),
+    "caption": Verb(
+        "caption",
+        "Describe what each touch feels like, by a vision-language model",
+        "palpate caption tag/ -o captions/ --server http://localhost:8000/v1",
+    ),
+    "caption check": Verb(
+        "caption_check",
+        "Check captions: labels in the text, refusals, words that no finger feels",
+        "palpate caption check captions/ --data tag/ --split noleak.json",
+    ),
     "audit": Verb(
         "audit",
         "Check whether a train/test split leaks",

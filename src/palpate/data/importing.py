@@ -12,9 +12,10 @@ from palpate.data.formats import FORMATS, Format
 from palpate.data.formats.base import MISSING, WORLD, finished, import_scanned, world_facts
 from palpate.data.formats.videos import is_templated
 from palpate.data.images import Check
-from palpate.data.imported import Imported, Validation
+from palpate.data.imported import Imported, Validation, removing_on_error
 from palpate.data.listing import write_table
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
+from palpate.data.texts import has_manifest, read_texts, reimported, with_texts
 
 #: All that an import writes.
 WRITTEN = {"manifest.parquet", "splits", "images"}
@@ -28,6 +29,7 @@ def import_dataset(
     skip_bad: bool = False,
     overwrite: bool = False,
     check: Check = "decode",
+    text: Path | str | None = None,
     progress: Progress = quiet,
     **options: Any,
 ) -> Imported:
@@ -40,6 +42,8 @@ def import_dataset(
         skip_bad: skip and list bad rows instead of raising.
         overwrite: replace the manifest of an earlier import.
         check: how images are checked.
+        text: table of texts by sample id, or the folder of captions, to join; the source may then
+            be an import as well.
         progress: progress callback.
         options: options of the format (``columns``, ``root``, ``size`` ...); None means the
             default.
@@ -50,8 +54,6 @@ def import_dataset(
         ProblemsError: with every bad row and file at once; nothing is left behind.
     """
     source, output = Path(source), Path(output)
-    name, form = recognized(source, format, options)
-    options = _given(name, form, options)
     foreign = {p.name for p in output.iterdir()} - WRITTEN if output.is_dir() else set[str]()
     if foreign:
         must = "must be a folder that is new, empty, or an earlier import"
@@ -62,12 +64,29 @@ def import_dataset(
         example = {"overwrite": True}
         raise PalpateError(must, str(output), fix, argument="output", example=example)
     common: dict[str, Any] = {"skip_bad": skip_bad, "check": check, "progress": progress}
-    with locked(output):
-        if form.run is not None:
-            return form.run(source, output, **common, **options)
-        scan = form.scan(source, progress=progress, **options)
-        facts = {**form.facts.of_manifest(), "format": name}
-        return import_scanned(scan, source, output, facts, **common)
+    texts = None if text is None else read_texts(Path(text))
+    with locked(output), removing_on_error(output) as created:
+        if text is None or texts is None:
+            return _imported(source, output, format, common, options)
+        if format == "auto" and has_manifest(source):
+            imported = reimported(source)
+        else:
+            imported = _imported(source, output, format, common, options)
+            written = [output / "manifest.parquet", *(output / "splits").glob("*.json")]
+            created += [] if overwrite else written
+        return with_texts(imported, texts, Path(text)).save(output, created)
+
+
+def _imported(
+    source: Path, output: Path, given: str, common: dict[str, Any], options: dict[str, Any]
+) -> Imported:
+    name, form = recognized(source, given, options)
+    options = _given(name, form, options)
+    if form.run is not None:
+        return form.run(source, output, **common, **options)
+    scan = form.scan(source, progress=common["progress"], **options)
+    facts = {**form.facts.of_manifest(), "format": name}
+    return import_scanned(scan, source, output, facts, **common)
 
 
 def validate(

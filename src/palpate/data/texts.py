@@ -27,13 +27,11 @@ class Texts:
         of: id -> text, only where there is one.
         ids: all ids of the table.
         source: where they come from, with a digest: kept in manifests and in models.
-        manifest: digest of the manifest that they were made for, if the table says so.
     """
 
     of: dict[str, str]
     ids: frozenset[str]
     source: str
-    manifest: str | None
 
 
 def texts_digest(table: pl.DataFrame) -> str:
@@ -42,10 +40,9 @@ def texts_digest(table: pl.DataFrame) -> str:
     return digest_lines(f"{name}\t{text}" for name, text in pairs)
 
 
-def write_texts(table: pl.DataFrame, path: Path, manifest: str, source: str) -> None:
-    """Write a table of texts, with the digest of its manifest and where the texts come from."""
-    facts = {"format": TEXTS_FORMAT, "digest": texts_digest(table)}
-    facts |= {"manifest": manifest, "source": source}
+def write_texts(table: pl.DataFrame, path: Path, source: str) -> None:
+    """Write a table of texts, with where they come from."""
+    facts = {"format": TEXTS_FORMAT, "digest": texts_digest(table), "source": source}
     write_parquet(table, path, {f"palpate.{name}": value for name, value in facts.items()})
 
 
@@ -76,37 +73,54 @@ def read_texts(path: Path) -> Texts:
         with open(path, "rb") as file:
             metadata = pl.read_parquet_metadata(file)
     source = metadata.get("palpate.source") or f"{path.name}, captions {short(texts_digest(rows))}"
-    return Texts(texts, frozenset(pairs), source, metadata.get("palpate.manifest"))
+    return Texts(texts, frozenset(pairs), source)
 
 
-def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
-    """The same samples with texts from a table; samples without one there keep theirs.
+def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) -> Manifest:
+    """The same samples with texts from a table.
+
+    Args:
+        manifest: the samples.
+        texts: by id.
+        where: the table, for the error.
+        keep: samples without a text there keep theirs.
 
     Raises:
-        PalpateError: if the table has a text for none of the samples.
+        PalpateError: if the table has none of the samples.
     """
-    manifest = imported.manifest
-    old, ids = manifest.column("text"), manifest.ids
-    new = [texts.of.get(name, text) for name, text in zip(ids, old, strict=True)]
-    absent = [name for name in ids if name not in texts.of]
-    if len(absent) == len(ids):
+    ids = manifest.ids
+    if texts.ids.isdisjoint(ids):
         got = f"{where}, with ids as {min(texts.ids, default='')!r} instead of {ids[0]!r}"
         must, fix = "must be texts of these samples", "Use the texts made for this data set"
         raise PalpateError(must, got, fix, argument="text")
+    old = manifest.column("text") if keep else [None] * len(ids)
+    new = [texts.of.get(name, text) for name, text in zip(ids, old, strict=True)]
+    table = manifest.table.with_columns(text=pl.Series(new, dtype=pl.String))
+    return replace(manifest, table=table, facts={**manifest.facts, "text_source": texts.source})
+
+
+def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
+    """An import with texts from a table; samples without one there keep theirs.
+
+    Raises:
+        PalpateError: if the table has none of the samples.
+    """
+    manifest = joined(imported.manifest, texts, where)
     suspicious = list(imported.suspicious)
-    if absent:
-        text = f"{len(absent)} of {len(ids)} samples have no text there, first {absent[0]!r}"
+    if absent := [name for name in manifest.ids if name not in texts.of]:
+        text = f"{len(absent)} of {len(manifest)} samples have no text there, first {absent[0]!r}"
         suspicious.append(Problem(str(where), "no-text", text))
-    facts = {**manifest.facts, "text_source": texts.source}
-    joined = Manifest(
-        manifest.table.with_columns(text=pl.Series(new, dtype=pl.String)), manifest.root, facts
-    )
-    splits = {name: replace(s, manifest=joined.digest) for name, s in imported.splits.items()}
-    return replace(imported, manifest=joined, splits=splits, suspicious=suspicious)
+    splits = {name: replace(s, manifest=manifest.digest) for name, s in imported.splits.items()}
+    return replace(imported, manifest=manifest, splits=splits, suspicious=suspicious)
 
 
-def reimported(folder: Path) -> Imported:
+def has_manifest(source: Path) -> bool:
+    """Whether a source is an import: a manifest, or the folder that holds one."""
+    return source.name == "manifest.parquet" or (source / "manifest.parquet").is_file()
+
+
+def reimported(source: Path) -> Imported:
     """An import that is there already, with its splits."""
-    folder = folder if folder.is_dir() else folder.parent
+    folder = source if source.is_dir() else source.parent
     splits = {path.stem: Split.load(path) for path in sorted((folder / "splits").glob("*.json"))}
     return Imported(Manifest.load(folder), splits=splits)

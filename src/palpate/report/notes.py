@@ -545,6 +545,34 @@ def _stand_in(style: Style) -> str:
     )
 
 
+CAPTIONS: dict[str, Sentence] = {
+    "captions-alone": (
+        "{count} of {of} samples have no {per}: each is described, and counted, by itself"
+    ),
+    "captions-code": (
+        "Without any name of a material the text still names the material in {accuracy:.0%} of new "
+        "videos: it is a code of the label, and scores that use it (CI- and D-TMMD, material "
+        "accuracy) reward copying it"
+    ),
+    "captions-common": "{count} captions have one text: {text!r}",
+    "captions-few": (
+        "Whether the text gives the material away was not measured: that needs ten videos and two "
+        "materials, got {groups} and {materials}"
+    ),
+    "captions-no-labels": "The samples have no materials: labels in the text were not looked for",
+    "captions-of-columns": (
+        "Captions were filled from columns ({template}): they say no more than these do, and "
+        "scores that use them measure the label"
+    ),
+    "captions-other-model": lambda p, _: (
+        f"The server answered as {few(p['models'])}, not as {p['model']}"
+    ),
+    "captions-words": lambda p, _: (
+        "Most often: " + ", ".join(f"{word} {count}" for word, count in p["words"].items())
+    ),
+}
+
+
 OTHER: dict[str, Sentence] = {
     "synthetic-data": (
         "The data are synthetic: palpate's procedural world. It shows mechanisms (leaks, guidance, "
@@ -593,7 +621,7 @@ OTHER: dict[str, Sentence] = {
         "audits say of leaks does not apply to them"
     ),
 }
-SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | OTHER
+SENTENCES: dict[str, Sentence] = METRICS | LEAKAGE | EVALUATION | CAPTIONS | OTHER
 
 
 def sentence(note: Note, style: Style = PYTHON) -> str:

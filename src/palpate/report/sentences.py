@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from palpate.core import Score
 from palpate.report.notes import count, number, percent, plural, question, score_text
 from palpate.report.results import Audit, Results, Signal
-from palpate.report.tables import Table, score_tables
+from palpate.report.tables import Table, family_of, score_tables
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
 #: is compared with), and the sentence about a share of the test samples. The first match wins.
@@ -179,7 +179,9 @@ def audit_line(audit: Audit) -> str:
 def purpose(results: Results) -> str:
     """Return one sentence that says what the page is."""
     parts: list[str] = []
-    if results.gallery or results.scores:
+    if any(family_of(score.metric).title == "Captions" for score in results.scores):
+        parts.append("what captions give away about their labels, and whether they can be used")
+    elif results.gallery or results.scores:
         parts.append("how close tactile images generated from photos come to real ones")
     if results.audits:
         parts.append("whether the split behind the numbers leaks from train into test")

@@ -50,6 +50,18 @@ FAMILIES = (
         ("contact ", "ssim", "psnr", "lpips", "l1", "mse"),
     ),
     Family(
+        "Captions",
+        "Can they be used, and do they name what they should only describe? Those of a contact "
+        "count once.",
+        ("share of captions",),
+    ),
+    Family(
+        "Material from captions",
+        "How often is the material predicted from the text alone, on new videos? Text that only "
+        "describes lies between the commonest material and 1.",
+        ("from the text",),
+    ),
+    Family(
         "Recognition",
         "What can be read from the image: its material, or the text and photo that belong to it?",
         ("acc", "top", "retriev", "probe", "@"),

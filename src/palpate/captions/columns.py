@@ -10,9 +10,7 @@ from palpate.data.captions import caption
 from palpate.data.manifest import SCHEMA, Manifest
 
 
-def template_texts(
-    template: str, manifest: Manifest, units: Units, seed: int
-) -> list[str | None]:
+def template_texts(template: str, manifest: Manifest, units: Units, seed: int) -> list[str | None]:
     """Fill a template for every unit, from its first sample.
 
     Args:

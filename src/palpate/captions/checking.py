@@ -1,0 +1,239 @@
+"""Do captions give labels away, and can they be used?
+
+Shares of captions, each caption of a contact counted once: those that name their label (with
+inflections and synonyms) or any material, with words that no finger feels, with digits, refusals,
+empty, overlong, the commonest text, and test captions that train has word for word. And how well
+the material is predicted from the text alone on new videos: a bag of words, logistic regression,
+five folds over whole videos, with and without the names of materials.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from palpate.captions.prompts import REFUSAL
+from palpate.captions.reading import read_captions
+from palpate.captions.vocabulary import Vocabulary, visual_in, words_of
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split, quiet, rng_for
+from palpate.data.manifest import Manifest
+from palpate.metrics.probe import fit_probe, mean_over_groups
+from palpate.report.results import Results
+
+#: Words from which a caption is overlong.
+LONGEST = 40
+#: Share of captions with one text from which that is worth a note, and accuracy without names from
+#: which the text is a code of the label.
+COMMON, CODE = 0.05, 0.9
+FOLDS, PENALTY, WORDS = 5, 1e-2, 500
+EXAMPLES, SHOWN_WORDS = 5, 12
+SHARE, FLAGGED, NAMING = "share of captions", "flagged", "naming a material"
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Captions, one a contact and text.
+
+    Attributes:
+        ids, texts, labels, groups: of each; ``""`` for no text or label.
+        parts: part of the split, ``""`` without one.
+        refused: marked as a refusal when they were made.
+    """
+
+    ids: list[str]
+    texts: list[str]
+    labels: list[str]
+    groups: list[str]
+    parts: list[str]
+    refused: list[bool]
+
+
+def check_captions(
+    captions: Any,
+    data: Any = None,
+    *,
+    split: Split | str | Path | None = None,
+    seed: int = 0,
+    progress: Progress = quiet,
+    **options: Any,
+) -> Results:
+    """Check captions for labels in them, and for what makes them useless.
+
+    Args:
+        captions: folder of :func:`palpate.caption` or a table with ``id`` and ``text``; without
+            ``data`` also a manifest with texts, or anything that :func:`palpate.load` reads.
+        data: the samples: their materials, videos and contacts.
+        split: also look for texts that train and test share.
+        seed: of the folds.
+        progress: progress callback.
+        options: options of a table without ``data``, e.g. ``columns``.
+
+    Returns:
+        Scores: shares of captions, and accuracies of the material from the text alone. The share
+        ``flagged`` is of those that name their label, have visual words or digits, are a refusal,
+        empty or overlong.
+
+    Raises:
+        PalpateError: if there are no captions, or they are of other samples.
+    """
+    manifest, table = read_captions(captions, data, **options)
+    flags = dict(table.select("id", "flags").iter_rows())
+    split = Split.load(split) if isinstance(split, str | Path) else split
+    rows = _rows(manifest, flags, split)
+    vocabulary = Vocabulary(sorted(set(rows.labels) - {""}))
+    scores, notes = _shares(rows, vocabulary), list[Note]()
+    if split is not None:
+        scores.append(_shared(rows))
+    if not any(rows.labels):
+        notes.append(Note("captions-no-labels"))
+    else:
+        accuracies, notes = _accuracies(rows, vocabulary, seed, progress)
+        scores += accuracies
+    digests = {"manifest": manifest.digest} | ({"split": split.digest} if split else {})
+    return Results(
+        title="Check of captions",
+        scores=scores,
+        notes=notes,
+        settings={
+            "digests": digests,
+            "text source": manifest.facts.get("text_source", "unknown"),
+            "options": {"seed": seed, "folds": FOLDS, "words": WORDS, "penalty": PENALTY},
+        },
+    )
+
+
+def _rows(manifest: Manifest, flags: dict[str, list[str]], split: Split | None) -> _Rows:
+    table = manifest.table.with_columns(
+        unit=pl.coalesce(pl.col("contact"), pl.col("id")),
+        group=pl.coalesce(*(pl.col(c) for c in ("video", "session", "object", "contact", "id"))),
+        text=pl.col("text").fill_null("").str.strip_chars(),
+        material=pl.col("material").fill_null(""),
+    ).unique(["unit", "text"], keep="first", maintain_order=True)
+    ids = table["id"].to_list()
+    return _Rows(
+        ids,
+        table["text"].to_list(),
+        table["material"].to_list(),
+        table["group"].to_list(),
+        ["" if split is None else split.parts.get(name, "") for name in ids],
+        ["refusal" in flags.get(name, ()) for name in ids],
+    )
+
+
+def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
+    """Shares of captions that have something wrong; the union of most comes first."""
+    kinds: dict[str, Callable[[str], Sequence[str]]] = {
+        NAMING: vocabulary.naming,
+        "visual words": visual_in,
+        "digits": lambda text: [c for c in text if c.isdigit()],
+        "refusals": lambda text: ["refusal"] if REFUSAL.search(text) else [],
+        "empty": lambda text: [] if text else ["empty"],
+        f"over {LONGEST} words": lambda text: ["long"] * (len(words_of(text)) > LONGEST),
+    }
+    hits = {name: [function(text) for text in rows.texts] for name, function in kinds.items()}
+    named = zip(rows.texts, rows.labels, strict=True)
+    label = [vocabulary.naming(text, name) if name else [] for text, name in named]
+    hits = {"naming their label": label} | hits if any(rows.labels) else hits
+    told = zip(hits["refusals"], rows.refused, strict=True)
+    hits["refusals"] = [words or ["refusal"] * refused for words, refused in told]
+    counted = [words for name, words in hits.items() if name != NAMING]
+    flagged = [[word for words in row for word in words] for row in zip(*counted, strict=True)]
+    scores = [_share(name, words, rows) for name, words in {FLAGGED: flagged, **hits}.items()]
+    text, count = Counter(rows.texts).most_common(1)[0]
+    common = _share("the commonest text", [[t] * (t == text) for t in rows.texts], rows)
+    if count > COMMON * len(rows.texts) and text:
+        common = replace(common, notes=[Note("captions-common", {"text": text, "count": count})])
+    return [*scores, common]
+
+
+def _share(name: str, words: Sequence[Sequence[str]], rows: _Rows) -> Score:
+    """The share of captions with words of a kind, those words, and examples."""
+    hits = np.array([bool(row) for row in words])
+    score = mean_over_groups(SHARE, hits, rows.groups, estimator="mean", subject=name)
+    counts = Counter(word for row in words for word in set(row))
+    listed = dict(counts.most_common(SHOWN_WORDS))
+    where = [k for k in np.flatnonzero(hits)[:EXAMPLES] if rows.texts[k]]
+    details = {"words": listed, "examples": {rows.ids[k]: rows.texts[k] for k in where}}
+    spoken = name.startswith(("naming", "visual"))
+    notes = [Note("captions-words", {"words": listed})] if spoken and listed else []
+    return replace(score, higher_is_better=False, details=details, notes=notes)
+
+
+def _shared(rows: _Rows) -> Score:
+    """The share of test captions that train has word for word."""
+    parts = zip(rows.parts, rows.texts, strict=True)
+    train = {text.lower() for part, text in parts if part == "train" and text}
+    test = [k for k, part in enumerate(rows.parts) if part == "test"]
+    if not train or not test:
+        must, got = "must have captions in train and test", f"{len(train)} and {len(test)}"
+        raise PalpateError(must, got, "Use the split of these samples", argument="split")
+    columns = (rows.ids, rows.texts, rows.labels, rows.groups, rows.parts, rows.refused)
+    part = _Rows(*([column[k] for k in test] for column in columns))  # type: ignore[arg-type]
+    words = [[text] * (text.lower() in train) for text in part.texts]
+    return _share("test captions that train has", words, part)
+
+
+def _accuracies(
+    rows: _Rows, vocabulary: Vocabulary, seed: int, progress: Progress
+) -> tuple[list[Score], list[Note]]:
+    """Material accuracy from the text alone on new groups, without names, and of the majority."""
+    keep = [k for k, label in enumerate(rows.labels) if label and rows.texts[k]]
+    labels, groups = ([column[k] for k in keep] for column in (rows.labels, rows.groups))
+    names, number = np.unique(np.array(groups), return_inverse=True)
+    if len(names) < 2 * FOLDS or len(set(labels)) < 2:
+        few = Note("captions-few", {"groups": len(names), "materials": len(set(labels))})
+        return [], [few]
+    fold = np.argsort(rng_for(seed, "caption folds").permutation(len(names)))[number] % FOLDS
+    texts = {
+        "text": [rows.texts[k] for k in keep],
+        "text without names of materials": [vocabulary.masked(rows.texts[k]) for k in keep],
+    }
+    hits: dict[str, NDArray[np.bool_]] = {}
+    for done, (subject, lines) in enumerate(texts.items()):
+        progress("predicting materials from texts", done, len(texts))
+        hits[subject] = _predicted(lines, labels, groups, fold) == np.array(labels)
+    progress("predicting materials from texts", len(texts), len(texts))
+    hits["commonest material"] = _majority(labels, fold) == np.array(labels)
+    settings = {"words": WORDS, "penalty": PENALTY, "folds": FOLDS}
+    common: dict[str, Any] = {"estimator": "mean", "settings": settings, "seed": seed}
+    metric = "material accuracy from the text"
+    scores = [mean_over_groups(metric, h, groups, subject=s, **common) for s, h in hits.items()]
+    scores = [replace(score, higher_is_better=False) for score in scores]
+    bare = scores[1].value or 0.0
+    notes = [Note("captions-code", {"accuracy": bare})] if bare > CODE else []
+    return [replace(scores[0], notes=notes), *scores[1:]], []
+
+
+def _predicted(
+    texts: Sequence[str], labels: Sequence[str], groups: Sequence[str], fold: NDArray[np.intp]
+) -> NDArray[Any]:
+    """Materials predicted by a bag of words fitted to the other folds: (n,)."""
+    bags = [set(words_of(text)) for text in texts]
+    predicted = np.empty(len(texts), dtype=object)
+    for k in range(FOLDS):
+        train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
+        counts = Counter(word for row in train for word in bags[row])
+        words = [word for word, count in counts.most_common(WORDS) if count > 1]
+        column = {word: c for c, word in enumerate(words)}
+        features = np.zeros((len(texts), len(words) + 1))
+        for row, bag in enumerate(bags):
+            features[row, [column[word] for word in bag if word in column]] = 1
+        names = [str(row) for row in train]
+        rows = [[items[row] for row in train] for items in (labels, groups)]
+        probe = fit_probe(FeatureSet(names, features[train], *rows), l2=PENALTY)
+        predicted[test] = probe.predict(features[test])
+    return predicted
+
+
+def _majority(labels: Sequence[str], fold: NDArray[np.intp]) -> NDArray[Any]:
+    """The commonest material of the other folds: (n,)."""
+    names = np.array(labels)
+    common = [Counter(names[fold != k].tolist()).most_common(1)[0][0] for k in range(FOLDS)]
+    return np.array(common)[fold]

@@ -1,0 +1,54 @@
+"""Captions to check or to mask: what ``palpate caption`` wrote, or any samples that have texts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from palpate.core import PalpateError
+from palpate.data.manifest import Manifest
+from palpate.data.reading import load
+from palpate.data.texts import TABLE, joined, read_texts
+
+#: Columns of a table of captions.
+SCHEMA = {"id": pl.String(), "text": pl.String()}
+SCHEMA |= dict.fromkeys(("adjectives", "flags"), pl.List(pl.String))
+
+
+def read_captions(captions: Any, data: Any = None, **options: Any) -> tuple[Manifest, pl.DataFrame]:
+    """Read captions.
+
+    Args:
+        captions: folder of captions or a table with ``id`` and ``text``; without ``data`` also
+            anything that :func:`palpate.load` reads.
+        data: the samples.
+        options: options of a table without ``data``.
+
+    Returns:
+        The samples with their captions as texts, and the captions with the columns of ``SCHEMA``.
+
+    Raises:
+        PalpateError: if there are none, or they are of other samples.
+    """
+    if isinstance(captions, str | Path):
+        captions = Path(captions)
+        captions = captions / TABLE if (captions / TABLE).is_file() else captions
+    if data is None:
+        manifest = load(captions, images=False, **options)
+    elif isinstance(captions, Path):
+        manifest = joined(load(data), read_texts(captions), captions, keep=False)
+    else:
+        must = "must be a folder or a table next to samples"
+        raise PalpateError(must, type(captions).__name__, "", argument="captions")
+    if not manifest.table["text"].count():
+        must, fix = "must hold captions", "Map the column text, or caption the samples first"
+        raise PalpateError(must, f"{captions} without any text", fix, argument="captions")
+    if isinstance(captions, Path) and captions.suffix == ".parquet":
+        table = pl.read_parquet(captions, glob=False)
+        if table.schema == pl.Schema(SCHEMA):
+            return manifest, table
+    empty = pl.lit([], SCHEMA["flags"])
+    lists = dict.fromkeys(("adjectives", "flags"), empty)
+    return manifest, manifest.table.select("id", "text").with_columns(**lists)

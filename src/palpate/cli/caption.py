@@ -1,0 +1,126 @@
+"""``palpate caption``: what each touch feels like, in words."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from palpate.cli.terminal import FAILED_CHECK, Common, OutPath, Switch, Terminal, error_line
+from palpate.core import PalpateError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where captions come from: one of --server, --local and --template."""
+
+    server: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
+    """Base URL of an OpenAI-compatible API, e.g. http://localhost:8000/v1."""
+    model: str | None = None
+    """Its model (default: the only one that it has)."""
+    local: Annotated[str | None, tyro.conf.arg(metavar="FOLDER_OR_ID")] = None
+    """A model of transformers for this process: its folder, or its id on the hub."""
+    template: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[TEXT]")] = None
+    """No model: columns in braces (`"{material} of {object}"`), or adjectives of the material."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asking:
+    """What a model is asked, and how."""
+
+    prompt: Annotated[str, tyro.conf.arg(metavar="NAME_OR_FILE")] = "touch-adjectives/1"
+    """`touch-adjectives/1`, `touch-sentence/1`, or a prompt file."""
+    per: Literal["contact", "frame", "object"] = "contact"
+    """What has a description of its own; that of its middle frame is copied to the others."""
+    crop: Annotated[
+        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="LEFT TOP RIGHT BOTTOM")
+    ] = None
+    """Also send this part of the photo, where the sensor touches; from 0 to 1."""
+    concurrency: int = 8
+    """Requests at once."""
+    timeout: float = 120.0
+    """Longest silence of the server, in seconds."""
+    max_tokens: int = 300
+    """Longest reply."""
+    seed: int = 0
+    """Of the model's sampling, and of templates."""
+    body: Annotated[str | None, tyro.conf.arg(metavar="JSON")] = None
+    """Further fields of every request, as a JSON object; null removes a field."""
+    key_variable: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Environment variable that holds the server's key (default: PALPATE_CAPTION_KEY, if set)."""
+    again: Switch = False
+    """Ask again where the reply was a refusal or could not be used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common):
+    """Describe what each touch feels like, by a vision-language model, once a contact.
+
+    Writes captions.parquet (id, text, adjectives, flags), record.json and every reply. Stopped at
+    any moment, the same command goes on. The exit status is 1 if photos are left without a
+    reply. Then: palpate caption check, palpate import --text.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """A manifest, the folder of an import, or anything that palpate reads."""
+    output: OutPath
+    """Folder to write."""
+    source: Source = field(default_factory=Source)
+    asking: Asking = field(default_factory=Asking)
+    dry_run: Switch = False
+    """Send no photo; print requests, tokens, time and price."""
+    prices: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="IN OUT")] = None
+    """With --dry-run: prices of a million tokens in and out."""
+
+
+def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
+    """Caption and print what was written, or the estimate."""
+    from palpate.captions import Captions, StoppedError, caption
+
+    template = options.source.template
+    arguments = vars(options.source) | vars(options.asking)
+    arguments["body"] = _object(options.asking.body)
+    arguments["template"] = None if template is None else " ".join(template)
+    try:
+        with terminal.progress() as progress:
+            result = caption(
+                options.data,
+                options.output,
+                dry_run=options.dry_run,
+                prices=options.prices,
+                progress=progress,
+                **arguments,
+            )
+    except StoppedError as stop:
+        terminal.print_line(f"palpate caption: {error_line('caption', stop)}")
+        return stop.to_json(), FAILED_CHECK
+    terminal.print(str(result))
+    if not isinstance(result, Captions):
+        return result.to_json(), 0
+    for note in result.notes:
+        terminal.note(note)
+    for command in (
+        f"palpate caption check {options.output} --data {options.data}",
+        f"palpate import {options.data} --text {options.output} -o FOLDER",
+    ):
+        terminal.print_line(f"Next: {command}")
+    return result.to_json(), FAILED_CHECK if result.problems else 0
+
+
+def _object(text: str | None) -> dict[str, Any] | None:
+    """The JSON object of an option.
+
+    Raises:
+        PalpateError: if it is none.
+    """
+    try:
+        value = None if text is None else json.loads(text)
+    except ValueError:
+        value = text
+    if value is not None and not isinstance(value, dict):
+        must, example = "must be a JSON object", {"body": '{"temperature": null}'}
+        raise PalpateError(must, str(text), "", argument="body", example=example)
+    return value

@@ -1,0 +1,78 @@
+"""``palpate caption check``: do captions give labels away, and can they be used?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from palpate.cli.importing import Maps, columns_of
+from palpate.cli.terminal import FAILED_CHECK, Common, OptionalOutPath, Terminal, guard_output
+from palpate.core import PalpateError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Common):
+    """Check captions: labels in the text, material read from the text alone on new videos, text
+    that train and test share, refusals, empty and overlong text, one text for many contacts, and
+    words of color and shape that no finger feels.
+    """
+
+    captions: Annotated[Path, tyro.conf.Positional]
+    """Folder of palpate caption, a table with the columns id and text, or without --data also
+    samples with texts."""
+    data: Path | None = None
+    """The samples: their materials, videos and contacts."""
+    split: Path | None = None
+    """Split file: also look for texts that train and test share."""
+    columns: Maps = ()
+    """Columns of a table without --data: `--map text=label id=tactile_fp`."""
+    fail_over: float | None = None
+    """Exit with status 1 if more than this share of the captions is flagged: names its label, has
+    visual words or digits, is a refusal, empty or overlong."""
+    mask: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Also write a new version of the captions without the names of materials."""
+    output: OptionalOutPath = None
+    """Write the scores as JSON, for `palpate report`."""
+    page: Path | None = None
+    """Write them as one self-contained page (.html)."""
+    seed: int = 0
+    """Of the folds."""
+
+
+def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
+    """Check, print the table, write."""
+    from palpate.captions import check_captions, mask_captions
+    from palpate.captions.checking import FLAGGED, SHARE
+
+    limit = options.fail_over
+    if limit is not None and not 0 <= limit <= 1:
+        raise PalpateError("must lie in [0, 1]", str(limit), "", argument="fail_over")
+    for path in filter(None, (options.output, options.page)):
+        guard_output(path, [options.captions], (b'"format": "palpate-', b"palpate"))
+    extra = {"columns": columns} if (columns := columns_of(options.columns)) else {}
+    with terminal.progress() as progress:
+        results = check_captions(
+            options.captions,
+            options.data,
+            split=options.split,
+            seed=options.seed,
+            progress=progress,
+            **extra,
+        )
+    results = replace(results, commands=[terminal.command])
+    terminal.show(results)
+    if options.output:
+        results.save(options.output)
+    if options.page:
+        results.to_html(options.page)
+    if options.mask:
+        masked = mask_captions(options.captions, options.mask, data=options.data, **extra)
+        terminal.facts(f"Masked captions {masked.path}", masked.record["counts"])
+    flagged = float(results[SHARE, FLAGGED])
+    failed = limit is not None and flagged > limit
+    if failed:
+        terminal.print_line(f"FAIL: share of flagged captions {round(flagged, 5)} is over {limit}")
+    return results.to_json() | {"failed": failed}, FAILED_CHECK if failed else 0

@@ -1,0 +1,168 @@
+"""A local server that speaks the OpenAI-compatible protocol, with scripted faults.
+
+``python tests/caption_server.py`` serves until its standard input closes and prints its URL.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import socket
+import struct
+import sys
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+WORDS = ["rough", "smooth", "hard", "soft", "gritty", "ridged", "slick", "dry", "fibrous", "woven"]
+
+
+def adjectives_of(image: bytes) -> list[str]:
+    """Three to six adjectives that depend on the image alone."""
+    digest = hashlib.sha256(image).digest()
+    return [*dict.fromkeys(WORDS[b % len(WORDS)] for b in digest[:4]), "firm", "even"]
+
+
+class FakeServer(ThreadingHTTPServer):
+    """Answers every image with adjectives of its bytes.
+
+    Attributes:
+        faults: called with the number of the request, from 1; returns what goes wrong, or None.
+        requests: payloads, with the key that came along.
+        images: image digest -> how often it was asked about.
+        busiest: most requests at once.
+    """
+
+    daemon_threads = True
+    request_queue_size = 128
+
+    def __init__(self, faults=lambda number: None, *, delay=0.0, key=None, model="fake/vlm-7b"):
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.faults, self.delay, self.key, self.model = faults, delay, key, model
+        self.lock, self.payloads, self.images = threading.Lock(), [], Counter()
+        self.count = self.now = self.busiest = 0
+        self.keep = True
+
+    @property
+    def url(self):
+        return f"http://127.0.0.1:{self.server_port}/v1"
+
+    def __enter__(self):
+        threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
+        return self
+
+    def __exit__(self, *error):
+        self.shutdown()
+        self.server_close()
+
+    def handle_error(self, request, client_address):
+        """Clients that leave are no news."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+    def log_message(self, *args):
+        pass
+
+    def send(self, status, body, headers=(), cut=None):
+        data = body if isinstance(body, bytes) else json.dumps(body).encode()
+        self.send_response(status)
+        for name, value in {"Content-Type": "application/json", **dict(headers)}.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data[:cut])
+
+    def do_GET(self):
+        if self.denied():
+            return
+        models = {"data": [{"id": self.server.model}]}
+        self.send(200 if self.path == "/v1/models" else 404, models)
+
+    def denied(self):
+        """Say no to another key, and repeat it, as some servers do."""
+        given = self.headers.get("Authorization", "").removeprefix("Bearer ")
+        if self.server.key is not None and given != self.server.key:
+            message = f"Incorrect API key provided: {given}"
+            self.send(401, {"error": {"message": message}})
+            return True
+        return False
+
+    def do_POST(self):
+        server = self.server
+        payload = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        if self.denied():
+            return
+        if self.path != "/v1/chat/completions" or payload["model"] != server.model:
+            self.send(404, {"error": {"message": f"no {payload['model']} at {self.path}"}})
+            return
+        content = payload["messages"][0]["content"]
+        url = next(part["image_url"]["url"] for part in content if part["type"] == "image_url")
+        image = base64.b64decode(url.partition(",")[2])
+        with server.lock:
+            server.count += 1
+            number = server.count
+            server.now += 1
+            server.busiest = max(server.busiest, server.now)
+            server.images[hashlib.sha256(image).hexdigest()] += 1
+            if server.keep:
+                server.payloads.append(payload)
+        try:
+            if server.delay:
+                time.sleep(server.delay)
+            self.reply(server.faults(number), image)
+        finally:
+            with server.lock:
+                server.now -= 1
+
+    def reply(self, fault, image):
+        """Answer, with a fault or without."""
+        status, _, rest = str(fault or "").partition(" ")
+        if status.isdigit():
+            headers = {"Retry-After": rest} if rest and status == "429" else {}
+            self.send(int(status), {"error": {"message": f"fault {status}"}}, headers)
+            return
+        if fault == "hang":
+            time.sleep(3)
+        answer = {"adjectives": adjectives_of(image), "surface_visible": True}
+        texts = {
+            "prose": "The surface feels rough and hard.",
+            "fenced": f"Here you are:\n```json\n{json.dumps(answer)}\n```",
+            "truncated": json.dumps(answer)[:25],
+            "refusal": "I'm sorry, but I can't help with that.",
+            "duplicate": '{"adjectives": ["hard", "flat", "cold"], "surface_visible": true}',
+            "hidden": json.dumps(answer | {"surface_visible": False}),
+            "echo": json.dumps(answer) + (self.server.key or ""),
+        }
+        message = {"role": "assistant", "content": texts.get(fault, json.dumps(answer))}
+        if fault == "flagged":
+            message = {"role": "assistant", "content": None, "refusal": "No."}
+        body = {
+            "model": "other/model" if fault == "other-model" else self.server.model,
+            "choices": [
+                {"message": message, "finish_reason": "length" if fault == "truncated" else "stop"}
+            ],
+            "usage": {"prompt_tokens": 700, "completion_tokens": 30},
+            "system_fingerprint": "fp_1",
+        }
+        if fault == "no-completion":
+            body = {"answer": 42}
+        self.send(200, body, cut=20 if fault == "reset" else None)
+        if fault == "reset":
+            with suppress(OSError):
+                self.wfile.flush()
+                linger = struct.pack("ii", 1, 0)
+                self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+            self.close_connection = True
+
+
+if __name__ == "__main__":
+    with FakeServer(delay=float((sys.argv[1:] or ["0"])[0])) as running:
+        running.keep = False
+        print(running.url, flush=True)
+        sys.stdin.read()
