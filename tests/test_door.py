@@ -20,6 +20,10 @@ SIGNATURES = {
         "false_positives encoder impact name worst cache threads root reading ids_in_time "
         "skip_bad progress"
     ),
+    "caption": (
+        "data output * server model local template prompt per crop concurrency timeout max_tokens "
+        "seed body key_variable again prices dry_run progress"
+    ),
     "generate": (
         "photos * model output split part seed guidance steps batch skip_bad device progress"
     ),

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from palpate.captions.photos import QUALITY, SIDE, Crop, file_digest, prepared
@@ -22,6 +22,8 @@ ATTEMPTS = 3
 AGAIN_TEMPERATURE = 0.5
 #: So many requests that the server does not take, and no answer, are no matter of single photos.
 ALL_REJECTED = 3
+#: Seconds after which Ctrl-C is noticed: once polars has run, it interrupts no waiting.
+CTRL_C = 0.2
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -242,7 +244,10 @@ def in_daemons(
     running = threads
     try:
         while running:
-            result = results.get()
+            try:
+                result = results.get(timeout=CTRL_C)
+            except Empty:
+                continue
             if isinstance(result, _End):
                 running -= 1
             else:

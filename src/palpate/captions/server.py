@@ -187,7 +187,8 @@ class Server:
     def _models(self) -> list[str]:
         """Names of the server's models; empty if it does not list them."""
         try:
-            listed = self._client.get(f"{self.url}/models").json()["data"]
+            response = self._client.get(f"{self.url}/models")
+            listed = response.json()["data"] if response.status_code == 200 else []
             return [str(model["id"]) for model in listed]
         except (self._errors, LookupError, TypeError, ValueError):
             return []

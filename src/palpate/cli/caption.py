@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -95,7 +96,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
                 **arguments,
             )
     except StoppedError as stop:
-        terminal.print_line(f"palpate caption: {error_line('caption', stop)}")
+        sys.stderr.write(f"palpate caption: {error_line('caption', stop)}\n")
         return stop.to_json(), FAILED_CHECK
     terminal.print(str(result))
     if not isinstance(result, Captions):

@@ -1,0 +1,373 @@
+"""Captions from a server: faults, resuming, the same table whatever the order, no key on disk."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from caption_server import FakeServer
+from palpate.captions import StoppedError, caption
+from palpate.captions.server import Server
+from palpate.cli import main
+from palpate.core import PalpateError
+
+TOP = Path(__file__).resolve().parents[1]
+KEY = "sk-planted-7c1f"
+
+
+@pytest.fixture
+def data(small_manifest, tmp_path):
+    """12 contacts of four frames, with photos of different bytes."""
+    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
+    return tmp_path / "tag"
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Pauses between tries of a hundredth of a second."""
+    init = Server.__init__
+    monkeypatch.setattr(Server, "__init__", lambda *a, **k: init(*a, **{"pause": 0.01} | k))
+
+
+def describe(data, output, server, **options):
+    return caption(data, output, server=server.url, **options)
+
+
+def table_of(output):
+    return (output / "captions.parquet").read_bytes()
+
+
+def test_one_photo_a_contact_and_its_caption_for_all_frames(data, tmp_path):
+    with FakeServer() as server:
+        result = describe(data, tmp_path / "c", server)
+    assert server.count == 12
+    assert result.record["model"] == server.model
+    assert result.record["counts"]["samples"] == 48
+    assert result.record["tokens"] == {"in": 12 * 700, "out": 12 * 30}
+    table = result.table.with_columns(frame=pl.col("id").str.split("/").list.get(1).cast(pl.Int64))
+    contacts = table.group_by(pl.col("id").str.split("/").list.get(0), pl.col("frame") // 100)
+    assert contacts.agg(pl.col("text").n_unique())["text"].to_list() == [1] * 12
+    lines = (tmp_path / "c" / "replies.jsonl").read_text().splitlines()
+    logged = [json.loads(line) for line in lines]
+    assert {row["id"].split("/")[1] for row in logged} == {"2", "102"}, "the middle frames"
+
+
+def test_requests_have_the_schema_at_the_top_and_an_image_without_metadata(data, tmp_path):
+    with FakeServer() as server:
+        describe(data, tmp_path / "c", server, body={"temperature": None, "top_k": 1}, seed=7)
+    payload = server.payloads[0]
+    assert payload["response_format"]["type"] == "json_schema"
+    assert payload["response_format"]["json_schema"]["strict"] is True
+    assert (payload["seed"], payload["top_k"], "temperature" in payload) == (7, 1, False)
+    text, image = payload["messages"][0]["content"]
+    assert "hand" in text["text"]
+    assert image["image_url"]["url"].startswith("data:image/jpeg;base64,")
+
+
+@pytest.mark.parametrize(("per", "count"), [("frame", 48), ("contact", 12), ("object", 0)])
+def test_units(data, tmp_path, per, count):
+    with FakeServer() as server:
+        if count:
+            describe(data, tmp_path / "c", server, per=per)
+        else:
+            with pytest.raises(PalpateError, match="none is known"):
+                describe(data, tmp_path / "c", server, per=per)
+    assert server.count == count
+
+
+def test_a_crop_is_a_second_image_and_another_question(data, tmp_path):
+    with FakeServer() as server:
+        describe(data, tmp_path / "c", server)
+        describe(data, tmp_path / "c", server, crop=(0.25, 0.25, 0.75, 0.75))
+        with pytest.raises(PalpateError, match="from 0 to 1"):
+            describe(data, tmp_path / "c", server, crop=(0.5, 0, 0.25, 1))
+    assert server.count == 24
+    content = server.payloads[-1]["messages"][0]["content"]
+    assert [part["type"] for part in content] == ["text", "image_url", "image_url"]
+    assert "second image" in content[0]["text"]
+
+
+FAULTS = {
+    "busy": ("429 0", 13, 12, ()),
+    "busy without a time": ("429", 13, 12, ()),
+    "failing": ("500", 13, 12, ()),
+    "reset in the middle of the body": ("reset", 13, 12, ()),
+    "truncated": ("truncated", 13, 12, ()),
+    "prose": ("prose", 13, 12, ()),
+    "wrapped": ("fenced", 12, 12, ("schema-ignored",)),
+    "refusing": ("refusal", 12, 11, ("refusal",)),
+    "flagged by the server": ("flagged", 12, 11, ("refusal",)),
+    "hidden": ("hidden", 12, 12, ("surface-hidden",)),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_one_fault_is_repaired_or_flagged(data, tmp_path, quick, name):
+    fault, requests, texts, flags = FAULTS[name]
+    with FakeServer(lambda number: fault if number == 5 else None) as server:
+        result = describe(data, tmp_path / "c", server, concurrency=1)
+    counts = result.record["counts"]
+    assert (server.count, counts["texts"]) == (requests, texts)
+    assert tuple(counts["flags"]) == flags
+
+
+def test_a_hanging_request_is_sent_again(data, tmp_path, quick):
+    with FakeServer(lambda number: "hang" if number == 3 else None) as server:
+        result = describe(data, tmp_path / "c", server, timeout=0.3)
+    assert (server.count, result.record["counts"]["texts"]) == (13, 12)
+
+
+def test_what_stays_unusable_is_flagged_kept_and_asked_again_on_request(data, tmp_path):
+    bad = {"on": True}
+    with FakeServer(lambda number: "truncated" if bad["on"] else None) as server:
+        result = describe(data, tmp_path / "c", server)
+        assert result.record["counts"]["flags"] == {"truncated": 12}
+        assert server.count == 36, "three tries each"
+        assert [p["max_tokens"] for p in server.payloads[:1]] == [300]
+        assert max(p["max_tokens"] for p in server.payloads) == 1200
+        assert describe(data, tmp_path / "c", server).record["counts"]["texts"] == 0
+        assert server.count == 36, "what was answered is not asked again"
+        bad["on"] = False
+        result = describe(data, tmp_path / "c", server, again=True)
+    assert (server.count, result.record["counts"]["texts"]) == (48, 12)
+    assert result.record["counts"]["flags"] == {}
+
+
+def test_a_server_that_answers_as_another_model_is_noted(data, tmp_path):
+    with FakeServer(lambda number: "other-model") as server:
+        result = describe(data, tmp_path / "c", server)
+    assert [note.code for note in result.notes] == ["captions-other-model"]
+    assert result.record["answered_as"] == {"other/model": 12}
+
+
+def test_the_same_table_whatever_the_order(data, tmp_path):
+    with FakeServer() as server:
+        describe(data, tmp_path / "a", server, concurrency=1)
+    with FakeServer(lambda number: "429 0.05" if number % 3 == 0 else None) as server:
+        describe(data, tmp_path / "b", server, concurrency=7)
+    lines = [(tmp_path / name / "replies.jsonl").read_text().splitlines() for name in "ab"]
+    assert lines[0] != lines[1]
+    assert table_of(tmp_path / "a") == table_of(tmp_path / "b")
+
+
+def test_no_more_requests_at_once_than_asked_for(data, tmp_path):
+    with FakeServer(delay=0.02) as server:
+        describe(data, tmp_path / "c", server, concurrency=3)
+    assert server.busiest == 3
+
+
+def test_a_torn_last_line_is_dropped_and_another_line_is_an_error(data, tmp_path):
+    with FakeServer() as server:
+        describe(data, tmp_path / "c", server)
+        whole, log = table_of(tmp_path / "c"), tmp_path / "c" / "replies.jsonl"
+        log.write_bytes(log.read_bytes()[:-25])
+        describe(data, tmp_path / "c", server)
+        assert server.count == 13
+        assert table_of(tmp_path / "c") == whole
+        assert all(json.loads(line) for line in log.read_text().splitlines())
+        log.write_text('{"format": "mine"}\n')
+        with pytest.raises(PalpateError, match="another line 1"):
+            describe(data, tmp_path / "c", server)
+
+
+RUN = "import sys; from palpate.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+def start(*args, **environment):
+    env = os.environ | {"PYTHONPATH": str(TOP / "src")} | environment
+    return subprocess.Popen(
+        [sys.executable, "-c", RUN, *map(str, args)],
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.mark.slow
+def test_killed_three_times_it_repeats_at_most_what_was_in_flight(data, tmp_path):
+    with FakeServer(delay=0.15, key=KEY) as server:
+        options = ["--server", server.url, "--per", "frame", "--concurrency", "3"]
+        command = ["caption", data, "-o", tmp_path / "c", *options]
+        environment = {"PALPATE_CAPTION_KEY": KEY}
+        for kill in range(3):
+            running, before = start(*command, **environment), server.count
+            while server.count < before + 8:
+                assert running.poll() is None, running.stdout.read()
+                time.sleep(0.01)
+            running.send_signal(signal.SIGKILL)
+            running.communicate()
+            assert not (tmp_path / "c" / "captions.parquet").exists(), kill
+        done = start(*command, **environment)
+        output = done.communicate()[0]
+        assert done.returncode == 0, output
+        assert sum(server.images.values()) - 48 <= 3 * 3
+        assert len(server.images) == 48
+        server.delay = 0
+        whole = start(*command[:3], tmp_path / "d", *options, **environment)
+        assert KEY not in output + whole.communicate()[0]
+    assert table_of(tmp_path / "c") == table_of(tmp_path / "d")
+    for path in tmp_path.rglob("*"):
+        assert not path.is_file() or KEY.encode() not in path.read_bytes(), path
+
+
+def test_two_runs_on_one_output(data, tmp_path):
+    with FakeServer(delay=0.3) as server:
+        command = ["caption", data, "-o", tmp_path / "c", "--server", server.url]
+        first = start(*command, "--concurrency", "1")
+        while not server.count:
+            time.sleep(0.01)
+        with pytest.raises(PalpateError, match="another run writes"):
+            describe(data, tmp_path / "c", server)
+        first.kill()
+        first.communicate()
+
+
+def test_ctrl_c_ends_at_once_although_a_request_hangs(data, tmp_path):
+    with FakeServer(delay=30) as server:
+        running = start("caption", data, "-o", tmp_path / "c", "--server", server.url, "-q")
+        while not server.count:
+            time.sleep(0.01)
+        running.send_signal(signal.SIGINT)
+        output = running.communicate(timeout=5)[0]
+    assert running.returncode == 130
+    assert "Run the same command again" in output
+
+
+@pytest.mark.parametrize("fault", ["500", "reset"])
+def test_a_server_that_dies_midway_keeps_what_is_done(data, tmp_path, quick, fault, capsys):
+    with FakeServer(lambda number: fault if number > 5 else None) as server:
+        with pytest.raises(StoppedError, match="5 of 12 photos are described") as caught:
+            describe(data, tmp_path / "c", server, concurrency=1)
+        assert (caught.value.answered, caught.value.total) == (5, 12)
+        args = ["caption", str(data), "-o", str(tmp_path / "d"), "--server", server.url, "-q"]
+        server.count = 0
+        assert main([*args, "--concurrency", "1"]) == 1
+        assert "run the same command again" in capsys.readouterr().err
+        server.faults = lambda number: None
+        assert main(args) == 0
+    assert len((tmp_path / "d" / "replies.jsonl").read_text().splitlines()) == 12
+
+
+def test_single_requests_that_the_server_does_not_take_are_listed(data, tmp_path, capsys):
+    with FakeServer(lambda number: "413" if number in (4, 6) else None) as server:
+        args = ["caption", data, "-o", tmp_path / "c", "--server", server.url, "-q"]
+        assert main([*map(str, args), "--concurrency", "1"]) == 1
+        assert "Without a caption: 2" in capsys.readouterr().out
+        table = pl.read_parquet(tmp_path / "c" / "captions.parquet")
+        assert table["flags"].list.contains("rejected").sum() == 8
+        assert table["text"].null_count() == 8
+        assert main([*map(str, args)]) == 0, "the same command asks again"
+    assert server.count == 14
+
+
+#: Arguments that are wrong, and what the error must say.
+WRONG = {
+    "no URL": ("--server localhost:8000/v1", "http://HOST:PORT"),
+    "password in the URL": ("--server http://me:secret@host/v1", "without password"),
+    "port": ("--server http://localhost:99999/v1", "http://HOST:PORT"),
+    "refused": ("--server http://127.0.0.1:9/v1 --model m", "Connection refused"),
+    "refused, no model": ("--server http://127.0.0.1:9/v1", "Connection refused"),
+    "path": ("--server {url}/x --model m", "http://HOST:PORT/v1"),
+    "path, no model": ("--server {url}/x", "Name it"),
+    "model": ("--server {url} --model gpt", "It has fake/vlm-7b"),
+    "variable": ("--server {url} --key-variable NONE_7", "NONE_7, which is not set"),
+    "body": ("--server {url} --body [1]", "a JSON object"),
+    "nothing": ("", "one of server, local, template"),
+    "two": ("--server {url} --template", "server and template"),
+    "concurrency": ("--server {url} --concurrency 0", "at least 1"),
+    "prompt": ("--server {url} --prompt none.txt", "touch-sentence/1"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_bad_arguments_are_one_line_and_exit_2(data, tmp_path, name, capsys):
+    options, says = WRONG[name]
+    with FakeServer() as server:
+        args = options.format(url=server.url).split()
+        started = time.perf_counter()
+        assert main(["caption", str(data), "-o", str(tmp_path / "c"), "-q", *args]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert "secret" not in error
+    assert len(error.splitlines()) == 1
+    assert time.perf_counter() - started < 3
+
+
+@pytest.mark.parametrize("given", ["", "wrong-key"])
+def test_a_wrong_key_is_named_by_its_variable_and_never_shown(
+    data, tmp_path, given, monkeypatch, capsys
+):
+    monkeypatch.setenv("PALPATE_CAPTION_KEY", given)
+    with FakeServer(key=KEY) as server:
+        args = ["caption", str(data), "-o", str(tmp_path / "c"), "--server", server.url, "-q"]
+        assert main(args) == 2
+    error = capsys.readouterr().err
+    assert "environment variable PALPATE_CAPTION_KEY" in error
+    assert "wrong-key" not in error
+
+
+def test_a_key_that_the_server_repeats_is_not_kept(data, tmp_path, monkeypatch):
+    monkeypatch.setenv("MY_KEY", KEY)
+    with FakeServer(lambda number: "echo", key=KEY) as server:
+        describe(data, tmp_path / "c", server, key_variable="MY_KEY")
+    for path in (tmp_path / "c").iterdir():
+        assert KEY.encode() not in path.read_bytes()
+
+
+def test_all_requests_rejected_is_an_error_and_not_a_table(data, tmp_path):
+    with FakeServer(lambda number: "400") as server:
+        with pytest.raises(PalpateError, match="fault 400"):
+            describe(data, tmp_path / "c", server)
+        assert server.count <= 8 + 3
+    assert not (tmp_path / "c" / "captions.parquet").exists()
+
+
+def test_a_photo_that_is_none_is_listed_and_costs_no_request(data, tmp_path, small_manifest):
+    broken, gone = small_manifest.paths("vision")[2], small_manifest.paths("vision")[6]
+    broken.write_bytes(b"no image")
+    gone.unlink()
+    with FakeServer() as server:
+        result = describe(data, tmp_path / "c", server)
+    assert server.count == 10
+    assert [problem.kind for problem in result.problems] == ["bad-image"] * 2
+    assert result.record["counts"]["flags"] == {"bad-image": 2}
+
+
+def test_samples_without_photos(small_manifest, tmp_path):
+    bare = replace(small_manifest, table=small_manifest.table.with_columns(vision=None))
+    with FakeServer() as server, pytest.raises(PalpateError, match="must have vision images"):
+        caption(bare, tmp_path / "c", server=server.url)
+
+
+def test_equal_photos_are_asked_about_once(data, tmp_path, small_manifest):
+    first = small_manifest.paths("vision")[0].read_bytes()
+    for path in small_manifest.paths("vision"):
+        path.write_bytes(first)
+    with FakeServer() as server:
+        result = describe(data, tmp_path / "c", server)
+    assert (server.count, result.record["counts"]["different"]) == (1, 1)
+
+
+def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
+    with FakeServer() as server:
+        estimate = describe(data, tmp_path / "c", server, dry_run=True, prices=(2.5, 10))
+        assert (estimate.requests, estimate.measured, server.count) == (12, 0, 0)
+        assert estimate.price == pytest.approx(
+            (2.5 * estimate.tokens[0] + 10 * estimate.tokens[1]) / 1e6
+        )
+        assert not (tmp_path / "c").exists()
+        server.faults = lambda number: "500" if number > 4 else None
+        with pytest.raises(StoppedError):
+            describe(data, tmp_path / "c", server, concurrency=1)
+        estimate = describe(data, tmp_path / "c", server, dry_run=True)
+    assert (estimate.requests, estimate.measured, estimate.tokens) == (8, 4, (5600, 240))
+    assert re.search("8 .4 are answered", str(estimate))
