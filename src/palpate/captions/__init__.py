@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
-from palpate._lazy import lazy_names
+from palpate._lazy import import_name
 
 if TYPE_CHECKING:
     from palpate.captions.captioning import Captions, Estimate, StoppedError, caption
@@ -33,4 +34,4 @@ __all__ = [
     "mask_captions",
 ]
 
-__getattr__ = lazy_names(__name__, _MODULES)
+__getattr__ = partial(import_name, __name__, _MODULES)
