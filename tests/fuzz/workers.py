@@ -44,7 +44,7 @@ class Worker:
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.pipe, end = context.Pipe()
-            self.process = context.Process(target=serve, args=(end, *self.settings), daemon=True)
+            self.process = context.Process(target=serve, args=(end, *self.settings))
             self.process.start()
             end.close()
             limit = 3 * cases.SECONDS  # with the start
@@ -78,9 +78,11 @@ def run(numbers: range, seed: int, workers: int = 2) -> Iterator[tuple[int, list
 
         def follow() -> None:
             worker = Worker(seed, base, work)
-            while (number := _next(todo, lock)) is not None:
-                done.append((number, *worker.check(number)))
-            worker.stop()
+            try:
+                while (number := _next(todo, lock)) is not None:
+                    done.append((number, *worker.check(number)))
+            finally:
+                worker.stop()
 
         threads = [threading.Thread(target=follow) for _ in range(workers)]
         for thread in threads:

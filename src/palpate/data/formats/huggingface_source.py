@@ -63,7 +63,9 @@ def open_source(source: Path, config: str | None = None, revision: str | None = 
     name = source.name if local else source.as_posix()
     loaded = _loaded(source, name, config, revision)
     splits: dict[str, Any] = dict(loaded) if isinstance(loaded, dict) else {"": loaded}
-    features = dict(next(iter(splits.values())).features or {}) if splits else {}
+    if not splits:
+        raise PalpateError(f"The data set {name} must hold rows", "none", "Check what wrote it")
+    features = dict(next(iter(splits.values())).features or {})
     images = [n for n, f in features.items() if isinstance(f, datasets.Image)]
     for split, data in splits.items():
         if list(data.features or {}) != list(features):
@@ -92,8 +94,6 @@ def first_line(error: BaseException) -> str:
 
 def _loaded(source: Path, name: str, config: str | None, revision: str | None) -> Any:
     """The data set as the library opens it, without a copy in its cache."""
-    import datasets
-
     local = source.is_dir()
     if not local:
         if source.exists() or re.fullmatch(r"[\w.\-]+(/[\w.\-]+)?", name) is None:
@@ -102,7 +102,7 @@ def _loaded(source: Path, name: str, config: str | None, revision: str | None) -
         _require_hub(name, revision)
     try:
         if any((source / mark).is_file() for mark in ("dataset_dict.json", "state.json")):
-            return datasets.load_from_disk(str(source))
+            return _saved(source)
         return _streamed(str(source) if local else name, config, revision, local)
     except PalpateError:
         raise
@@ -111,6 +111,18 @@ def _loaded(source: Path, name: str, config: str | None, revision: str | None) -
         fix = "Write it again with save_to_disk, or as Parquet" if local else fix
         must = f"The data set {name} must be whole and readable"
         raise PalpateError(must, first_line(error), fix) from None
+
+
+def _saved(source: Path) -> dict[str, Any]:
+    """The parts of ``save_to_disk`` that have rows; the library cannot open the others."""
+    import datasets
+
+    parts = {"": source}
+    if (source / "dataset_dict.json").is_file():
+        names = json.loads((source / "dataset_dict.json").read_bytes())["splits"]
+        parts = {name: source / name for name in names}
+    rows = {n: json.loads((p / "state.json").read_bytes())["_data_files"] for n, p in parts.items()}
+    return {n: datasets.load_from_disk(str(p)) for n, p in parts.items() if rows[n]}
 
 
 def _require_hub(name: str, revision: str | None) -> None:
