@@ -24,6 +24,7 @@ from palpate.cli.terminal import (
 from palpate.core import PalpateError, is_stream, write_text
 from palpate.report.results import Audit
 
+TABLE_FORMAT = "palpate-audit-table/1"
 Modality = Literal["vision", "tactile"]
 
 
@@ -172,7 +173,7 @@ def _check(options: Options) -> None:
     for output, marks in (
         *((path, (b'"format": "palpate-', b"Audit of", b"palpate")) for path in pages),
         (outputs.output, (b'"format": "palpate-',)),
-        (outputs.table, (b"PAR1", b"id,video,frame,material,leaking")),
+        (outputs.table, (TABLE_FORMAT.encode(), b"id,video,frame,material,leaking")),
     ):
         if output is not None:
             guard_output(output, inputs, marks)
@@ -211,7 +212,7 @@ def _write(outputs: Outputs, audit: Audit, terminal: Terminal) -> None:
     elif outputs.table:
         from palpate.data.manifest import write_parquet
 
-        write_parquet(audit.to_frame(), outputs.table)
+        write_parquet(audit.to_frame(), outputs.table, {"palpate.format": TABLE_FORMAT})
     if outputs.page:
         settings = {"version": __version__}
         results = replace(audit.to_results(), commands=[terminal.command], settings=settings)

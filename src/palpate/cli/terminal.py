@@ -381,7 +381,7 @@ def guard_output(
     Args:
         output: the file to write.
         inputs: what the command reads.
-        signatures: an existing file must hold one of these in its first 4 KB to be replaced.
+        signatures: an existing file must hold one of these at its start or end to be replaced.
 
     Raises:
         PalpateError: saying which.
@@ -393,8 +393,10 @@ def guard_output(
     _require_writable(output)
     if output.is_file():
         with open(output, "rb") as file:
-            head = file.read(4096)
-        if head and not any(each in head for each in signatures):
+            ends = file.read(4096)
+            file.seek(max(0, output.stat().st_size - 16_384))
+            ends += file.read()
+        if ends and not any(each in ends for each in signatures):
             must = f"{output} must be new, or a file of the kind that this command writes"
             raise PalpateError(must, "another file", "Choose another file, or remove it")
 

@@ -43,8 +43,24 @@ _CUT = (struct.error, zlib.error, Image.DecompressionBombError)
 BROKEN = (OSError, SyntaxError, ValueError, EOFError, IndexError, TypeError, *_CUT)
 #: What to do about unreadable files that are not being imported now.
 REFETCH = "Fetch these files again, or skip the bad ones with: palpate import"
+#: Pixels of the largest image that is decoded: some twenty bytes each while it becomes RGB.
+LARGEST = 50_000_000
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+def opened(source: Path | BinaryIO) -> Image.Image:
+    """Open an image whose pixels fit into memory; they are not decoded yet.
+
+    Raises:
+        Image.DecompressionBombError: if there are more than ``LARGEST``.
+        OSError: with most other broken files; see ``BROKEN``.
+    """
+    image = Image.open(source)
+    if image.width * image.height > LARGEST:
+        size = f"{image.width} x {image.height} pixels"
+        raise Image.DecompressionBombError(f"{size}, more than {LARGEST:,}")
+    return image
 
 
 def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Image:
@@ -59,7 +75,7 @@ def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Ima
     """
     path = Path(path)
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             if at_least is not None:
                 image.draft("RGB", at_least)
             image.load()
@@ -81,7 +97,7 @@ def check_image(path: Path, how: Check = "decode") -> str | None:
     if how == "none":
         return None if path.is_file() else "no such file"
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             if how == "decode":
                 image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))
                 image.load()
@@ -250,7 +266,7 @@ def _rgb(image: Image.Image) -> Image.Image:
     if image.mode == "RGB":
         return image
     if image.mode.startswith("I"):  # 16-bit gray; "I" is the same in 32-bit cells
-        values = np.clip(np.asarray(image).astype(np.int64), 0, 65535)
+        values = np.clip(np.asarray(image), 0, 65535).astype(np.int32)
         return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
     if image.mode == "F":
         raise ValueError("floating-point pixels, whose range is not defined")

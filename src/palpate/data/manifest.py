@@ -27,7 +27,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -264,9 +265,9 @@ class Manifest:
         if not path.is_file():
             raise PalpateError("The manifest must exist", f"no file {path}", fix)
         try:
-            with open(path, "rb") as file:
+            with open(path, "rb") as file, reading_parquet():
                 meta = pl.read_parquet_metadata(file)
-            table = pl.read_parquet(path, glob=False)  # a path may hold brackets
+                table = pl.read_parquet(path, glob=False)  # a path may hold brackets
         except Exception as error:  # polars raises several kinds for a file that is not Parquet
             got = str(error).splitlines()[0]
             raise PalpateError(f"The manifest {path} must be a Parquet file", got, fix) from None
@@ -295,6 +296,15 @@ class Manifest:
 
 def _with_prefix(table: pl.DataFrame, prefix: str, names: Iterable[str]) -> pl.DataFrame:
     return table.with_columns((pl.lit(prefix) + pl.col(name)).alias(name) for name in names)
+
+
+@contextmanager
+def reading_parquet() -> Generator[None]:
+    """Raise a panic of polars over a damaged file, which is no Exception, as ValueError."""
+    try:
+        yield
+    except pl.exceptions.PanicException as error:
+        raise ValueError(str(error)) from None
 
 
 def write_parquet(

@@ -14,7 +14,7 @@ from palpate.data.formats.base import Scan, finished, manifest_of
 from palpate.data.imported import raise_if, require_some
 from palpate.data.importing import recognized, scan_options
 from palpate.data.listing import LINE, read_list
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest
+from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, reading_parquet
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
@@ -110,7 +110,7 @@ def is_manifest(path: Path) -> bool:
     if path.suffix.lower() != ".parquet":
         return False
     try:
-        with open(path, "rb") as file:
+        with open(path, "rb") as file, reading_parquet():
             metadata = pl.read_parquet_metadata(file)
     except Exception:  # polars raises several kinds for a file that is not Parquet
         return False

@@ -23,6 +23,7 @@ from typing import Any
 import polars as pl
 
 from palpate.core import PalpateError, Problem
+from palpate.data.manifest import reading_parquet
 from palpate.data.mapping import text_of
 
 csv.field_size_limit(1 << 30)  # by default a long text is an error, for the whole process
@@ -257,13 +258,21 @@ def _schema(path: Path) -> dict[str, pl.DataType]:
 
 
 def _parquet(path: Path) -> Table:
+    def read(columns: Sequence[str]) -> pl.DataFrame:
+        try:
+            with reading_parquet():
+                return pl.read_parquet(path, columns=list(columns), glob=False)
+        except Exception as error:  # polars raises several kinds
+            must, got = f"{path} must be a whole Parquet file", str(error).splitlines()[0]
+            raise PalpateError(must, got, "Write it again") from None
+
     try:
-        schema = _schema(path)
-        pl.read_parquet(path, n_rows=1, glob=False)
+        with reading_parquet():
+            schema = _schema(path)
+            pl.read_parquet(path, n_rows=1, glob=False)
     except Exception as error:  # polars raises several kinds for a file that is not Parquet
         reason = f"not Parquet: {str(error).splitlines()[0]}"
         return Table(str(path), [], [Problem(str(path), "bad-table", reason)], lambda columns: [])
-    read = lambda columns: pl.read_parquet(path, columns=list(columns), glob=False)  # noqa: E731
     return _of_frame(str(path), schema, read)
 
 

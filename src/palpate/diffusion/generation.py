@@ -46,7 +46,7 @@ from palpate.core import (
 )
 from palpate.core.digest import canonical_json
 from palpate.core.records import from_plain
-from palpate.data.images import SUFFIXES, check_image, load_images, read_image, square
+from palpate.data.images import BROKEN, SUFFIXES, check_image, load_images, read_image, square
 from palpate.encoders.models import FIX_MODEL, find_model
 
 if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first needs none of it
@@ -286,7 +286,7 @@ class _Target:
         try:
             with Image.open(path) as image:
                 text = [image.info.get(f"palpate.{k}") for k in ("id", "settings", "input")]
-        except OSError:
+        except BROKEN:
             return False
         return text == [sample_id, self.digest, stamp]
 

@@ -179,11 +179,10 @@ def read_parquet(path: Path) -> tuple[Mapping[str, str], pl.DataFrame]:
     """
     import polars as pl
 
-    try:
-        with open(path, "rb") as file:
-            return pl.read_parquet_metadata(file), pl.read_parquet(path, glob=False)
-    except pl.exceptions.PanicException as error:  # derives from BaseException
-        raise ValueError(str(error)) from None
+    from palpate.data.manifest import reading_parquet
+
+    with open(path, "rb") as file, reading_parquet():
+        return pl.read_parquet_metadata(file), pl.read_parquet(path, glob=False)
 
 
 def embeddings_of_table(table: pl.DataFrame, source: str, encoder: str | None = None) -> Embeddings:

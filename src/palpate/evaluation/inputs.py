@@ -218,14 +218,12 @@ def _file_digest(path: Path, _changed: int) -> str:
 
 
 def _image_size(path: Path) -> tuple[int, int]:
-    from PIL import Image
-
-    from palpate.data.images import read_image
+    from palpate.data.images import BROKEN, opened, read_image
 
     try:
-        with Image.open(path) as image:  # reads the header alone
+        with opened(path) as image:  # reads the header alone
             return image.size
-    except OSError:
+    except BROKEN:
         return read_image(path).size  # raises the reason
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
-from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, read_image
+from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, opened, read_image
 
 VERSION = 3
 SIDE = 32
@@ -52,7 +52,7 @@ class Thumbnails:
 def thumbnail(path: Path) -> NDArray[np.uint8] | str:
     """One image, (32, 32, 3) YCbCr; or why it cannot be read."""
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             image.draft("YCbCr", (DRAFT, DRAFT))
             image.load()
             if image.mode in PLAIN and not image.has_transparency_data:

@@ -25,6 +25,8 @@ TINY = 96
 SIZES = ((256, 88), (192, 86), (160, 84), (128, 82), (96, 78), (64, 72), (48, 64), (32, 60))
 #: Below this side, rows that are folded anyway are skipped before images shrink further.
 KEEP_ALL = 128
+#: Pixels of the largest image that is decoded.
+LARGEST = 50_000_000
 #: Bytes of markup around the images of one row, roughly.
 ROW_MARKUP = 1_500
 
@@ -112,6 +114,8 @@ def thumbnail(
         return Thumbnail(problem="not recorded")
     try:
         with Image.open(base / name) as file:
+            if file.width * file.height > LARGEST:
+                return Thumbnail(problem="image too large")
             tiny = max(file.size) <= TINY
             file.draft("RGB", (2 * side, 2 * side))
             image = to_rgb(file)

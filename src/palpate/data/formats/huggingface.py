@@ -33,7 +33,7 @@ from PIL import Image
 from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
 from palpate.data.formats.base import Cells, Facts, Format, Scan, import_scanned
 from palpate.data.formats.huggingface_source import ROW, Source, first_line, open_source
-from palpate.data.images import BROKEN, Check
+from palpate.data.images import BROKEN, Check, opened
 from palpate.data.imported import Imported, removing_on_error
 from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
@@ -173,7 +173,7 @@ class _Store:
 def _checked(data: bytes, how: Check) -> tuple[str, str | None]:
     """(format of an image, why it is unusable or None)."""
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with opened(io.BytesIO(data)) as image:
             kind = str(image.format)
             if how == "decode":
                 image.draft("L", (max(1, image.width // 8), max(1, image.height // 8)))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.core import Progress
-from palpate.data.images import BROKEN, in_threads
+from palpate.data.images import BROKEN, in_threads, opened
 
 #: Fewer recordings than this have no typical gel.
 FEWEST = 3
@@ -45,7 +45,7 @@ def look(paths: Sequence[Path]) -> Look | None:
     thumbnails: list[NDArray[np.float64]] = []
     for path in paths:
         try:
-            with Image.open(path) as image:
+            with opened(path) as image:
                 size = image.size
                 image.draft("RGB", (max(THUMBNAIL, size[0] // 8), max(THUMBNAIL, size[1] // 8)))
                 small = image.convert("RGB").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
