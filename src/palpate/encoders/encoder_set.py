@@ -40,7 +40,6 @@ from palpate.core import PalpateError, atomic_folder, digest_json, read_record, 
 from palpate.data.images import square
 from palpate.encoders.models import (
     FIX_ENCODERS,
-    UNREADABLE,
     architecture,
     digest_modules,
     find_model,
@@ -268,7 +267,7 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
     try:
         with silent():
             tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
-    except UNREADABLE as error:
+    except Exception as error:  # tokenizers raises bare ones
         raise PalpateError(must, first_line(error), CLIP_FIX) from None
     size = int(model.config.vision_config.image_size)
     preprocess = Preprocess.from_config(folder / "preprocessor_config.json", size)
