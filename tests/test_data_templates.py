@@ -34,7 +34,22 @@ def test_templates_match_paths(template, path, fields):
 
 
 @pytest.mark.parametrize(
-    "text", ["", " ", "/a/{x}.png", "../{x}.png", "a/", "{x", "x}", "{}", "{1}", "{x:e}", "{x!r}"]
+    "text",
+    [
+        "",
+        " ",
+        "/a/{x}.png",
+        "../{x}.png",
+        "a/",
+        "{x",
+        "x}",
+        "{}",
+        "{1}",
+        "{x:e}",
+        "{x!r}",
+        "{x}{y}.png",
+        "*{y}.png",
+    ],
 )
 def test_malformed_templates_are_errors(text):
     with pytest.raises(PalpateError):

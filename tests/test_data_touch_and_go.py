@@ -10,8 +10,9 @@ from PIL import Image
 import palpate.data.recordings as recordings
 from data_fixtures import number, tree, write_frames, write_image, write_video
 from palpate.core import PalpateError, ProblemsError, Split
-from palpate.data.formats.touch_and_go import find_videos, import_touch_and_go
+from palpate.data.formats.touch_and_go import find_videos, import_touch_and_go, write_lists
 from palpate.data.images import read_image
+from palpate.data.listing import read_list
 from palpate.data.manifest import Manifest
 
 av = pytest.importorskip("av", reason="PyAV is not installed")
@@ -313,3 +314,18 @@ def test_the_five_real_clips(real_data, tmp_path):
         change = [np.abs(gel(p) - rest).mean() for p in group["tactile"]]
         assert max(change) > change[0], group["contact"][0]
         assert (pl.Series(change) > 0).all()
+
+
+def test_materials_of_ones_own_get_numbers_and_a_table_in_lists(tmp_path):
+    materials = ["Wood", "oak bark", "felt: thin", None]
+    rows = [
+        {"id": f"v/{k}", "video": "v", "frame": k, "material": m} for k, m in enumerate(materials)
+    ]
+    manifest = Manifest.from_rows(rows, tmp_path)
+    split = Split.from_ids(train=manifest.ids)
+    files = write_lists(manifest, split, tmp_path / "lists")
+    assert [path.name for path in files] == ["train.txt", "category_reference.txt"]
+    again = read_list(files[0]).manifest
+    assert dict(again.table.select("id", "material").iter_rows()) == {
+        f"v/{k:010d}": name for k, name in enumerate(materials) if name
+    }

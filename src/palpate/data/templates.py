@@ -68,26 +68,32 @@ class Template:
             PalpateError: if it is empty, leaves the root, or has a field that cannot be read.
         """
         path = text.strip().removeprefix("./")
-        must = "must be a path below the folder" if argument else "A template is a path"
+
+        def wrong(must: str, got: str) -> PalpateError:
+            clause = must if argument else f"A template {must}"
+            return PalpateError(clause, got, FIX, argument=argument)
+
         if not path or path.endswith("/") or re.search(CLIMBS, path):
-            raise PalpateError(must, repr(text), FIX, argument=argument)
+            raise wrong("must be a path below the folder", repr(text))
         pieces: list[str] = []
         specs: dict[str, str] = {}
-        loose = False  # whether a digit before a number could belong to the piece before it
+        before = "literal"  # what the piece before is
         for token in _TOKEN.finditer(path):
             name, spec = token["deep"] or token["field"], "**" if token["deep"] else token["spec"]
             spec = "d" if name == "frame" and not spec else spec or ""
-            if token["wrong"] or (
-                name and (spec not in ("", "d", "**") or not name.isidentifier())
-            ):
-                got = f"{token[0]!r} in {text!r}"
-                raise PalpateError("must have fields that can be read", got, FIX, argument=argument)
+            known = spec in ("", "d", "**") and (not name or name.isidentifier())
+            if token["wrong"] or not known:
+                raise wrong("must have fields that can be read", f"{token[0]!r} in {text!r}")
+            kind = token.lastgroup if token["literal"] or token["end"] else spec or "any"
+            if before == kind == "any":
+                got = f"{token[0]!r} right after another in {text!r}"
+                raise wrong("must have a sign between fields", got)
             if name and name in specs:
                 pieces.append(f"(?P={name})")
             else:
-                pieces.append(_piece(token, name, spec, loose=loose))
+                pieces.append(_piece(token, name, spec, loose=before in ("any", "d")))
                 specs |= {name: spec} if name else {}
-            loose = token["literal"] is None
+            before = kind
         last = path.rpartition("/")[2]
         if "." not in re.sub(r"\{\w+:?[^{}]*\}", "", last) and not last.endswith("*"):
             pieces.append(r"\.[^/]*" if not last.endswith(":**}") else "")

@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from palpate.core import PalpateError, Problem, Progress, Split, quiet, require_choice
+from palpate.core import PalpateError, Problem, Progress, Split, quiet, require_choice, write_text
 from palpate.data.formats.base import WORLD, Facts, Format, Row, Scan, world_facts
 from palpate.data.formats.layout import require_folder, subfolders
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
@@ -180,27 +180,35 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
 
     The classes are those of the manifest's fact ``classes``, which an import with another table
     than the published one writes, else the published ones. A material that is none of them keeps
-    its number if it is one (bare lists without a category table).
+    its number if it is one (bare lists without a category table), else it gets the next one, and
+    ``category_reference.txt`` says which.
 
     Raises:
-        PalpateError: if a sample has no video or frame, or a material that is no class.
+        PalpateError: if a sample has no video or frame.
     """
     classes: dict[str, str] = json.loads(manifest.facts.get("classes", "{}"))
     ids: dict[str | None, int] = {name: int(k) for k, name in (classes or CATEGORIES).items()}
+    names = set(manifest.column("material")) - {None, *ids}
+    more = sorted(name for name in names if not name.isdecimal())
+    ids |= {name: k for k, name in enumerate(more, max(ids.values()) + 1)}
+    table = "".join(f"{name}: {k}\n" for name, k in ids.items())
     ids[None] = INCONCLUSIVE
     columns = ("id", "video", "frame", "material")
     files: list[Path] = []
     for part in split.counts():
         rows: list[tuple[str, int]] = []
         for i, video, frame, name in manifest.part(split, part).table.select(columns).iter_rows():
-            label = int(name) if name not in ids and str(name).isdecimal() else ids.get(name)
-            if video is None or frame is None or label is None:
-                must = "A frame list needs the video, frame and class of every sample"
-                got = f"{i!r} with video {video!r}, frame {frame!r} and material {name!r}"
+            label = ids[name] if name in ids else int(name)
+            if video is None or frame is None:
+                must = "A frame list needs the video and frame of every sample"
+                got = f"{i!r} with video {video!r} and frame {frame!r}"
                 raise PalpateError(must, got, "Write the split file alone")
             rows.append((f"{video}/{frame:010d}.jpg", label))
         files.append(Path(folder) / f"{part}.txt")
         write_list(files[-1], rows)
+    if more:
+        files.append(Path(folder) / "category_reference.txt")
+        write_text(files[-1], table)
     return files
 
 
