@@ -43,7 +43,8 @@ class Metrics:
     ids are those of the reference."""
     sigma: tuple[str, ...] = ()
     """Bandwidths: numbers, `median` (of the reference's distances), `multi` (five around it).
-    Default: 10, comparable with the literature, and `multi`, which sees more than the mean."""
+    Default: 10, comparable with the literature; for TMMD also `multi`, which sees more than the
+    mean."""
     estimator: Literal["unbiased", "biased", "grouped"] | None = None
     """Instead of the presets' estimators."""
     backend: Literal["auto", "blocked", "moments"] = "auto"

@@ -197,6 +197,14 @@ class Manifest:
         names = " + ".join(m.facts.get("dataset", "?") for m in manifests)
         return cls(table, root, {"dataset": names})
 
+    @property
+    def synthetic(self) -> bool | None:
+        """Whether a simulator made the images; None where neither facts nor sensors are known."""
+        if {"synthetic", "simulated"} & set(self.facts):
+            return True
+        sensors = set(self.table["sensor"].drop_nulls())
+        return sensors == {"simulated"} if sensors else None
+
     def ref(self, row: Mapping[str, Any]) -> SampleRef:
         """A row of the table as a reference with absolute image paths, for reports."""
         full = {n: os.path.realpath(self.path(row[n])) if row[n] else None for n in IMAGE_COLUMNS}

@@ -246,7 +246,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         "seed": seed,
         "palpate": __version__,
         "parameters": sum(p.numel() for p in denoiser.unet.parameters()),
-        "synthetic": bool(manifest.facts.get("synthetic")),
+        "synthetic": bool(manifest.synthetic),
         "materials": sorted({str(m) for m in train.column("material") if m}),
         "start": start.digest if start else None,
         "start_record": dict(start.training) if start else None,

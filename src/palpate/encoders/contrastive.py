@@ -303,6 +303,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     log = fit(model, loss, len(train), options, folder, what=what, key=key, progress=progress)
     card = _card(facts, options, log, place) | {"clip": clip.name, "clip_card": clip.card}
     card["start_card"] = start.card if start else None
+    card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
     return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from palpate.core import PalpateError, Progress, Score, Split, quiet
+from palpate.evaluation.controls import encoder_notes
 from palpate.evaluation.scoring import load_encoders
 from palpate.metrics.probe import fit_probe, material_accuracy, retrieval
 from palpate.report.results import Results
@@ -83,9 +85,10 @@ def probe(
         keys = embed(test, encoders, other, **options)
         name = f"{modality} to {other}"
         scores += retrieval(test_set, keys, top=top, name=name, split=split.digest)
+    notes = encoder_notes(encoders, manifest, None) if modality == "tactile" else []
     return Results(
         title=f"Probe of the {modality} encoder",
-        scores=scores,
+        scores=[replace(s, notes=[*s.notes, *notes]) for s in scores],
         settings={
             "digests": {
                 "manifest": manifest.digest,

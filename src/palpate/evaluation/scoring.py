@@ -42,7 +42,15 @@ from palpate.evaluation.controls import (
     with_warnings,
 )
 from palpate.evaluation.inputs import REFERENCE, Inputs, Samples, Source, read_inputs
-from palpate.metrics import PRESETS, compare, distance, paired_by_id, tmmd
+from palpate.metrics import (
+    PRESETS,
+    Comparison,
+    compare,
+    compare_tmmd,
+    distance,
+    paired_by_id,
+    tmmd,
+)
 from palpate.metrics.mmd import sample_units
 from palpate.report.results import GalleryItem, Results
 
@@ -71,12 +79,17 @@ class Family:
     common: Mapping[str, Any]
 
     def columns(self, *, grouped: bool, rows: int) -> list[tuple[str | None, float | str]]:
-        """(preset, bandwidth) of each column; None is the preset that fits the ids of a metric."""
+        """(preset, bandwidth) of each column; None is the preset that fits the ids of a metric.
+
+        Of bandwidths that nobody requested, ``multi`` is for TMMD alone, of the first preset.
+        """
         fits: Sequence[str | None] = ("paper",)
         if self.estimator in (None, "grouped"):
             fits = ("grouped", "paper") if grouped else (None,)
-        sigmas = self.sigmas or ((SIGMA, "multi") if rows <= MANY else (SIGMA,))
-        return [(p, s) for p in self.presets or fits for s in sigmas]
+        presets = self.presets or fits
+        columns: list[tuple[str | None, float | str]]
+        columns = [(p, s) for p in presets for s in self.sigmas or (SIGMA,)]
+        return columns + [(presets[0], "multi")] * (not self.sigmas and rows <= MANY)
 
     def named(self, score: Score, sigma: float | str) -> Score:
         """A score with an unusual estimator in its preset, and bandwidth in the metric's name."""
@@ -122,18 +135,21 @@ def score_family(
             fast: dict[str, Any] = {**options, "permutations": 0}
             least = tmmd(train, features.reference, **fast).value
         for some in features.batches():
-            result = compare(some, features.reference, floor=floor, **options)
-            assert result.excess is not None  # `compare` always gives it
+            if sigma in (family.sigmas or (SIGMA,)):
+                result = compare(some, features.reference, floor=floor, **options)
+            else:
+                result = compare_tmmd(some, features.reference, **options)
+            more = result.excess or Comparison([], [])
             scores = [replace(s, floor=least) if s.metric == "TMMD" else s for s in result.scores]
             both = (
-                (outcome.scores, scores, result.excess.scores),
-                (outcome.differences, result.differences, result.excess.differences),
+                (outcome.scores, scores, more.scores),
+                (outcome.differences, result.differences, more.differences),
             )
             for results, own, excess in both:
                 results += [family.named(s, sigma) for s in _interleaved(own, excess)]
             outcome.notes += [
                 Note("below-floor", {"metric": s.metric, "subject": s.subject})
-                for s in (family.named(s, sigma) for s in result.excess.scores)
+                for s in (family.named(s, sigma) for s in more.scores)
                 if s.floor and s.interval and s.interval[1] < s.floor
             ]
         progress("TMMD family", done + 1, len(columns))
@@ -256,7 +272,8 @@ def score(  # noqa: PLR0913
             and ``paper`` where groups are known; else ``paper``, but ``grouped`` for TMMD of sets
             that share ids, whose pairs of one scene are dependent.
         sigma: bandwidth or bandwidths: numbers, ``"median"``, ``"multi"``. Default: 10, which is
-            comparable, and ``multi``, which sees more than the mean (up to 50,000 rows).
+            comparable, and for TMMD also ``multi``, which sees more than the mean (up to 50,000
+            rows).
         estimator: instead of the presets' own.
         backend: of kernel sums.
         normalize: for embeddings that are not of unit length: raise, divide by the norm, or keep
@@ -330,8 +347,7 @@ def score(  # noqa: PLR0913
                 progress,
             )
             outcome = run.score(requested, controls=controls)
-    if split is not None:
-        outcome.scores = [with_warnings(s, inputs, encoders, split) for s in outcome.scores]
+    outcome.scores = with_warnings(outcome.scores, inputs, encoders, split)
     settings = _settings(inputs, family, outcome, encoders)
     if split is not None:
         settings["split rule"] = dict(split.rule)

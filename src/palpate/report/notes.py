@@ -498,6 +498,12 @@ EVALUATION: dict[str, Sentence] = {
         "{subject}: {copies} of {n} generated rows are bit for bit rows of the reference: a copy "
         "is not a generator"
     ),
+    "synthetic-encoder": lambda p, _: (
+        "The encoder was trained on simulated tactile images alone, and "
+        + ("these are real" if p["real"] else "nothing says whether these are real")
+        + ": what it sees in real ones is unproven. Train an encoder on real images, or trust the "
+        "contact scores"
+    ),
     "encoder-of-other-split": (
         "The tactile encoder was trained on another split: it may have seen test samples"
     ),

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 from palpate.core import Note, Score, columns, plain, short
@@ -77,7 +78,7 @@ PRESETS = {
     "paper": "the paper's formula to the letter, random halves",
     "paper-tables": "the reading that fits the paper's printed tables",
     "cmmd": "as CMMD's published code",
-    "grouped": "whole groups kept together",
+    "grouped": "whole groups, or both images of a scene, kept together",
 }
 
 
@@ -278,8 +279,9 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
 
 
 def _features(metric: str) -> str:
-    """``"tactile"`` of ``"FID (tactile)"``; '' for a name without brackets."""
-    return metric[metric.rindex(" (") + 2 : -1] if metric.endswith(")") and " (" in metric else ""
+    """``"tactile"`` of ``"FID (tactile)"``; '' for a name without brackets, or with a bandwidth."""
+    bracket = metric[metric.rindex(" (") + 2 : -1] if metric.endswith(")") and " (" in metric else ""
+    return "" if bracket.startswith("σ") else bracket
 
 
 def _references(scores: Sequence[Score]) -> list[int]:
@@ -352,6 +354,33 @@ def _difference(score: Score, footnotes: Footnotes) -> Difference:
         details.get("p_adjusted"),
         _digits([score]),
     )
+
+
+def rankings(table: Table) -> list[tuple[str, str]]:
+    """Return (metric, generators from best to worst) where three or more are compared.
+
+    ``>`` stands between neighbors whose paired difference is decided (Holm's p under 0.05), ``~``
+    between the others. Metrics without a better direction have no row.
+    """
+    of_metric: dict[str, list[Difference]] = {}
+    for d in table.differences:
+        of_metric.setdefault(f"{d.metric} {d.arrow}", []).append(d)
+    if not of_metric or max(map(len, of_metric.values())) < 3:
+        return []
+    rows = [(m, _ranking(ds)) for m, ds in of_metric.items()]
+    return [(metric, ranking) for metric, ranking in rows if ranking]
+
+
+def _ranking(differences: Sequence[Difference]) -> str:
+    wins = dict.fromkeys([name for d in differences for name in (d.a, d.b)], 0)
+    known = [d for d in differences if d.confidence is not None]
+    for d in known:
+        wins[d.a if (d.confidence or 0) > 0.5 else d.b] += 1
+    apart = {frozenset((d.a, d.b)) for d in known if d.p is not None and d.p < 0.05}
+    names = sorted(wins, key=lambda name: -wins[name])
+    signs = [">" if frozenset(pair) in apart else "~" for pair in pairwise(names)]
+    steps = (f" {sign} {name}" for sign, name in zip(signs, names[1:], strict=True))
+    return names[0] + "".join(steps) if known else ""
 
 
 def _digits(scores: Sequence[Score]) -> int:

@@ -12,10 +12,12 @@ from rich.text import Text
 from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, count, percent, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import audit_line, cause_texts, threshold_text
-from palpate.report.tables import BEST, Cell, Table, score_tables
+from palpate.report.tables import BEST, Cell, Table, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
-NAMES = ("metric", "subject", "a", "b", "notes")
+NAMES = ("metric", "subject", "a", "b", "notes", "best first")
+#: Head of the rankings, which stand for the differences of more than two generators.
+RANKED = "Best first on the same samples: > decided, ~ not told apart"
 
 
 def print_result(result: Results | Audit, console: Console, style: Style = COMMAND_LINE) -> None:
@@ -26,10 +28,16 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
     for table in score_tables(result.scores):
         console.print(Text(table.title, "bold"))
         _print_rows(_score_rows(table), console)
-        if table.differences:
+        marked = [cell for column in table.columns for cell in column.cells]
+        if ranked := rankings(table):
+            console.print(Text(RANKED, "bold"))
+            _print_rows([{"metric": m, "best first": order} for m, order in ranked], console)
+        elif table.differences:
+            marked += [d.cell for d in table.differences]
             console.print(Text("Differences on the same samples, a - b", "bold"))
             _print_rows(_difference_rows(table), console)
-        lines = [f"({k}) {sentence(note, style)}" for k, note in enumerate(table.notes, 1)]
+        notes = {k: table.notes[k - 1] for cell in marked for k in cell.footnotes}
+        lines = [f"({k}) {sentence(note, style)}" for k, note in sorted(notes.items())]
         if any(cell.best for column in table.columns for cell in column.cells):
             lines.insert(0, f"* {BEST}")
         for line in lines:
