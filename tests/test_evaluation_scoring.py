@@ -14,7 +14,7 @@ from palpate.core import FeatureSet, PalpateError, Score, Split
 from palpate.core.score import require_comparable
 from palpate.data.manifest import Manifest
 from palpate.evaluation import companions, inputs, score, scoring
-from palpate.metrics import Polynomial, compare, distance, i_tmmd, ssim
+from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
 from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.intervals import mean_interval
 from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
@@ -551,13 +551,94 @@ def test_a_split_scores_controls_and_a_material_probe(tmp_path, small_manifest, 
     assert probed == {"g", "background only", "real"}
     assert not [m for m, _, _ in scores if "difference" in m]
     doubts = [n.code for n in scores["TMMD", "g", "paper"].notes]
-    assert doubts == ["encoder-of-other-split"]
+    assert doubts == ["synthetic-encoder", "encoder-of-other-split"]
     fewer = by_key(score(tmp_path / "g", small_manifest, controls=False, **options))
     assert {subject for _, subject, _ in fewer} == {"g", "real"}
     for key, s in fewer.items():
         assert scores[key].value == s.value or s.value == pytest.approx(scores[key].value), key
     with pytest.raises(PalpateError, match=r"`names` must not be .*'real'"):
         score({"real": tmp_path / "g"}, small_manifest, **options)
+
+
+@pytest.mark.parametrize(
+    ("facts", "sensor", "real"),
+    [({"synthetic": "yes"}, None, None), ({}, "GelSight", True), ({}, None, False)],
+)
+def test_an_encoder_of_simulated_images_says_so_in_every_score(
+    tmp_path, small_manifest, mini, facts, sensor, real
+):
+    paint(tmp_path / "g", small_manifest.ids, 1)
+    table = small_manifest.table.with_columns(pl.lit(sensor, pl.String).alias("sensor"))
+    reference = Manifest(table, small_manifest.root, facts)
+    results = score(tmp_path / "g", reference, encoder=mini, permutations=0)
+    notes = {
+        s.metric: [n.params["real"] for n in s.notes if n.code == "synthetic-encoder"]
+        for s in results
+        if s.encoder
+    }
+    assert {"TMMD", "TMMD (σ multi)", "I-TMMD E", "FID (tactile)"} <= {*notes}
+    assert all(found == ([] if real is None else [real]) for found in notes.values())
+    assert not [n for s in results if not s.encoder for n in s.notes if "encoder" in n.code]
+
+
+def test_one_background_stands_for_all_images_of_a_folder(tmp_path, small_manifest):
+    real = tmp_path / "real"
+    for row in small_manifest.table.iter_rows(named=True):
+        file = real / f"{row['id']}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(small_manifest.path(row["tactile"]), file)
+    paint(tmp_path / "g", small_manifest.ids, 1)
+    gel = small_manifest.path(small_manifest.table["background"][0])
+    contact = {"companions": ["contact"]}
+    results = score(tmp_path / "g", real, background=gel, **contact)
+    pixels = [np.asarray(Image.open(f).convert("RGB")) for f in (gel, *sorted(real.rglob("*.png")))]
+    made = [np.asarray(Image.open(f)) for f in sorted((tmp_path / "g").rglob("*.png"))]
+    want = contact_scores(np.stack(made), np.stack(pixels[1:]), pixels[0])
+    for s in want:
+        got = results[s.metric, "g"]
+        assert got.value == pytest.approx(s.value)
+        assert got.settings["background"] == s.settings["background"]
+    with pytest.raises(PalpateError, match=r"background='gel\.png'"):
+        score(tmp_path / "g", real, **contact)
+    with pytest.raises(PalpateError, match="`background` must go with images"):
+        score(SETS["far"], SETS["real"], background=gel)
+
+
+def test_clusters_stand_in_for_materials_and_say_so(tmp_path, small_manifest, mini):
+    bare = {k: dataclasses.replace(SETS[k], labels=None) for k in ("near", "far", "real")}
+    results = score({"a": bare["near"], "b": bare["far"]}, bare["real"], labels="cluster:3", **FAST)
+    for metric, marked in {"TMMD": False, "I-TMMD": False, "CI-TMMD": True, "D-TMMD": True}.items():
+        for s in [*results[metric], *results[f"{metric} difference"]]:
+            assert ("pseudo-labels" in {n.code for n in s.notes}) == marked
+            assert (s.settings.get("labels") == "cluster:3 of the reference's features") == marked
+    assert {*results["CI-TMMD"][0].details["classes"]} <= {f"cluster {k}" for k in (1, 2, 3)}
+    again = score(bare["near"], bare["real"], labels="cluster:3", **FAST)
+    assert again["D-TMMD", "generated"].value == results["D-TMMD", "a"].value
+    paint(tmp_path / "g", small_manifest.ids, 1)
+    options = {"encoder": mini, "labels": "cluster:2", **FAST}
+    of_photos = score(tmp_path / "g", small_manifest, **options)["CI-TMMD", "g"]
+    assert of_photos.settings["labels"] == "cluster:2 of photos"
+    for labels, made, words in (
+        ("cluster:x", bare["far"], "cluster: and a number"),
+        ("cluster:40", bare["far"], "four samples a cluster"),
+        ("cluster:3", bare["far"].features, "share no ids"),
+    ):
+        with pytest.raises(PalpateError, match=words):
+            score(made, bare["real"], labels=labels, **FAST)
+
+
+def test_tactile_images_without_photos_are_scored(tmp_path, small_manifest, mini):
+    paint(tmp_path / "g", small_manifest.ids, 1)
+    table = small_manifest.table.with_columns(vision=pl.lit(None, pl.String))
+    reference = Manifest(table, small_manifest.root)
+    ids = small_manifest.ids
+    split = Split.from_ids(train=ids[:24], test=ids[24:], rule={}, manifest=reference.digest)
+    results = score(tmp_path / "g", reference, encoder=mini, split=split, permutations=0)
+    subjects = {s.subject for s in results["TMMD"]}
+    assert subjects == {"g", "background only", "real, same material"}
+    results.to_html(tmp_path / "page.html")
+    labels = score(tmp_path / "g", reference, encoder=mini, labels="cluster:2", **FAST)
+    assert labels["CI-TMMD", "g"].settings["labels"] == "cluster:2 of the reference's features"
 
 
 def test_an_interrupted_run_goes_on_from_its_embeddings(

@@ -1,10 +1,13 @@
 """The table model of scores: tables, columns, best marks, footnotes, differences and matrices."""
 
+from dataclasses import replace
+
 import pytest
 
 from palpate.core import Note, PalpateError
 from palpate.report.notes import decimals, number, percent, plural, score_text
-from palpate.report.tables import family_of, heat_tables, score_tables, settings_of
+from palpate.report.results import Results
+from palpate.report.tables import family_of, heat_tables, rankings, score_tables, settings_of
 from report_fixtures import difference, score, text_note
 
 
@@ -128,6 +131,27 @@ def test_features_of_several_networks_do_not_split_the_scores_of_one_run():
 def test_best_needs_a_decided_difference_against_every_other(differences, best):
     table = score_tables([*(score(subject=s) for s in "abc"), *differences])[0]
     assert [c.score.subject for c in table.columns[0].cells if c.best] == ([best] if best else [])
+
+
+def test_more_than_two_generators_are_ranked():
+    def pair(a, b, p_better, p):
+        d = difference(a, b)
+        return replace(d, details={**d.details, "p_better": p_better, "p_adjusted": p})
+
+    pairs = [pair("a", "b", 0.01, 0.02), pair("a", "c", 0.3, 0.6), pair("b", "c", 0.9, 0.2)]
+    results = Results("Scores", scores=[*(score(subject=s) for s in "abc"), *pairs])
+    (table,) = score_tables(results.scores)
+    assert rankings(table) == [("TMMD ↓", "b ~ c ~ a")]  # b and a are no neighbors
+    assert "b ~ c ~ a" in str(results)
+    assert "a - b" not in str(results)
+    decided = [pairs[0], pair("a", "c", 0.01, 0.001), pairs[2]]
+    assert rankings(score_tables([*results.scores[:3], *decided])[0]) == [("TMMD ↓", "b ~ c > a")]
+    assert rankings(score_tables([score(subject="a"), score(subject="b"), pairs[0]])[0]) == []
+
+
+def test_a_bandwidth_is_no_kind_of_features():
+    tables = score_tables([score("TMMD"), score("TMMD (σ multi)")])
+    assert [[c.label for c in t.columns] for t in tables] == [["TMMD", "TMMD (σ multi)"]]
 
 
 def test_equal_notes_have_one_number():

@@ -25,7 +25,7 @@ class Samples:
     """Names of the generators in the tables, instead of those of their folders and files."""
     labels: Path | None = None
     """CSV or Parquet file with the columns id, material, video, in place of what the inputs
-    have."""
+    have; or `cluster:8`, eight clusters of the reference's photos (else features) for materials."""
     groups: Path | None = None
     """The same for groups alone, where labels and groups are in two files."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
@@ -82,6 +82,8 @@ class Options(Common):
     encoder: str | None = None
     """Folder of `palpate train encoder`, a hub id, or palpate/mini; the tactile encoder gives the
     features. Embeddings need none."""
+    background: Path | None = None
+    """One image of the sensor without contact, for all images of a folder: gives contact scores."""
     split: Path | None = None
     """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe
     and the controls."""
@@ -105,6 +107,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     arguments: dict[str, Any] = {
         "encoder": options.encoder,
         "split": options.split,
+        "background": options.background,
         **vars(options.samples),
         **vars(metrics),
         "names": options.samples.names or None,

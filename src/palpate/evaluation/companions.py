@@ -212,8 +212,9 @@ def _require(
         raise PalpateError(must, name, "Score folders of images, or drop it", **argument)
     if name == "contact" and not background:
         must = "must need no background images where the reference has none"
-        fix = "Pass a reference with a column background, or drop it"
-        raise PalpateError(must, name, fix, **argument)
+        fix = "Pass one no-contact image for all, a reference with a column background, or drop it"
+        example = {"background": "gel.png"}
+        raise PalpateError(must, name, fix, example=example, **argument)
     if name == "lpips" and weights.lpips is None:
         from palpate.encoders.perceptual import FIX
 

@@ -94,7 +94,9 @@ def with_warnings(
     of_generator = {
         name: [Note("generator-of-other-split")]
         for name, s in inputs.generators.items()
-        if split is not None and s.generator is not None and s.generator.get("split") != split.digest
+        if split is not None
+        and s.generator is not None
+        and s.generator.get("split") != split.digest
     }
     return [
         replace(

@@ -85,6 +85,7 @@ class Samples:
         features: (n, d), possibly memory-mapped.
         encoder: digest of the encoder that made the features.
         path: file of the features.
+        background: one no-contact image for all of a reference.
         widened: half-precision type that the features were converted from, if any.
         generator: settings of ``palpate generate``, for its folders.
     """
@@ -100,6 +101,7 @@ class Samples:
     features: NDArray[Any] | None = None
     encoder: str | None = None
     path: Path | None = None
+    background: Samples | None = None
     widened: str = ""
     generator: Mapping[str, Any] | None = None
 
@@ -114,8 +116,9 @@ class Samples:
 
     @property
     def has_background(self) -> bool:
-        """Whether every sample has its no-contact image."""
-        return self.manifest is not None and not self.manifest.table["background"].null_count()
+        """Whether every sample has its no-contact image, or there is one for all."""
+        rows = self.manifest is not None and not self.manifest.table["background"].null_count()
+        return rows or self.background is not None
 
     def take(self, ids: Sequence[str]) -> Samples:
         """The samples of ``ids``, in that order.
@@ -175,6 +178,9 @@ class Samples:
         """The images as squares, (n, size, size, 3); many of them memory-mapped from the cache."""
         from palpate.data.images import cached_images, load_images, square
 
+        if column == "background" and self.background is not None:
+            gel = self.background.pixels(size, cache, progress)[0]
+            return np.broadcast_to(gel, (len(self), *gel.shape))
         if self.manifest is None:
             from PIL import Image
 
@@ -436,6 +442,7 @@ def read_inputs(
     labels: Source,
     groups: Source,
     group: str,
+    background: Source,
     split: Split | None,
     reserved: Sequence[str],
 ) -> Inputs:
@@ -451,6 +458,11 @@ def read_inputs(
     real = read(reference, REFERENCE, column)
     made = {name: read(source, name, column) for name, source in sources.items()}
     _require_one_kind([real, *made.values()])
+    if background is not None:
+        if real.features is not None:
+            must, got = "must go with images", "embeddings"
+            raise PalpateError(must, got, "Drop it", argument="background")
+        real = replace(real, background=read([background], "background"))
     known = _keywords(labels, groups, column, exact=group != "auto")
     given = {i for keyword in known for i in keyword.values}
     real = _complete(real, known)
@@ -459,7 +471,7 @@ def read_inputs(
         raise PalpateError(f"{known[0].source} must hold ids of the samples", "other ids", "")
     if real.numbered:  # row k of a generator is not row k of the reference
         real = replace(real, ids=[f"{REFERENCE} {i}" for i in real.ids])
-    made = {name: _from_reference(samples, real) for name, samples in made.items()}
+    made = {name: from_reference(samples, real) for name, samples in made.items()}
     widened = [s for s in (real, *made.values()) if s.widened]
     notes = [Note("widened", {"source": s.source, "type": s.widened}) for s in widened]
     train = None
@@ -632,7 +644,7 @@ def _complete(samples: Samples, keywords: Sequence[_Keyword]) -> Samples:
     return samples
 
 
-def _from_reference(samples: Samples, real: Samples) -> Samples:
+def from_reference(samples: Samples, real: Samples) -> Samples:
     """Samples with labels and groups of the reference, which hold for images of the same ids."""
     lacking = [
         name

@@ -41,16 +41,15 @@ from palpate.evaluation.controls import (
     material_accuracies,
     with_warnings,
 )
-from palpate.evaluation.inputs import REFERENCE, Inputs, Samples, Source, read_inputs
-from palpate.metrics import (
-    PRESETS,
-    Comparison,
-    compare,
-    compare_tmmd,
-    distance,
-    paired_by_id,
-    tmmd,
+from palpate.evaluation.inputs import (
+    REFERENCE,
+    Inputs,
+    Samples,
+    Source,
+    from_reference,
+    read_inputs,
 )
+from palpate.metrics import PRESETS, Comparison, compare, compare_tmmd, distance, paired_by_id, tmmd
 from palpate.metrics.mmd import sample_units
 from palpate.report.results import GalleryItem, Results
 
@@ -236,6 +235,7 @@ def score(  # noqa: PLR0913
     labels: Source = None,
     groups: Source = None,
     group: str = "auto",
+    background: Source = None,
     presets: Sequence[Preset] | None = None,
     sigma: float | str | Sequence[float | str] | None = None,
     estimator: Literal["unbiased", "biased", "grouped"] | None = None,
@@ -264,10 +264,14 @@ def score(  # noqa: PLR0913
             a material probe and the controls.
         names: of the generators, in the tables.
         labels: materials, and possibly groups, by id: a CSV or Parquet file or a frame with the
-            columns id, material, video; id -> material; or one material per row.
+            columns id, material, video; id -> material; or one material per row. ``"cluster:8"``
+            takes eight clusters of the reference's photos (without photos or encoder: of its
+            features) for materials, by id; a note of CI- and D-TMMD says so.
         groups: the same for groups.
         group: the column whose values stay together in halves and intervals; ``auto`` takes what
             the split kept whole, else the video.
+        background: one image (or its file) of the sensor without contact, for all real images: what
+            contact scores need where the reference is no manifest with backgrounds.
         presets: readings of the TMMD family (:data:`palpate.metrics.PRESETS`). Default: ``grouped``
             and ``paper`` where groups are known; else ``paper``, but ``grouped`` for TMMD of sets
             that share ids, whose pairs of one scene are dependent.
@@ -304,6 +308,7 @@ def score(  # noqa: PLR0913
         40
     """
     split = None if split is None else Split.load(split)
+    labels, clusters = _clusters(labels)
     requested: Any = [companions] if isinstance(companions, str) else companions
     family = Family(
         presets=_names(presets, PRESETS, "presets") or (),
@@ -319,6 +324,7 @@ def score(  # noqa: PLR0913
         labels=labels,
         groups=groups,
         group=group,
+        background=background,
         split=split,
         reserved=(REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL),
     )
@@ -346,7 +352,9 @@ def score(  # noqa: PLR0913
                 cache is not None,
                 progress,
             )
+            run, of = run.clustered(clusters) if clusters else (run, "")
             outcome = run.score(requested, controls=controls)
+            outcome = _with_clusters(outcome, clusters, of) if clusters else outcome
     outcome.scores = with_warnings(outcome.scores, inputs, encoders, split)
     settings = _settings(inputs, family, outcome, encoders)
     if split is not None:
@@ -386,6 +394,35 @@ def _sigmas(sigma: float | str | Sequence[float | str] | None) -> tuple[float | 
             example = {"sigma": 10}
             raise PalpateError(must, repr(value), "", argument="sigma", example=example)
     return tuple(dict.fromkeys(values))
+
+
+def _clusters(labels: Source) -> tuple[Source, int]:
+    """Labels, and how many clusters stand in for them: ``cluster:8`` -> (None, 8)."""
+    word, _, count = str(labels).partition(":") if isinstance(labels, str | Path) else ("", "", "")
+    if word != "cluster":
+        return labels, 0
+    if not count.isdecimal() or int(count) < 2:
+        must = "must be a file, or cluster: and a number of at least 2"
+        example = {"labels": "cluster:8"}
+        raise PalpateError(must, repr(str(labels)), "", argument="labels", example=example)
+    return None, int(count)
+
+
+def _with_clusters(outcome: Outcome, clusters: int, of: str) -> Outcome:
+    """Scores that looked at classes, and their differences, say that these are clusters."""
+    of_classes = {s.metric for s in outcome.scores if "classes" in s.details}
+    for scores in (outcome.scores, outcome.differences):
+        scores[:] = [
+            replace(
+                s,
+                settings={**s.settings, "labels": f"cluster:{clusters} of {of}"},
+                notes=[*s.notes, Note("pseudo-labels", {"clusters": clusters, "of": of})],
+            )
+            if s.metric.removesuffix(" difference") in of_classes
+            else s
+            for s in scores
+        ]
+    return outcome
 
 
 def load_encoders(encoder: Any, progress: Progress) -> Any:
@@ -459,6 +496,46 @@ class _Run:
             for scores in (outcome.scores, outcome.differences):
                 scores[:] = [replace(s, reference=digest) if s.m else s for s in scores]
         return outcome
+
+    def clustered(self, count: int) -> tuple[_Run, str]:
+        """The same samples with clusters of the reference for labels, and what was clustered.
+
+        Photos say more of a material than touch does, and no generator is judged by its own.
+
+        Raises:
+            PalpateError: with too few samples, or generators of other ids.
+        """
+        from scipy.cluster.vq import kmeans2
+
+        real, seed = self.inputs.reference, self.family.common["seed"]
+        photos = real.manifest is not None and not real.manifest.table["vision"].null_count()
+        if self.encoders is not None and photos:
+            from palpate.encoders.embed import embed
+
+            options: dict[str, Any] = {"keep_pixels": False, "progress": self.progress}
+            x, of = embed(real.manifest, self.encoders, "vision", **options).features, "photos"
+        elif self.encoders is not None or real.features is not None:
+            x, of = self._features(real).features, "the reference's features"
+        else:
+            fix, example = "Pass an encoder", {"encoder": "palpate/mini"}
+            must, got = "must be a file where there are no features", "clusters"
+            raise PalpateError(must, got, fix, argument="labels", example=example)
+        if len(x) < 4 * count:
+            must, got = "must leave four samples a cluster", f"{count} of {len(x)} samples"
+            raise PalpateError(must, got, "Choose fewer", argument="labels")
+        rows = np.asarray(x, np.float64)
+        number = kmeans2(rows, count, iter=50, minit="++", seed=rng_for(seed, "clusters"))[1]
+        real = replace(real, labels=[f"cluster {k + 1}" for k in number])
+        made = {
+            name: from_reference(replace(s, labels=None), real)
+            for name, s in self.inputs.generators.items()
+        }
+        if other := next((s for s in made.values() if s.labels is None), None):
+            must = "must be a file where generated and real images share no ids"
+            raise PalpateError(must, f"clusters for {other.source}", "", argument="labels")
+        train = self.inputs.train and replace(self.inputs.train, labels=None)
+        inputs = replace(self.inputs, generators=made, reference=real, train=train)
+        return replace(self, inputs=inputs), of
 
     def _features(self, samples: Samples) -> FeatureSet:
         """Features by the tactile encoder; without one, zeros that carry ids, labels and groups."""

@@ -55,7 +55,7 @@ from palpate.metrics.images import (
     multiscale_similarity,
     require_side,
 )
-from palpate.metrics.inputs import checked_names
+from palpate.metrics.inputs import checked_names, to_host
 
 Mask = NDArray[np.bool_]
 Markers = Literal["skip", "keep"]
@@ -89,7 +89,8 @@ def contact_mask(tactile: Any, background: Any, *, least: float = LEAST) -> Mask
 
     Args:
         tactile: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1].
-        background: the same shape: the gel without contact, of the same sensor at the same time.
+        background: the same shape, or one image (h, w, c) for all: the gel without contact, of the
+            same sensor at the same time.
         least: least change that is a contact, on the scale of [0, 1]; noise can only raise it.
 
     Returns:
@@ -99,8 +100,17 @@ def contact_mask(tactile: Any, background: Any, *, least: float = LEAST) -> Mask
         PalpateError: on other shapes, dtypes or ranges, or a ``least`` outside (0, 1).
     """
     check_least(least)
+    background = _for_all(background, tactile)
     pairs = image_pairs(tactile, background, arguments=("tactile", "background"))
     return np.stack([mask_of(image, empty, least)[0] for image, empty in pairs])
+
+
+def _for_all(background: Any, images: Any) -> Any:
+    """One background (h, w, c) repeated for all images (n, h, w, c); a stack as it is."""
+    if getattr(background, "ndim", 4) != 3:
+        return background
+    gel = np.asarray(to_host(background))
+    return np.broadcast_to(gel, (len(images), *gel.shape))
 
 
 def check_least(least: Any) -> None:
@@ -128,11 +138,11 @@ def mask_of(image: Array, background: Array, least: float) -> tuple[Mask, Mask]:
 
 
 def background_digest(images: Any) -> str:
-    """Sixteen digits for the different images of a stack (n, h, w, c), in any order and dtype.
+    """Sixteen digits for the different images of a stack, or one, in any order and dtype.
 
     Contact scores against other backgrounds are not comparable.
     """
-    stack = image_stack("background", images)
+    stack = image_stack("background", _for_all(images, range(1)))
     rows = {
         hashlib.sha256(np.rint(stack[i] * 65535).astype("<u2").tobytes()).digest()
         for i in range(len(stack))
@@ -181,7 +191,8 @@ class ContactOptions(TypedDict, total=False):
     """How contacts are compared.
 
     Attributes:
-        generated_background: (n, h, w, c), the generator's gel without contact; default: the real.
+        generated_background: (n, h, w, c) or (h, w, c), the generator's gel without contact;
+            default: the real.
         markers: skip the pixels of the real markers (``"skip"``, the default), or compare them.
         least: as in :func:`palpate.metrics.contact_mask`.
     """
@@ -203,7 +214,7 @@ def contact_scores(
     Args:
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape: the real tactile image of each generated one.
-        background: the same shape: the real gel without contact.
+        background: the same shape, or one image (h, w, c) for all: the real gel without contact.
         **options: :class:`ContactOptions` and :class:`palpate.metrics.images.ScoreOptions`.
 
     Returns:
@@ -369,12 +380,14 @@ def _checked(
     """Generated and real images, each with its background; errors as :func:`contact_scores`."""
     require_choice("markers", markers, ("skip", "keep"))
     check_least(least)
+    background = _for_all(background, reference)
     real = image_pairs(reference, background, arguments=("reference", "background"))
     require_side(real.size, WINDOW, "contact metrics")
     image_pairs(generated, reference)
     if generated_background is None:
         return image_pairs(generated, background), real, markers, least
     names = ("generated", "generated_background")
+    generated_background = _for_all(generated_background, generated)
     return image_pairs(generated, generated_background, arguments=names), real, markers, least
 
 

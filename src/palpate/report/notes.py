@@ -498,6 +498,10 @@ EVALUATION: dict[str, Sentence] = {
         "{subject}: {copies} of {n} generated rows are bit for bit rows of the reference: a copy "
         "is not a generator"
     ),
+    "pseudo-labels": (
+        "The classes are {clusters} clusters of {of}, not materials: not comparable with scores "
+        "over materials"
+    ),
     "synthetic-encoder": lambda p, _: (
         "The encoder was trained on simulated tactile images alone, and "
         + ("these are real" if p["real"] else "nothing says whether these are real")

@@ -280,7 +280,9 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
 
 def _features(metric: str) -> str:
     """``"tactile"`` of ``"FID (tactile)"``; '' for a name without brackets, or with a bandwidth."""
-    bracket = metric[metric.rindex(" (") + 2 : -1] if metric.endswith(")") and " (" in metric else ""
+    bracket = (
+        metric[metric.rindex(" (") + 2 : -1] if metric.endswith(")") and " (" in metric else ""
+    )
     return "" if bracket.startswith("σ") else bracket
 
 
