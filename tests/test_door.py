@@ -30,7 +30,7 @@ SIGNATURES = {
     "load": "source * format images skip_bad progress **options",
     "probe": "data split * encoder modality group balanced top seed cache progress",
     "score": (
-        "generated reference * encoder split names labels groups group presets sigma "
+        "generated reference * encoder split names labels groups group background presets sigma "
         "estimator backend normalize companions controls inception clip lpips "
         "permutations seed cache progress"
     ),
