@@ -14,6 +14,7 @@ from PIL import Image
 import palpate as pp
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
+from palpate.evaluation.auditing import audit as measured
 from palpate.leakage import audit, signals
 from palpate.leakage.auditing import known_group
 from palpate.leakage.inputs import NAMES, shared_names
@@ -254,6 +255,53 @@ def test_only_the_audits_group_counts_and_the_table_holds_every_signal():
     assert (by_object.leaking_samples, by_object.groups_shared) == (1, 1)
     again = Audit.from_json(json.loads(json.dumps(by_object.to_json())))
     assert again.signals[1].flagged == 1
+
+
+def untouched(root, contact):
+    """Ten materials in turn under one gel: slow drift and noise, and a contact if asked for."""
+    rng, (y, x) = np.random.default_rng(0), np.mgrid[:64, :64] / 64
+    gel = np.stack([90 + 60 * x, 110 + 50 * y, 140 - 40 * x], -1)
+    rows = []
+    for k in range(320):
+        video, t = f"v{k // 8}", k / 320
+        slow = np.sin(2 * np.pi * (t + x)) * np.cos(2 * np.pi * (y - 3 * t)) * 4
+        picture = gel + slow[..., None] * [1, 0.8, 0.6] + rng.normal(0, 1, gel.shape)
+        at = 0.2 + 0.6 * np.random.default_rng(k // 8).random(2)
+        if contact:
+            picture += 5 * (np.hypot(y - at[0], x - at[1]) < 0.1)[..., None]
+        path = root / video / f"{k}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.clip(picture + 0.5, 0, 255).astype(np.uint8)).save(path)
+        material = f"m{k // 32}"
+        rows.append(
+            {"id": f"{k}", "video": video, "material": material, "tactile": f"{video}/{k}.png"}
+        )
+    return Manifest.from_rows(rows, root)
+
+
+@pytest.mark.parametrize("contact", [False, True])
+def test_materials_that_differ_by_drift_alone_cannot_be_judged(contact, tmp_path):
+    samples = untouched(tmp_path, contact)
+    split = pp.split(samples, by="video")
+    result = measured(samples, split=split, impact=True)
+    numbers = result.verdict, result.reason, result.leaking_samples
+    assert numbers == (("none", "", 0) if contact else ("cannot tell", "untouched", 0))
+    assert (result.impact is None, "impact-of-nothing" in codes(result.notes)) == 2 * (not contact,)
+    assert ("Cannot be judged: nothing was touched" in str(result)) != contact
+    page = tmp_path / "p.html"
+    result.to_html(page)
+    assert ("cannot tell</p>" in page.read_text()) != contact
+    assert ("cannot tell leaked" in page.with_suffix(".md").read_text()) != contact
+    by_frame = Split({i: "test" if k % 4 == 0 else "train" for k, i in enumerate(samples.ids)})
+    leaking = audit(samples, split=by_frame, impact=lambda *_: 1 / 0 if not contact else None)
+    assert (leaking.verdict, leaking.leaked_fraction) == ("leaks", 1)
+
+
+def test_photos_that_are_all_alike_cannot_be_judged(tmp_path):
+    samples = untouched(tmp_path, contact=False).table
+    photos = samples.with_columns(vision="tactile", tactile=pl.lit(None, pl.String))
+    result = audit(*(Manifest(photos[a:b], tmp_path) for a, b in ((0, 240), (240, 320))))
+    assert (result.verdict, result.reason) == ("cannot tell", "alike")
 
 
 def test_the_matrix_puts_shared_groups_first():

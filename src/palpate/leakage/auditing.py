@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from palpate.core import Note, PalpateError, Progress, Split, quiet, require_choice
 from palpate.data.manifest import MODALITIES, Manifest
+from palpate.leakage.content import shows_nothing
 from palpate.leakage.groups import GROUPS, shared_groups
 from palpate.leakage.inputs import (
     Data,
@@ -314,7 +315,7 @@ def _compare(
     gaps = nearest_in_video(*(in_time(t) if options.ids_in_time else t for t in (a, b)))
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
-    verdict, reason = _verdict(flags, bool(leaks.any()), named=not equal)
+    reason = _reason(train, test, flags, options, named=not equal)
     timed = gaps.frames[gaps.frames >= 0]
     last = int(timed.max()) if timed.size else 0
     edges = [e for e in GAP_EDGES if e <= last] + [last + 1] if timed.size else []
@@ -347,35 +348,38 @@ def _compare(
         ),
         groups_in_all=len(groups[0] | groups[1]),
         shared={c: n for c, n in shared_groups(a, b).items() if c not in equal},
-        verdict=verdict,
+        verdict="leaks" if leaks.any() else CANNOT_TELL if reason else "none",
         reason=reason,
         table=signal_table(test, train, flags, gaps),
     )
 
 
-def _verdict(flags: Sequence[Flags], leaks: bool, *, named: bool) -> tuple[str, str]:
-    """Whether the split leaks, and why that cannot be told.
+def _reason(
+    train: Manifest, test: Manifest, flags: Sequence[Flags], options: _Options, *, named: bool
+) -> str:
+    """Why a leak might not show; '' where it would.
 
     Args:
+        train: samples.
+        test: the samples in question.
         flags: all signals.
-        leaks: whether any sample leaks.
+        options: of the audit.
         named: whether equal names say something.
     """
     near = [f for f in flags if f.kind.startswith("near-duplicate")]
-    reasons = {note.code: note.params for note in near[-1].notes} if near else {}
+    if near and options.encoder is None:
+        column = near[-1].kind.split()[-1]  # tactile images decide where there are any
+        if shows_nothing([train, test], column, options.threads, options.progress):
+            return "untouched" if column == "tactile" else "alike"
+    codes = {note.code for f in near[-1:] for note in f.notes}
+    if "cannot-tell-untouched" in codes:
+        return "untouched"
     files = [f for f in flags if f.kind == "identical bytes"]
-    if leaks:
-        return "leaks", ""
-    if "cannot-tell-untouched" in reasons:
-        return CANNOT_TELL, "untouched"
-    if reasons.get("cannot-tell-no-null", {}).get("threshold") is not None:
-        return CANNOT_TELL, "alike"
-    if not any(np.isfinite(f.score).any() for f in (*near, *files)):
-        if not named:
-            return CANNOT_TELL, "names"
-        if {f.kind for f in flags} <= {"identical sample", "identical bytes"}:
-            return CANNOT_TELL, "ids"
-    return "none", ""
+    if any(np.isfinite(f.score).any() for f in (*near, *files)):
+        return ""
+    if not named:
+        return "names"
+    return "ids" if {f.kind for f in flags} <= {"identical sample", "identical bytes"} else ""
 
 
 def _notes(

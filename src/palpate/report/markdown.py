@@ -37,6 +37,7 @@ from palpate.report.sentences import (
     leak_line,
     meaning_of,
     purpose,
+    share_of,
     summary_lines,
     threshold_line,
     threshold_text,
@@ -264,7 +265,7 @@ def _finding(audit: Audit) -> list[str]:
         )
     facts += [f"split: {audit.split}"] if audit.split else []
     return [
-        f"### {esc(against + audit.name)}: {esc(percent(audit.leaked_fraction))} leaked",
+        f"### {esc(against + audit.name)}: {esc(share_of(audit))} leaked",
         "",
         *pipe_table(["", esc(audit.against), "test"], rows),
         *_items([*facts, *map(sentence, audit.notes)]),

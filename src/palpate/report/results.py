@@ -181,7 +181,7 @@ class Audit:
         shared: column (video, session, object) that both parts know -> (test groups that are in
             train, test groups): whether the test part asks for new videos, or for new objects.
         verdict: ``leaks``, ``none``, or ``cannot tell``; '' in files of earlier versions.
-        reason: why that cannot be told: nothing was touched (``untouched``), all images are alike
+        reason: why a leak might not show: nothing was touched (``untouched``), all images are alike
             (``alike``), or there are no images and equal names mean nothing (``names``), or ids
             alone are known (``ids``).
         impact: what the leak does to scores, if requested.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from palpate.core import Score
 from palpate.report.notes import count, number, percent, plural, question, score_text
-from palpate.report.results import Audit, Results, Signal
+from palpate.report.results import CANNOT_TELL, Audit, Results, Signal
 from palpate.report.tables import Table, family_of, score_tables
 
 #: Beginning of a kind of leak -> what it means ({thing} is the rest of the name, {data} what test
@@ -124,12 +124,17 @@ def leak_line(audit: Audit) -> str:
         several = len(audit.signals) != 1
         signals = f"any of the {len(audit.signals)} signals" if several else "the one signal"
         line = f"None of {total} leaks by {signals} checked."
-        if audit.reason:
+        if audit.verdict == CANNOT_TELL:
             return f"Cannot be judged: {UNTOLD[audit.reason]}. {line}"
         return " ".join(filter(None, [line, question_line(audit)]))
     return (
         f"{count(n)} of {total} {'leaks' if n == 1 else 'leak'} ({percent(audit.leaked_fraction)})."
     )
+
+
+def share_of(audit: Audit) -> str:
+    """Return the leaking share of the test samples, or that it cannot be told."""
+    return CANNOT_TELL if audit.verdict == CANNOT_TELL else percent(audit.leaked_fraction)
 
 
 def question_line(audit: Audit) -> str:
