@@ -68,6 +68,15 @@ def test_a_weak_press_after_a_strong_one_and_a_gel_that_relaxes_slowly():
     ]
 
 
+def test_a_declared_gel_finds_a_press_that_is_held_longer_than_the_gel_is_free():
+    video = gel_video(60, ((8, 58),))
+    video[8:59] = video[30]
+    contacts = find_contacts(video, gel=gel_video(1, ())[0])
+    assert contacts.method == "declared"
+    assert [overlap(run, (8, 58)) > 0.9 for run in contacts.runs] == [True]
+    assert contacts.backgrounds[0] < 8
+
+
 def test_a_declared_reference_is_used_and_brightness_is_no_contact():
     video = gel_video(60, ((0, 59),))
     assert find_contacts(video, reference=7).reference == 7

@@ -14,7 +14,10 @@ from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.data import Manifest, import_dataset, load
 from palpate.data.detection import detect_layout
+from palpate.data.frames import MOVING
 from palpate.data.templates import Template, assign, join
+from test_data_contacts import gel_video, photos
+from test_data_videos import save
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "your-data.md"
 SECTIONS = re.findall(
@@ -31,6 +34,8 @@ def make_tree(paths, table=""):
         if path.endswith(".csv"):
             Path(path).parent.mkdir(parents=True, exist_ok=True)
             Path(path).write_text(table)
+        elif path.endswith(MOVING):
+            save(Path(path), gel_video(70, ((20, 30), (45, 55)), seed=k))
         else:
             write_image(Path(path), k)
 
@@ -46,6 +51,13 @@ def test_the_commands_of_the_page_run_and_use_every_file(
     words = shlex.split(command.replace("\\\n", " "))
     assert main([*words[1:], "-q"]) == 0, capsys.readouterr().err
     table = Manifest.load(Path("m")).require_valid().table
+    if any(p.endswith(MOVING) for p in paths):
+        moving = [p for p in paths if p.endswith(MOVING)]
+        sides = sum(table[side].count() > 0 for side in ("vision", "tactile"))
+        stills = len(paths) - len(moving)
+        assert table["video"].n_unique() == len(moving) // (sides - bool(stills))
+        assert table["contact"].n_unique() == 2 * table["video"].n_unique()
+        return
     used = {v for c in ("vision", "tactile", "background") for v in table[c].drop_nulls()}
     assert used == {p.removeprefix("own/") for p in paths if not p.endswith(".csv")}
     assert table["id"].n_unique() == len(table)
@@ -224,6 +236,11 @@ STRANGERS = {
         ["--vision", "{object}_{frame}.png", "--tactile", "{object}_{frame}_real.png"],
     ),
     "one-sided": (("touch/{o}/{c}/{f}.png",), []),
+    "flat videos": (("{o}_cam.mp4", "{o}_gel.mp4"), ["--max-per-contact", "4"]),
+    "one-sided videos": (
+        ("{o}_1.mov",),
+        ["--tactile", "{object}_{video}.mov", "--max-per-contact", "4"],
+    ),
     "table": (
         (PHOTO, TOUCH),
         ["--map", "vision=image", "tactile=gel", "video=clip", "material=kind"],
@@ -232,6 +249,11 @@ STRANGERS = {
 
 
 def write_stranger(root, sides, as_table):
+    if sides[0].endswith(MOVING):
+        for o, side in product(range(6), sides):
+            make = photos if "cam" in side else gel_video
+            save(root / side.format(o=f"thing{o}"), make(70, ((20, 30), (45, 55)), seed=o))
+        return root
     lines = ["clip,kind,image,gel"]
     for o, c, f in product(range(6), range(2), range(4)):
         paths = [side.format(o=f"thing{o}", c=c, f=f) for side in sides]
@@ -259,7 +281,8 @@ def test_a_strangers_layout_reaches_every_verb_with_one_import(name, tmp_path, m
     encoder = ("m", "--split", "s.json", "--preset", "tiny", "--device", "cpu", "-o", "e")
     run("train", "encoder", *encoder)
     if len(sides) == 1:
-        run("score", source / "touch" / "thing1", "--reference", "m", "--encoder", "e")
+        (generated, *_) = [*source.glob("touch/thing1"), *Path("m/images").glob("thing1/*/*")]
+        run("score", generated, "--reference", "m", "--encoder", "e")
         return
     generator = ("m", "--split", "s.json", "--clip", "e", "--preset", "tiny", "--steps", "2")
     run("train", "generator", *generator, "--device", "cpu", "-o", "g")

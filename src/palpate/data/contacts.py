@@ -68,16 +68,24 @@ def thumbnail(image: Any, size: tuple[int, int] = SIZE) -> Pixels:
     return np.asarray(picture.convert("RGB").resize(size, Image.Resampling.BOX))
 
 
-def find_contacts(thumbnails: Pixels, reference: int | None = None) -> Contacts:
+def find_contacts(
+    thumbnails: Pixels, reference: int | None = None, *, gel: Pixels | None = None
+) -> Contacts:
     """Find the contacts of one video.
 
     Args:
         thumbnails: (n, 48, 64, 3) frames in order, 0 to 255; at least one.
         reference: the frame that shows the untouched gel, if it is known.
+        gel: (48, 64, 3) the untouched gel, if there is an image of it; the reference is then the
+            frame most like it.
     """
-    method = "found" if reference is None else "declared"
-    reference = find_reference(thumbnails) if reference is None else reference
-    energy = contact_energy(thumbnails, thumbnails[reference])
+    method = "found" if reference is None and gel is None else "declared"
+    if gel is not None:
+        energy = contact_energy(thumbnails, gel)
+        reference = int(energy.argmin())
+    else:
+        reference = find_reference(thumbnails) if reference is None else reference
+        energy = contact_energy(thumbnails, thumbnails[reference])
     runs, backgrounds = _contacts(energy, _noise(thumbnails), reference)
     return Contacts(energy, reference, method, runs, backgrounds)
 

@@ -47,15 +47,15 @@ def findings(
         thumbnails: ``vision``, ``tactile`` or both -> (n, 48, 64, 3) frames in order.
         seconds: of those that are videos -> (n,) when each frame is presented.
     """
-    changes = {name: _changes(images) for name, images in thumbnails.items()}
+    changes = {name: changes_of(images) for name, images in thumbnails.items()}
     problems = [p for name, change in changes.items() for p in _frozen(name, change)]
     problems += [p for name, times in seconds.items() for p in _dropped(name, times)]
     if len(changes) == 2:
-        problems += _unequal(thumbnails, seconds) or _lag(changes["tactile"], changes["vision"])
+        problems += _unequal(thumbnails, seconds) or lag_of(changes["tactile"], changes["vision"])
     return problems + (_changed_gel(thumbnails["tactile"]) if "tactile" in thumbnails else [])
 
 
-def _changes(images: Pixels) -> NDArray[np.float64]:
+def changes_of(images: Pixels) -> NDArray[np.float64]:
     """(n - 1,) root mean square of the change to the next frame."""
     pairs = zip(images[1:], images[:-1], strict=True)
     return np.sqrt(
@@ -103,7 +103,8 @@ def _unequal(
     return []
 
 
-def _lag(tactile: NDArray[np.float64], vision: NDArray[np.float64]) -> list[Finding]:
+def lag_of(tactile: NDArray[np.float64], vision: NDArray[np.float64]) -> list[Finding]:
+    """The lag between the changes (n,) of two streams, if one stands out."""
     count = min(len(tactile), len(vision))
     if count < LEAST_FRAMES:
         return []

@@ -30,14 +30,14 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet
-from palpate.data.contacts import Contacts, find_contacts
+from palpate.data.contacts import Contacts, find_contacts, thumbnail
 from palpate.data.formats import touch_and_go
 from palpate.data.formats.base import Cells, Facts, Format, Scan, few
 from palpate.data.formats.layout import require_folder
 from palpate.data.formats.pairs import Side, name_apart, templates_of
 from palpate.data.formats.touch_and_go import extracted, require_frame_options
 from palpate.data.frames import MOVING, ImageFormat
-from palpate.data.images import SUFFIXES, Check, in_threads
+from palpate.data.images import SUFFIXES, Check, in_threads, read_image
 from palpate.data.imported import Imported, removing_on_error
 from palpate.data.manifest import SCHEMA, Manifest
 from palpate.data.recordings import Recordings, Row, VideoFiles, thin
@@ -122,7 +122,7 @@ def scan(
     decoded = check == "decode"
     _require_amounts(videos, every if decoded else 1, max_per_contact)
     work = _opened(result, videos, result.base, progress, "jpg", None, [])
-    contacts = _contacts(work, progress) if decoded else {}
+    contacts = _contacts(work, videos, progress) if decoded else {}
     rows = _rows(work, videos, contacts, every if decoded else 1)
     rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
     for row, cell in zip(rows, _cells(work, rows, videos, None), strict=True):
@@ -164,7 +164,7 @@ def run(  # noqa: PLR0913 (a public verb)
     _require_amounts(videos, every, max_per_contact)
     with removing_on_error(out) as created:
         work = _opened(result, videos, Path(out), progress, image_format, size, created)
-        contacts = _contacts(work, progress)
+        contacts = _contacts(work, videos, progress)
         rows = _rows(work, videos, contacts, every)
         rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
         rows = extracted(work, rows, result.base, skip_bad=skip_bad, progress=progress)
@@ -282,17 +282,21 @@ def _path(result: Scan, path: str | None) -> Path | None:
     return None if path is None else result.base / path
 
 
-def _contacts(work: Recordings, progress: Progress) -> dict[str, Contacts | None]:
+def _contacts(
+    work: Recordings, videos: Mapping[str, _Video], progress: Progress
+) -> dict[str, Contacts | None]:
     """Recording -> its contacts, None without touch; what looks wrong is reported."""
 
     def find(video: str) -> tuple[Contacts | None, list[Finding]] | str:
         try:
+            declared = videos[video].still.get("background")
+            gel = None if declared is None else thumbnail(read_image(work.root / declared))
             streams = {m: frames.stream() for m, frames in work.frames[video].items()}
         except PalpateError as error:
             return error.got
         images = {m: stream[0] for m, stream in streams.items() if stream is not None}
         seconds = {m: stream[1] for m, stream in streams.items() if stream is not None}
-        contacts = find_contacts(images["tactile"]) if "tactile" in images else None
+        contacts = find_contacts(images["tactile"], gel=gel) if "tactile" in images else None
         return contacts, findings(images, {m: t for m, t in seconds.items() if t is not None})
 
     contacts: dict[str, Contacts | None] = {}
