@@ -132,7 +132,7 @@ def test_a_declared_background_and_further_fields(layouts, tmp_path):
     )
     table = imported.manifest.require_valid().table
     assert set(table["background"].str.split("/").list.last()) == {"empty_gel.png"}
-    assert len(table.filter(video="cup/1")) < 30  # of another gel all 70 frames would differ
+    assert table.filter(video="cup/1")["contact"].n_unique() == 2  # seen against that image
     assert set(table["brand"]) == {"cup", "big_mug"}
     assert set(table["video"]) == {"cup/1", "cup/2", "big_mug/1", "big_mug/2"}
     assert set(table["sensor"]) == {"mini"}
