@@ -146,7 +146,7 @@ class Estimate:
             "from": f"{self.measured:,} replies so far" if self.measured else assumed,
         }
         kept = {name: value for name, value in rows.items() if value is not None}
-        return "\n".join(["Nothing was sent", *fact_lines(kept)])
+        return "\n".join(["No photo was sent", *fact_lines(kept)])
 
 
 def caption(  # noqa: PLR0913 (a public verb)
@@ -272,7 +272,7 @@ def _made(
 ) -> dict[str, Any]:
     """What the record says of the model and of its replies."""
     prompt = question.prompt
-    answers = [replies[key] for key in sorted(set(photos.keys) & set(replies))]
+    answers = _answers(photos, replies)
     return {
         "model": question.model,
         "server": server,
@@ -289,6 +289,12 @@ def _made(
     }
 
 
+def _answers(photos: Photos, replies: Mapping[str, Reply]) -> list[Reply]:
+    """The replies about these photos, each once."""
+    keys = sorted({key for key in photos.keys if key is not None and key in replies})
+    return [replies[key] for key in keys]
+
+
 def _estimate(
     photos: Photos,
     question: Question,
@@ -298,7 +304,7 @@ def _estimate(
 ) -> Estimate:
     """What is left to ask, by the replies so far or by assumptions."""
     count = len(photos.pending(replies, question.prompt))
-    known = [replies[key] for key in set(photos.keys) & set(replies)]
+    known = _answers(photos, replies)
     if known:
         inward, outward = (sum(r.tokens[k] for r in known) / len(known) for k in (0, 1))
         seconds = sum(reply.seconds for reply in known) / len(known)
@@ -366,9 +372,9 @@ def _notes(manifest: Manifest, units: Units, made: Mapping[str, Any]) -> list[No
         notes.append(Note("captions-alone", params))
     if made["model"] is None:
         notes.append(Note("captions-of-columns", {"template": made["template"]}))
-    others = [name for name in made.get("answered_as", ()) if not _same(name, made["model"])]
-    if others:
-        notes.append(Note("captions-other-model", {"models": others, "model": made["model"]}))
+    model = str(made["model"])
+    if others := [name for name in made.get("answered_as", ()) if not _same(name, model)]:
+        notes.append(Note("captions-other-model", {"models": others, "model": model}))
     return notes
 
 

@@ -148,7 +148,7 @@ def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
     scores = [_share(name, words, rows) for name, words in {FLAGGED: flagged, **hits}.items()]
     text, count = Counter(rows.texts).most_common(1)[0]
     common = _share("the commonest text", [[t] * (t == text) for t in rows.texts], rows)
-    if count > COMMON * len(rows.texts) and text:
+    if count > max(1, COMMON * len(rows.texts)) and text:
         common = replace(common, notes=[Note("captions-common", {"text": text, "count": count})])
     return [*scores, common]
 
@@ -225,9 +225,9 @@ def _predicted(
         features = np.zeros((len(texts), len(words) + 1))
         for row, bag in enumerate(bags):
             features[row, [column[word] for word in bag if word in column]] = 1
+        known = [[items[row] for row in train.tolist()] for items in (labels, groups)]
         names = [str(row) for row in train]
-        rows = [[items[row] for row in train] for items in (labels, groups)]
-        probe = fit_probe(FeatureSet(names, features[train], *rows), l2=PENALTY)
+        probe = fit_probe(FeatureSet(names, features[train], known[0], known[1]), l2=PENALTY)
         predicted[test] = probe.predict(features[test])
     return predicted
 

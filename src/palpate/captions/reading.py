@@ -13,8 +13,8 @@ from palpate.data.reading import load
 from palpate.data.texts import TABLE, joined, read_texts
 
 #: Columns of a table of captions.
-SCHEMA = {"id": pl.String(), "text": pl.String()}
-SCHEMA |= dict.fromkeys(("adjectives", "flags"), pl.List(pl.String))
+LISTS = dict.fromkeys(("adjectives", "flags"), pl.List(pl.String))
+SCHEMA = {"id": pl.String(), "text": pl.String(), **LISTS}
 
 
 def read_captions(captions: Any, data: Any = None, **options: Any) -> tuple[Manifest, pl.DataFrame]:
@@ -50,5 +50,5 @@ def read_captions(captions: Any, data: Any = None, **options: Any) -> tuple[Mani
         if table.schema == pl.Schema(SCHEMA):
             return manifest, table
     empty = pl.lit([], SCHEMA["flags"])
-    lists = dict.fromkeys(("adjectives", "flags"), empty)
+    lists = dict.fromkeys(LISTS, empty)
     return manifest, manifest.table.select("id", "text").with_columns(**lists)

@@ -24,8 +24,8 @@ _ENDINGS = (
     ("ic", ("",)),
 )
 #: Parts of labels that say nothing by themselves.
-_EMPTY = {"a", "an", "and", "of", "or", "the", "with", "material", "surface"}
-_EMPTY |= {"natural", "synthetic", "other", "others"}
+_ARTICLES = {"a", "an", "and", "of", "or", "the", "with"}
+_EMPTY = _ARTICLES | {"material", "surface", "natural", "synthetic", "other", "others"}
 
 
 def words_of(text: str) -> list[str]:

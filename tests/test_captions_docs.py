@@ -1,0 +1,41 @@
+"""The page about captions: its commands run against a local server, its flags exist."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from caption_server import FakeServer
+from palpate.cli import main
+from palpate.core import Split
+from palpate.sim import WorldOptions, write_world
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "captions.md"
+
+
+@pytest.mark.slow
+def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
+    options = WorldOptions(
+        materials=3, objects_per_material=4, contacts_per_video=2, frames_per_contact=2, test=0.4
+    )
+    write_world(tmp_path / "data", options)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data" / "splits" / "Orig.json").rename(tmp_path / "noleak.json")
+    assert Split.load("noleak.json").counts()["test"]
+    text = PAGE.read_text(encoding="utf-8")
+    with FakeServer() as server:
+        for block in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            for line in block.replace("http://localhost:8000/v1", server.url).splitlines():
+                assert main(shlex.split(line)[1:]) == 0, line
+    for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        exec(compile(block, str(PAGE), "exec"), {})
+    assert "material accuracy from the text" in capsys.readouterr().out
+
+
+def test_every_flag_has_an_example():
+    flags = re.findall(r"^\| `([a-z-]+)` \| ", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    sources = (PAGE.parents[1] / "src" / "palpate" / "captions").glob("*.py")
+    code = "".join(path.read_text(encoding="utf-8") for path in sources)
+    assert all(f'"{flag}"' in code for flag in flags)
+    assert len(flags) == 10
