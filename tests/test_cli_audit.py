@@ -1,7 +1,10 @@
 """``palpate audit`` from the outside: every kind of input, every output, bad input in a line."""
 
 import json
+import shlex
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -11,6 +14,7 @@ from PIL import Image
 from format_trees import TREES
 from palpate.cli import main
 from palpate.core import Split
+from palpate.data.manifest import Manifest
 
 
 def run(capsys, *args):
@@ -109,6 +113,32 @@ def test_equal_file_names_of_two_roots_are_no_leak_and_a_copied_file_is(layout, 
     shutil.rmtree(tmp_path / "b" / "m", ignore_errors=True)
     status, data, _ = run(capsys, *sources())
     assert (status, data["leaking_samples"], data["leaked_fraction"]) == (1, 1, round(1 / 12, 5))
+
+
+def test_the_next_commands_of_tactile_data_work_on_it(tmp_path, capsys, monkeypatch):
+    """With videos, and without any: near-duplicates are then all that can be kept together."""
+    monkeypatch.chdir(tmp_path)
+    for k in range(60):
+        path = tmp_path / "own" / f"rec{k % 12}" / f"{k}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        texture(k if k != 59 else 3, 64).save(path)
+    assert main(["import", "own", "--as", "tactile", "-o", "with", "-q"]) == 0
+    assert main(["import", "own", "--as", "tactile", "-o", "plain", "-q"]) == 0
+    whole = Manifest.load("plain")
+    none = {c: pl.lit(None, whole.table[c].dtype) for c in ("video", "frame", "object", "contact")}
+    replace(whole, table=whole.table.with_columns(**none)).save(Path("plain/manifest.parquet"))
+    Split({i: "test" if int(i.split("/")[-1]) % 5 == 4 else "train" for i in whole.ids}).save(
+        "s.json"
+    )
+    capsys.readouterr()
+    for folder in ("with", "plain"):
+        status, data, _ = run(capsys, folder, "--split", "s.json")
+        assert (status, len(data["commands"])) == (1, 2)
+        assert data["commands"][0] == f"palpate split {folder} --near tactile -o noleak.json"
+        for command in data["commands"]:
+            assert main([*shlex.split(command)[1:], "--json"]) == 0, command
+            answer = json.loads(capsys.readouterr().out)
+        assert answer["leaking_samples"] == 0
 
 
 def test_a_damaged_picture_is_named_and_the_others_are_compared(folders, capsys):

@@ -43,6 +43,28 @@ def page_of(results, folder, **options):
     return write_report(results, folder / "page.html", **options).page.read_text(encoding="utf-8")
 
 
+def test_near_duplicates_show_what_chance_explains(tmp_path):
+    calibrated = Signal(
+        "near-duplicate tactile",
+        100,
+        3,
+        0.4,
+        0.01,
+        verdict="none",
+        expected=1.0,
+        measured=0.012,
+        counts=False,
+    )
+    untold = Signal("near-duplicate vision", 100, 0, 1.0, 0.01, verdict="cannot tell")
+    audit = small_audit(signals=[calibrated, untold])
+    texts = str(audit), Tree(page_of(Results("T", audits=[audit]), tmp_path)).text
+    texts = *texts, Results("T", audits=[audit]).to_markdown()
+    for text in texts:
+        text = text.replace("\u00a0", " ").replace("\\", "")
+        assert "no leak (1.000 expected by chance; promised rate 1.0 %, measured 1.2 %)" in text
+        assert "cannot tell" in text
+
+
 def test_pairs_without_photos_show_the_contact_and_no_empty_boxes(tmp_path):
     """A disc of three gray levels on a strong gradient: invisible as it is, plain as a contact."""
     y, x = np.mgrid[:64, :64]

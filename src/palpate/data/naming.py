@@ -235,11 +235,11 @@ def _paths(
     rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
     template = Template.parse(options[side], side) if side and options.get(side) else None
     for k, row in rows:
-        if paths and paths[k]:
-            row[PATH] = paths[k]
-            fields = template.match(paths[k]) if template else {}
+        if place := paths[k] if paths else None:
+            row[PATH] = place
+            fields = template.match(place) if template else {}
             if fields is None:
-                text = f"{paths[k]!r} is not like the template {template and template.text}"
+                text = f"{place!r} is not like the template {options[side]}"
                 table.problems.append(Problem(table.where(k), "no-match", text))
             row |= {n: v for n, v in (fields or {}).items() if n in SCHEMA and n not in row}
         if "frame" in row:

@@ -163,12 +163,8 @@ def audit(  # noqa: PLR0913
     require(not (impact and test is not None), "impact", "needs samples with a split", "no split")
     sources = [x for x in (train_or_data, test, pretrain) if x is not None]
     read = read_all(sources, skip_bad, progress, root, reading)
-    parts, notes = (
-        [source.manifest for source in read],
-        [n for source in read for n in source.notes],
-    )
-    if test is None and split is None:
-        split = _stated(read[0].splits)
+    parts = [source.manifest for source in read]
+    notes = [note for source in read for note in source.notes]
     if by == "contact":
         parts = number_contacts(parts)
     if test is not None:
@@ -176,7 +172,8 @@ def audit(  # noqa: PLR0913
         result = _compare(parts[0], parts[1], options, title)
         test_part = parts[1]
     else:
-        whole, parted = parts[0], Split.load(split)
+        whole = parts[0]
+        parted = _stated(read[0].splits) if split is None else Split.load(split)
         test_part, val = whole.part(parted, "test"), whole.part(parted, "val")
         title = name or str(parted.rule.get("name") or _name(split, "split"))
         result = _compare(whole.part(parted, "train"), test_part, options, title, val=val)

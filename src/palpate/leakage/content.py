@@ -80,7 +80,7 @@ def structure(images: Floats, grounds: Floats) -> Floats:
     x, ground = (a - a.mean((1, 2), keepdims=True) for a in (images, grounds))
     gain = (x * ground).sum((1, 2), keepdims=True)
     gain /= np.maximum((ground**2).sum((1, 2), keepdims=True), 1)
-    power = fft.dctn(x - gain * ground, axes=(1, 2), norm="ortho") ** 2
+    power = np.asarray(fft.dctn(x - gain * ground, axes=(1, 2), norm="ortho")) ** 2
     k = np.maximum(*np.mgrid[:SIDE, :SIDE])
     contact, pixels = (power[:, band].mean((1, 2)) for band in ((k >= 6) & (k < 20), k >= 36))
     return np.sqrt(contact) / np.maximum(np.sqrt(pixels), NOISE)

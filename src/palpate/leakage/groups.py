@@ -8,7 +8,6 @@ smallest value of the first column in it, so that a group of one video has the v
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -48,8 +47,8 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, Note | None]:
         )
     lacks = [_lacks(manifest.table, column, parts) for column in chain[:-1]]
     at = next((k for k, note in enumerate(lacks) if note is None), len(lacks))
-    if at:
-        return chain[at], replace(lacks[0], params=lacks[0].params | {"taken": chain[at]})
+    if at and (first := lacks[0]):
+        return chain[at], Note(first.code, {**first.params, "taken": chain[at]})
     if chain[0] == named != "video":
         return chain[0], Note("group-of-data-set", {"group": chain[0]})
     return chain[0], None if "video" in chain else Note("group-instead", {"group": chain[0]})

@@ -94,6 +94,7 @@ class Flags:
         false_positives, edges, unrelated, matches: see :class:`palpate.report.results.Signal`.
         cause: (n,) one of ``CAUSES``, or '' below the threshold; None for exact signals.
         notes: what a reader must know.
+        verdict, expected, measured: see :class:`palpate.report.results.Signal`.
     """
 
     kind: str
@@ -108,6 +109,9 @@ class Flags:
     matches: Sequence[int] = ()
     cause: NDArray[np.str_] | None = None
     notes: Sequence[Note] = ()
+    verdict: str = ""
+    expected: float | None = None
+    measured: float | None = None
 
     def columns(self, ids: NDArray[np.object_]) -> dict[str, pl.Series]:
         """Score, flag, nearest train id and, where known, the cause, as table columns."""
@@ -141,6 +145,9 @@ class Flags:
             worst=self._worst(train, test, gaps, worst),
             notes=list(self.notes),
             counts=self.counts,
+            verdict=self.verdict,
+            expected=self.expected,
+            measured=self.measured,
         )
 
     def _worst(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> list[LeakPair]:
@@ -180,7 +187,7 @@ def identical_samples(
     same = np.array([place.get(name, -1) for name in test.ids], np.int64)
     nearest = np.where(same >= 0, same, np.where(gaps.frames == 0, gaps.row, -1))
     flag = nearest >= 0
-    score = np.where({"id", "video"} & {*named}, flag, np.nan).astype(np.float32)
+    score = np.where(bool({"id", "video"} & {*named}), flag, np.nan).astype(np.float32)
     return Flags("identical sample", score, flag, nearest)
 
 

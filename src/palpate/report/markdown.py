@@ -33,6 +33,7 @@ from palpate.report.results import Audit, Impact, LeakPair, Results
 from palpate.report.sentences import (
     cause_notes,
     cause_texts,
+    chance_text,
     data_of,
     leak_line,
     meaning_of,
@@ -280,7 +281,7 @@ def _signals(audit: Audit) -> list[str]:
     for s in audit.signals:
         rate = "–" if s.false_positives is None else percent(s.false_positives)
         share = percent(s.fraction) if s.checked else "–"
-        causes = "; ".join(cause_texts(s)) or "–"
+        causes = "; ".join(filter(None, [*cause_texts(s), chance_text(s)])) or "–"
         cells = [s.kind, count(s.checked), count(s.flagged), share, threshold_text(s), rate, causes]
         rows.append([esc(cell) for cell in cells])
         about = [meaning_of(s, audit)]

@@ -81,7 +81,12 @@ class Signal:
         worst: the strongest pairs.
         notes: what a reader must know.
         counts: whether flagged samples count as leaking; a shared group other than the audit's is
-            reported but not counted.
+            reported but not counted, nor are as many near-duplicates as chance explains.
+        verdict: of near-duplicates: ``leaks``, ``none``, or ``cannot tell`` (``worst`` is then a
+            ranking); '' where the signal is exact.
+        expected: samples that chance alone flags at ``false_positives``; None if not known.
+        measured: the rate at which train images of other videos are flagged by thresholds from
+            the other half of the videos; None if not known.
     """
 
     kind: str
@@ -96,6 +101,9 @@ class Signal:
     worst: Sequence[LeakPair] = ()
     notes: Sequence[Note] = ()
     counts: bool = True
+    verdict: str = ""
+    expected: float | None = None
+    measured: float | None = None
 
     @property
     def fraction(self) -> float:

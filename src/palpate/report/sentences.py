@@ -95,6 +95,19 @@ def cause_notes(signal: Signal) -> list[str]:
     ]
 
 
+def chance_text(signal: Signal) -> str:
+    """Return a verdict on near-duplicates, beside what chance explains; '' for exact signals."""
+    if not signal.verdict:
+        return ""
+    words = {"leaks": "leaks", "none": "no leak"}.get(signal.verdict, signal.verdict)
+    facts = [] if signal.expected is None else [f"{number(signal.expected)} expected by chance"]
+    if signal.false_positives is not None and signal.expected is not None:
+        rates = f"promised rate {percent(signal.false_positives)}"
+        known = signal.measured is not None
+        facts.append(rates + (f", measured {percent(signal.measured or 0.0)}" if known else ""))
+    return words + (f" ({'; '.join(facts)})" if facts else "")
+
+
 def threshold_line(signal: Signal) -> str:
     """Return how the threshold was set, and how many samples are at or above it."""
     line = f"The threshold is a score of {score_text(signal.threshold)}"

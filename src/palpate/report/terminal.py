@@ -11,7 +11,7 @@ from rich.text import Text
 
 from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, count, percent, sentence
 from palpate.report.results import Audit, Results
-from palpate.report.sentences import audit_line, cause_texts, threshold_text
+from palpate.report.sentences import audit_line, cause_texts, chance_text, threshold_text
 from palpate.report.tables import BEST, Cell, Table, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
@@ -143,9 +143,9 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     width = max((len(signal.kind) for signal in audit.signals), default=0)
     for signal in audit.signals:
         share = f"{count(signal.flagged)} of {count(signal.checked)} ({percent(signal.fraction)})"
-        facts = [share, threshold_text(signal), *cause_texts(signal)]
+        facts = [share, threshold_text(signal), *cause_texts(signal), chance_text(signal)]
         facts = facts if signal.checked else ["none could be checked"]
-        lines.append(f"  {signal.kind:<{width}}  {', '.join(facts)}")
+        lines.append(f"  {signal.kind:<{width}}  {', '.join(filter(None, facts))}")
     for signal in audit.signals:
         lines += [f"  {signal.kind}: {sentence(note, style)}" for note in signal.notes]
     lines += [sentence(note, style) for note in audit.notes]
