@@ -194,7 +194,7 @@ def tally_tmmd(
             options = {"sigma": sigma, "seed": r, "permutations": 0 if shift else permutations}
             scores = {"videos": tmmd(*sets, **options)}
             if r < frames:
-                scores["frames"] = tmmd(*without_groups(*sets), **options)
+                scores["frames"] = tmmd(*without_groups(*sets), preset="paper", **options)
             for unit, score in scores.items():
                 tally = tallies[name + (", frames" if unit == "frames" else "")]
                 tally.add(score.value, score.interval, truth.tmmd[shift])

@@ -26,7 +26,7 @@ from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.encoders.zero_shot import zero_shot_accuracy
 from palpate.evaluation.scoring import score
-from palpate.metrics.probe import material_accuracy, retrieval, text_positives
+from palpate.metrics.probe import material_accuracy, retrieval
 from palpate.sim import MATERIALS, WorldOptions
 from palpate.sim.objects import make_object
 from palpate.sim.plan import ObjectRef
@@ -105,9 +105,8 @@ def score_encoders(
     }
     vision, tactile = sides["vision"][1], sides["tactile"][1]
     text = embed(new, encoders, "text", cache=cache, progress=progress)
-    same = text_positives(
-        embed_texts(texts_of(new)[0], encoders), 0.999
-    )  # equal captions count as right
+    words = embed_texts(texts_of(new)[0], encoders)
+    same = words @ words.T > 0.999  # equal captions count as right
     scores = [
         ("zero-shot material, vision", zero_shot_accuracy(vision, names, encoders)),
         ("zero-shot material, tactile", zero_shot_accuracy(tactile, names, encoders)),

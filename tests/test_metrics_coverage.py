@@ -99,6 +99,31 @@ def test_what_needs_no_reference_covers(model, truth):
 
 
 @pytest.mark.slow
+def test_the_excess_covers_where_videos_have_1_to_60_frames(model, truth):
+    tallies = [
+        study.tally_halves(model, truth, videos, EACH, seed=14, lengths=study.UNEQUAL)
+        for videos in VIDEOS
+    ]
+    for name in ("I-TMMD: E", "CI-TMMD: E", "D: E_ratio"):
+        assert study.COVERAGE[0] <= share(tallies, name) <= study.COVERAGE[1], name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenes", study.SCENES)
+def test_shared_ids_alone_cover_and_the_formula_lies_below_the_truth(model, truth, scenes):
+    found = study.tally_scenes(model, truth, scenes, EACH, seed=15)
+    for (shift, sigma, preset), tally in found.items():
+        value, _, _, exact = tally.table.T
+        bias = (value - exact).mean() / (value.std() / np.sqrt(EACH))
+        if preset is None:
+            assert abs(bias) < 4, (shift, sigma)
+            assert tally.coverage >= study.COVERAGE[0]
+        elif not shift:
+            assert bias < -10, sigma
+            assert tally.coverage < 0.6
+
+
+@pytest.mark.slow
 def test_paired_differences_cover(model, truth):
     tallies, wider = zip(
         *[study.tally_difference(model, truth, videos, EACH, seed=13) for videos in VIDEOS],

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 from palpate.core import FeatureSet, PalpateError
-from palpate.metrics.probe import fit_probe, material_accuracy, retrieval, text_positives
+from palpate.metrics.probe import fit_probe, material_accuracy, retrieval
 
 
 def features(x, labels=None, groups=None, encoder="e", start=0):
@@ -170,8 +170,3 @@ def test_chance_of_a_pool_does_not_depend_on_n(n):
 def test_retrieval_rejects_sets_that_do_not_pair(queries, keys, pool, match):
     with pytest.raises(PalpateError, match=match):
         retrieval(features(queries), keys, pool=pool)
-
-
-def test_texts_above_the_threshold_count_as_the_same():
-    same = text_positives(np.array([[2, 0], [0.8, 0.6], [0, 1]], np.float32))
-    assert same.tolist() == [[True, True, False], [True, True, False], [False, False, True]]

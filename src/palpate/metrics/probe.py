@@ -170,7 +170,7 @@ def retrieval(
         pool: rank among so many samples drawn at random instead of among all; chance is then
             k / pool whatever n.
         repeats: pools to average over.
-        positives: (n, n), keys that also count for a query, e.g. :func:`text_positives`.
+        positives: (n, n), keys that also count for a query: equal texts.
         seed: of the pools.
         name: start of the metric's name (``"vision to tactile"``).
         subject: what is scored, kept in the scores.
@@ -220,11 +220,6 @@ def retrieval(
         )
         for k in top
     ]
-
-
-def text_positives(texts: NDArray[Any], threshold: float = 0.6356) -> NDArray[np.bool_]:
-    """Pairs of texts (n, d) that count as the same: cosine above TVL's threshold; (n, n)."""
-    return _unit(texts) @ _unit(texts).T > threshold
 
 
 def recall_by_class(hits: NDArray[Any], labels: Sequence[str]) -> dict[str, float]:
