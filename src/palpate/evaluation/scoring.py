@@ -508,23 +508,27 @@ class _Run:
         from scipy.cluster.vq import kmeans2
 
         real, seed = self.inputs.reference, self.family.common["seed"]
-        photos = real.manifest is not None and not real.manifest.table["vision"].null_count()
-        if self.encoders is not None and photos:
+        manifest = real.manifest
+        photos = manifest is not None and not manifest.table["vision"].null_count()
+        if self.encoders is not None and manifest is not None and photos:
             from palpate.encoders.embed import embed
 
             options: dict[str, Any] = {"keep_pixels": False, "progress": self.progress}
-            x, of = embed(real.manifest, self.encoders, "vision", **options).features, "photos"
+            x, of = embed(manifest, self.encoders, "vision", **options).features, "photos"
         elif self.encoders is not None or real.features is not None:
             x, of = self._features(real).features, "the reference's features"
         else:
             fix, example = "Pass an encoder", {"encoder": "palpate/mini"}
             must, got = "must be a file where there are no features", "clusters"
             raise PalpateError(must, got, fix, argument="labels", example=example)
-        if len(x) < 4 * count:
-            must, got = "must leave four samples a cluster", f"{count} of {len(x)} samples"
-            raise PalpateError(must, got, "Choose fewer", argument="labels")
         rows = np.asarray(x, np.float64)
-        number = kmeans2(rows, count, iter=50, minit="++", seed=rng_for(seed, "clusters"))[1]
+        distinct = np.unique(rows, axis=0)
+        if len(distinct) < 4 * count:
+            got = f"{count} of {len(distinct)} different samples"
+            must = "must leave four samples a cluster"
+            raise PalpateError(must, got, "Choose fewer", argument="labels")
+        first = distinct[rng_for(seed, "clusters").choice(len(distinct), count, replace=False)]
+        number = kmeans2(rows, first, iter=100, minit="matrix")[1]
         real = replace(real, labels=[f"cluster {k + 1}" for k in number])
         made = {
             name: from_reference(replace(s, labels=None), real)

@@ -175,11 +175,12 @@ class PairSums:
     @cached_property
     def totals(self) -> Totals:
         """Sums over all items."""
-        n, sums, same, *more = self._part(slice(None))
+        n, sums, same, diagonal, squares = self._part(slice(None))
         cell = np.searchsorted(self.units, self.unit) * self.segments + self.segment
         count = np.bincount(cell, weights=self.n, minlength=len(self.units) * self.segments)
         count = count.reshape(-1, self.segments).astype(np.float64)
-        return Totals(n, sums, same, count.T @ count, *more, self.even and self.even.totals)
+        even = self.even and self.even.totals
+        return Totals(n, sums, same, count.T @ count, diagonal, squares, even)
 
     def leave_one_out(self) -> Iterator[Totals]:
         """The totals without each unit in turn: ``sums - C - C' + B``.
