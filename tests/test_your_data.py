@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from data_fixtures import write_image
 from palpate.cli import main
 from palpate.core import PalpateError
 from palpate.data import Manifest, import_dataset, load
-from palpate.data.detection import detect_layout
+from palpate.data.detection import detect_layout, template_of
 from palpate.data.frames import MOVING
 from palpate.data.templates import Template, assign, join
 from test_data_contacts import gel_video, photos
@@ -198,6 +200,19 @@ def test_templates_of_names(names, tactile):
         )
     )
     assert (len(rows) > 0, problems) == (True, [])
+
+
+NAME = st.text("aB1_-. {}*ü", min_size=1, max_size=6).filter(lambda name: name.strip(". ") != "")
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.lists(NAME, min_size=1, max_size=3).map("/".join), min_size=1, unique=True))
+def test_a_template_that_is_found_matches_every_file(paths):
+    files = [f"{path}.png" for path in paths]
+    for text in (template_of(files), *detect_layout(files, "own").templates.values()):
+        Template.parse(text)
+    template = Template.parse(template_of(files))
+    assert [file for file in files if template.match(file) is None] == []
 
 
 def test_a_hundred_thousand_names_are_understood_quickly():

@@ -172,11 +172,13 @@ def template_of(files: Sequence[str], several: bool | None = None) -> str:
     fields: set[str] = set()
     pieces = _folders(folders, fields)
     free = [k for k, piece in enumerate(pieces) if piece is None]
-    for k in reversed(free):
-        default = "object" if fields & {"video", "contact"} else "video" if several else "sample"
-        pieces[k] = f"{{{_new(fields, default, 'object', f'folder_{k + 1}')}}}"
+    named = ["object"] if fields & {"video", "contact"} else ["video" if several else "sample"]
+    for k in free if named == ["object"] else reversed(free):
+        pieces[k] = f"{{{_new(fields, *named, 'object', f'folder_{k + 1}')}}}"
     stem = _stem([stem for stem, _ in names], fields)
-    return "/".join([*map(str, pieces), stem + (min(suffixes) if len(suffixes) == 1 else ".*")])
+    suffix = min(suffixes) if len(suffixes) == 1 else ".*"
+    text = "/".join([*map(str, pieces), stem + suffix])
+    return re.sub(r"\**(\{\w+\})\**", r"\1", text)  # a field takes what is beside it
 
 
 def _new(fields: set[str], *names: str) -> str:

@@ -67,13 +67,13 @@ class Template:
         Raises:
             PalpateError: if it is empty, leaves the root, or has a field that cannot be read.
         """
-        path = text.strip().removeprefix("./")
+        path = text.removeprefix("./")
 
         def wrong(must: str, got: str) -> PalpateError:
             clause = must if argument else f"A template {must}"
             return PalpateError(clause, got, FIX, argument=argument)
 
-        if not path or path.endswith("/") or re.search(CLIMBS, path):
+        if not path.strip() or path.endswith("/") or re.search(CLIMBS, path):
             raise wrong("must be a path below the folder", repr(text))
         pieces: list[str] = []
         specs: dict[str, str] = {}
