@@ -15,8 +15,8 @@ from test_data_contacts import EVENTS, gel_video, photos
 PRESSES = ((20, 30), (45, 55))
 
 
-def save(path, images):
-    """A stack, or a video of another suffix."""
+def save(path, images, times=None):
+    """A stack, or a video of another suffix whose frames are presented at ``times``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".npy":
         np.save(path, images)
@@ -28,7 +28,7 @@ def save(path, images):
         stream.pix_fmt = "yuv420p"
         for k, image in enumerate(images):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts = k
+            frame.pts = k if times is None else times[k]
             out.mux(stream.encode(frame))
         out.mux(stream.encode())
 
@@ -180,6 +180,27 @@ def test_what_is_wrong_with_videos_is_told(layouts, tmp_path):
     assert not (tmp_path / "out").exists()
     imported = import_dataset(root, tmp_path / "out", skip_bad=True, **options)
     assert sorted(set(imported.manifest.table["video"])) == ["big_mug/1", "big_mug/2"]
+
+
+def test_validation_tells_lag_dropped_frames_and_another_gel(tmp_path):
+    touch, scene = gel_video(200, EVENTS), photos(200, EVENTS)
+    late = np.concatenate([np.repeat(scene[:1], 12, 0), scene[:-12]])
+    other = np.concatenate([gel_video(100, PRESSES, 8), gel_video(100, PRESSES, 8, seed=9)])
+    leaps = [k + 4 * (k > 80) for k in range(200)]
+    recordings = {"sound": (touch, scene), "late": (touch, late), "other": (other, scene)}
+    for name, (tactile, vision) in {**recordings, "gaps": (touch, scene)}.items():
+        save(tmp_path / name / "gel.mp4", tactile, leaps if name == "gaps" else None)
+        save(tmp_path / name / "camera.mp4", vision)
+    report = validate(tmp_path)
+    assert {(p.where, p.kind) for p in report.suspicious} == {
+        ("late", "lag"),
+        ("other", "changed-gel"),
+        ("gaps", "dropped-frames"),
+    }
+    texts = {p.kind: p.text for p in report.suspicious}
+    assert "12 frames before" in texts["lag"]
+    assert "lacks 4 frames at 1 place, the first after frame 80" in texts["dropped-frames"]
+    assert report.ok
 
 
 @pytest.mark.parametrize(

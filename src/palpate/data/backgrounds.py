@@ -129,7 +129,8 @@ def propose_backgrounds(
         raise PalpateError("must hold no manifest yet", str(output), fix, argument="output")
     manifest = load(source, progress=progress, **options)
     table = manifest.table
-    given = [None] * len(table) if replace_all else table["background"].to_list()
+    given: list[str | None] = table["background"].to_list()
+    given = [None] * len(given) if replace_all else given
     if not table["tactile"].count() or None not in given:
         got = "a background for every sample" if table["tactile"].count() else "no tactile images"
         must, fix = "must have tactile images without a background", "Replace those that are there"

@@ -200,9 +200,10 @@ def _videos(
         kinds = {path.lower().endswith(MOVING) for path, _ in matches[column]}
         images = column == "background" or (column == "vision" and "tactile" in templates)
         if kinds not in ({True}, {False}) or (kinds == {False} and not images):
-            got = f"{template.text}, which matches none of {few(moving)}"
-            got = f"{template.text}, which matches images, too" if len(kinds) == 2 else got
-            raise PalpateError("must match videos", got, FIX, argument=column)
+            got = f"{template.text}, which matches none of {few(files)}"
+            got = got if not kinds else f"{template.text}, which matches images, too"
+            must = "must match images or videos" if images else "must match videos"
+            raise PalpateError(must, got, FIX, argument=column)
         if "frame" in template.fields:
             got, fix = f"{template.text} with the field frame", "Name it video"
             raise PalpateError("must say which video, not frame", got, fix, argument=column)
