@@ -59,7 +59,7 @@ def random_case(seed: int, number: int, base: Path, folder: Path) -> list[str]:
             change = mutations.change_content if rng.random() < 0.8 else mutations.change_place
             if kept := [p for p in files if p.is_file() and not p.is_symlink()]:
                 change(rng, kept)
-    return args
+    return [arg.replace("\0", "") for arg in args]  # no shell can pass one
 
 
 def prepare(command: str, base: Path, folder: Path) -> list[str]:

@@ -20,7 +20,7 @@ from palpate.cli import main
 from palpate.data.manifest import Manifest
 
 MINI = Path(palpate.__file__).parent / "mini"
-#: Command -> how often it is drawn, next to the others; those that load models are slow. ``demo`` is
+#: Command -> how often it is drawn next to the others; those that load models are slow. ``demo`` is
 #: missing: its stages are the other verbs, and it takes minutes.
 COMMANDS: dict[str, int] = {
     "import IN/touch-and-go -o OUT/m": 3,

@@ -231,6 +231,8 @@ def in_threads(
         threads: how many; default: the number of cores, 16 at most.
         stop: set when the caller leaves early, for functions that run long and look at it.
     """
+    if threads is not None and threads < 1:
+        raise PalpateError("must be at least 1", str(threads), "", argument="threads")
     threads = threads or min(16, os.cpu_count() or 1)
     remaining = iter(items)
     progress(what, 0, len(items))
