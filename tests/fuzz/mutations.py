@@ -400,7 +400,8 @@ def option(rng: Rng, verb: str, places: list[str]) -> list[str]:
 
 def change_arguments(rng: Rng, args: list[str], places: list[str], outputs: list[str]) -> None:
     """An argument is replaced, lost or doubled, or an option joins."""
-    verb = " ".join(args[:2]) if args[0] == "train" else args[0]
+    two = " ".join(args[:2])
+    verb = two if two in VERBS else args[0]
     first = len(verb.split())
     k = int(rng.integers(first, len(args))) if len(args) > first else first
     kind = int(rng.integers(6))

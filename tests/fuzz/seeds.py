@@ -20,8 +20,8 @@ from palpate.cli import main
 from palpate.data.manifest import Manifest
 
 MINI = Path(palpate.__file__).parent / "mini"
-#: Command -> how often it is drawn next to the others; those that load models are slow. ``demo`` is
-#: missing: its stages are the other verbs, and it takes minutes.
+#: Command -> how often it is drawn next to the others; those that load models are slow. Missing are
+#: ``demo``, whose stages are the other verbs and take minutes, and ``caption``, which needs a server.
 COMMANDS: dict[str, int] = {
     "import IN/touch-and-go -o OUT/m": 3,
     "import IN/touch-and-go -o OUT/m --labels IN/touch-and-go/train.txt --max-per-contact 2": 1,
@@ -37,7 +37,7 @@ COMMANDS: dict[str, int] = {
     "import IN/hf --format hf --map vision=rgb tactile=gel material=kind -o OUT/m": 3,
     "import IN/video -o OUT/m": 5,
     "import IN/videos --every 2 -o OUT/m": 3,
-    "import IN/videos --tactile {video}/gel.npy --skip-bad -o OUT/m": 2,
+    "import IN/videos --tactile {video}/gel.npy --every 2 -o OUT/m": 2,
     "background IN/manifest --replace -o OUT/m": 2,
     "validate IN/videos": 1,
     "import IN/table/rows.csv -o OUT/m": 4,
@@ -45,6 +45,14 @@ COMMANDS: dict[str, int] = {
     "import IN/table/rows.jsonl -o OUT/m": 3,
     "import IN/table/rows.json -o OUT/m": 3,
     "import IN/table/rows.parquet -o OUT/m --skip-bad": 4,
+    "import IN/pairs --vision vision/{video}/{frame:d}.jpg "
+    "--tactile tactile/{video}/{frame:d}.jpg -o OUT/m": 3,
+    "import IN/video/dataset --vision {video}/video.mp4 --tactile {video}/gelsight.mp4 "
+    "--every 4 -o OUT/m": 3,
+    "validate IN/video/dataset --tactile {video}/gelsight.mp4": 2,
+    "caption check IN/captions/captions.csv --data IN/manifest -o OUT/s.json --page OUT/p.html": 2,
+    "audit IN/lists/train.txt IN/lists/test.txt --ids-in-time": 1,
+    "audit IN/pairs/tactile IN/manifest --as tactile --threads 1 --table OUT/a.csv": 1,
     "validate IN/touch-and-go": 2,
     "validate IN/hct": 1,
     "validate IN/table/rows.csv": 2,
@@ -131,6 +139,9 @@ def _tables(folder: Path) -> None:
     (table / "rows.json").write_text(json.dumps(rows))
     (table / "rows.jsonl").write_text("\n".join(map(json.dumps, rows)))
     pl.DataFrame(rows).write_parquet(table / "rows.parquet")
+    (folder / "captions").mkdir()
+    texts = [["id", "text"], *([f"s{k}", f"Hard, smooth and cold, {k}."] for k in range(8))]
+    write_csv(folder / "captions" / "captions.csv", None, texts)
     (folder / "lists").mkdir()
     for part, videos, start in (("train", "abc", 0), ("test", "cd", 40)):
         lines = [f"{v}/{k:010d}.jpg,{k % 3}" for v in videos for k in range(start, start + 3)]
