@@ -50,7 +50,8 @@ from palpate.evaluation.inputs import (
     read_inputs,
 )
 from palpate.metrics import PRESETS, Comparison, compare, compare_tmmd, distance, paired_by_id, tmmd
-from palpate.metrics.mmd import sample_units
+from palpate.metrics.kernels import MOMENT_BYTES
+from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
 from palpate.report.results import GalleryItem, Results
 
 #: Bandwidth of the paper; the name of a metric says any other one where several are requested.
@@ -185,11 +186,14 @@ def score_streamed(
     for done, (name, samples, fitting, sigma) in enumerate(todo):
         progress("streaming", done, len(todo))
         x, y = samples.features, real.features
+        assert x is not None  # images are not streamed
         scenes, units = not {*samples.ids}.isdisjoint(real.ids), dict[str, Any]()
         preset = fitting or ("grouped" if scenes else "paper")
         estimator: Any = family.estimator or PRESETS[preset].estimator
         if scenes and estimator == "grouped":
-            of_rows, *_ = sample_units([*samples.ids, *real.ids], seed)
+            numbers, _, names_of = sample_units([*samples.ids, *real.ids], seed)
+            few = max(2, min(BLOCKS_OF_MANY, MOMENT_BYTES // (8 * x.shape[1] ** 2)))
+            of_rows = numbers * few // len(names_of)  # blocks whose moments fit
             units = {"groups_x": of_rows[: len(samples)], "groups_y": of_rows[len(samples) :]}
         called = (f"The features of {name!r}", "The reference features")
         how: dict[str, Any] = {"sigma": sigma, "estimator": estimator, **units, **options}
