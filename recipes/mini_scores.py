@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from zero_shot import zero_shot_accuracy
 
 from palpate.core import Progress, Score, Split
 from palpate.data.images import cached_images
@@ -24,7 +25,6 @@ from palpate.diffusion.generation import generate
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.encoders.zero_shot import zero_shot_accuracy
 from palpate.evaluation.scoring import score
 from palpate.metrics.probe import material_accuracy, retrieval
 from palpate.sim import MATERIALS, WorldOptions
