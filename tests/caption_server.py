@@ -150,8 +150,7 @@ class _Handler(BaseHTTPRequestHandler):
             "usage": {"prompt_tokens": 700, "completion_tokens": 30},
             "system_fingerprint": "fp_1",
         }
-        if fault == "no-completion":
-            body = {"answer": 42}
+        body = {"no-completion": {"answer": 42}, "page": b"<html>"}.get(fault, body)
         self.send(200, body, cut=20 if fault == "reset" else None)
         if fault == "reset":
             with suppress(OSError):

@@ -43,6 +43,12 @@ def test_templates_that_name_no_filled_column(data, tmp_path, template, got):
     assert caught.value.argument == "template"
 
 
+def test_a_template_has_no_dry_run(data, tmp_path):
+    with pytest.raises(PalpateError, match="asks nobody"):
+        caption(data, tmp_path / "c", template="", dry_run=True)
+    assert not (tmp_path / "c").exists()
+
+
 def test_an_import_joins_captions_and_models_will_name_their_digest(data, tmp_path):
     made = caption(data, tmp_path / "c", template="{material} of {video}")
     args = ["import", data, "--text", tmp_path / "c", "-o", tmp_path / "tag-c", "-q"]

@@ -33,8 +33,8 @@ def test_digest_is_of_what_the_model_gets_not_of_the_name():
 @pytest.mark.parametrize(
     ("text", "got"),
     [
-        ("Describe it.", "no line name"),
-        (HEAD.replace("text: sentence\n", ""), "no line text"),
+        ("Describe it.", "no line that begins with 'name:'"),
+        (HEAD.replace("text: sentence\n", ""), "no line that begins with 'text:'"),
         (HEAD.replace("reply: sentence", "reply: color"), "'color' is none of"),
         (HEAD.replace("text: sentence", "text: adjectives"), "not one of sentence"),
         (HEAD.replace("Answer with a sentence.", "Go."), "does not ask for the field 'sentence'"),

@@ -323,11 +323,13 @@ def test_a_key_that_the_server_repeats_is_not_kept(data, tmp_path, monkeypatch):
         assert KEY.encode() not in path.read_bytes()
 
 
-def test_all_requests_rejected_is_an_error_and_not_a_table(data, tmp_path):
-    with FakeServer(lambda number: "400") as server:
-        with pytest.raises(PalpateError, match="fault 400"):
+@pytest.mark.parametrize(
+    ("fault", "got"), [("400", "fault 400"), ("no-completion", "choices"), ("page", "no JSON")]
+)
+def test_all_requests_rejected_is_an_error_and_not_a_table(data, tmp_path, fault, got):
+    with FakeServer(lambda number: fault) as server:
+        with pytest.raises(PalpateError, match=got):
             describe(data, tmp_path / "c", server)
-        assert server.count <= 8 + 3
     assert not (tmp_path / "c" / "captions.parquet").exists()
 
 

@@ -212,6 +212,9 @@ def caption(  # noqa: PLR0913 (a public verb)
     manifest, output = load(data, progress=progress), Path(output)
     units = units_of(manifest, per)
     if template is not None:
+        if dry_run:
+            got, fix = "a template, which asks nobody", "Leave one of the two out"
+            raise PalpateError("must be of a model", got, fix, argument="dry_run")
         texts = template_texts(template, manifest, units, seed)
         descriptions = [Description(text, flags=() if text else ("no-column",)) for text in texts]
         made = {"model": None, "template": template or "adjectives of the material", "prompt": None}

@@ -119,7 +119,7 @@ class Prompt:
         pairs = (line.partition(":") for line in head.splitlines())
         values = {name.strip(): value.strip() for name, _, value in pairs}
         if missing := [name for name in HEAD if not values.get(name)]:
-            raise ValueError(f"no line {missing[0]}: ...")
+            raise ValueError(f"no line that begins with '{missing[0]}:'")
         fields = tuple(name.strip() for name in values["reply"].split(","))
         if unknown := [name for name in fields if name not in FIELDS]:
             raise ValueError(f"the reply field {unknown[0]!r} is none of {', '.join(FIELDS)}")

@@ -156,7 +156,7 @@ class Server:
             try:
                 return json.loads(text)
             except ValueError:
-                reason = f"no JSON: {text[:80]!r}"
+                raise RejectedError(f"the reply is no JSON: {text[:80]!r}") from None
         raise self._gone(reason)
 
     def _gone(self, reason: str) -> PalpateError:

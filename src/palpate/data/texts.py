@@ -57,8 +57,8 @@ def read_texts(path: Path) -> Texts:
     path = path / TABLE if path.is_dir() else path
     table = open_table(path)
     if missing := [name for name in ("id", "text") if name not in table.names]:
-        must, got = "must be a table with the columns id and text", f"{path} without {missing[0]}"
-        raise PalpateError(must, got, "Rename the columns", argument="text")
+        must = "A table of texts must have the columns id and text"
+        raise PalpateError(must, f"{path} without {missing[0]}", "Rename the columns")
     rows = table.read(["id", "text"])
     again = rows.filter(pl.col("id").is_duplicated() | pl.col("id").is_null())
     for line, name in again.select("palpate_line", "id").iter_rows():
@@ -91,8 +91,8 @@ def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) 
     ids = manifest.ids
     if texts.ids.isdisjoint(ids):
         got = f"{where}, with ids as {min(texts.ids, default='')!r} instead of {ids[0]!r}"
-        must, fix = "must be texts of these samples", "Use the texts made for this data set"
-        raise PalpateError(must, got, fix, argument="text")
+        fix = "Use the texts made for this data set"
+        raise PalpateError("The texts must be of these samples", got, fix)
     old = manifest.column("text") if keep else [None] * len(ids)
     new = [texts.of.get(name, text) for name, text in zip(ids, old, strict=True)]
     table = manifest.table.with_columns(text=pl.Series(new, dtype=pl.String))
