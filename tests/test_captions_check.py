@@ -182,7 +182,7 @@ def test_captions_and_samples_in_two_places(samples, tmp_path, capsys):
     assert record["masked_from"]["digest"] == made.record["digest"]
     args[2] = tmp_path / "m"
     assert main([*map(str, args), "--fail-over", "0.1"]) == 0
-    capsys.readouterr()
+    assert "masked   60" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -327,9 +327,8 @@ def test_a_key_that_the_server_repeats_is_not_kept(data, tmp_path, monkeypatch):
     ("fault", "got"), [("400", "fault 400"), ("no-completion", "choices"), ("page", "no JSON")]
 )
 def test_all_requests_rejected_is_an_error_and_not_a_table(data, tmp_path, fault, got):
-    with FakeServer(lambda number: fault) as server:
-        with pytest.raises(PalpateError, match=got):
-            describe(data, tmp_path / "c", server)
+    with FakeServer(lambda number: fault) as server, pytest.raises(PalpateError, match=got):
+        describe(data, tmp_path / "c", server)
     assert not (tmp_path / "c" / "captions.parquet").exists()
 
 
@@ -373,3 +372,15 @@ def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
         estimate = describe(data, tmp_path / "c", server, dry_run=True)
     assert (estimate.requests, estimate.measured, estimate.tokens) == (8, 4, (5600, 240))
     assert re.search("8 .4 are answered", str(estimate))
+
+
+def test_the_client_is_loaded_when_a_server_is_asked_and_missed_in_one_line(
+    data, tmp_path, monkeypatch, capsys
+):
+    code = "import sys, palpate.captions.captioning, palpate.captions.checking; "
+    code += "assert not {'httpx2', 'torch', 'transformers'} & set(sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+    monkeypatch.setitem(sys.modules, "httpx2", None)
+    args = ["caption", str(data), "-o", str(tmp_path / "c"), "--server", "http://localhost:1/v1"]
+    assert main(args) == 2
+    assert "pip install -e '.[caption]'" in capsys.readouterr().err

@@ -90,22 +90,11 @@ class Captions:
         }
 
     def __str__(self) -> str:
-        counts = self.record["counts"]
-        rows = {
-            "table": str(self.path),
-            "digest": self.record["digest"],
-            "model": self.record["model"],
-            "prompt": (self.record["prompt"] or {}).get("name"),
-            "template": self.record.get("template"),
-            "photos": counts["photos"],
-            "samples": counts["samples"],
-            "with text": counts["texts"],
-            "different texts": counts["different"],
-            "flags": counts["flags"],
-            "tokens": self.record.get("tokens"),
-        }
-        rows = {name: value for name, value in rows.items() if value}
-        lines = [f"Captions per {self.record['per']}", *fact_lines(rows)]
+        names = ("digest", "model", "template", "per")
+        rows = {"table": str(self.path), **{name: self.record.get(name) for name in names}}
+        rows["prompt"] = (self.record.get("prompt") or {}).get("name")
+        rows |= {**self.record["counts"], "tokens": self.record.get("tokens")}
+        lines = ["Captions", *fact_lines({name: value for name, value in rows.items() if value})]
         lines += [f"Without a caption: {len(self.problems)}"] * bool(self.problems)
         return "\n".join([*lines, *problem_lines(self.problems)])
 

@@ -70,7 +70,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         results.to_html(options.page)
     if options.mask:
         masked = mask_captions(options.captions, options.mask, data=options.data, **extra)
-        terminal.facts(f"Masked captions {masked.path}", masked.record["counts"])
+        terminal.print(str(masked))
     flagged = float(results[SHARE, FLAGGED])
     failed = limit is not None and flagged > limit
     if failed:
