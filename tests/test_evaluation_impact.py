@@ -14,6 +14,7 @@ from PIL import Image
 from scipy.stats import t as student
 
 from palpate.core import FeatureSet, PalpateError, ProblemsError, Split
+from palpate.core.records import from_plain
 from palpate.data.formats.touch_and_go import import_touch_and_go
 from palpate.data.manifest import Manifest
 from palpate.evaluation import impact_features, impact_scores
@@ -292,7 +293,7 @@ def test_equal_input_gives_an_equal_result_whatever_the_order() -> None:
     again = impact(turned, by_frame(turned), features={"x": x[order]})
     assert again.rows == found.rows
     assert list(again.clean_splits) == list(found.clean_splits)
-    assert Impact.from_json(json.loads(json.dumps(asdict(found)))) == found
+    assert from_plain(Impact, json.loads(json.dumps(asdict(found)))) == found
 
 
 def test_both_sides_get_the_same_materials_and_as_many_train_samples() -> None:
@@ -412,7 +413,7 @@ def test_new_objects_have_rows_of_their_own_where_the_split_knows_its_objects() 
     assert (given, new < 0.8) == (1, True)
     assert f"Of new objects (splits by object): {100 * new:.1f} %." in result.headline
     assert (
-        Impact.from_json(json.loads(json.dumps(asdict(result), default=asdict))).rows[-1].group
+        from_plain(Impact, json.loads(json.dumps(asdict(result), default=asdict))).rows[-1].group
         == "object"
     )
     by_object = leak_free_split(samples, by="object", train=0.5)
