@@ -8,7 +8,7 @@ where it stopped.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Event
 from typing import Literal
@@ -157,6 +157,20 @@ class VideoFrames:
 
 
 Frames = FolderFrames | VideoFrames
+
+
+def streams_of(
+    frames: Mapping[str, Frames],
+) -> tuple[dict[str, NDArray[np.uint8]], dict[str, NDArray[np.float64]]]:
+    """Thumbnails of each modality without gaps, and the seconds of those that are videos.
+
+    Raises:
+        PalpateError: if one cannot be read to its end.
+    """
+    streams = {modality: source.stream() for modality, source in frames.items()}
+    there = {modality: stream for modality, stream in streams.items() if stream is not None}
+    seconds = {modality: times for modality, (_, times) in there.items() if times is not None}
+    return {modality: images for modality, (images, _) in there.items()}, seconds
 
 
 def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:

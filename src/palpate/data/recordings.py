@@ -28,6 +28,7 @@ from palpate.data.frames import (
     VideoFrames,
     nearest_to_median,
     save_frame,
+    streams_of,
 )
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.listing import FrameList, FrameTable
@@ -280,12 +281,9 @@ class Recordings:
 
         def check(video: str) -> list[Finding]:
             try:
-                streams = {m: frames.stream() for m, frames in self.frames[video].items()}
+                return findings(*streams_of(self.frames[video]))
             except PalpateError:
                 return []  # reported where its frames are read
-            there = {m: stream for m, stream in streams.items() if stream is not None}
-            seconds = {m: times for m, (_, times) in there.items() if times is not None}
-            return findings({m: images for m, (images, _) in there.items()}, seconds)
 
         results = in_threads(check, sorted(self.frames), "checking streams", progress)
         self.suspicious += [

@@ -36,7 +36,7 @@ from palpate.data.formats.base import Cells, Facts, Format, Scan, few
 from palpate.data.formats.layout import require_folder
 from palpate.data.formats.pairs import Side, name_apart, templates_of
 from palpate.data.formats.touch_and_go import extracted, require_frame_options
-from palpate.data.frames import MOVING, ImageFormat
+from palpate.data.frames import MOVING, ImageFormat, streams_of
 from palpate.data.images import SUFFIXES, Check, in_threads, read_image
 from palpate.data.imported import Imported, removing_on_error
 from palpate.data.manifest import SCHEMA, Manifest
@@ -292,13 +292,11 @@ def _contacts(
         try:
             declared = videos[video].still.get("background")
             gel = None if declared is None else thumbnail(read_image(work.root / declared))
-            streams = {m: frames.stream() for m, frames in work.frames[video].items()}
+            images, seconds = streams_of(work.frames[video])
         except PalpateError as error:
             return error.got
-        images = {m: stream[0] for m, stream in streams.items() if stream is not None}
-        seconds = {m: stream[1] for m, stream in streams.items() if stream is not None}
         contacts = find_contacts(images["tactile"], gel=gel) if "tactile" in images else None
-        return contacts, findings(images, {m: t for m, t in seconds.items() if t is not None})
+        return contacts, findings(images, seconds)
 
     contacts: dict[str, Contacts | None] = {}
     for video, found in in_threads(find, sorted(work.frames), "finding contacts", progress):
