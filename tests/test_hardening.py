@@ -29,6 +29,11 @@ def zip_named_npy(path: Path) -> None:
         file.writestr("a", "b")
 
 
+def whole_manifest(path: Path) -> None:
+    rows = [{"id": i, "video": i, "text": i} for i in "ab"]
+    Manifest.from_rows(rows, path.parent).save(path)
+
+
 def typed_manifest(path: Path) -> None:
     """A manifest whose columns have other types than palpate writes."""
     Manifest.from_rows([{"id": "a", "vision": "a.jpg"}], path.parent).save(path)
@@ -71,6 +76,14 @@ def typed_manifest(path: Path) -> None:
         ("a.txt", "", "audit a.txt b\udcff.txt", "must be UTF-8"),
         ("a.txt", "", ["audit", "a.txt", ""], "not empty"),
         ("m/manifest.parquet", typed_manifest, "export m --to csv -o c", "must have the format"),
+        *(
+            ("m/manifest.parquet", whole_manifest, f"{command} m/manifest.parquet", words)
+            for command, words in (
+                ("caption check m --output", "must not replace an input"),
+                ("audit m m --no-images --table", "must not replace an input"),
+                ("audit a.jpg a.jpg --table", "must be new"),
+            )
+        ),
         ("s.png", "my notes", "world -o w --preset tiny --sheet s.png", "of the kind"),
     ],
 )

@@ -21,7 +21,8 @@ from palpate.data.manifest import Manifest
 
 MINI = Path(palpate.__file__).parent / "mini"
 #: Command -> how often it is drawn next to the others; those that load models are slow. Missing are
-#: ``demo``, whose stages are the other verbs and take minutes, and ``caption``, which needs a server.
+#: ``demo``, whose stages are the other verbs and take minutes, and ``caption``, which needs a
+#: server.
 COMMANDS: dict[str, int] = {
     "import IN/touch-and-go -o OUT/m": 3,
     "import IN/touch-and-go -o OUT/m --labels IN/touch-and-go/train.txt --max-per-contact 2": 1,

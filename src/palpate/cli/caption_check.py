@@ -51,7 +51,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     if limit is not None and not 0 <= limit <= 1:
         raise PalpateError("must lie in [0, 1]", str(limit), "", argument="fail_over")
     for path in filter(None, (options.output, options.page)):
-        guard_output(path, [options.captions], (b'"format": "palpate-', b"palpate"))
+        inputs = [p for p in (options.captions, options.data, options.split) if p is not None]
+        guard_output(path, inputs, (b'"format": "palpate-', b"palpate"))
     extra = {"columns": columns} if (columns := columns_of(options.columns)) else {}
     with terminal.progress() as progress:
         results = check_captions(

@@ -382,22 +382,25 @@ def guard_output(
     Args:
         output: the file to write.
         inputs: what the command reads.
-        signatures: an existing file must hold one of these at its start or end to be replaced.
+        signatures: an existing file must hold one of these in its first 4 KB to be replaced; of a
+            Parquet file, whose metadata are at its end, the whole name of its format.
 
     Raises:
         PalpateError: saying which.
         OSError: if the disk is full.
     """
-    if any(output.exists() and path.exists() and output.samefile(path) for path in inputs):
+    files = [*inputs, *(path / "manifest.parquet" for path in inputs)]
+    if any(output.exists() and path.exists() and output.samefile(path) for path in files):
         must, fix = "An output must not replace an input of the same command", "Choose another file"
         raise PalpateError(must, str(output), fix)
     _require_writable(output)
     if output.is_file():
         with open(output, "rb") as file:
-            ends = file.read(4096)
-            file.seek(max(0, output.stat().st_size - 16_384))
-            ends += file.read()
-        if ends and not any(each in ends for each in signatures):
+            head = file.read(4096)
+            if head.startswith(b"PAR1"):
+                file.seek(max(0, output.stat().st_size - 16_384))
+                head, signatures = file.read(), [name for name in signatures if b"/" in name]
+        if head and not any(each in head for each in signatures):
             must = f"{output} must be new, or a file of the kind that this command writes"
             raise PalpateError(must, "another file", "Choose another file, or remove it")
 

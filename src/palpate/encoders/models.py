@@ -179,7 +179,7 @@ def load_model(kind: Any, name: str, must: str, fix: str, **options: Any) -> Any
     try:
         with silent():
             model, report = kind.from_pretrained(name, output_loading_info=True, **options)
-    except UNREADABLE as error:
+    except Exception as error:  # the libraries raise many kinds
         raise PalpateError(must, first_line(error), fix) from None
     if missing := sorted(report["missing_keys"]):
         got = f"{len(missing)} weights are missing, first {missing[0]}"
