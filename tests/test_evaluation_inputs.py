@@ -212,7 +212,14 @@ def test_other_objects_are_rejected(source, words):
 
 
 def aligned(generated, reference, **keywords):
-    options = {"names": None, "labels": None, "groups": None, "group": "auto", "split": None}
+    options = {
+        "names": None,
+        "labels": None,
+        "groups": None,
+        "group": "auto",
+        "split": None,
+        "background": None,
+    }
     return read_inputs(generated, reference, reserved=("reference",), **options | keywords)
 
 
