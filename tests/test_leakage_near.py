@@ -1,8 +1,6 @@
 """Near-duplicates: the similarity against a slow one, calibration, causes, groups, bad files."""
 
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -10,16 +8,10 @@ import pytest
 from PIL import Image
 
 from leakage_fixtures import MATERIALS, NoiseVideo, crop, make_leaky, save
-from palpate.core import PalpateError, quiet
+from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
-from palpate.leakage import calibration, near
-from palpate.leakage.background import remove_background
-from palpate.leakage.correlation import REACH, band_pass, similarities, similarity_grid
-from palpate.leakage.matches import Entries, Matcher, Matches
 from palpate.leakage.near import near_duplicates, near_groups
-from palpate.leakage.pool import quantized
-from palpate.leakage.similarity import ImageSimilarity, best_matches
-from palpate.leakage.thumbnails import SIDE, thumbnail, thumbnails
+from palpate.leakage.thumbnails import thumbnail, thumbnails
 
 DROPPED = ("video", "contact", "object", "session", "material", "sensor", "domain")
 
@@ -31,145 +23,10 @@ def anonymous(manifest):
     return Manifest(table, manifest.root)
 
 
-def fields(n, seed=0, sigma=2.0):
-    from scipy import ndimage
-
-    x = ndimage.gaussian_filter(
-        np.random.default_rng(seed).standard_normal((n, 3, 48, 48)), (0, 0, sigma, sigma)
-    )
-    return (40 * x / x.std()).astype(np.float32)
-
-
-def test_similarity_is_the_best_overlap_at_whole_offsets_and_more_between():
-    x = quantized(band_pass(fields(6)[:, :, :SIDE, :SIDE]))
-    i, j = np.array([0, 0, 1, 2, 4]), np.array([0, 1, 2, 3, 5])
-    flags = similarities(x, i, j)
-    for s, a, b in zip(flags, i, j, strict=True):
-        t = x[a, :, REACH:-REACH, REACH:-REACH].astype(float)
-        t -= t.mean((1, 2), keepdims=True)
-        best = -1.0
-        for dy in range(2 * REACH + 1):
-            for dx in range(2 * REACH + 1):
-                w = x[b, :, dy : dy + t.shape[1], dx : dx + t.shape[2]].astype(float)
-                w = w - w.mean((1, 2), keepdims=True)
-                best = max(best, float((t * w).sum() / np.sqrt((t**2).sum() * (w**2).sum())))
-        assert best - 1e-3 <= s <= best + 0.12
-    assert flags[0] == pytest.approx(1, abs=1e-3)
-    grid = similarity_grid(x, i, np.arange(6))
-    assert grid[np.arange(5), j] == pytest.approx(flags, abs=1e-5)
-
-
-def test_similarity_survives_gain_offset_and_shift_and_tells_others_apart():
-    big = fields(20)
-    a, b = big[:, :, 2:34, 2:34], 1.3 * big[:, :, 4:36, 1:33] + 17
-    plates = quantized(band_pass(np.concatenate([a, b])))
-    n = np.arange(20)
-    assert similarities(plates, n, n + 20).min() > 0.9
-    assert similarities(plates, n, (n + 1) % 20 + 20).max() < 0.6
-
-
-def test_background_leaves_contact_alone_and_takes_shifted_markers_off():
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[:36, :36]
-    gel = np.stack([100 + x, 90 + y, 120 - x], 0).astype(np.float32)
-    for cy in range(3, 36, 8):
-        for cx in range(3, 36, 8):
-            gel -= 60 * np.exp(-((y - cy) ** 2 + (x - cx) ** 2) / 3)
-    contact = np.zeros_like(gel)
-    contact[:, 12:20, 14:22] = rng.normal(0, 12, (3, 8, 8))
-    touch = 1.05 * gel + contact
-    for dy, dx in ((0, 0), (1, -1)):
-        t, b = touch[None, :, 2:34, 2:34], gel[None, :, 2 + dy : 34 + dy, 2 + dx : 34 + dx]
-        left = remove_background(t, b)[0]
-        outside = np.ones((32, 32), bool)
-        outside[8:20, 10:22] = False
-        inner = np.s_[:, 4:28, 4:28]
-        assert np.abs(left[inner])[:, outside[4:28, 4:28]].mean() < 1.0
-        assert (
-            np.corrcoef(left[:, 10:18, 12:20].ravel(), contact[:, 12:20, 14:22].ravel())[0, 1] > 0.9
-        )
-
-
-def gel_with_markers(size=136):
-    """(size, size, 3): a gel of soft colors with 8 x 8 dots, about a thumbnail pixel wide."""
-    rng = np.random.default_rng(4)
-    y, x = np.mgrid[:size, :size].astype(float)
-    gel = np.stack([120 + 0.2 * x, 110 + 0.1 * y, 125 - 0.15 * x], -1)
-    for cy in np.arange(7, size, 15.3):
-        for cx in np.arange(5, size, 15.3):
-            away = np.hypot(y - cy - rng.normal(0, 0.7), x - cx - rng.normal(0, 0.7))
-            gel *= 1 - 0.9 * np.clip(rng.uniform(1.6, 2.6) + 0.5 - away, 0, 1)[..., None]
-    return gel
-
-
-def test_markers_do_not_hide_a_faint_print_in_a_shifted_copy():
-    gel = gel_with_markers()
-    y, x = np.mgrid[:136, :136]
-    waves = np.stack([np.sin(x / 5 + y / 9), np.sin(y / 6 - x / 11), np.cos(x / 7)], -1)
-    touch = gel + 8 * np.exp(-((y - 60) ** 2 + (x - 75) ** 2) / 900)[..., None] * waves
-    small = lambda p: np.asarray(  # noqa: E731
-        Image.fromarray(np.clip(p + 0.5, 0, 255).astype(np.uint8))
-        .resize((SIDE, SIDE), Image.Resampling.BILINEAR)
-        .convert("YCbCr")
-    )
-    background = np.moveaxis(small(crop(gel)), -1, 0)[None].astype(np.float32)
-    moves = [(0, 0), (1, 2), (2, -3), (-4, 4), (4, 1), (-1, -2)]
-    left = [
-        remove_background(
-            np.moveaxis(small(crop(touch, *m)), -1, 0)[None].astype(np.float32), background
-        )[0]
-        for m in moves
-    ]
-    plates = quantized(band_pass(np.stack(left)))
-    assert similarities(plates, np.zeros(5, np.int64), np.arange(1, 6)).min() > 0.88
-
-
-def test_candidates_find_what_comparing_all_finds(monkeypatch):
-    big = fields(300, sigma=3)
-    rng = np.random.default_rng(1)
-    shift = rng.integers(0, 5, (300, 2))
-    copies = np.stack(
-        [big[k, :, a : a + 32, b : b + 32] for k, (a, b) in enumerate(shift)]
-    ) + rng.normal(0, 3, (300, 3, 32, 32))
-    comparer = ImageSimilarity(
-        quantized(band_pass(np.concatenate([big[:, :, 2:34, 2:34], copies.astype(np.float32)])))
-    )
-    queries, base = np.arange(300, 600), np.arange(300)
-    exact, s = best_matches(comparer, queries, base)
-    monkeypatch.setattr("palpate.leakage.similarity.EXHAUSTIVE", 0)
-    flags, t = best_matches(comparer, queries, base)
-    assert (exact == base).mean() > 0.995
-    assert (flags == exact).mean() > 0.995
-    assert t[flags == exact] == pytest.approx(s[flags == exact], abs=1e-5)
-
-
-def test_copies_across_videos_do_not_move_the_threshold():
-    rng = np.random.default_rng(0)
-    clean = rng.gumbel(0.3, 0.05, 3000).astype(np.float32)
-    plain = calibration.other_videos(clean, 0.001)
-    assert 0.0002 < (calibration.score(clean) >= plain.threshold).mean() + 0.0003 < 0.004
-    mixed = np.concatenate([clean, rng.uniform(1.5, 3, 600).astype(np.float32)])
-    assert calibration.other_videos(mixed, 0.001).threshold == pytest.approx(
-        plain.threshold, abs=0.05
-    )
-
-
-def test_random_pairs_are_carried_over_to_the_whole_train_part():
-    rng = np.random.default_rng(0)
-    z = rng.gumbel(0.1, 0.09, (1500, 64)).astype(np.float32)
-    flags = calibration.random_pairs(z, 5000, 0.001)
-    exact = 0.1 + 0.09 * (np.log(5000) - np.log(-np.log1p(-0.001)))
-    assert np.arctanh(flags.threshold) == pytest.approx(exact, rel=0.12)
-
-
 @pytest.fixture(scope="module")
 def leaky(tmp_path_factory):
     return make_leaky(
-        tmp_path_factory.mktemp("leaky"),
-        5,
-        objects=3,
-        materials=MATERIALS[:6],
-        kinds=("near-duplicate",),
+        tmp_path_factory.mktemp("leaky"), 5, materials=MATERIALS[:6], kinds=("near-duplicate",)
     )
 
 
@@ -179,21 +36,20 @@ def test_planted_copies_are_found_and_others_are_not(leaky, modality, known):
     train, test = (
         (leaky.train, leaky.test) if known else (anonymous(leaky.train), anonymous(leaky.test))
     )
-    flags = near_duplicates(train, test, modality)
+    flags = near_duplicates(train, test, modality, false_positives=0.01)
     truth = leaky.truth("near-duplicate")
-    missed = [leaky.change[i] for i, t in zip(test.ids, truth & ~flags.flag, strict=True) if t]
-    # A print of half a gray level is no more than what JPEG 60 changes in it, so without videos
-    # some copies stay below any safe threshold.
-    assert len(missed) <= (0.25 if modality == "tactile" and not known else 0.1) * truth.sum()
-    assert all("jpeg" in how for how in missed)
+    found, copies = truth & flags.flag, np.flatnonzero(truth)
     assert flags.flag[~truth].mean() <= 0.03
-    source = [
-        leaky.planted["near-duplicate"][i]
-        for i, t in zip(test.ids, truth & flags.flag, strict=True)
-        if t
-    ]
-    assert [train.ids[k] for k in flags.nearest[truth & flags.flag]] == source
-    assert set(flags.cause) <= {"", "content", "nothing touched", "sensor drift"}
+    # In 45 videos little is learned of the gel: faint copies stay below a safe threshold.
+    assert found.sum() >= (0.4 if modality == "tactile" else 0.9) * truth.sum()
+    order = np.argsort(-flags.score)
+    assert truth[order[: round(0.7 * truth.sum())]].all()
+    still = [k for k in copies if flags.flag[k] or "shift" not in leaky.change[test.ids[k]]]
+    sources = [leaky.planted["near-duplicate"][test.ids[k]] for k in still]
+    assert [train.ids[k] for k in flags.nearest[still]] == sources
+    assert flags.verdict == "leaks"
+    assert flags.expected == pytest.approx(0.01 * len(test), abs=0.01)
+    assert set(flags.cause) <= {"", "content", "nothing touched"}
     assert sum(flags.matches) == np.isfinite(flags.score).sum() == len(test)
     assert len(flags.edges) == len(flags.unrelated) + 1
 
@@ -215,25 +71,6 @@ def test_groups_join_copies_and_nothing_else(leaky):
     assert (
         sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 4
     )  # a video between two others joins them
-
-
-def test_groups_join_faint_touches_that_the_slow_part_finds_too(tmp_path, monkeypatch):
-    leaky = make_leaky(tmp_path, 12, objects=3, materials=MATERIALS[:6], kinds=("near-duplicate",))
-    both = Manifest.join(leaky.train, leaky.test)
-    label = dict(zip(both.ids, near_groups(both, "tactile").tolist(), strict=True))
-    pairs = leaky.planted["near-duplicate"].items()
-    assert all(label[a] == label[b] >= 0 for a, b in pairs)
-    monkeypatch.setattr("palpate.leakage.near.AGREED", 1.0)
-    alone = dict(zip(both.ids, near_groups(both, "tactile").tolist(), strict=True))
-    assert not all(alone[a] == alone[b] >= 0 for a, b in pairs)
-    allowed = {frozenset(i.split("/")[0] for i in pair) for pair in pairs}
-    joined = {
-        frozenset((a.split("/")[0], b.split("/")[0]))
-        for a in label
-        for b in label
-        if label[a] == label[b] >= 0
-    }
-    assert sum(len(pair) == 2 and pair not in allowed for pair in joined) <= 2
 
 
 def rows(root, name, images, background=None):
@@ -293,65 +130,9 @@ def test_untouched_gel_is_named_and_is_no_leak(tmp_path):
     flags = near_duplicates(train, test, "tactile")
     assert flags.cause[-1] == "nothing touched"
     assert not flags.flag.any()
-    assert flags.nearest[-1] == 24
+    assert flags.nearest[-1] == -1
+    assert np.isnan(flags.score[-1])
     assert "blank-images" in [note.code for note in flags.notes]
-
-
-def test_drift_of_the_gel_is_named_and_is_no_leak(tmp_path):
-    videos, samples = gels(tmp_path)
-    scar = np.zeros((104, 104, 1))
-    scar[30:34, 20:80], scar[50:80, 60:64], scar[60:63, 15:50] = 45, -45, 45
-    worn = [np.clip(videos[0].background() + scar, 0, 255).astype(np.uint8) for _ in range(3)]
-    save(tmp_path / "worn.jpg", crop(worn[2]))
-    later = []
-    for k in range(2):
-        save(tmp_path / f"scar{k}.jpg", crop(worn[k]))
-        later.append(
-            {
-                "id": f"scar{k}",
-                "video": "v0",
-                "frame": 500 + k,
-                "tactile": f"scar{k}.jpg",
-                "background": "v0b0.jpg",
-            }
-        )
-    other = {
-        "id": "after",
-        "video": "v0",
-        "frame": 900,
-        "tactile": "v0t7.jpg",
-        "background": "worn.jpg",
-    }
-    flags = near_duplicates(
-        Manifest.from_rows([*samples[:24], later[0], other], tmp_path),
-        Manifest.from_rows([*samples[24:], later[1]], tmp_path),
-        "tactile",
-    )
-    assert flags.cause[-1] == "sensor drift"
-    assert not flags.flag.any()
-
-
-def test_a_score_near_the_threshold_counts_where_the_slow_part_matches_the_same_image(monkeypatch):
-    n = 4
-    score = np.array([0.5, 0.5, 0.3, 0.5], np.float32)  # 0.8 of the threshold is 0.458, as z
-    limit, items = calibration.Calibration(0.55), np.arange(n)
-    none, content = np.full(n, "", "<U15"), np.array(["content"] * 3 + [""], "<U15")
-    fine = Matches(score, items, np.full(n, 0.8, np.float32), none, limit, True)
-    slow = replace(
-        fine, score=np.full(n, 0.7, np.float32), place=np.array([0, 3, 2, 3]), cause=content
-    )
-    images = np.zeros((n, 3, SIDE, SIDE), np.int8)
-    pool = SimpleNamespace(
-        blank=np.zeros(n, bool), backgrounds=None, filtered=lambda **_: (images, None)
-    )
-    monkeypatch.setattr(Matcher, "match", lambda *_: slow)
-    matcher, entries = Matcher(None, 0.001, None, quiet), Entries.of(items, items)
-    named = near._name_drift(fine, pool, matcher, entries, entries)
-    assert list(named.cause) == ["content", "sensor drift", "sensor drift", ""]
-    assert named.score == pytest.approx([0.55, 0.7, 0.7, 0.5])
-    assert list(named.place) == [0, 3, 2, 3]
-    without = near._name_drift(replace(fine, by_videos=False), pool, matcher, entries, entries)
-    assert list(without.cause) == ["sensor drift"] * 3 + [""]
 
 
 def test_black_photos_show_nothing(tmp_path):
@@ -399,7 +180,8 @@ def test_rubbish_files_and_modes_are_told_and_never_raised(tmp_path):
         seen = thumbnail(tmp_path / name)
         assert isinstance(seen, np.ndarray)
         assert seen.shape == (32, 32, 3)
-        assert np.abs(seen[..., 0].astype(float) - thumbnail(tmp_path / "a.jpg")[..., 0]).mean() < 6
+        luma = [x @ [0.299, 0.587, 0.114] for x in (seen, thumbnail(tmp_path / "a.jpg"))]
+        assert np.abs(luma[0] - luma[1]).mean() < 6
     manifest = Manifest.from_rows(
         [*({"id": n, "vision": n} for n in [*names, "absent.jpg"]), {"id": "none"}], tmp_path
     )
@@ -471,7 +253,8 @@ def test_many_rows_of_one_image_and_tiny_sets_are_answered(tmp_path):
     )
     flags = near_duplicates(many, many, "vision")
     assert flags.flag.all()
-    assert "threshold-default" in [note.code for note in flags.notes]
+    assert flags.verdict == "leaks"
+    assert "cannot-tell-no-null" in [note.code for note in flags.notes]
     empty = Manifest(many.table.clear(), tmp_path)
     assert len(near_duplicates(many, empty, "vision").score) == 0
     assert np.isnan(
@@ -546,7 +329,13 @@ def test_copies_are_found_however_many_they_are(tmp_path, case):
     flags = near_duplicates(
         Manifest.from_rows(train, tmp_path), Manifest.from_rows(test, tmp_path), "vision"
     )
-    assert flags.flag.mean() >= 0.95, flags.notes
+    if case in ("one video", "most of train twice"):  # what is chance cannot be known
+        assert flags.verdict == "cannot tell"
+        assert flags.expected is None
+    else:
+        assert flags.flag.mean() >= 0.95, flags.notes
+    copied = [train[k]["id"][1:] for k in flags.nearest]
+    assert np.mean([a == row["id"][1:] for a, row in zip(copied, test, strict=True)]) >= 0.95
 
 
 def test_equal_pictures_score_one_however_many_there_are(tmp_path):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from palpate.leakage.neighbors import nearest, other_nearest
+from palpate.leakage import neighbors
+from palpate.leakage.neighbors import Apart, Base, nearest
 
 
 def unit(rng, n, d=24):
@@ -28,22 +29,25 @@ def test_the_nearest_rows_are_those_of_brute_force(k, sizes):
     np.testing.assert_array_equal(nearest(x, y, k), expected)
 
 
-def test_rows_of_the_same_group_are_no_neighbors_and_an_unknown_group_excludes_nothing():
+def test_related_rows_are_no_neighbors():
     rng = np.random.default_rng(3)
     x, y = unit(rng, 60), unit(rng, 80)
-    of_x, of_y = rng.integers(-1, 4, 60), rng.integers(-1, 4, 80)
-    index = nearest(x, y, 3, groups=(of_x, of_y))
-    excluded = (of_x[:, None] == of_y) & (of_x[:, None] >= 0)
-    np.testing.assert_array_equal(index, brute(x, y, 3, excluded))
-    everything = nearest(x, y, 1, groups=(np.zeros(60, int), np.zeros(80, int)))
-    assert (everything == -1).all()
+    of_x, of_y = rng.integers(0, 4, 60), rng.integers(0, 4, 80)
+    index = nearest(x, y, 3, apart=Apart(of_x, of_y))
+    np.testing.assert_array_equal(index, brute(x, y, 3, of_x[:, None] == of_y))
+    assert (nearest(x, y, 1, apart=Apart(np.zeros(60, int), np.zeros(80, int))) == -1).all()
+    index = nearest(x, x, 3, apart=Apart(np.arange(60), np.arange(60), 5))
+    away = np.abs(np.arange(60)[:, None] - np.arange(60))
+    np.testing.assert_array_equal(index, brute(x, x, 3, away <= 5))
 
 
-def test_a_row_is_no_neighbor_of_itself_even_among_equal_rows():
-    x = unit(np.random.default_rng(4), 50)
-    expected = brute(x, x, 4, np.eye(50, dtype=bool))
-    np.testing.assert_array_equal(other_nearest(x, 4), expected)
-    equal = np.repeat(x[:2], 20, axis=0)
-    index = other_nearest(equal, 3)
-    assert (index != np.arange(40)[:, None]).all()
-    assert (index // 20 == np.arange(40)[:, None] // 20).all()
+@pytest.mark.parametrize("count", [1, 4])
+def test_few_and_many_pairs_give_the_same_matches(monkeypatch, count):
+    rng = np.random.default_rng(4)
+    x, y = unit(rng, 50, 300), unit(rng, 90, 300)
+    apart = Apart(rng.integers(0, 9, 50), rng.integers(0, 9, 90))
+    every = Base(y).closest(x, count, apart)
+    monkeypatch.setattr(neighbors, "EXHAUSTIVE", 0)
+    rows, cosines = Base(y.astype(np.float16)).closest(x, count, apart)
+    np.testing.assert_array_equal(rows, every[0])
+    np.testing.assert_allclose(cosines, every[1], atol=2e-3)

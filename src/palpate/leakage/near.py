@@ -1,51 +1,59 @@
 """Near-duplicate images in vision and tactile, which no metadata reveals.
 
-Every test sample gets the train sample with the most similar image, a score in [0, 1], and, at or
-over a threshold calibrated on the data, the cause:
+Every test sample gets the train sample with the most similar image and a score, its cosine
+(:mod:`palpate.leakage.calibration`). Images that show nothing, blank photos and untouched gel, are
+named before anything is matched. The answer is one of three verdicts:
 
-=================  ===============================================================================
-cause              when
-=================  ===============================================================================
-content            the images are similar (tactile: what the contact adds to the passive gel); only
-                   this is a leak
-nothing touched    both show nothing: blank photos, or no more than untouched gel (``pool``)
-sensor drift       tactile images similar only in what varies slowly over the image, or in what the
-                   passive gel shows at another time: light, gel and residue, not contact. With
-                   videos known, an image whose score is near the threshold (0.8 of it as z) is
-                   content if what varies slowly matches the same train image: then both indicate
-                   a copy
-=================  ===============================================================================
+===============  =================================================================================
+verdict          when
+===============  =================================================================================
+``leaks``        more samples are over the threshold than chance explains
+``none``         no more than chance explains
+``cannot tell``  nothing was touched, or there is no null: unrelated images are not known to be so,
+                 or are all similar. Samples are ranked; only equal images are flagged, or with a
+                 cosine of 0.9 or more where no null contradicts: then they are leaks
+===============  =================================================================================
 
-Steps: thumbnails and backgrounds (``pool``), candidates and similarity (``similarity``), score and
-threshold (``matches``, ``calibration``), causes (``causes``).
+Images are compared as they are and as if edited, tactile ones with their backgrounds, where these
+are known, and without (:mod:`palpate.leakage.descriptors`); gray copies among colored images by
+their luma. All questions share one rate.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from palpate.core import PalpateError, Progress, quiet
+from palpate.core import Note, PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibration
-from palpate.leakage.causes import blank_matches, gel_similarity
-from palpate.leakage.matches import Entries, Matcher, Matches
+from palpate.leakage.calibration import STRICTER, VIDEOS, Tail
+from palpate.leakage.descriptors import Embeddings
+from palpate.leakage.matching import (
+    Unrelated,
+    View,
+    answers,
+    image_views,
+    links,
+    ordered,
+    unrelated,
+)
 from palpate.leakage.neighbors import Floats, Ints
 from palpate.leakage.pool import Pool, codes, pool
 from palpate.leakage.signals import Flags
-from palpate.leakage.similarity import CosineSimilarity, ImageSimilarity, close_pairs
 
-#: Share of a pair's similarity that the passive gel must reach to be the reason for it.
-GEL_SHARE = 0.65
-#: Share of the threshold, as z, from which a tactile image is a copy if what varies slowly agrees.
-AGREED = 0.8
 #: Nearest images that an image may be linked to in a cluster.
 LINKS = 16
+#: Cosine from which images are linked in any case.
+LINKED = 0.75
+#: Cosine of images that are equal but for encoding, where nothing is known to be unrelated.
+COPY = 0.9
+#: Cosine of equal images.
+SAME = 0.9995
 
 
 def near_duplicates(
@@ -67,7 +75,7 @@ def near_duplicates(
         modality: ``vision`` or ``tactile``.
         false_positives: share of unrelated samples that may be flagged, in (0, 0.1].
         features: embeddings of train and test, (n_train, d) and (n_test, d), to compare instead of
-            the images; causes are then all ``content``.
+            the images.
         cache: folder for thumbnails, so that a rerun is quick; None keeps nothing.
         threads: that decode.
         progress: callback.
@@ -77,22 +85,12 @@ def near_duplicates(
     """
     if features is None:
         images = pool(train, test, modality, cache=cache, threads=threads, progress=progress)
-        matcher = Matcher(ImageSimilarity(images.images), false_positives, images.blank, progress)
-        item, videos = images.item, images.videos
     else:
-        vectors = _embeddings(features, (len(train), len(test)))
-        images, matcher = None, Matcher(CosineSimilarity(vectors), false_positives, None, progress)
-        item, videos = np.arange(len(vectors)), codes((train, test), "video")
+        images = _embedded(features, train, test)
+    base, queries = _shown(images, slice(len(train))), _shown(images, slice(len(train), None))
+    matches = _match(images, base, queries, false_positives, progress)
     cut = len(train)
-    base, queries = Entries.of(item[:cut], videos[:cut]), Entries.of(item[cut:], videos[cut:])
-    matches = matcher.match(base, queries)
-    if images is not None:
-        matches = blank_matches(images, base, queries, matches)
-        if modality == "tactile":
-            matches = _name_drift(matches, images, matcher, base, queries)
-    flags = _flags(modality, matches, base, queries)
-    notes = [*(images.notes if images is not None else []), *flags.notes]
-    return replace(flags, false_positives=false_positives, notes=notes)
+    return _flags(modality, images, (base, queries), matches, cut=cut, rate=false_positives)
 
 
 def near_groups(
@@ -106,10 +104,11 @@ def near_groups(
 ) -> Ints:
     """Clusters of near-duplicates, to be kept whole by a split.
 
-    Two images are linked if each is near the other by the rules of :func:`near_duplicates` and the
-    cause is content; a cluster is a connected component. Clusters chain: the first and the last
-    frame of a long slide may share nothing, so a cluster may be as large as a recording. That is
-    what a split needs, but a cluster is no list of duplicates.
+    Two images are linked if one is near the other by the rules of :func:`near_duplicates`, and from
+    a cosine of 0.75 in any case: other videos may hold copies here, which raise the threshold. A
+    cluster is a connected component. Clusters chain: the first and
+    the last frame of a long slide may share nothing, so a cluster may be as large as a recording.
+    That is what a split needs, but a cluster is no list of duplicates.
 
     Args:
         manifest: (n) samples.
@@ -125,147 +124,210 @@ def near_groups(
     """
     none = Manifest(manifest.table.clear(), manifest.root)
     images = pool(manifest, none, modality, cache=cache, threads=threads, progress=progress)
-    matcher = Matcher(ImageSimilarity(images.images), false_positives, images.blank, progress)
-    entries = Entries.of(images.item, images.videos)
-    entries = entries.only(np.unique(entries.item, return_index=True)[1])
-    entries = entries.only(~images.blank[entries.item])
-    i, j, similarity = close_pairs(matcher.similarity, entries.item, LINKS, progress)
-    score, threshold, by_videos = _pair_scores(matcher, entries, i, j, similarity)
-    linked = (score >= threshold) | (similarity >= matcher.similarity.same)
-    if modality == "tactile":
-        if by_videos:
-            close = np.flatnonzero(~linked & (score >= _agreed(threshold)))
-            linked[close] = _slow_agrees(images, matcher, entries, i[close], j[close])
-        rows = np.unique(np.concatenate([i[linked], j[linked]]))
-        gel = np.zeros(len(entries), np.float32)
-        gel[rows] = gel_similarity(images, entries.only(rows))
-        linked &= np.maximum(gel[i], gel[j]) < similarity * GEL_SHARE
-    return _clusters(images.item, images.blank, entries.item[i[linked]], entries.item[j[linked]])
+    base = _shown(images, slice(None))
+    views = image_views(images, base, base)
+    null = _null(images, base, views)
+    tasks = [] if null is None else [(base[null.rows], null.apart)]
+    i, j = [base[:0]], [base[:0]]
+    for view in views:
+        nulls = [row for values, _ in answers(view, base, tasks, progress) for row in values]
+        fitted = calibration.tails(nulls)
+        for question, first, second, cosine in links(view, base, LINKS, progress):
+            limit = min([t.threshold(false_positives) for t in fitted[question:][:1]] + [LINKED])
+            i.append(first[cosine >= limit])
+            j.append(second[cosine >= limit])
+    return _clusters(images, base[np.concatenate(i)], base[np.concatenate(j)])
 
 
-def _embeddings(features: tuple[object, object], counts: tuple[int, int]) -> Floats:
-    """Train and test in one array, float32."""
-    train, test = (np.asarray(f, np.float32) for f in features)
-    shapes = [train.shape, test.shape]
+@dataclass(frozen=True)
+class Matches:
+    """The answer for the images of test.
+
+    Attributes:
+        score: (n,) NaN where there is nothing to compare with.
+        place: (n,) the best match in the base, -1 for none.
+        threshold: score from which images are flagged.
+        stricter: score from which they would be at a hundredth of the rate; None without a null.
+        unrelated: (k,) scores of the null.
+        measured: share of the null that is over a threshold from its other half.
+        note: where the threshold is from.
+    """
+
+    score: Floats
+    place: Ints
+    threshold: float
+    note: Note
+    stricter: float | None = None
+    unrelated: Floats = field(default_factory=lambda: np.zeros(0, np.float32))
+    measured: float | None = None
+
+
+def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progress) -> Matches:
+    """Match images with train, over a threshold from what is unrelated."""
+    if not len(base) or not len(queries):
+        note = Note("cannot-tell-untouched", {"part": "train" if len(queries) else "test"})
+        nothing = np.full(len(queries), np.nan, np.float32), np.full(len(queries), -1, np.int64)
+        return Matches(*nothing, 1.0, note)
+    views = _views(images, base, queries)
+    null = _null(images, base, views)
+    matches: list[tuple[Floats, Ints]] = []
+    nulls: list[Floats] = []
+    for view in views:
+        tasks = [(queries, None)] + ([] if null is None else [(base[null.rows], null.apart)])
+        (similarity, place), *more = answers(view, base, tasks, progress)
+        similarity[:, ~view.queries[queries]] = np.nan
+        matches += zip(similarity, place, strict=True)
+        # Equal images of two videos are copies for certain, and say nothing of unrelated ones.
+        nulls += [np.where(row < SAME, row, np.nan) for values, _ in more for row in values]
+    similarities, places = (np.stack(x) for x in zip(*matches, strict=True))
+    fitted = calibration.tails(nulls) or [Tail(0, 1)] * len(matches)
+    rarest = np.nan_to_num(calibration.excess(similarities, fitted), nan=-np.inf).argmax(axis=0)
+    score = calibration.score(similarities, fitted)
+    place = np.take_along_axis(places, rarest[None], axis=0)[0]
+    limit = calibration.threshold(fitted, rate)
+    if null is None or not calibration.tails(nulls) or limit >= 1:
+        params = {"images": len(base), "threshold": None if null is None else round(limit, 3)}
+        limit = COPY if null is None else 1.0
+        return Matches(score, place, limit, Note("cannot-tell-no-null", params))
+    groups = len(np.unique(null.groups))
+    params = {"threshold": round(limit, 3), "samples": len(null.rows), "groups": groups}
+    return Matches(
+        score,
+        place,
+        limit,
+        Note(f"threshold-{null.source}", params | {"rate": rate, "few": groups < VIDEOS}),
+        calibration.threshold(fitted, rate / STRICTER),
+        calibration.score(nulls, fitted),
+        calibration.measured(nulls, null.groups, rate),
+    )
+
+
+def _flags(
+    modality: str,
+    images: Pool,
+    parts: tuple[Ints, Ints],
+    matches: Matches,
+    *,
+    cut: int,
+    rate: float,
+) -> Flags:
+    """From images to the samples of test, with the verdict."""
+    base, queries = parts
+    item, first = images.item[cut:], _first(images.item[:cut], len(images.images))
+    at = np.full(len(images.images) + 1, -1, np.int64)  # the last for samples without an image
+    at[queries] = np.arange(len(queries))
+    at, known = at[item], at[item] >= 0
+    score, nearest = np.full(len(item), np.nan, np.float32), np.full(len(item), -1, np.int64)
+    if known.any() and len(base):
+        score[known] = matches.score[at[known]]
+        nearest[known] = first[base[matches.place[at[known]]]]
+    thumbs, rows = np.unique(images.images[base], return_index=True)
+    same = known & np.isin(images.images[item], thumbs)
+    score[same], nearest[same] = (
+        1.0,
+        first[base[rows[np.searchsorted(thumbs, images.images[item[same]])]]],
+    )
+    flag = same | (np.nan_to_num(score) >= matches.threshold)
+    checked = int(np.isfinite(score).sum())
+    if matches.stricter is None:
+        verdict = "leaks" if flag.any() else "cannot tell"
+    else:
+        unit = images.unit[cut:]
+        groups = np.where(unit >= 0, unit, -1 - np.arange(len(unit)))
+        strict = np.nan_to_num(score) >= matches.stricter
+        levels = [(flag, rate), (strict, rate / STRICTER)]
+        chance = not same.any() and not calibration.beyond_chance(levels, groups, checked)
+        verdict = "none" if chance else "leaks"
+    score = np.clip(score, 0, 1)
+    cause = np.where(flag, "content", "").astype("<U15")
+    cause[(item >= 0) & images.blank[item]] = "nothing touched"
+    edges, unrelated_scores, histogram = calibration.histograms(matches.unrelated, score)
+    return Flags(
+        f"near-duplicate {modality}",
+        score,
+        flag,
+        nearest,
+        min(matches.threshold, 1.0),
+        counts=verdict == "leaks",
+        false_positives=rate,
+        edges=edges,
+        unrelated=unrelated_scores,
+        matches=histogram,
+        cause=cause,
+        notes=[*images.notes, matches.note],
+        verdict=verdict,
+        expected=None if matches.stricter is None else round(rate * checked, 2),
+        measured=matches.measured,
+    )
+
+
+def _shown(images: Pool, part: slice) -> Ints:
+    """The different images of some samples that show something."""
+    items = np.unique(images.item[part])
+    items = items[items >= 0]
+    return items[~images.blank[items]]
+
+
+def _first(item: Ints, count: int) -> Ints:
+    """(count,) the first sample of each image; -1 for none."""
+    first, known = np.full(count, -1, np.int64), np.flatnonzero(item >= 0)[::-1]
+    first[item[known]] = known
+    return first
+
+
+def _views(images: Pool, base: Ints, queries: Ints) -> list[View]:
+    if images.vectors is None:
+        return image_views(images, base, queries)
+    return [View(Embeddings(images.vectors), ~images.blank, ~images.blank)]
+
+
+def _null(images: Pool, base: Ints, views: list[View]) -> Unrelated | None:
+    """What is known to be unrelated among train images."""
+    first = _first(images.item, len(images.images))[base]
+    null = unrelated(images.unit[first], first)
+    if null is None or (null.source == "order" and not ordered(views[0], base, null)):
+        return None
+    return null
+
+
+def _embedded(features: tuple[object, object], train: Manifest, test: Manifest) -> Pool:
+    """Embeddings of train and test as a pool."""
+    parts, counts = [np.asarray(f, np.float32) for f in features], (len(train), len(test))
+    shapes = [part.shape for part in parts]
     if (
         any(len(s) != 2 for s in shapes)
-        or train.shape[1:] != test.shape[1:]
-        or ((len(train), len(test)) != counts)
+        or shapes[0][1:] != shapes[1][1:]
+        or (len(parts[0]), len(parts[1])) != counts
     ):
         raise PalpateError(
             f"The embeddings must be (n, d): {counts[0]} of train, {counts[1]} of test",
             " and ".join(map(str, shapes)),
             "Embed the same samples",
         )
-    vectors = np.concatenate([train, test])
+    vectors = np.concatenate(parts)
     if not np.isfinite(vectors).all():
         raise PalpateError(
             "The embeddings must be finite", "a number that is not", "Embed the images again"
         )
-    return vectors
+    rows = np.arange(len(vectors))
+    return Pool(
+        item=rows,
+        unit=codes((train, test), "video"),
+        pixels=np.zeros((0, 1, 1, 3), np.uint8),
+        images=rows,
+        backgrounds=np.full(len(rows), -1),
+        blank=np.zeros(len(rows), bool),
+        vectors=vectors,
+    )
 
 
-def _pair_scores(
-    matcher: Matcher, entries: Entries, i: Ints, j: Ints, similarity: Floats
-) -> tuple[Floats, float, bool]:
-    """Scores of pairs of entries, the threshold, and whether it comes from videos."""
-    limit, by_videos = matcher.calibrate(entries, entries)
-    level = np.zeros(len(entries), np.float32)
-    if by_videos:
-        rows = np.unique(np.concatenate([i, j]))
-        best = _best_elsewhere(entries, i, j, similarity)[rows]
-        level[rows] = matcher.levels(entries, entries.only(rows), best)
-    z = calibration.fisher(similarity)
-    return calibration.score(z, np.maximum(level[i], level[j])), limit.threshold, by_videos
-
-
-def _best_elsewhere(entries: Entries, i: Ints, j: Ints, similarity: Floats) -> Ints:
-    """For each entry its most similar candidate in another video; -1 where there is none."""
-    apart = np.flatnonzero((entries.videos[i] != entries.videos[j]) | (entries.videos[i] < 0))
-    apart = apart[np.lexsort((j[apart], similarity[apart]))]
-    best = np.full(len(entries), -1, np.int64)
-    best[i[apart]] = j[apart]  # of several, the last written is the most similar
-    return best
-
-
-def _clusters(item: Ints, blank: NDArray[np.bool_], i: Ints, j: Ints) -> Ints:
+def _clusters(images: Pool, i: Ints, j: Ints) -> Ints:
     """Components of images that are linked, or belong to several samples; -1 for samples alone."""
-    count = len(blank)
+    count = len(images.blank)
     graph = coo_matrix((np.ones(len(i), np.int8), (i, j)), shape=(count, count))
     component = connected_components(graph, directed=False)[1] if count else np.zeros(1, np.int64)
-    usable = item >= 0
-    usable[usable] = ~blank[item[usable]]
-    label = np.where(usable, component[item], -1).astype(np.int64)
+    usable = images.item >= 0
+    usable[usable] = ~images.blank[images.item[usable]]
+    label = np.where(usable, component[images.item], -1).astype(np.int64)
     sizes = np.bincount(label[usable], minlength=count + 1)
     return np.where(usable & (sizes[label] > 1), label, -1)
-
-
-def _name_drift(
-    matches: Matches, images: Pool, matcher: Matcher, base: Entries, queries: Entries
-) -> Matches:
-    """Name the tactile images that are similar through the state of the sensor alone."""
-    cause, score, threshold = matches.cause.copy(), matches.score, matches.calibration.threshold
-    slow = _slow(images, matcher).match(base, queries)
-    only_slow = (slow.cause == "content") & (cause == "") & ~images.blank[queries.item]
-    if matches.by_videos:
-        # Images that share no more than the gel are as similar in fine structure as any two: a
-        # score near the threshold shows more.
-        agreed = only_slow & (slow.place == matches.place) & (score >= _agreed(threshold))
-        cause[agreed], only_slow = "content", only_slow & ~agreed
-        score = np.where(agreed, np.maximum(score, threshold), score)
-    content = np.flatnonzero(cause == "content")
-    gel = gel_similarity(images, queries.only(content))
-    cause[content[gel >= matches.similarity[content] * GEL_SHARE]] = "sensor drift"
-    cause[only_slow] = "sensor drift"
-    score = np.where(only_slow, np.maximum(slow.score, threshold), score).astype(np.float32)
-    place = np.where(only_slow, slow.place, matches.place)
-    return replace(matches, cause=cause, score=score, place=place)
-
-
-def _slow(images: Pool, matcher: Matcher) -> Matcher:
-    """The same for what varies slowly over the image."""
-    filtered, _ = images.filtered(slow=True, progress=matcher.progress)
-    return replace(matcher, similarity=ImageSimilarity(filtered), blank=None)
-
-
-def _agreed(threshold: float) -> float:
-    """The score from which what varies slowly may decide."""
-    return float(np.tanh(AGREED * np.arctanh(threshold)))
-
-
-def _slow_agrees(
-    images: Pool, matcher: Matcher, entries: Entries, i: Ints, j: Ints
-) -> NDArray[np.bool_]:
-    """Whether pairs of entries are similar in what varies slowly, by its threshold."""
-    if not len(i):
-        return np.zeros(0, bool)
-    slow = _slow(images, matcher)
-    similarity = slow.similarity.pairs(entries.item[i], entries.item[j], matcher.progress)
-    score, threshold, _ = _pair_scores(slow, entries, i, j, similarity)
-    return score >= threshold
-
-
-def _flags(modality: str, matches: Matches, base: Entries, queries: Entries) -> Flags:
-    """From entries to the samples of test."""
-    count, limit = len(queries.back), matches.calibration
-    score, nearest = np.full(count, np.nan, np.float32), np.full(count, -1, np.int64)
-    cause = np.full(count, "", "<U15")
-    known = queries.back >= 0
-    if len(base):
-        at = queries.back[known]
-        score[known], cause[known] = matches.score[at], matches.cause[at]
-        place = matches.place[at]
-        nearest[known] = np.where(place >= 0, base.sample[place], -1)
-    edges, unrelated, histogram = calibration.histograms(limit.unrelated, score)
-    return Flags(
-        f"near-duplicate {modality}",
-        score,
-        cause == "content",
-        nearest,
-        limit.threshold,
-        edges=edges,
-        unrelated=unrelated,
-        matches=histogram,
-        cause=cause,
-        notes=limit.notes,
-    )

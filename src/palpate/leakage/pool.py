@@ -1,11 +1,10 @@
 """Every distinct image of one modality in train and test, ready to be compared.
 
-An image is blank where it shows nothing: a photo without any structure (a lens cap, a black frame),
-a tactile image that differs from its background no more than the passive gel differs from itself.
-The strength of an image is the root mean square of its band-passed thumbnail in gray levels; the
-limit for tactile images comes from pairs of different backgrounds of one video (without videos, of
-each and the one most similar to it), which show untouched gel at two times, as 1.5 times the 10 %
-quantile of their strength (the others may hold the beginning of a contact), within 0.3 and 1.1.
+An image shows nothing if its strength is below a limit: the root mean square, in gray levels, of
+what varies over 16 x 16 cells of the thumbnail faster than a plane, for tactile images after the
+background is subtracted. The limit for tactile images is what pairs of backgrounds of one video
+show, untouched gel at two times. Without a background an image is called untouched only where it
+shows no more than the median image of its sensor does: contact is never hidden for want of one.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -21,19 +19,17 @@ from numpy.typing import NDArray
 
 from palpate.core import Note, Progress, quiet
 from palpate.data.manifest import Manifest
-from palpate.leakage.background import Backgrounds, backgrounds, planar, remove_background
-from palpate.leakage.correlation import Floats, Ints, band_pass, even, rms, smooth
-from palpate.leakage.neighbors import other_nearest
+from palpate.leakage.neighbors import Floats, Ints
 from palpate.leakage.thumbnails import SIDE, Thumbnails, thumbnails
 
-#: Strength below which a photo shows nothing.
-BLANK_PHOTO = 0.6
-#: Bounds of the limit for tactile images; the upper one where no two backgrounds are known.
-BLANK_TACTILE = (0.3, 1.1)
-#: Local contrast in gray levels up to which an image counts less: noise and compression.
-FLOOR = {"vision": 3.0, "tactile": 20.0}
-#: Pairs of backgrounds that a limit needs, and how many are compared.
-PAIRS, MOST_PAIRS = 5, 2000
+#: Strength below which a photo shows nothing; bounds of the limit for tactile images.
+BLANK_PHOTO, UNTOUCHED = 0.6, (0.3, 0.6)
+#: Pairs of backgrounds that a limit needs, and how many are compared; images of a median.
+PAIRS, MOST = 5, 500
+#: Difference of the channels, in gray levels, up to which a thumbnail has no color.
+COLORLESS = 2
+#: What names images that may show one contact, the first that is known.
+UNITS = ("video", "session", "object", "contact")
 BLOCK = 1024
 
 
@@ -42,51 +38,29 @@ class Pool:
     """Distinct images of train and test together.
 
     Attributes:
-        modality: ``vision`` or ``tactile``.
         item: (n,) for each sample, train first, the number of its image; -1 if it cannot be read.
-        videos: (n,) codes; -1 where unknown.
+        unit: (n,) codes of what names related images, -1 where unknown.
         pixels: (u, 32, 32, 3) thumbnails of images and backgrounds.
-        thumb: (items,) row of each image in ``pixels``.
-        backgrounds: of all samples, for tactile images.
-        behind: (items,) row of each image in ``backgrounds.pixels``.
-        images: (items, 3, 32, 32) band-passed, each scaled to 127.
+        images, backgrounds: (items,) rows in ``pixels``; -1 without a background.
         blank: (items,) whether an image shows nothing.
         notes: what a reader must know.
+        vectors: (items, d) embeddings in place of thumbnails.
     """
 
-    modality: str
     item: Ints
-    videos: Ints
+    unit: Ints
     pixels: NDArray[np.uint8]
-    thumb: Ints
-    backgrounds: Backgrounds | None
-    behind: Ints
+    images: Ints
+    backgrounds: Ints
+    blank: NDArray[np.bool_]
     notes: list[Note] = field(default_factory=list)
-    images: NDArray[np.int8] = field(init=False)
-    blank: NDArray[np.bool_] = field(init=False)
+    vectors: Floats | None = None
 
-    def planes(self, items: Ints) -> Floats:
-        """(n, 3, 32, 32): photos, or tactile images without their background, in gray levels."""
-        x = planar(self.pixels[self.thumb[items]])
-        if self.backgrounds is None:
-            return x
-        return remove_background(x, planar(self.backgrounds.pixels[self.behind[items]]))
-
-    def filtered(
-        self, *, slow: bool = False, progress: Progress = quiet
-    ) -> tuple[NDArray[np.int8], Floats]:
-        """All images band-passed (``slow``: with what varies slowly), and their strength before."""
-        count = len(self.thumb)
-        images = np.empty((count, 3, SIDE, SIDE), np.int8)
-        strength = np.empty(count, np.float32)
-        for start in range(0, count, BLOCK):
-            progress("describing images", start, count)
-            items = np.arange(start, min(start + BLOCK, count))
-            x = smooth(self.planes(items)) if slow else band_pass(self.planes(items))
-            strength[items] = rms(x)
-            images[items] = quantized(x if slow else even(x, FLOOR[self.modality]))
-        progress("describing images", count, count)
-        return images, strength
+    def colorless(self) -> NDArray[np.bool_]:
+        """(items,) whether an image has no color."""
+        pixels = self.pixels[self.images]
+        least, most = pixels.min(axis=-1).astype(np.int16), pixels.max(axis=-1)
+        return (most - least).max(axis=(1, 2), initial=0) <= COLORLESS
 
 
 def pool(
@@ -110,60 +84,88 @@ def pool(
     """
     parts = (train, test)
     paths = _paths(parts, modality)
-    behind = _paths(parts, "background") if modality == "tactile" else []
+    behind = _paths(parts, "background") if modality == "tactile" else [None] * len(paths)
     thumbs = thumbnails([*paths, *behind], cache=cache, threads=threads, progress=progress)
-    videos, row, recorded = (
-        codes(parts, "video"),
-        thumbs.row[: len(paths)],
-        thumbs.row[len(paths) :],
-    )
+    row, recorded = thumbs.row[: len(paths)], thumbs.row[len(paths) :]
     notes = _unreadable_notes(paths, row, thumbs, modality)
-    gel: Backgrounds | None = None
-    key = np.stack([row, np.zeros_like(row)], axis=1)
-    if modality == "tactile":
-        gel = backgrounds(row, recorded, thumbs.pixels, videos, codes(parts, "sensor"))
-        levels: dict[str, Any] = dict(zip(("video", "sensor", "all"), gel.medians, strict=True))
-        if any(gel.medians):
-            notes.append(Note("median-backgrounds", levels))
-        key[:, 1] = gel.row
+    unit = next(
+        (u for c in UNITS if (u := codes(parts, c)).max(initial=-1) >= 0), codes(parts, "video")
+    )
     item = np.full(len(paths), -1, np.int64)
     readable = row >= 0
-    different, place = np.unique(key[readable], axis=0, return_inverse=True)
-    item[readable] = place.ravel()
+    key = np.stack([row, recorded], axis=1)[readable]
+    different, item[readable] = _distinct(key)
+    images, backgrounds = different[:, 0], different[:, 1]
     result = Pool(
-        modality, item, videos, thumbs.pixels, different[:, 0], gel, different[:, 1], notes
+        item, unit, thumbs.pixels, images, backgrounds, np.zeros(len(images), bool), notes
     )
-    result.images, strength = result.filtered(progress=progress)
-    limit, source, pairs = BLANK_PHOTO, "photo", 0
+    limit, pairs = BLANK_PHOTO, 0
+    reference = backgrounds
     if modality == "tactile":
-        limit, source, pairs = _tactile_limit(thumbs.pixels, recorded, videos)
-    result.blank = strength < limit
+        limit, pairs = _untouched(thumbs.pixels, recorded, unit)
+        sensor = np.zeros(len(images), np.int64)
+        sensor[item[readable]] = codes(parts, "sensor")[readable]
+        result.pixels, reference = _with_medians(thumbs.pixels, images, backgrounds, sensor)
+    result.blank = strength(result.pixels, images, reference) < limit
     if count := int(result.blank[item[readable]].sum()):
-        params = {"count": count, "of": len(item), "limit": round(limit, 2), "source": source}
-        notes.append(Note("blank-images", params | {"pairs": pairs}))
+        params = {"count": count, "of": len(item), "limit": round(limit, 2), "pairs": pairs}
+        notes.append(Note("blank-images", params | {"modality": modality}))
     return result
 
 
-def quantized(x: Floats) -> NDArray[np.int8]:
-    """Each image scaled so that its strongest value is 127."""
-    strongest = np.abs(x).max(axis=(1, 2, 3), keepdims=True)
-    return np.round(x * (127 / np.maximum(strongest, np.float32(1e-6)))).astype(np.int8)
-
-
-def small_images(pixels: NDArray[np.uint8], rows: Ints) -> Floats:
-    """Thumbnails at 8 x 8, (n, 192), scaled so that distances are root mean square gray levels."""
-    small = np.empty((len(rows), 192), np.float32)
-    for start in range(0, len(rows), BLOCK):
-        part = pixels[rows[start : start + BLOCK]]
-        cells = part.reshape(len(part), 8, 4, 8, 4, 3).mean(axis=(2, 4))
-        small[start : start + BLOCK] = cells.reshape(len(part), -1)
-    return small / np.float32(np.sqrt(192))
+def strength(pixels: NDArray[np.uint8], images: Ints, reference: Ints) -> Floats:
+    """(n,) what images show beyond a plane and the image ``reference`` (none if -1), in levels."""
+    at = np.linspace(-1, 1, SIDE // 2)
+    plane = np.stack([np.ones(at.size**2), np.repeat(at, at.size), np.tile(at, at.size)], axis=1)
+    basis = np.linalg.qr(plane)[0].astype(np.float32)
+    out = np.empty(len(images), np.float32)
+    for start in range(0, len(images), BLOCK):
+        part = slice(start, start + BLOCK)
+        x = pixels[images[part]].astype(np.float32)
+        x -= (
+            np.where(reference[part] >= 0, 1.0, 0.0).astype(np.float32)[:, None, None, None]
+            * pixels[reference[part]]
+        )
+        x = x.reshape(len(x), at.size, 2, at.size, 2, 3).mean(axis=(2, 4)).reshape(len(x), -1, 3)
+        x -= basis @ (basis.T @ x)
+        out[part] = np.sqrt(np.square(x).mean(axis=(1, 2)))
+    return out
 
 
 def codes(parts: Sequence[Manifest], column: str) -> Ints:
     """One column of several manifests as numbers; -1 where null."""
     values = pl.concat([m.table[column] for m in parts])
     return values.rank("dense").cast(pl.Int64).fill_null(0).to_numpy() - 1
+
+
+def _distinct(key: Ints) -> tuple[Ints, Ints]:
+    """Different rows, and the place of each row among them."""
+    different, place = np.unique(key, axis=0, return_inverse=True)
+    return different, place.ravel()
+
+
+def _with_medians(
+    pixels: NDArray[np.uint8], images: Ints, backgrounds: Ints, sensor: Ints
+) -> tuple[NDArray[np.uint8], Ints]:
+    """Thumbnails with medians of each sensor's images, for images without a background."""
+    reference, more = backgrounds.copy(), [pixels]
+    for code in np.unique(sensor[backgrounds < 0]).tolist():
+        rows = images[sensor == code]
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST)).astype(np.int64)]
+        reference[(backgrounds < 0) & (sensor == code)] = len(pixels) + len(more) - 1
+        more.append(np.median(pixels[rows], axis=0).astype(np.uint8)[None])
+    return np.concatenate(more) if len(more) > 1 else pixels, reference
+
+
+def _untouched(pixels: NDArray[np.uint8], recorded: Ints, unit: Ints) -> tuple[float, int]:
+    """The strength that untouched gel shows, and from how many pairs of backgrounds."""
+    known = np.unique(np.stack([unit, recorded], axis=1)[(unit >= 0) & (recorded >= 0)], axis=0)
+    first = np.flatnonzero(known[1:, 0] == known[:-1, 0])
+    if len(first) < PAIRS:
+        return UNTOUCHED[0], 0
+    first = first[np.linspace(0, len(first) - 1, min(len(first), MOST)).astype(np.int64)]
+    levels = strength(pixels, known[first, 1], known[first + 1, 1])
+    return float(np.clip(1.5 * np.quantile(levels, 0.1), *UNTOUCHED)), len(first)
 
 
 def _paths(parts: Sequence[Manifest], column: str) -> list[Path | None]:
@@ -187,24 +189,3 @@ def _unreadable_notes(
     if gels := [Path(p).name for p in thumbs.unreadable if p not in named]:
         notes.append(Note("backgrounds-unreadable", {"count": len(gels), "files": gels[:3]}))
     return notes
-
-
-def _tactile_limit(
-    pixels: NDArray[np.uint8], recorded: Ints, videos: Ints
-) -> tuple[float, str, int]:
-    """The strength that untouched gel shows, where that is known from, and from how many pairs."""
-    known = np.unique(np.stack([videos, recorded], axis=1)[(videos >= 0) & (recorded >= 0)], axis=0)
-    following = np.flatnonzero(known[1:, 0] == known[:-1, 0])
-    first, second, source = known[following, 1], known[following + 1, 1], "video"
-    if len(first) < PAIRS:
-        first, source = np.unique(recorded[recorded >= 0]), "similar"
-        if len(first) < 2 * PAIRS:
-            return BLANK_TACTILE[1], "default", 0
-        second = first[other_nearest(small_images(pixels, first), 1)[:, 0]]
-    chosen = np.linspace(0, len(first) - 1, min(len(first), MOST_PAIRS)).astype(np.int64)
-    strength = [
-        rms(band_pass(remove_background(planar(pixels[first[k]]), planar(pixels[second[k]]))))
-        for k in np.array_split(chosen, -(-len(chosen) // BLOCK))
-    ]
-    limit = float(np.clip(1.5 * np.quantile(np.concatenate(strength), 0.1), *BLANK_TACTILE))
-    return limit, source, len(chosen)

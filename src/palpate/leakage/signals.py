@@ -153,7 +153,8 @@ class Flags:
     def _worst(self, train: Manifest, test: Manifest, gaps: Gaps, worst: int) -> list[LeakPair]:
         """The strongest pairs, one a video first; then a few of each cause that is no leak."""
         paired = self.nearest >= 0
-        chosen = _varied(np.flatnonzero(self.flag & paired), self.score, test, worst)
+        ranked = self.flag | (self.verdict == "cannot tell")
+        chosen = _varied(np.flatnonzero(ranked & paired), self.score, test, worst)
         if self.cause is not None:
             for name in CAUSES[1:]:
                 rows = np.flatnonzero((self.cause == name) & paired)

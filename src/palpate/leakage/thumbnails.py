@@ -1,4 +1,6 @@
-"""Images as thumbnails of 32 x 32 pixels in YCbCr, 3 kB each.
+"""Images as thumbnails of 32 x 32 pixels in RGB, 3 kB each.
+
+They are squashed to a square on purpose: quarter turns and mirrors then permute pixels.
 
 Each distinct file is decoded once, a JPEG at the smallest scale that libjpeg offers above 48 pixels
 (Pillow's ``draft``). Equal thumbnails are kept once. Files that are cut, empty or no images are
@@ -20,7 +22,7 @@ from PIL import Image, ImageOps
 from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
 from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, opened, read_image
 
-VERSION = 3
+VERSION = 4
 SIDE = 32
 #: Files of one cached piece.
 PIECE = 1024
@@ -28,7 +30,7 @@ PIECE = 1024
 #: shift.
 DRAFT = 48
 #: Modes that need no rule of :func:`palpate.data.images.read_image`.
-PLAIN = ("YCbCr", "RGB", "L")
+PLAIN = ("RGB", "L")
 
 #: Thumbnails of some files, and which of the files cannot be read, with the reason.
 Decoded = tuple[NDArray[np.uint8], dict[int, str]]
@@ -40,7 +42,7 @@ class Thumbnails:
 
     Attributes:
         row: (n,) the thumbnail of each path; -1 without a path or where it cannot be read.
-        pixels: (u, 32, 32, 3) YCbCr, 0 to 255, all different.
+        pixels: (u, 32, 32, 3) 0 to 255, all different.
         unreadable: path -> reason.
     """
 
@@ -50,17 +52,16 @@ class Thumbnails:
 
 
 def thumbnail(path: Path) -> NDArray[np.uint8] | str:
-    """One image, (32, 32, 3) YCbCr; or why it cannot be read."""
+    """One image, (32, 32, 3); or why it cannot be read."""
     try:
         with opened(path) as image:
-            image.draft("YCbCr", (DRAFT, DRAFT))
+            image.draft("RGB", (DRAFT, DRAFT))
             image.load()
             if image.mode in PLAIN and not image.has_transparency_data:
                 upright = ImageOps.exif_transpose(image) if image.info.get("exif") else image
-                small = upright.resize((SIDE, SIDE), Image.Resampling.BILINEAR)
-                return np.asarray(small.convert("YCbCr"))
-        small = read_image(path).resize((SIDE, SIDE), Image.Resampling.BILINEAR)
-        return np.asarray(small.convert("YCbCr"))
+                small = upright.resize((SIDE, SIDE), Image.Resampling.BOX)
+                return np.asarray(small.convert("RGB"))
+        return np.asarray(read_image(path).resize((SIDE, SIDE), Image.Resampling.BOX))
     except PalpateError as error:
         return error.got
     except BROKEN as error:

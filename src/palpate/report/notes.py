@@ -255,17 +255,14 @@ def _rows_skipped(params: Mapping[str, Any], _: Style) -> str:
 
 
 def _blank_images(params: Mapping[str, Any], _: Style) -> str:
-    where = {
-        "photo": "",
-        "default": ", a default, since too few backgrounds are known",
-        "video": f", from {params['pairs']} pairs of backgrounds of one video",
-        "similar": f", from {params['pairs']} pairs of backgrounds most similar to each other",
-    }[params["source"]]
-    what = "photos" if params["source"] == "photo" else "tactile images"
-    shows = "nothing at all" if params["source"] == "photo" else "no more than untouched gel does"
+    what, shows = "photos", "nothing at all"
+    if params["modality"] == "tactile":
+        pairs = params["pairs"]
+        what = "tactile images"
+        shows = "untouched gel" + (f" (by {plural(pairs, 'pair')} of backgrounds)" if pairs else "")
     return (
-        f"{params['count']} of {params['of']} {what} show {shows}"
-        f" (strength under {params['limit']:.2f} gray levels{where})"
+        f"{params['count']} of {params['of']} {what} show {shows}, under"
+        f" {params['limit']:.2f} gray levels, and were not compared"
     )
 
 
@@ -278,29 +275,33 @@ def _equal_names(p: Mapping[str, Any], style: Style) -> str:
     )
 
 
-def _median_backgrounds(params: Mapping[str, Any], _: Style) -> str:
-    names = {"video": "their video", "sensor": "their sensor", "all": "all frames"}
-    medians = [f"{params[k]} take the median of {name}" for k, name in names.items() if params[k]]
-    return f"Tactile images without a recorded background: {'; '.join(medians)}"
+def _threshold(source: str) -> Sentence:
+    def write(params: Mapping[str, Any], _: Style) -> str:
+        known = plural(params["groups"], "video" if source == "videos" else "stretch of frames")
+        line = (
+            f"Threshold {params['threshold']:.3f} from the best matches of {params['samples']} "
+            f"train images {source_of[source]} ({known}), for {params['rate']:.2%} of unrelated "
+            "samples"
+        )
+        guess = "; with so few the rate is an extrapolation, by a factor of three or more"
+        return line + (guess if params["few"] else "")
+
+    source_of = {
+        "videos": "in other videos",
+        "order": "far from them in the order of the files, as no videos are known",
+    }
+    return write
 
 
-def _threshold(params: Mapping[str, Any]) -> str:
-    lowest = " (the lowest that is allowed; the data alone would set it lower)"
-    return f"Threshold {params['threshold']:.3f}{lowest if params['lowest'] else ''} from"
-
-
-def _threshold_other_videos(params: Mapping[str, Any], _: Style) -> str:
-    return (
-        f"{_threshold(params)} the best matches of {params['samples']} samples in other videos, for"
-        f" {params['rate']:.2%} of unrelated samples; {params['over']:.2%} of those lie over it"
-    )
-
-
-def _threshold_random_pairs(params: Mapping[str, Any], _: Style) -> str:
-    return (
-        f"{_threshold(params)} random pairs (in blocks of {params['block']}), carried over to the"
-        f" best of {params['images']} train images, for {params['rate']:.2%} of unrelated samples"
-    )
+def _no_null(params: Mapping[str, Any], _: Style) -> str:
+    if params["threshold"] is None:
+        why = (
+            f"none of the {plural(params['images'], 'train image')} is known to be unrelated to "
+            "enough others, by video or by order"
+        )
+    else:
+        why = "train images of other videos are as similar as equal ones"
+    return f"Cannot tell which similarity is chance: {why}. The most similar pairs are listed"
 
 
 #: Column whose groups train and test share -> what the test part then asks for.
@@ -350,15 +351,14 @@ def _listed(template: str) -> Sentence:
 
 LEAKAGE: dict[str, Sentence] = {
     "backgrounds-unreadable": lambda p, _: (
-        f"{p['count']} background images cannot be read{_few(p['files'])}; medians replace them"
+        f"{p['count']} background images cannot be read{_few(p['files'])}; their tactile images "
+        "were compared as they are"
     ),
     "blank-images": _blank_images,
-    "copies-across-videos": (
-        "{count} of {of} are so similar that they are taken for copies across videos and do "
-        "not set the threshold"
-    ),
-    "equal-names": _equal_names,
+    "cannot-tell-no-null": _no_null,
+    "cannot-tell-untouched": "Nothing can be compared: no image of {part} shows any contact",
     "empty-files": "{count} files are empty (0 bytes) and were not compared",
+    "equal-names": _equal_names,
     "group-few": lambda p, _: (
         f"There are fewer than {p['parts']} {p['group']}s: whole {p.get('taken', 'contact')}s are "
         f"kept together instead, and train and test share a {p['group']}"
@@ -388,7 +388,6 @@ LEAKAGE: dict[str, Sentence] = {
         "a classifier tells recordings by the drift of the sensor, not materials"
     ),
     "impact-failed": "What leaking costs could not be measured: {reason}",
-    "median-backgrounds": _median_backgrounds,
     "missing-materials": _listed(
         "Could be in every part, but not together with the others: {materials}"
     ),
@@ -413,20 +412,8 @@ LEAKAGE: dict[str, Sentence] = {
         "a near-duplicate joins it"
     ),
     "split-of-other-manifest": "The split was made for another manifest (the digests differ)",
-    "threshold-default": lambda p, _: (
-        f"Fewer than {p['fewest']} pairs are known to be unrelated: the threshold "
-        f"{p['threshold']} is a default, not calibrated to {p['rate']:.2%}"
-    ),
-    "threshold-few-videos": (
-        "Train has too few samples of two known videos to measure how similar unrelated images are"
-    ),
-    "threshold-other-videos": _threshold_other_videos,
-    "threshold-random-pairs": _threshold_random_pairs,
-    "threshold-untrusted": (
-        "Best matches in other videos would set the threshold to {threshold:.3f}: many "
-        "recordings of train are copies of one another, or these"
-        " features cannot separate images. Random pairs set it instead"
-    ),
+    "threshold-order": _threshold("order"),
+    "threshold-videos": _threshold("videos"),
     "validation-leaks": (
         "{count} {group} groups of the validation part occur in train or test as well: "
         "choosing a checkpoint on it leaks"

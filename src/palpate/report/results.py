@@ -36,7 +36,7 @@ COMMAND_KEYS = ("format", "skipped", "failed")
 #: Rows of the group-by-part matrix that an audit keeps.
 MATRIX_ROWS = 60
 #: Why two images are similar. Only ``content`` is a leak.
-CAUSES = ("content", "nothing touched", "sensor drift")
+CAUSES = ("content", "nothing touched")
 
 
 @dataclass(frozen=True)

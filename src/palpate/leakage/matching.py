@@ -1,0 +1,148 @@
+"""Best matches of images among train: by each way to compare them, as they are and as if edited."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import Progress, quiet, rng_for
+from palpate.leakage.descriptors import Descriptors, Edits, Whitened
+from palpate.leakage.neighbors import Apart, Base, Floats, Ints
+from palpate.leakage.pool import Pool
+
+#: Rows in recording order within which two images may show one contact.
+WINDOW = 16
+#: Train images whose unrelated matches make the null.
+NULL_IMAGES = 4000
+
+
+@dataclass(frozen=True)
+class View:
+    """One way to compare images.
+
+    Attributes:
+        descriptors: of all images.
+        known: (items,) those that can be compared so.
+        queries: (items,) those whose matches are of interest.
+    """
+
+    descriptors: Descriptors
+    known: NDArray[np.bool_]
+    queries: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Unrelated:
+    """Train images, and which others are known to be unrelated to each.
+
+    Attributes:
+        rows: (k,) rows of the base.
+        apart: of these against the base.
+        groups: (k,) videos, or pieces of the recording order.
+        source: ``videos`` or ``order``.
+    """
+
+    rows: Ints
+    apart: Apart
+    groups: Ints
+    source: str
+
+
+def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
+    """Log thumbnails without and with backgrounds, in color and, for gray copies, in gray."""
+    both = np.concatenate([base, queries])
+    gray = images.colorless()
+    kinds = [(False, ~images.blank)]
+    if gray[queries].any() and not gray[base].all():
+        kinds.append((True, gray))
+    views: list[View] = []
+    for luma, asked in kinds:
+        for backgrounds in (None, images.backgrounds):
+            known = ~images.blank if backgrounds is None else ~images.blank & (backgrounds >= 0)
+            if backgrounds is None or (known[base].any() and known[queries].any()):
+                described = Whitened(
+                    images.pixels, images.images, backgrounds, gray=luma, fit=both[known[both]]
+                )
+                views.append(View(described, known, asked))
+    return views
+
+
+def unrelated(unit: Ints, order: Ints) -> Unrelated | None:
+    """What is known to be unrelated among train images; None if nothing is.
+
+    Args:
+        unit: (m,) video of each image of the base, negative where unknown.
+        order: (m,) place in recording order, all different.
+    """
+    rng = rng_for(0, "near-duplicates", "null")
+    rows = np.flatnonzero(unit >= 0)
+    if len(np.unique(unit[rows])) >= 2:
+        # An image without a video is unrelated to none for certain: the null is higher for it.
+        keys = np.where(unit >= 0, unit, -1 - np.arange(len(unit)))
+        rows = np.sort(rng.permutation(rows)[:NULL_IMAGES])
+        return Unrelated(rows, Apart(keys[rows], keys), keys[rows], "videos")
+    if len(unit) <= 3 * WINDOW or len(rows) == len(unit):
+        return None
+    keys = np.argsort(np.argsort(order))
+    rows = np.sort(rng.permutation(len(unit))[:NULL_IMAGES])
+    return Unrelated(rows, Apart(keys[rows], keys, WINDOW), keys[rows] // (2 * WINDOW), "order")
+
+
+def ordered(view: View, base: Ints, null: Unrelated) -> bool:
+    """Whether recording order says anything: whether best matches lie within the window."""
+    itself = Apart(null.apart.queries, null.apart.base, 0)
+    _, places = answers(view, base, [(base[null.rows], itself)])[0]
+    known = places[0] >= 0
+    near = np.abs(null.apart.queries - null.apart.base[places[0]])[known] <= WINDOW
+    chance = 2 * WINDOW / len(base)
+    return bool(near.mean() > chance + 4 * np.sqrt(chance / max(len(near), 1)))
+
+
+def answers(
+    view: View, base: Ints, tasks: Sequence[tuple[Ints, Apart | None]], progress: Progress = quiet
+) -> list[tuple[Floats, Ints]]:
+    """Best matches of several sets of images among the base.
+
+    Returns:
+        for each task the similarities and places in ``base``, (questions, n); NaN and -1 where
+        there is none.
+    """
+    b = np.flatnonzero(view.known[base])
+    found: list[tuple[Floats, Ints]] = []
+    steps: list[tuple[Ints, Apart | None, Callable[[int], Edits]]] = []
+    for items, apart in tasks:
+        q = np.flatnonzero(view.known[items])
+        shape = (view.descriptors.questions, len(items))
+        found.append((np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int64)))
+        if apart is not None:
+            apart = Apart(apart.queries[q], apart.base[b], apart.window)
+        steps.append((q, apart, view.descriptors.test(items[q])))
+    for k in range(view.descriptors.bases):
+        progress("comparing images", k, view.descriptors.bases)
+        among = Base(view.descriptors.train(base[b], k))
+        for (q, apart, edits), (similarity, place) in zip(steps, found, strict=True):
+            for question, at, vectors in edits(k):
+                best, where = similarity[question], place[question]
+                rows, values = among.closest(vectors, 1, None if apart is None else apart.only(at))
+                better = (rows[:, 0] >= 0) & ~(values[:, 0] <= best[q[at]])
+                best[q[at[better]]] = values[better, 0]
+                where[q[at[better]]] = b[rows[better, 0]]
+    return found
+
+
+def links(
+    view: View, base: Ints, count: int, progress: Progress = quiet
+) -> Iterator[tuple[int, Ints, Ints, Floats]]:
+    """Pairs of images that may be linked: (question, i, j, cosines)."""
+    b = np.flatnonzero(view.known[base])
+    edits = view.descriptors.test(base[b])
+    for k in range(view.descriptors.bases):
+        progress("comparing images", k, view.descriptors.bases)
+        among = Base(view.descriptors.train(base[b], k))
+        for question, at, vectors in edits(k):
+            rows, cosines = among.closest(vectors, count, Apart(at, np.arange(len(b)), 0))
+            known = rows >= 0
+            yield question, b[at[np.nonzero(known)[0]]], b[rows[known]], cosines[known]
