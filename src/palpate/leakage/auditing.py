@@ -312,7 +312,7 @@ def _compare(
     gaps = nearest_in_video(*(in_time(t) if options.ids_in_time else t for t in (a, b)))
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
-    reason = _reason(train, test, flags, options, named=not equal)
+    reason = _reason(train, test, group, flags, options, named=not equal)
     timed = gaps.frames[gaps.frames >= 0]
     last = int(timed.max()) if timed.size else 0
     edges = [e for e in GAP_EDGES if e <= last] + [last + 1] if timed.size else []
@@ -352,13 +352,20 @@ def _compare(
 
 
 def _reason(
-    train: Manifest, test: Manifest, flags: Sequence[Flags], options: _Options, *, named: bool
+    train: Manifest,
+    test: Manifest,
+    group: str,
+    flags: Sequence[Flags],
+    options: _Options,
+    *,
+    named: bool,
 ) -> str:
     """Why a leak might not show; '' where it would.
 
     Args:
         train: samples.
         test: the samples in question.
+        group: of the audit.
         flags: all signals.
         options: of the audit.
         named: whether equal names say something.
@@ -371,6 +378,8 @@ def _reason(
     codes = {note.code for f in near[-1:] for note in f.notes}
     if "cannot-tell-untouched" in codes:
         return "untouched"
+    if near and group == NO_GROUP and near[-1].verdict == CANNOT_TELL:
+        return "chance"
     files = [f for f in flags if f.kind == "identical bytes"]
     if any(np.isfinite(f.score).any() for f in (*near, *files)):
         return ""

@@ -10,8 +10,8 @@ Where no video is known, images more than ``WINDOW`` apart in recording order ta
 the order says anything: an image's best match must lie within the window more often than chance
 has it. A threshold is never replaced by a looser one; without a null nothing is promised.
 
-Several questions (as it is, moved, edited) share the rate. The answer that is rarest among unrelated
-images counts, and the score is the similarity of the first question that would be as rare.
+Several questions (as it is, moved, edited) share the rate. The answer that is rarest by chance
+counts, and the score is the similarity of the first question that would be as rare.
 """
 
 from __future__ import annotations

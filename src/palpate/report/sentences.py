@@ -45,10 +45,7 @@ KINDS: tuple[tuple[str, str, str], ...] = (
     ),
 )
 #: Causes of similar images that are no leak.
-HARMLESS = {
-    "nothing touched": "the gel was untouched in both, and untouched gel looks similar everywhere",
-    "sensor drift": "the gel's slow change over time makes both similar, not the contact",
-}
+HARMLESS = {"nothing touched": "they show no contact, and were not compared"}
 
 
 def data_of(audit: Audit) -> str:
@@ -88,8 +85,7 @@ def cause_texts(signal: Signal) -> list[str]:
 def cause_notes(signal: Signal) -> list[str]:
     """Return a sentence for each cause that is no leak."""
     return [
-        f"{plural(signal.causes[cause], 'test sample')} at or above the threshold: {why} "
-        f"({cause}). Not counted as leaking."
+        f"{plural(signal.causes[cause], 'test sample')} ({cause}): {why}."
         for cause, why in HARMLESS.items()
         if signal.causes.get(cause)
     ]
@@ -110,21 +106,27 @@ def chance_text(signal: Signal) -> str:
 
 def threshold_line(signal: Signal) -> str:
     """Return how the threshold was set, and how many samples are at or above it."""
+    if signal.verdict == CANNOT_TELL:
+        return "Which similarity is chance cannot be told: the most similar pairs are listed, unjudged."
     line = f"The threshold is a score of {score_text(signal.threshold)}"
-    if signal.false_positives is not None:
-        rate = percent(signal.false_positives)
-        line += f", where {rate} of the samples known to be unrelated find a match by chance"
-    above = max(sum(signal.causes.values()), signal.flagged)
-    share = percent(above / signal.checked if signal.checked else 0.0)
-    verb = "is" if above == 1 else "are"
+    share = percent(signal.fraction)
+    verb = "is" if signal.flagged == 1 else "are"
     samples = plural(signal.checked, "test sample")
-    return f"{line}. {count(above)} of {samples} ({share}) {verb} at or above it."
+    line += f". {count(signal.flagged)} of {samples} ({share}) {verb} at or above it"
+    if signal.expected is None or signal.false_positives is None:
+        return f"{line}."
+    line += f", where chance explains {number(signal.expected)} ({percent(signal.false_positives)}"
+    if signal.measured is not None:
+        line += f"; measured on train images of other videos {percent(signal.measured)}"
+    verdicts = {"leaks": "more than chance explains", "none": "no more than chance explains"}
+    return f"{line}): {verdicts[signal.verdict]}." if signal.verdict else f"{line})."
 
 
 #: Why it cannot be told whether a split leaks.
 UNTOLD = {
     "untouched": "nothing was touched, so images cannot show what is new",
     "alike": "images of different videos are all alike, so they cannot show what is new",
+    "chance": "no images are known to be unrelated, so none show what similarity is chance",
     "ids": "ids alone could be compared, since no video, object or image is known",
     "names": "equal names of different roots mean nothing, and there are no images to compare",
 }
