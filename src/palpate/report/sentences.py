@@ -107,7 +107,7 @@ def chance_text(signal: Signal) -> str:
 def threshold_line(signal: Signal) -> str:
     """Return how the threshold was set, and how many samples are at or above it."""
     if signal.verdict == CANNOT_TELL:
-        return "Which similarity is chance cannot be told: the most similar pairs are listed, unjudged."
+        return "Which similarity is chance cannot be told: the most similar pairs are listed."
     line = f"The threshold is a score of {score_text(signal.threshold)}"
     share = percent(signal.fraction)
     verb = "is" if signal.flagged == 1 else "are"
