@@ -77,7 +77,7 @@ def threshold_text(signal: Signal) -> str:
 def cause_texts(signal: Signal) -> list[str]:
     """Return how many test samples are similar for which cause."""
     return [
-        f"{cause} {count(n)}{'' if cause == "content" else ' (no leak)'}"
+        f"{cause} {count(n)}" + " (no leak)" * (cause != "content")
         for cause, n in signal.causes.items()
     ]
 
