@@ -68,7 +68,8 @@ class PalpateError(Exception):
         parts = [must, f"Got {self.got}", self.fix]
         if self.example:
             parts.append("E.g. " + " ".join(example(k, v) for k, v in self.example.items()))
-        return " ".join(f"{part.rstrip('.')}." for part in parts if part)
+        sentences = (p if p.endswith("...") else f"{p.rstrip('.')}." for p in parts if p)
+        return " ".join(sentences)
 
     def to_json(self) -> dict[str, Any]:
         """Return the error as a JSON object: ``error, must, got, fix, argument``."""
