@@ -90,7 +90,7 @@ def read(
         splits = {} if split is None else {str(split.rule["name"]): split}
         columns = {*manifest.filled().columns} | {*manifest.table.columns[len(SCHEMA) :]}
         bare = "path" in columns and columns.isdisjoint(MODALITIES)
-        notes = [Note("names-only", {"name": Path(source).name})] if bare else []
+        notes = [Note("names-only", {"name": str(path and path.name)})] if bare else []
         return Source(manifest, splits, [*_notes(skipped), *notes])
     manifest, skipped = read_samples(
         source, skip_bad=skip_bad, root=root, progress=progress, **options
