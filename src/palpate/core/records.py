@@ -50,7 +50,8 @@ def _value(hint: Any, value: Any, name: str) -> Any:
         return _value(hint, value, name)
     if dataclasses.is_dataclass(hint):
         try:
-            return hint.from_json(value) if hasattr(hint, "from_json") else from_plain(hint, value)
+            kind: Any = hint
+            return kind.from_json(value) if hasattr(kind, "from_json") else from_plain(kind, value)
         except (AttributeError, TypeError):
             raise ValueError(f"{name} that holds no object") from None
     if origin is tuple and isinstance(value, list | tuple) and len(value) == len(inner):
