@@ -121,10 +121,11 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
             raise
         must, got = f"{output or folder} must be writable", error.strerror or str(error)
         raise PalpateError(must, got, "Choose another path, or check its rights") from None
-    handle = os.open(folder, os.O_RDONLY)
+    handle = -1
     try:
-        import fcntl
+        import fcntl  # not on Windows, where a folder cannot be opened either
 
+        handle = os.open(folder, os.O_RDONLY)
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
@@ -138,7 +139,8 @@ def locked(folder: Path, output: Path | None = None) -> Generator[None]:
         if made:
             with suppress(OSError):
                 folder.rmdir()
-        os.close(handle)
+        if handle >= 0:
+            os.close(handle)
 
 
 def write_text(path: Path, text: str) -> None:
