@@ -344,3 +344,12 @@ def test_the_worst_pairs_come_from_different_videos_first():
     none = Gaps(np.full(4, -1), np.full(4, -1))
     worst = flags.summary(train, test, none, 3).worst
     assert [p.test.id for p in worst] == ["t2", "t3", "t0"]
+
+
+def test_frames_whose_images_are_not_at_hand_are_audited_by_names_with_a_note(small_manifest):
+    table = small_manifest.table
+    audited = audit(table[: len(table) // 2], table[len(table) // 2 :])
+    assert [note.code for note in audited.notes].count("images-not-found") == 1
+    assert not any("near-duplicate" in signal.kind for signal in audited.signals)
+    with_root = audit(table[:4], table[4:], root=small_manifest.root)
+    assert "images-not-found" not in {note.code for note in with_root.notes}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,9 @@ def read_samples(
     path = Path(source)
     if format == "auto" and path.exists():
         if is_manifest(path):
+            if unknown := sorted(set(options) - {"root"}):
+                got = repr(options[unknown[0]])
+                raise PalpateError("must be left out for a manifest", got, "", argument=unknown[0])
             return Manifest.load(path, options.get("root")), []
         if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
             listed = read_list(path, skip_bad=skip_bad)
@@ -150,9 +154,20 @@ def _of_table(
     classes = None if "classes" not in options else read_classes(Path(options["classes"]))
     cells = maps.apply(table.read(maps.columns))
     rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
+    facts = {"dataset": Path(table.name).stem}
+    base = Path(options.get("root", root))
+    if "root" not in options and _without_files(rows, base):
+        rows = [(k, {c: v for c, v in row.items() if c not in IMAGE_COLUMNS}) for k, row in rows]
+        facts["images_not_below"] = str(base)
     places = [(table.where(k), row) for k, row in rows]
-    scan = Scan(Path(options.get("root", root)), rows=places, problems=table.problems)
-    return _of_scan(scan, table.name, {"dataset": Path(table.name).stem}, skip_bad, quiet)
+    scan = Scan(base, rows=places, problems=table.problems)
+    return _of_scan(scan, table.name, facts, skip_bad, quiet)
+
+
+def _without_files(rows: Sequence[tuple[int, dict[str, Any]]], root: Path) -> bool:
+    """Whether rows name images, and none of these is a file: their root is not known."""
+    paths = [row[c] for _, row in rows for c in IMAGE_COLUMNS if row.get(c)]
+    return bool(paths) and not any((root / path).is_file() for path in paths)
 
 
 def _of_scan(

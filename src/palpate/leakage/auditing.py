@@ -190,6 +190,7 @@ def audit(  # noqa: PLR0913
         title = f"{_name(pretrain, 'pretraining')} / test"
         against = _compare(parts[-1], test_part, options, title, against="pretraining")
         result = replace(result, others=[against])
+    notes = [note for k, note in enumerate(notes) if note not in notes[:k]]  # of train and test
     return replace(result, notes=[*result.notes, *notes])
 
 

@@ -96,7 +96,10 @@ def read(
         source, skip_bad=skip_bad, root=root, progress=progress, **options
     )
     stated = sorted(path.glob("splits/*.json")) if path is not None and path.is_dir() else []
-    return Source(manifest, {p.stem: Split.load(p) for p in stated}, _notes(skipped))
+    notes = _notes(skipped)
+    if lost := manifest.facts.get("images_not_below"):
+        notes.append(Note("images-not-found", {"root": lost}))
+    return Source(manifest, {p.stem: Split.load(p) for p in stated}, notes)
 
 
 def _notes(skipped: Sequence[Problem]) -> list[Note]:

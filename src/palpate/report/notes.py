@@ -401,6 +401,10 @@ LEAKAGE: dict[str, Sentence] = {
         "were compared"
     ),
     "no-materials": "No sample has a material: only the sizes of the parts are balanced",
+    "images-not-found": (
+        "No image that the table names is a file below {root}, so images were not read; pass the "
+        "folder that its paths start from as {arg:root=FOLDER}"
+    ),
     "question": _question,
     "rare-materials": _listed("In fewer than {parts} groups, so not in every part: {materials}"),
     "rows-skipped": _rows_skipped,
