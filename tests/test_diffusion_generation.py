@@ -175,7 +175,7 @@ def test_wrong_inputs_and_outputs_are_explained(pipeline, tmp_path):
     two = [tmp_path / "a" / "x.png", tmp_path / "b" / "x.png"]
     for photos, output, message in (
         (tmp_path / "empty", "out", "at least one photo"),
-        (tmp_path / "nowhere", "out", "1 bad-image"),
+        (tmp_path / "nowhere", "out", "nowhere: no such file"),
         (tmp_path / "model", "out", "`photos` must be images. Got .*, a saved model"),
         (two, "out", r"`photos` must differ in name in a list\. Got 'x.png' twice"),
         (photo, "in", "must be empty or hold generated"),
