@@ -342,7 +342,7 @@ def main():
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--rows", nargs="+", default=list(ROWS), help="beginnings of names")
     parser.add_argument("--promised", type=float, default=0.01)
-    parser.add_argument("--work", type=Path, default=Path("/tmp/near_duplicates"))
+    parser.add_argument("--work", type=Path, default=Path("runs/near_duplicates"))
     parser.add_argument("--encoder", help="folder or hub id of a frozen encoder")
     parser.add_argument("--no-edits", dest="edits", action="store_false")
     parser.add_argument(
