@@ -351,3 +351,37 @@ def test_a_small_tree_whose_backgrounds_are_all_unlike_is_audited(tmp_path, caps
     )
     assert "Traceback" not in err
     assert status == (found["leaked_fraction"] > 0)
+
+
+@pytest.fixture
+def tables(tmp_path):
+    """Two tables of paths below d/, in another folder; b/2.png is a copy of a/0.png."""
+    for part, first in (("a", 0), ("b", 100)):
+        for k in range(3):
+            path = tmp_path / "d" / part / f"{k}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            texture(first + k).save(path)
+        rows = [f"{part}/{k}.png" for k in range(3)]
+        (tmp_path / f"{part}.csv").write_text("\n".join(["tactile", *rows]))
+    shutil.copy(tmp_path / "d" / "a" / "0.png", tmp_path / "d" / "b" / "2.png")
+    return tmp_path
+
+
+def test_images_of_tables_are_compared_below_the_given_root(tables, capsys):
+    status, data, _ = run(capsys, tables / "a.csv", tables / "b.csv", "--root", tables / "d")
+    assert (status, data["leaking_samples"]) == (1, 1)
+    assert {s["kind"]: s["flagged"] for s in data["signals"]}["identical bytes"] == 1
+
+
+def test_a_list_of_bad_rows_alone_is_a_mistake_of_the_user(tables, capsys):
+    for cell in ("nan", "3.5"):
+        (tables / "bad.csv").write_text(f"tactile,frame\na.png,{cell}\n")
+        status, _, err = run(capsys, tables / "bad.csv", tables / "b.csv")
+        assert status == 2
+        assert "bad-frame" in err
+
+
+def test_near_both_takes_the_modality_that_there_is(tables, tmp_path, capsys):
+    source = ["--root", str(tables / "d"), "-o", str(tmp_path / "s.json")]
+    assert main(["split", str(tables / "a.csv"), "--near", "both", *source]) in (0, 2)
+    assert "Near-duplicates need" not in capsys.readouterr().err

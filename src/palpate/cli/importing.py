@@ -162,7 +162,8 @@ def format_options(options: SourceOptions) -> dict[str, Any]:
     groups = (options.table, options.formats)
     given = {field.name: getattr(group, field.name) for group in groups for field in fields(group)}
     given |= {"columns": columns_of(options.table.columns)}
-    return {name: value for name, value in given.items() if value not in (None, False, (), {})}
+    unset = (None, (), {})
+    return {k: v for k, v in given.items() if v is not False and v not in unset}  # 0 is a value
 
 
 def columns_of(items: Sequence[Sequence[str]]) -> dict[str, str]:

@@ -31,6 +31,7 @@ from palpate.data.formats import hct
 from palpate.data.formats.intervals import NAMES as INTERVAL_NAMES
 from palpate.data.formats.intervals import NEEDED, ORDER
 from palpate.data.images import SUFFIXES
+from palpate.data.imported import require_some
 from palpate.data.manifest import SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import PART_NAMES, manifest_rows, read_classes
@@ -61,8 +62,8 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
     Args:
         path: a file.
         options: ``columns`` (manifest column -> map expression), ``names`` of the columns of a
-            table without a header, ``classes``, and the templates ``vision`` or ``tactile`` of its
-            paths.
+            table without a header, ``classes``, ``root``, and the templates ``vision`` or
+            ``tactile`` of its paths.
 
     Returns:
         The samples, without images unless they are there; what is wrong with the list; and the
@@ -223,7 +224,8 @@ def _paths(
     frame = table.read(columns)
     cells = compiled.apply(frame)
     side, paths = _named_images(frame, cells, options)
-    there = {p for p in paths or () if p and (path.parent / p).is_file()} if paths else set[str]()
+    root = Path(options.get("root") or path.parent)
+    there = {p for p in paths or () if p and (root / p).is_file()} if paths else set[str]()
     stated = {"id", "video", "object"} & cells.keys()
     plain = there or (not paths and "split" not in cells)
     if not (paths or stated) or (plain and not nested):
@@ -233,6 +235,7 @@ def _paths(
     for name in ("vision", "tactile") if not there else ():
         cells.pop(name, None)
     rows, _ = manifest_rows(cells, len(table.lines), table.where, classes, table.problems)
+    require_some(len(rows), path, table.problems)
     template = Template.parse(options[side], side) if side and options.get(side) else None
     for k, row in rows:
         if place := paths[k] if paths else None:

@@ -136,7 +136,9 @@ def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
     except PalpateError as error:
         if not error.choices:
             raise
-        return form.scan(path, **options, side="vision")
+        scan = form.scan(path, **options, side="vision")
+        scan.facts["side_assumed"] = "vision"
+        return scan
 
 
 def _of_table(

@@ -6,8 +6,8 @@ the null: above its 90 % quantile u an exponential tail of mean excess b is fitt
 
     t(rate) = u + b log(.1 / rate).
 
-Where no video is known, images more than ``WINDOW`` apart in recording order take that place, if
-the order says anything: an image's best match must lie within the window more often than chance
+Where no video is known, images far apart in recording order take that place, if
+the order says anything: an image's best match must lie near it more often than chance
 has it. A threshold is never replaced by a looser one; without a null nothing is promised.
 
 Several questions (as it is, moved, edited) share the rate. The answer that is rarest by chance
@@ -26,16 +26,14 @@ from scipy.stats import poisson
 
 from palpate.leakage.neighbors import Floats, Ints
 
-#: Rows in recording order within which two images may show one contact.
-WINDOW = 16
 #: Unrelated matches that a null needs; from how many videos a rate is more than a guess.
 FEWEST, VIDEOS = 30, 80
 TAIL, BINS = 0.9, 50
 #: Least scale of a tail.
 NARROWEST = 0.02
-#: Matches that must be rarer by chance than this before they are leaks, and by how much more rarely
-#: a match must be expected before a few of them are enough.
-CHANCE, STRICTER = 0.01, 100.0
+#: Flags that chance explains no more often than this are leaks, and a null that is over its
+#: threshold so rarely by chance contradicts a rate of MISSED times the promised one.
+CHANCE, MISSED = 0.01, 3.0
 
 
 @dataclass(frozen=True)
@@ -94,20 +92,30 @@ def threshold(fitted: Sequence[Tail], rate: float) -> float:
     return fitted[0].threshold(rate / len(fitted))
 
 
-def measured(nulls: Sequence[Floats], groups: Ints, rate: float) -> float | None:
+def rate_of(score: float, fitted: Sequence[Tail]) -> float:
+    """The share of unrelated images that exceeds a score: the inverse of :func:`threshold`."""
+    over = np.exp((fitted[0].location - score) / fitted[0].scale)
+    return float(len(fitted) * (1 - TAIL) * min(over, 1.0))
+
+
+def measured(nulls: Sequence[Floats], groups: Ints, rate: float) -> float:
     """The share of unrelated images over a threshold from the other half of the groups.
 
-    None where a half is too small.
+    Where a half is too small, over the threshold from all.
     """
     half = np.unique(groups, return_inverse=True)[1] % 2 == 0
     over = 0
     for fold in (half, ~half):
-        fitted = tails([null[~fold] for null in nulls])
-        if not fitted:
-            return None
+        fitted = tails([null[~fold] for null in nulls]) or tails(nulls)
         values = score([null[fold] for null in nulls], fitted)
         over += int((values >= threshold(fitted, rate)).sum())
     return over / len(groups)
+
+
+def missed(measured: float, count: int, rate: float) -> bool:
+    """Whether a measured rate contradicts MISSED times the promised one."""
+    over = round(measured * count)
+    return over > 0 and bool(poisson.sf(over - 1, MISSED * rate * count) < CHANCE)
 
 
 def beyond_chance(

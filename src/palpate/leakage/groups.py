@@ -17,7 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from palpate.core import Note, PalpateError
-from palpate.data.manifest import Manifest
+from palpate.data.manifest import MODALITIES, Manifest
 
 #: Columns that a split can keep whole, and by which a split can be audited.
 GROUPS = ("video", "contact", "object", "session", "domain", "sensor")
@@ -39,11 +39,13 @@ def choose_group(manifest: Manifest, parts: int = 2) -> tuple[str, Note | None]:
     named = manifest.facts.get("group")
     chain = list(dict.fromkeys([*_known(manifest, [str(named)]), *nested_groups(manifest)]))
     if not chain:
+        images = any(manifest.table[modality].count() for modality in MODALITIES)
         raise PalpateError(
             "A leak-free split needs the video, object or contact of every sample",
             "nulls in each of these columns",
-            "Import a table that has one, or keep near-duplicates together",
-            example={"near": "both"},
+            "Import a table that has one"
+            + (", or keep near-duplicates together" if images else ""),
+            example={"near": "both"} if images else {},
         )
     lacks = [_lacks(manifest.table, column, parts) for column in chain[:-1]]
     at = next((k for k, note in enumerate(lacks) if note is None), len(lacks))

@@ -77,12 +77,12 @@ def read(
     root = options.pop("root", root)
     paths = data if isinstance(data, (list, tuple)) else ()
     if len(paths) > 1 and all(isinstance(path, (str, Path)) for path in paths):
-        manifest, skipped = _join([Path(path) for path in paths], skip_bad, options)
+        manifest, skipped = _join([Path(path) for path in paths], skip_bad, root, options)
         return Source(manifest, {}, _notes(skipped))
     source = paths[0] if len(paths) == 1 and not isinstance(paths[0], dict) else data
     path = Path(source) if isinstance(source, (str, Path)) else None
     plain = path is None or not path.is_file() or is_manifest(path) or is_list(path)
-    named = None if plain or path is None else read_names(path, **options)
+    named = None if plain or path is None else read_names(path, **options, root=root)
     if named is not None:
         manifest, skipped, split = named
         if skipped and not skip_bad:
@@ -97,6 +97,8 @@ def read(
     )
     stated = sorted(path.glob("splits/*.json")) if path is not None and path.is_dir() else []
     notes = _notes(skipped)
+    if "side_assumed" in manifest.facts:
+        notes.append(Note("photos-assumed", {"name": manifest.facts.get("dataset", "")}))
     if lost := manifest.facts.get("images_not_below"):
         notes.append(Note("images-not-found", {"root": lost}))
     return Source(manifest, {p.stem: Split.load(p) for p in stated}, notes)
@@ -200,7 +202,7 @@ def _prefixed(column: str, names: pl.Series, part: str) -> pl.Expr:
 
 
 def _join(
-    paths: list[Path], skip_bad: bool, reading: Mapping[str, Any]
+    paths: list[Path], skip_bad: bool, root: str | Path | None, reading: Mapping[str, Any]
 ) -> tuple[Manifest, list[Problem]]:
     """Several lists as one manifest."""
     for path in paths:
@@ -211,7 +213,7 @@ def _join(
                 "Name one manifest, or lists alone",
             )
     if not all(map(is_list, paths)):
-        parts = read_all(paths, skip_bad, quiet, None, reading)
+        parts = read_all(paths, skip_bad, quiet, root, reading)
         return Manifest.join(*(part.manifest for part in parts)), []
     table = paths[0].parent / "category_reference.txt"
     joined = read_lists(

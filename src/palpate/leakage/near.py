@@ -21,17 +21,19 @@ their luma. All questions share one rate.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from palpate.core import Note, PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibration
-from palpate.leakage.calibration import STRICTER, VIDEOS, Tail
+from palpate.leakage.calibration import VIDEOS, Tail
 from palpate.leakage.descriptors import Embeddings
 from palpate.leakage.matching import (
     Unrelated,
@@ -147,7 +149,7 @@ class Matches:
         score: (n,) NaN where there is nothing to compare with.
         place: (n,) the best match in the base, -1 for none.
         threshold: score from which images are flagged.
-        stricter: score from which they would be at a hundredth of the rate; None without a null.
+        tails: of the null, one for each question; none without a null.
         unrelated: (k,) scores of the null.
         measured: share of the null that is over a threshold from its other half.
         note: where the threshold is from.
@@ -157,7 +159,7 @@ class Matches:
     place: Ints
     threshold: float
     note: Note
-    stricter: float | None = None
+    tails: Sequence[Tail] = ()
     unrelated: Floats = field(default_factory=lambda: np.zeros(0, np.float32))
     measured: float | None = None
 
@@ -196,7 +198,7 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         place,
         limit,
         Note(f"threshold-{null.source}", params | {"rate": rate, "few": groups < VIDEOS}),
-        calibration.threshold(fitted, rate / STRICTER),
+        fitted,
         calibration.score(nulls, fitted),
         calibration.measured(nulls, null.groups, rate),
     )
@@ -229,15 +231,7 @@ def _flags(
     )
     flag = same | (np.nan_to_num(score) >= matches.threshold)
     checked = int(np.isfinite(score).sum())
-    if matches.stricter is None:
-        verdict = "leaks" if flag.any() else "cannot tell"
-    else:
-        unit = images.unit[cut:]
-        groups = np.where(unit >= 0, unit, -1 - np.arange(len(unit)))
-        strict = np.nan_to_num(score) >= matches.stricter
-        levels = [(flag, rate), (strict, rate / STRICTER)]
-        chance = not same.any() and not calibration.beyond_chance(levels, groups, checked)
-        verdict = "none" if chance else "leaks"
+    verdict = _verdict(matches, images.unit[cut:], score, flag, same, rate=rate)
     score = np.clip(score, 0, 1)
     cause = np.where(flag, "content", "").astype("<U15")
     cause[(item >= 0) & images.blank[item]] = "nothing touched"
@@ -256,9 +250,36 @@ def _flags(
         cause=cause,
         notes=[*images.notes, matches.note],
         verdict=verdict,
-        expected=None if matches.stricter is None else round(rate * checked, 2),
+        expected=None if not matches.tails else round(rate * checked, 2),
         measured=matches.measured,
     )
+
+
+def _verdict(
+    matches: Matches,
+    unit: Ints,
+    score: Floats,
+    flag: NDArray[np.bool_],
+    same: NDArray[np.bool_],
+    *,
+    rate: float,
+) -> str:
+    """Whether the flags are more than chance explains: all of them, or the strongest alone."""
+    if same.any() or not flag.any():
+        return "leaks" if same.any() else "none" if matches.tails else "cannot tell"
+    if not matches.tails:
+        return "leaks"
+    known = np.isfinite(matches.unrelated).sum()
+    if matches.measured and calibration.missed(matches.measured, int(known), rate):
+        return "cannot tell"
+    groups = np.where(unit >= 0, unit, -1 - np.arange(len(unit)))
+    strongest = float(np.nanmax(score))
+    levels = [
+        (flag, rate),
+        (np.nan_to_num(score) >= strongest, calibration.rate_of(strongest, matches.tails)),
+    ]
+    beyond = calibration.beyond_chance(levels, groups, int(np.isfinite(score).sum()))
+    return "leaks" if beyond else "none"
 
 
 def _shown(images: Pool, part: slice) -> Ints:

@@ -173,14 +173,10 @@ def near_links(
     require(known, "near", "must be vision, tactile or both", near, "both")
     from palpate.leakage.near import near_groups
 
-    modalities = list(MODALITIES) if near == "both" else [near]
-    for modality in modalities:
-        if manifest.table[modality].null_count() == len(manifest):
-            raise PalpateError(
-                f"Near-duplicates need {modality} images",
-                "samples without any",
-                "Import the data set first: palpate import",
-            )
+    modalities = [m for m in MODALITIES if near in (m, "both") and manifest.table[m].count()]
+    if not modalities:
+        must = f"Near-duplicates need {'' if near == 'both' else f'{near} '}images"
+        raise PalpateError(must, "samples without any", "Leave it out, or import the images")
     folder = None if cache is None else Path(cache)
     links = [near_groups(manifest, m, cache=folder, progress=progress) for m in modalities]
     return links, {"modalities": modalities}

@@ -99,6 +99,10 @@ def where(sample: SampleRef) -> str:
     return sample.video if sample.frame is None else f"{sample.video}, frame {sample.frame}"
 
 
+#: Arguments whose option has another name.
+_OPTIONS = {"side": "as", "columns": "map"}
+
+
 @dataclass(frozen=True)
 class Style:
     """How arguments are written in a sentence: as Python keywords or as options."""
@@ -109,7 +113,7 @@ class Style:
         """``name`` or ``name=value`` in this style."""
         name, equals, value = spec.partition("=")
         if self.command_line:
-            return f"--{name.replace('_', '-')}" + (
+            return f"--{_OPTIONS.get(name, name).replace('_', '-')}" + (
                 f" {value}" if value not in ("", "True") else ""
             )
         return (
@@ -277,7 +281,7 @@ def _equal_names(p: Mapping[str, Any], style: Style) -> str:
 
 def _threshold(source: str) -> Sentence:
     def write(params: Mapping[str, Any], _: Style) -> str:
-        known = plural(params["groups"], "video" if source == "videos" else "stretch of frames")
+        known = plural(params["groups"], "group" if source == "videos" else "piece")
         line = (
             f"Threshold {params['threshold']:.3f} from the best matches of {params['samples']} "
             f"train images {source_of[source]} ({known}), for {params['rate']:.2%} of unrelated "
@@ -401,6 +405,10 @@ LEAKAGE: dict[str, Sentence] = {
         "were compared"
     ),
     "no-materials": "No sample has a material: only the sizes of the parts are balanced",
+    "photos-assumed": (
+        "Nothing says what the images of {name} show, so they were taken for photos; if they are "
+        "tactile images: {arg:side=tactile}"
+    ),
     "images-not-found": (
         "No image that the table names is a file below {root}, so images were not read; pass the "
         "folder that its paths start from as {arg:root=FOLDER}"

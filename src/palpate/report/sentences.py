@@ -95,7 +95,8 @@ def chance_text(signal: Signal) -> str:
     """Return a verdict on near-duplicates, beside what chance explains; '' for exact signals."""
     if not signal.verdict:
         return ""
-    words = {"leaks": "leaks", "none": "no leak"}.get(signal.verdict, signal.verdict)
+    none = "no more than chance explains" if signal.flagged else "no leak"
+    words = none if signal.verdict == "none" else signal.verdict
     facts = [] if signal.expected is None else [f"{number(signal.expected)} expected by chance"]
     if signal.false_positives is not None and signal.expected is not None:
         rates = f"promised rate {percent(signal.false_positives)}"
