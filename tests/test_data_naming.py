@@ -107,6 +107,36 @@ def test_what_one_list_hides_the_other_shows(tmp_path):
     assert rows == [("cup3", 35), ("cup3", 36), ("cup3", 37)]
 
 
+def test_a_list_of_two_published_data_sets_is_read_row_by_row(tmp_path, capsys):
+    """The images of SSVTP lie in one folder, which is no video."""
+    hct, ssvtp = "hct/data1/{}-17{:03d}.70/tactile/{}-0.02.jpg", "ssvtp/images_tac/image_{}_tac.jpg"
+    for part, numbers in (("train", range(35)), ("test", range(35, 45))):
+        rows = [{"gel": hct.format(k // 10, k // 10, k)} for k in numbers]
+        rows += [{"gel": ssvtp.format(k)} for k in numbers]
+        (tmp_path / f"{part}.json").write_text(json.dumps(rows))
+    paths = [tmp_path / f"{part}.json" for part in ("train", "test")]
+    named, names = name_together([read_names(path)[0] for path in paths])
+    rows = named[1].table.select("video", "frame", "session").rows()
+    assert names == "HCT, SSVTP"
+    assert rows[0] == ("data1/3-17003.70", 35, "data1/0-17000.70")
+    assert rows[10] == (None, 35, None)
+    assert main(["audit", *map(str, paths), "--json"]) == 1
+    data = json.loads(capsys.readouterr().out)
+    assert (data["leaking_samples"], data["test_samples"]) == (5, 20)  # those of HCT, as above
+
+
+@pytest.mark.parametrize("columns", ["photo,gel", "url,tactile"])
+def test_a_template_of_the_photos_is_held_against_the_photos(columns, tmp_path):
+    table = tmp_path / "t.csv"
+    lines = [f"rig/cup{k // 10}/photo/{k}.png,gel/{k}.png" for k in range(8, 12)]
+    table.write_text("\n".join([columns, *lines]))
+    manifest, problems, _ = read_names(table, vision="rig/{video}/photo/{frame}.png")
+    assert problems == []
+    assert manifest.column("video") == ["cup0", "cup0", "cup1", "cup1"]
+    manifest, problems, _ = read_names(table, tactile="gel/{frame}.png")
+    assert (manifest.column("frame"), problems) == ([8, 9, 10, 11], [])
+
+
 def test_bad_lines_and_wrong_options_are_named(tmp_path, capsys):
     path = tmp_path / "l.txt"
     path.write_text("v 1 5\nv 9 7\nv one 3\n\nv 20 22 wood\n")

@@ -49,6 +49,9 @@ def test_templates_match_paths(template, path, fields):
         "{x!r}",
         "{x}{y}.png",
         "*{y}.png",
+        "{vision}/{frame}.png",  # the columns of the paths themselves
+        "{tactile:d}.png",
+        "{background:**}/{frame}.png",
     ],
 )
 def test_malformed_templates_are_errors(text):

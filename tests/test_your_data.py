@@ -130,6 +130,34 @@ def test_fields_beyond_the_columns_are_kept_with_the_digest(tmp_path):
     assert "finger" in Manifest.join(again, again.prefixed("x/")).table.columns
 
 
+@pytest.mark.parametrize(
+    ("column", "template", "places", "names"),
+    [
+        ("contact", "{material}/{contact}_{frame}", ["bark/0", "wool/0"], ["bark/0", "wool/0"]),
+        ("contact", "{material}/{contact}_{frame}", ["bark/0", "wool/1"], ["0", "1"]),
+        ("video", "{material}/{video}_{frame}", ["bark/0", "wool/0"], ["bark/0", "wool/0"]),
+        ("contact", "{session}/{contact}_{frame}", ["mon/0", "tue/0"], ["mon/0", "tue/0"]),
+        (
+            "contact",
+            "{session}/{object}/{contact}_{frame}",
+            ["mon/cup/0", "mon/mug/0", "tue/cup/0"],
+            ["cup/mon/0", "cup/tue/0", "mug/mon/0"],
+        ),
+        (
+            "contact",
+            "{material}/{video}/{contact}_{frame}",
+            ["bark/0/0", "wool/0/0"],
+            ["bark/0/0", "wool/0/0"],  # the video has the name of its material
+        ),
+        ("contact", "{split}/{contact}_{frame}", ["train/0", "test/0"], ["0"]),
+    ],
+)
+def test_one_name_under_different_fields_is_several(tmp_path, column, template, places, names):
+    make_tree([str(tmp_path / "own" / f"{p}_{k}.png") for p, k in product(places, "12")])
+    table = load(tmp_path / "own", tactile=f"{template}.png").table
+    assert sorted(table[column].unique()) == names
+
+
 PLACES = ("rgb/1", "rgb/2", "rgb/3", "tac/1", "tac/2")
 
 

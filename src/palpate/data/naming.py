@@ -88,37 +88,41 @@ def name_together(manifests: Sequence[Manifest]) -> tuple[list[Manifest], str]:
     """Fill what the paths of several lists say of their samples.
 
     Returns:
-        The manifests, those without a column of paths as they are, and the template or name of a
-        published list, or ''.
+        The manifests, those without a column of paths as they are, and the template or names of
+        the published lists, or ''.
     """
     tables = [m.table for m in manifests]
     unread = [t for t in tables if PATH in t.columns and not t["video"].count()]
-    paths = [path for table in unread for path in table[PATH].to_list()]
+    paths = [path for table in unread for path in table[PATH].drop_nulls()]
     if not paths:
         return list(manifests), ""
-    known = next(
-        (name for name, p in KNOWN.items() if all(re.fullmatch(p, path) for path in paths)), ""
-    )
-    text = known or template_of(paths)
-    pattern = re.compile(KNOWN[known]) if known else Template.parse(text).pattern
+    lists = [
+        next((name for name, p in KNOWN.items() if re.fullmatch(p, path)), "") for path in paths
+    ]
+    known = [] if "" in lists else [name for name in KNOWN if name in lists]
+    text = ", ".join(known) or template_of(paths)
+    patterns = [re.compile(KNOWN[name]) for name in known] or [Template.parse(text).pattern]
     named = [
-        replace(m, table=_filled(m.table, pattern)) if any(m.table is t for t in unread) else m
+        replace(m, table=_filled(m.table, patterns)) if any(m.table is t for t in unread) else m
         for m in manifests
     ]
-    if known == "HCT":
+    if "HCT" in known:
         sessions = hct.sessions_of({v for m in named for v in m.table["video"].drop_nulls()}, 60.0)
         session = pl.col("video").replace_strict(sessions, default=None, return_dtype=pl.String)
         named = [replace(m, table=m.table.with_columns(session=session)) for m in named]
     return named, text
 
 
-def _filled(table: pl.DataFrame, pattern: re.Pattern[str]) -> pl.DataFrame:
-    """The table with the groups of a pattern of its paths in the columns that are empty."""
-    matches = [pattern.fullmatch(path) for path in table[PATH].to_list()]
+def _filled(table: pl.DataFrame, patterns: Sequence[re.Pattern[str]]) -> pl.DataFrame:
+    """The table with what the first pattern of each path says in the columns that are empty."""
+    rows = [
+        next((m.groupdict() for p in patterns if (m := p.fullmatch(path or ""))), {})
+        for path in table[PATH].to_list()
+    ]
     columns: list[pl.Series] = []
-    for name in pattern.groupindex:
+    for name in dict.fromkeys(name for pattern in patterns for name in pattern.groupindex):
         if name in SCHEMA and not table[name].count():
-            values = pl.Series(name, [m and m[name] for m in matches], pl.String)
+            values = pl.Series(name, [row.get(name) for row in rows], pl.String)
             columns.append(values.cast(SCHEMA[name], strict=False))
     return table.with_columns(columns)
 
@@ -269,14 +273,19 @@ def _id(row: Mapping[str, Any], place: str) -> str:
     return str(row.get(PATH, place)).rpartition(".")[0] or place
 
 
-def _path_columns(names: Sequence[str]) -> list[str]:
-    """Columns that may hold paths: tactile by their name first, then photos, then others."""
-    words = {name: set(re.findall("[a-z]+", name.lower())) for name in names}
-    order = [
-        next((k for k, r in enumerate(("tactile", "vision")) if w & set(ROLES[r])), 2)
-        for w in words.values()
-    ]
-    return [name for _, name in sorted(zip(order, words, strict=True), key=lambda pair: pair[0])]
+def _path_columns(names: Sequence[str], side: str = "") -> list[str]:
+    """Columns that may hold paths: tactile by their name first, then photos, then others.
+
+    With a side, those of the side first, then those that may be of it, then those of the other.
+    """
+
+    def place(name: str) -> int:
+        words = set(re.findall("[a-z]+", name.lower()))
+        role = next((r for r in ("tactile", "vision") if words & set(ROLES[r])), "")
+        order = (side, "", *ROLES) if side else ("tactile", "vision", "")
+        return order.index(role)
+
+    return sorted(names, key=place)
 
 
 def _named_images(
@@ -286,7 +295,8 @@ def _named_images(
     side = next((s for s in ("tactile", "vision") if options.get(s)), "")
     columns = {name: cells[name] for name in (side, "tactile", "vision") if name in cells}
     columns |= {n: frame[n].to_list() for n in _path_columns(frame.columns) if n not in columns}
-    for values in columns.values():
+    for name in _path_columns([*columns], side) if side else columns:
+        values = columns[name]
         some = [str(value).lower() for value in values[:100] if value is not None]
         if some and all(value.endswith(SUFFIXES) for value in some):
             return side, values

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from palpate.core import PalpateError, Problem
-from palpate.data.manifest import CLIMBS
+from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS
 
 _TOKEN = re.compile(
     r"(?<![^/])(?:\*\*|\{(?P<deep>\w+):\*\*\})(?P<end>/|$)"
@@ -65,7 +65,8 @@ class Template:
             argument: the name of the argument that holds it, for errors.
 
         Raises:
-            PalpateError: if it is empty, leaves the root, or has a field that cannot be read.
+            PalpateError: if it is empty, leaves the root, or has a field that cannot be read or
+                is named like the column of the paths themselves.
         """
         path = text.removeprefix("./")
 
@@ -84,6 +85,9 @@ class Template:
             known = spec in ("", "d", "**") and (not name or name.isidentifier())
             if token["wrong"] or not known:
                 raise wrong("must have fields that can be read", f"{token[0]!r} in {text!r}")
+            if name in IMAGE_COLUMNS:
+                must = f"must have fields other than {', '.join(IMAGE_COLUMNS)}"
+                raise wrong(must, f"{token[0]!r} in {text!r}")
             kind = token.lastgroup if token["literal"] or token["end"] else spec or "any"
             if before == kind == "any":
                 got = f"{token[0]!r} right after another in {text!r}"

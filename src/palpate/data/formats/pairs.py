@@ -14,7 +14,8 @@ names of the files (:mod:`palpate.data.detection`)::
     {object}/press_{contact}/touch/{frame}.jpg
 
 Fields become columns, also new ones, and equal fields join the sides. The id is made of all fields.
-A ``contact`` or ``video`` of one name below several folders is several, named by those fields, too.
+A ``contact`` or ``video`` of one name is several, named by those fields, too, where an ``object``,
+``session``, ``material`` (or ``video``) before it differs.
 Map expressions may use the fields and ``path``, the path of the tactile (or vision) image.
 """
 
@@ -288,17 +289,17 @@ def _fit(files: Sequence[str], templates: Mapping[str, str]) -> bool:
 
 def name_apart(rows: Sequence[Cells], fields: Sequence[str]) -> None:
     """Name a video or contact by the fields before it, too, where its name alone means several."""
-    for column, outer in (("video", ("object", "session")), ("contact", ("video", "object"))):
+    outer = ("object", "session", "material")
+    for column, around in (("video", outer), ("contact", ("video", *outer))):
         before = fields[: fields.index(column)] if column in fields else ()
-        around = [name for name in outer if name in before]
-        around = around[:1] if column == "contact" else around  # the video has its object's name
         named = [row for row in rows if column in row]
-        pairs = {(row[column], *map(row.get, around)) for row in named}
-        if len(pairs) > len({row[column] for row in named}):
-            for row in named:
-                row[column] = "/".join(
-                    [*(row[name] for name in around if name in row), row[column]]
-                )
+        names: list[str] = []  # those that tell apart what the ones before them do not
+        count = len({row[column] for row in named})
+        for name in (name for name in around if name in before):
+            several = len({tuple(map(row.get, (column, *names, name))) for row in named})
+            names, count = ([*names, name], several) if several > count else (names, count)
+        for row in named:
+            row[column] = "/".join([*(row[name] for name in names if name in row), row[column]])
 
 
 def _add_ids(rows: Sequence[Cells], fields: Sequence[str]) -> None:
