@@ -332,8 +332,9 @@ def test_copies_are_found_however_many_they_are(tmp_path, case):
     if case in ("one video", "most of train twice"):  # what is chance cannot be known
         assert flags.verdict == "cannot tell"
         assert flags.expected is None
-    else:
-        assert flags.flag.mean() >= 0.95, flags.notes
+    else:  # fewer than twenty videos: only evident copies are flagged
+        assert flags.flag.mean() >= 0.75, flags.notes
+        assert flags.verdict == "leaks"
     copied = [train[k]["id"][1:] for k in flags.nearest]
     assert np.mean([a == row["id"][1:] for a, row in zip(copied, test, strict=True)]) >= 0.95
 

@@ -52,6 +52,10 @@ def load(
             imported first.
         ProblemsError: with every bad row, unless ``skip_bad``.
     """
+    imported = isinstance(source, str | Path) and is_manifest(Path(source))
+    if imported and (unknown := sorted(set(options) - {"root"})):
+        got = repr(options[unknown[0]])
+        raise PalpateError("must be left out for a manifest", got, "", argument=unknown[0])
     options |= {"format": format, "skip_bad": skip_bad, "progress": progress}
     manifest, _ = read_samples(source, **options)
     without = not manifest.table["vision"].count() and not manifest.table["tactile"].count()
@@ -87,9 +91,6 @@ def read_samples(
     path = Path(source)
     if format == "auto" and path.exists():
         if is_manifest(path):
-            if unknown := sorted(set(options) - {"root"}):
-                got = repr(options[unknown[0]])
-                raise PalpateError("must be left out for a manifest", got, "", argument=unknown[0])
             return Manifest.load(path, options.get("root")), []
         if path.is_file() and (path.suffix.lower() not in TABLES or is_list(path)):
             listed = read_list(path, skip_bad=skip_bad)

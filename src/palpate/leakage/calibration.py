@@ -28,6 +28,8 @@ from palpate.leakage.neighbors import Floats, Ints
 
 #: Unrelated matches that a null needs; from how many videos a rate is more than a guess.
 FEWEST, VIDEOS = 30, 80
+#: Videos below which best matches in other videos say nothing of the tail.
+GROUPS = 20
 TAIL, BINS = 0.9, 50
 #: Least scale of a tail.
 NARROWEST = 0.02

@@ -33,7 +33,7 @@ from scipy.sparse.csgraph import connected_components
 from palpate.core import Note, PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibration
-from palpate.leakage.calibration import VIDEOS, Tail
+from palpate.leakage.calibration import GROUPS, VIDEOS, Tail
 from palpate.leakage.descriptors import Embeddings
 from palpate.leakage.matching import (
     Unrelated,
@@ -187,9 +187,10 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
     score = calibration.score(similarities, fitted)
     place = np.take_along_axis(places, rarest[None], axis=0)[0]
     limit = calibration.threshold(fitted, rate)
-    if null is None or not calibration.tails(nulls) or limit >= 1:
-        params = {"images": len(base), "threshold": None if null is None else round(limit, 3)}
-        limit = COPY if null is None else 1.0
+    few = null is None or (null.source == "videos" and len(np.unique(null.groups)) < GROUPS)
+    if few or null is None or not calibration.tails(nulls) or limit >= 1:
+        params = {"images": len(base), "threshold": None if few else round(limit, 3)}
+        limit = COPY if few else 1.0
         return Matches(score, place, limit, Note("cannot-tell-no-null", params))
     groups = len(np.unique(null.groups))
     params = {"threshold": round(limit, 3), "samples": len(null.rows), "groups": groups}
