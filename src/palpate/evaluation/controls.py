@@ -1,4 +1,4 @@
-"""What a split adds to its scores: controls, a material probe, doubts about what was trained.
+"""What a split adds to its scores: controls and a material probe.
 
 - ``background only``: the no-contact image in place of every tactile image. Scores of pixels reward
   it (paper, section 1); a score of touch must not;
@@ -8,18 +8,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from palpate.core import FeatureSet, Note, Progress, Score, Split, rng_for
+from palpate.core import FeatureSet, Progress, Score, rng_for
 from palpate.evaluation.companions import Features
 from palpate.evaluation.inputs import Inputs, Samples
 from palpate.metrics.probe import fit_probe, material_accuracy
-
-if TYPE_CHECKING:
-    from palpate.data.manifest import Manifest
 
 #: Rows of the tables that are not generators.
 BACKGROUND, SAME_MATERIAL, REAL = "background only", "real, same material", "real"
@@ -64,48 +59,4 @@ def material_accuracies(train: FeatureSet, features: Features) -> list[Score]:
         material_accuracy(train, s, probe=probe, subject=name, split=features.common["split"])
         for name, s in subjects.items()
         if s.labels is not None and any(s.labels)
-    ]
-
-
-def encoder_notes(encoders: Any, manifest: Manifest | None, split: Split | None) -> list[Note]:
-    """What readers must know of every score that an encoder made of these images.
-
-    That it knows simulated images alone and these are real, or may be; and, with a split, that it
-    may have seen test samples (paper, section 5).
-    """
-    card, notes = getattr(encoders, "card", None), list[Note]()
-    if card is None:
-        return notes
-    simulated = manifest.synthetic if manifest is not None else None
-    if card.get("synthetic") and not simulated:
-        notes.append(Note("synthetic-encoder", {"real": simulated is False}))
-    if split is not None and card.get("split") != split.digest:
-        known = card.get("split") is not None
-        notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))
-    return notes
-
-
-def with_warnings(
-    scores: Sequence[Score], inputs: Inputs, encoders: Any, split: Split | None
-) -> list[Score]:
-    """The scores with :func:`encoder_notes`, and of a generator that may have seen test samples."""
-    digest = encoders.digest("tactile") if encoders is not None else ""
-    of_encoder = encoder_notes(encoders, inputs.reference.manifest, split)
-    of_generator = {
-        name: [Note("generator-of-other-split")]
-        for name, s in inputs.generators.items()
-        if split is not None
-        and s.generator is not None
-        and s.generator.get("split") != split.digest
-    }
-    return [
-        replace(
-            s,
-            notes=[
-                *s.notes,
-                *(of_encoder if s.encoder == digest else []),
-                *of_generator.get(s.subject, []),
-            ],
-        )
-        for s in scores
     ]

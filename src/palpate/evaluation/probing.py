@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from palpate.core import PalpateError, Progress, Score, Split, quiet
-from palpate.evaluation.controls import encoder_notes
-from palpate.evaluation.scoring import load_encoders
+from palpate.evaluation.scoring import encoder_notes, load_encoders
 from palpate.metrics.probe import fit_probe, material_accuracy, retrieval
 from palpate.report.results import Results
 

@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -39,7 +39,6 @@ from palpate.evaluation.controls import (
     SAME_MATERIAL,
     control_samples,
     material_accuracies,
-    with_warnings,
 )
 from palpate.evaluation.inputs import (
     REFERENCE,
@@ -53,6 +52,9 @@ from palpate.metrics import PRESETS, Comparison, compare, compare_tmmd, distance
 from palpate.metrics.kernels import MOMENT_BYTES
 from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
 from palpate.report.results import GalleryItem, Results
+
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
 
 #: Bandwidth of the paper; the name of a metric says any other one where several are requested.
 SIGMA = 10.0
@@ -703,3 +705,47 @@ def _gallery(inputs: Inputs, seed: int) -> list[GalleryItem]:
         gel = str(real.path(background).resolve()) if background else None
         items.append(GalleryItem(real.ref(rows[i]), str(files[i].resolve()), gel))
     return items
+
+
+def encoder_notes(encoders: Any, manifest: Manifest | None, split: Split | None) -> list[Note]:
+    """What readers must know of every score that an encoder made of these images.
+
+    That it knows simulated images alone and these are real, or may be; and, with a split, that it
+    may have seen test samples (paper, section 5).
+    """
+    card, notes = getattr(encoders, "card", None), list[Note]()
+    if card is None:
+        return notes
+    simulated = manifest.synthetic if manifest is not None else None
+    if card.get("synthetic") and not simulated:
+        notes.append(Note("synthetic-encoder", {"real": simulated is False}))
+    if split is not None and card.get("split") != split.digest:
+        known = card.get("split") is not None
+        notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))
+    return notes
+
+
+def with_warnings(
+    scores: Sequence[Score], inputs: Inputs, encoders: Any, split: Split | None
+) -> list[Score]:
+    """The scores with :func:`encoder_notes`, and of a generator that may have seen test samples."""
+    digest = encoders.digest("tactile") if encoders is not None else ""
+    of_encoder = encoder_notes(encoders, inputs.reference.manifest, split)
+    of_generator = {
+        name: [Note("generator-of-other-split")]
+        for name, s in inputs.generators.items()
+        if split is not None
+        and s.generator is not None
+        and s.generator.get("split") != split.digest
+    }
+    return [
+        replace(
+            s,
+            notes=[
+                *s.notes,
+                *(of_encoder if s.encoder == digest else []),
+                *of_generator.get(s.subject, []),
+            ],
+        )
+        for s in scores
+    ]
