@@ -44,7 +44,7 @@ def test_templates_that_name_no_filled_column(data, tmp_path, template, got):
 
 
 def test_a_template_has_no_dry_run(data, tmp_path):
-    with pytest.raises(PalpateError, match="asks nobody"):
+    with pytest.raises(PalpateError, match="needs no model"):
         caption(data, tmp_path / "c", template="", dry_run=True)
     assert not (tmp_path / "c").exists()
 

@@ -37,7 +37,7 @@ def test_digest_is_of_what_the_model_gets_not_of_the_name():
         (HEAD.replace("text: sentence\n", ""), "no line that begins with 'text:'"),
         (HEAD.replace("reply: sentence", "reply: color"), "'color' is none of"),
         (HEAD.replace("text: sentence", "text: adjectives"), "not one of sentence"),
-        (HEAD.replace("Answer with a sentence.", "Go."), "does not ask for the field 'sentence'"),
+        (HEAD.replace("Answer with a sentence.", "Go."), "does not request the field 'sentence'"),
         (HEAD.replace("reply: sentence", "reply: surface_visible"), "a reply field with a text"),
         (b"\xff\xfe\x00", "utf-8"),
     ],

@@ -301,7 +301,7 @@ def test_photos_that_are_all_alike_cannot_be_judged(tmp_path):
     samples = untouched(tmp_path, contact=False).table
     photos = samples.with_columns(vision="tactile", tactile=pl.lit(None, pl.String))
     result = audit(*(Manifest(photos[a:b], tmp_path) for a, b in ((0, 240), (240, 320))))
-    assert (result.verdict, result.reason) == ("cannot tell", "alike")
+    assert (result.verdict, result.reason) == ("cannot tell", "similar")
 
 
 def test_the_matrix_puts_shared_groups_first():

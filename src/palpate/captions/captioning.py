@@ -1,8 +1,8 @@
 """``palpate.caption``: descriptions of touches, as a table that an import joins.
 
 The output folder holds ``captions.parquet`` (id, text, adjectives, flags; one row a sample),
-``record.json`` (what made them) and, where a model was asked, ``replies.jsonl``. The table depends
-on the samples and the replies alone, never on the order in which these arrived.
+``record.json`` (what made them) and, where a model described them, ``replies.jsonl``. The table
+depends on the samples and the replies alone, never on the order in which these arrived.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Any
 import polars as pl
 
 from palpate import __version__
-from palpate.captions.asking import Photos, Question, ask_all
 from palpate.captions.columns import template_texts
 from palpate.captions.photos import checked_crop, sent_size
 from palpate.captions.prompts import Description, Prompt
+from palpate.captions.querying import Photos, Question, query_all
 from palpate.captions.replies import Describer, Reply, ReplyLog, read_replies
 from palpate.captions.server import Server
 from palpate.captions.units import Per, Units, units_of
@@ -185,7 +185,7 @@ def caption(  # noqa: PLR0913 (a public verb)
         body: further fields of every request; None as a value removes one.
         key_variable: environment variable that holds the server's key; by default
             ``PALPATE_CAPTION_KEY``, if it is set.
-        again: ask again where the reply was a refusal or could not be used.
+        again: repeat requests whose reply was a refusal or could not be used.
         prices: of a million tokens in and out, for the estimate.
         dry_run: send nothing, return an :class:`Estimate`.
         progress: progress callback.
@@ -202,7 +202,7 @@ def caption(  # noqa: PLR0913 (a public verb)
     units = units_of(manifest, per)
     if template is not None:
         if dry_run:
-            got, fix = "a template, which asks nobody", "Leave one of the two out"
+            got, fix = "a template, which needs no model", "Leave one of the two out"
             raise PalpateError("must be of a model", got, fix, argument="dry_run")
         texts = template_texts(template, manifest, units, seed)
         descriptions = [Description(text, flags=() if text else ("no-column",)) for text in texts]
@@ -211,23 +211,25 @@ def caption(  # noqa: PLR0913 (a public verb)
     if not manifest.table["vision"].count():
         must, fix = "must have vision images", "Map the column vision to the photos"
         raise PalpateError(must, "samples without any", fix, argument="data")
-    asked = prompt if isinstance(prompt, Prompt) else Prompt.load(prompt)
+    instruction = prompt if isinstance(prompt, Prompt) else Prompt.load(prompt)
     area = checked_crop(crop)
     options = {"key_variable": key_variable, "body": body, "timeout": timeout}
     options["connections"] = concurrency
-    with closing(_describer(server, model, local, **options)) as who:
-        question = Question(who.model, asked, area, max_tokens, seed, body or {})
+    with closing(_describer(server, model, local, **options)) as describer:
+        question = Question(describer.model, instruction, area, max_tokens, seed, body or {})
         if dry_run:
             replies, _ = read_replies(output / REPLIES)
             photos = Photos.of(manifest, units, question, progress)
-            threads = who.threads or concurrency
+            threads = describer.threads or concurrency
             return _estimate(photos, question, replies, threads, prices)
         with locked(output), closing(ReplyLog(output / REPLIES)) as log:
             photos = Photos.of(manifest, units, question, progress)
             pending = photos.pending(log.replies, question.prompt, again=again)
-            threads = min(who.threads or concurrency, len(pending))
+            threads = min(describer.threads or concurrency, len(pending))
             try:
-                problems = ask_all(pending, question, who, log, threads=threads, progress=progress)
+                problems = query_all(
+                    pending, question, describer, log, threads=threads, progress=progress
+                )
             except PalpateError as error:
                 if not log.appended:
                     raise
@@ -294,7 +296,7 @@ def _estimate(
     threads: int,
     prices: Sequence[float] | None,
 ) -> Estimate:
-    """What is left to ask, by the replies so far or by assumptions."""
+    """What the remaining requests take, by the replies so far or by assumptions."""
     count = len(photos.pending(replies, question.prompt))
     known = _answers(photos, replies)
     if known:
@@ -372,5 +374,5 @@ def _notes(manifest: Manifest, units: Units, made: Mapping[str, Any]) -> list[No
 
 def _same(served: str, requested: str) -> bool:
     """Whether a server's name of a model may be the requested one: a version of it, or its path."""
-    one, two = (name.lower().rstrip("/").rpartition("/")[2] for name in (served, requested))
-    return one.startswith(two) or two.startswith(one)
+    a, b = (name.lower().rstrip("/").rpartition("/")[2] for name in (served, requested))
+    return a.startswith(b) or b.startswith(a)

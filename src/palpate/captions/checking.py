@@ -35,6 +35,9 @@ COMMON, CODE = 0.05, 0.9
 FOLDS, PENALTY, WORDS = 5, 1e-2, 500
 EXAMPLES, SHOWN_WORDS = 5, 12
 SHARE, FLAGGED, NAMING = "share of captions", "flagged", "naming a material"
+LABEL, VISUAL = "naming their label", "visual words"
+#: Shares whose words a note lists.
+LISTED = (NAMING, LABEL, VISUAL)
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def check_captions(
     """
     manifest, table = read_captions(captions, data, **options)
     flags = dict(table.select("id", "flags").iter_rows())
-    split = Split.load(split) if isinstance(split, str | Path) else split
+    split = None if split is None else Split.load(split)
     rows = _rows(manifest, flags, split)
     vocabulary = Vocabulary(sorted(set(rows.labels) - {""}))
     scores, notes = _shares(rows, vocabulary), list[Note]()
@@ -131,7 +134,7 @@ def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
     """Shares of captions that have something wrong; the union of most comes first."""
     kinds: dict[str, Callable[[str], Sequence[str]]] = {
         NAMING: vocabulary.naming,
-        "visual words": visual_in,
+        VISUAL: visual_in,
         "digits": lambda text: [c for c in text if c.isdigit()],
         "refusals": lambda text: ["refusal"] if REFUSAL.search(text) else [],
         "empty": lambda text: [] if text else ["empty"],
@@ -140,9 +143,9 @@ def _shares(rows: _Rows, vocabulary: Vocabulary) -> list[Score]:
     hits = {name: [function(text) for text in rows.texts] for name, function in kinds.items()}
     named = zip(rows.texts, rows.labels, strict=True)
     label = [vocabulary.naming(text, name) if name else [] for text, name in named]
-    hits = {"naming their label": label} | hits if any(rows.labels) else hits
-    told = zip(hits["refusals"], rows.refused, strict=True)
-    hits["refusals"] = [words or ["refusal"] * refused for words, refused in told]
+    hits = {LABEL: label} | hits if any(rows.labels) else hits
+    pairs = zip(hits["refusals"], rows.refused, strict=True)
+    hits["refusals"] = [words or ["refusal"] * refused for words, refused in pairs]
     counted = [words for name, words in hits.items() if name != NAMING]
     flagged = [[word for words in row for word in words] for row in zip(*counted, strict=True)]
     scores = [_share(name, words, rows) for name, words in {FLAGGED: flagged, **hits}.items()]
@@ -161,8 +164,7 @@ def _share(name: str, words: Sequence[Sequence[str]], rows: _Rows) -> Score:
     listed = dict(counts.most_common(SHOWN_WORDS))
     where = [k for k in np.flatnonzero(hits)[:EXAMPLES] if rows.texts[k]]
     details = {"words": listed, "examples": {rows.ids[k]: rows.texts[k] for k in where}}
-    spoken = name.startswith(("naming", "visual"))
-    notes = [Note("captions-words", {"words": listed})] if spoken and listed else []
+    notes = [Note("captions-words", {"words": listed})] if name in LISTED and listed else []
     return replace(score, higher_is_better=False, details=details, notes=notes)
 
 

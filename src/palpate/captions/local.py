@@ -22,7 +22,7 @@ SERVE = "Use another model, or serve this one (vLLM, SGLang) and name the server
 
 
 class Local:
-    """A model loaded here, asked one image at a time.
+    """A model loaded here, which takes one image at a time.
 
     Args:
         source: folder or hub id.

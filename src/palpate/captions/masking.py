@@ -19,7 +19,7 @@ def mask_captions(
 ) -> Captions:
     """Write captions without the names of materials.
 
-    Adjectives that name one go; inside a phrase ``material`` stands for it. A caption that is
+    Adjectives that name one go; inside a phrase ``material`` takes its place. A caption that is
     nothing else becomes empty.
 
     Args:

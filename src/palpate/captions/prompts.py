@@ -1,4 +1,4 @@
-"""Prompts as versioned text files, and the replies that they ask for.
+"""Prompts as versioned text files, and the replies that they request.
 
 A prompt file has three head lines, an empty line, and the text that the model reads::
 
@@ -57,7 +57,7 @@ class Description:
 
     Attributes:
         text: the caption; None if the reply has none that can be used.
-        adjectives: its adjectives, if it was asked for some.
+        adjectives: its adjectives, if the prompt requests some.
         flags: ``refusal``, ``invalid``, ``schema-ignored``, ``surface-hidden``.
     """
 
@@ -67,13 +67,13 @@ class Description:
 
     @property
     def answered(self) -> bool:
-        """Whether asking again is of no use: there is a text, or the model refuses."""
+        """Whether another request is of no use: there is a text, or the model refuses."""
         return self.text is not None or "refusal" in self.flags
 
 
 @dataclass(frozen=True)
 class Prompt:
-    """What a model is asked, and what it must answer.
+    """An instruction to a model, and the schema of its reply.
 
     Attributes:
         name: name and version, ``touch-adjectives/1``.
@@ -125,10 +125,10 @@ class Prompt:
             raise ValueError(f"the reply field {unknown[0]!r} is none of {', '.join(FIELDS)}")
         if values["text"] not in fields or values["text"] not in TEXTS:
             choices = [name for name in fields if name in TEXTS]
-            one = f"one of {', '.join(choices)}" if choices else "a reply field with a text"
-            raise ValueError(f"text: {values['text']} is not {one}")
+            known = f"one of {', '.join(choices)}" if choices else "a reply field with a text"
+            raise ValueError(f"text: {values['text']} is not {known}")
         if absent := [name for name in fields if name not in body]:
-            raise ValueError(f"the text does not ask for the field {absent[0]!r}")
+            raise ValueError(f"the text does not request the field {absent[0]!r}")
         return cls(values["name"], body.strip(), fields, values["text"])
 
     @cached_property
@@ -191,7 +191,7 @@ def _shipped() -> Iterator[str]:
 
 
 def _bare(word: str) -> str:
-    """An adjective as it stands in a list: lower case, without quotes and full stops."""
+    """An adjective as in a list: lower case, without quotes and full stops."""
     return " ".join(word.strip(" \t\n.,;:'\"").lower().split())
 
 

@@ -31,7 +31,7 @@ class Request:
 
     Attributes:
         images: JPEG files: the photo and, if a crop was requested, that part of it.
-        prompt: what is asked.
+        prompt: the instruction, with the schema of its reply.
         max_tokens: longest reply.
         temperature, seed: of the sampling.
     """
@@ -63,7 +63,7 @@ class Reply:
         finish: why it ended: ``stop``, or ``length`` where it was cut.
         tokens: of the request and of the reply.
         seconds: from request to reply.
-        tries: how often the model was asked until it could be used.
+        tries: requests until it could be used.
         fingerprint: of the server's configuration, if it says so.
     """
 

@@ -2,9 +2,9 @@
 
 Structured output is requested by the top-level ``response_format`` alone, which vLLM, SGLang,
 Ollama, llama.cpp, LM Studio and hosted models share; servers may ignore it, so replies are read as
-if none did. Busy or failing servers (429, 5xx, broken connections, time-outs) are asked again after
-``Retry-After`` or a doubling pause. The key comes from an environment variable and is in no file,
-log or error.
+if none did. Busy or failing servers (429, 5xx, broken connections, time-outs) get the request again
+after ``Retry-After`` or a doubling pause. The key comes from an environment variable and is in no
+file, log or error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from palpate.core import MissingExtraError, PalpateError
 KEY_VARIABLE = "PALPATE_CAPTION_KEY"
 #: Longest pause before another try, in seconds.
 LONGEST_PAUSE = 60.0
-#: Longest wait that a server may ask for, in seconds.
+#: Longest wait that a server may request, in seconds.
 LONGEST_WAIT = 600.0
 #: Statuses after which the same request may well succeed.
 BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)

@@ -17,7 +17,7 @@ PER: tuple[Per, ...] = ("frame", "contact", "object")
 
 @dataclass(frozen=True)
 class Units:
-    """Which photo stands for which samples.
+    """Which photo describes which samples.
 
     Attributes:
         of: (n samples) number of the unit of every sample.

@@ -2,7 +2,7 @@
 
 A word names a material if one of its forms is one of the name's: ``wooden``, ``woods``, ``woody``
 are forms of ``wood``. Synonyms are in ``words/materials.tsv``; a label that is not there is matched
-by its own words.
+by its words.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Vocabulary:
     def masked(self, text: str) -> str:
         """The text without names of materials.
 
-        Parts between commas that are nothing but such names go; in others ``material`` stands for
+        Parts between commas that are nothing but such names go; in others ``material`` replaces
         them.
         """
         parts: list[str] = []
@@ -94,12 +94,12 @@ def visual_in(text: str) -> list[str]:
 
 @cache
 def _names(label: str) -> frozenset[str]:
-    """Lemmas that name a label: its own words and their synonyms."""
-    own = [word for word in words_of(label) if word not in _EMPTY]
+    """Lemmas that name a label: its words and their synonyms."""
+    words = [word for word in words_of(label) if word not in _EMPTY]
     synonyms = _synonyms()
-    keys = {" ".join(words_of(label)), *(form for word in own for form in forms_of(word))}
+    keys = {" ".join(words_of(label)), *(form for word in words for form in forms_of(word))}
     listed = [word for key in keys for word in synonyms.get(key, ())]
-    return frozenset(form for word in (*own, *listed) for form in (word, *_singular(word)))
+    return frozenset(form for word in (*words, *listed) for form in (word, *_singular(word)))
 
 
 def _singular(word: str) -> Iterator[str]:

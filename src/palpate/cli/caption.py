@@ -29,8 +29,8 @@ class Source:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asking:
-    """What a model is asked, and how."""
+class RequestOptions:
+    """The instruction to the model, and its limits."""
 
     prompt: Annotated[str, tyro.conf.arg(metavar="NAME_OR_FILE")] = "touch-adjectives/1"
     """`touch-adjectives/1`, `touch-sentence/1`, or a prompt file."""
@@ -70,7 +70,7 @@ class Options(Common):
     output: OutPath
     """Folder to write."""
     source: Source = field(default_factory=Source)
-    asking: Asking = field(default_factory=Asking)
+    requests: RequestOptions = field(default_factory=RequestOptions)
     dry_run: Switch = False
     """Send no photo; print requests, tokens, time and price."""
     prices: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="IN OUT")] = None
@@ -82,8 +82,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     from palpate.captions import Captions, StoppedError, caption
 
     template = options.source.template
-    arguments = vars(options.source) | vars(options.asking)
-    arguments["body"] = _object(options.asking.body)
+    arguments = vars(options.source) | vars(options.requests)
+    arguments["body"] = _object(options.requests.body)
     arguments["template"] = None if template is None else " ".join(template)
     try:
         with terminal.progress() as progress:

@@ -1,6 +1,6 @@
 """The templates of a folder, found from the names of its files.
 
-Names are cut into words, numbers and signs. A word such as ``photo`` or ``gelsight`` that stands in
+Names are cut into words, numbers and signs. A word such as ``photo`` or ``gelsight`` that occurs in
 some paths and not in others gives their side. Without such words, two names of one place (sibling
 folders, endings of names) under which the same paths recur are two sides, though nothing says
 which. What the paths of a side have in common is written out; what varies becomes a field:
@@ -178,7 +178,7 @@ def template_of(files: Sequence[str], several: bool | None = None) -> str:
     stem = _stem([stem for stem, _ in names], fields)
     suffix = min(suffixes) if len(suffixes) == 1 else ".*"
     text = "/".join([*map(str, pieces), stem + suffix])
-    return re.sub(r"\**(\{\w+\})\**", r"\1", text)  # a field takes what is beside it
+    return re.sub(r"\**(\{\w+\})\**", r"\1", text)  # a field takes what is next to it
 
 
 def _new(fields: set[str], *names: str) -> str:

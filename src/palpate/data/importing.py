@@ -158,9 +158,10 @@ def recognized(
         templated = "videos" if given and is_templated(source, given) else "pairs"
         name = templated if given else next(looks, "")
     if not name:
-        known = "; ".join(f"{n}: {form.looks_for}" for n, form in FORMATS.items())
-        must = f"must look like a known data set ({known})"
-        fix = "Name its format, or write a table of its images"
+        must = f"must hold images, videos, a table or a known data set ({', '.join(FORMATS)})"
+        fix = "Check the path, or write a table of its images"
+        if source.is_dir() and (source / "manifest.parquet").is_file():
+            fix = "This is an import: name the data set that it was made from"
         raise PalpateError(must, _contents(source), fix, argument="source")
     return name, FORMATS[name]
 

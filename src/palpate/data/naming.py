@@ -52,8 +52,6 @@ KNOWN = {
 }
 #: The column of the paths that a list names.
 PATH = "path"
-#: What a list is read by.
-OPTIONS = ("columns", "names", "classes", "vision", "tactile")
 
 
 def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Split | None] | None:
@@ -164,7 +162,7 @@ def _intervals(path: Path) -> tuple[Manifest, list[Problem], None]:
     )
     frames = table.explode("frame").unique(["video", "frame"], maintain_order=True)
     frames = frames.with_columns(id=pl.format("{}/{}", "video", "frame"))
-    return _manifest(path, frames, declared=True), problems, None
+    return _manifest(path, frames, path.parent, declared=True), problems, None
 
 
 def _records(path: Path) -> Table | None:
@@ -210,7 +208,7 @@ def _scalars(items: Sequence[Any]) -> bool:
 
 
 def _flat(item: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Cells of nested objects under names like ``image.path``; lists are left out."""
+    """Cells of nested objects under names like ``image.path``; lists are skipped."""
     for key, value in item.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{key}.")
@@ -258,7 +256,7 @@ def _paths(
         samples = samples.unique("id", keep="first", maintain_order=True)
         text = f"{len(doubled)} ids occur twice or more, first {doubled.sort()[0]!r}"
         table.problems.append(Problem(str(path), "duplicate-id", text))
-    manifest = _manifest(path, samples, declared=bool(stated) and not nested)
+    manifest = _manifest(path, samples, root, declared=bool(stated) and not nested)
     split = None
     if "split" in samples.columns:
         stated_split = samples.drop_nulls("split")
@@ -303,10 +301,10 @@ def _named_images(
     return side, None
 
 
-def _manifest(path: Path, samples: pl.DataFrame, *, declared: bool) -> Manifest:
-    """A manifest of rows without a root of their own."""
+def _manifest(path: Path, samples: pl.DataFrame, root: Path, *, declared: bool) -> Manifest:
+    """A manifest of the rows of a list."""
     empty = (pl.lit(None, kind).alias(c) for c, kind in SCHEMA.items() if c not in samples.columns)
     more = [PATH] if PATH in samples.columns else []
     table = samples.with_columns(empty).with_columns(pl.col(c).cast(k) for c, k in SCHEMA.items())
     facts = {"dataset": path.stem} if declared else {"source": path.name}
-    return Manifest(table.select([*SCHEMA, *more]), path.parent, facts)
+    return Manifest(table.select([*SCHEMA, *more]), root, facts)

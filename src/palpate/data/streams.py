@@ -12,7 +12,7 @@ All checks see thumbnails (:mod:`palpate.data.contacts`), so a difference is in 
   shifts of up to a third of the recording, at most 2 s at 30 fps. A shift of at least 3 frames is
   reported where its correlation is at least 0.6, and 0.25 above that of every shift more than 5
   frames away, 0 included. Where photos do not show the press (the camera looks elsewhere, or is
-  shaken by hand), no shift stands out and nothing can be said.
+  shaken by hand), no shift is distinct and nothing is reported.
 * ``changed-gel``: the untouched gel found in the first third and in the last differ by at least 4
   gray levels, and by 0.7 times the strongest contact of either third.
 """
@@ -104,7 +104,7 @@ def _unequal(
 
 
 def lag_of(tactile: NDArray[np.float64], vision: NDArray[np.float64]) -> list[Finding]:
-    """The lag between the changes (n,) of two streams, if one stands out."""
+    """The lag between the changes (n,) of two streams, if one is distinct."""
     count = min(len(tactile), len(vision))
     if count < LEAST_FRAMES:
         return []

@@ -9,7 +9,7 @@ in a template   matches
 ``*``  ``**``   the same as the first and the last, but not kept
 ==============  ====================================================================================
 
-Everything else stands for itself. A field that occurs twice is equal in both places. Where the last
+Everything else is literal. A field that occurs twice is equal in both places. Where the last
 name has no dot, any suffix goes: ``{frame}`` is ``{frame}.*``.
 """
 
@@ -161,11 +161,6 @@ def walk(root: Path, suffixes: tuple[str, ...] = ("",)) -> tuple[list[str], list
     return files, outside
 
 
-def walk_matches(root: Path, template: Template, suffixes: tuple[str, ...] = ("",)) -> Matches:
-    """The files below a folder that a template matches, with their fields."""
-    return assign(walk(root, suffixes)[0], {"": template})[""]
-
-
 def assign(files: Sequence[str], templates: Mapping[str, Template]) -> dict[str, Matches]:
     """The files of each template; of several that match, the one that spells out most has it."""
     matches: dict[str, list[tuple[str, Fields]]] = {side: [] for side in templates}
@@ -204,7 +199,7 @@ def join(
         known = {name for row in rows for name in row} - set(sides)
         keys = tuple(sorted(known & {name for _, fields in matches for name in fields}))
         if not keys and len(rows) > 1 and len(matches) > 1:
-            must = "Templates must share a field, which tells what belongs together"
+            must = "Templates must share a field, which says what belongs together"
             got = f"none for {len(rows)} files of {first} and {len(matches)} of {side}"
             raise PalpateError(must, got, "Give one part of both paths the same field")
         partners = _by_key([(fields, path) for path, fields in matches], keys)

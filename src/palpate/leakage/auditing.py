@@ -179,7 +179,7 @@ def audit(  # noqa: PLR0913
         result = _compare(whole.part(parted, "train"), test_part, options, title, val=val)
         notes += _split_notes(whole, parted, val, result.group)
         result = replace(result, split=parted.digest)
-        if impact is not None and result.reason in ("untouched", "alike"):
+        if impact is not None and result.reason in ("untouched", "similar"):
             notes.append(Note("impact-of-nothing"))
         elif impact is not None:
             try:
@@ -375,7 +375,7 @@ def _reason(
     if near and options.encoder is None:
         column = near[-1].kind.split()[-1]  # tactile images decide where there are any
         if shows_nothing([train, test], column, options.threads, options.progress):
-            return "untouched" if column == "tactile" else "alike"
+            return "untouched" if column == "tactile" else "similar"
     codes = {note.code for f in near[-1:] for note in f.notes}
     if "cannot-tell-untouched" in codes:
         return "untouched"

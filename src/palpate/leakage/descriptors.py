@@ -17,7 +17,7 @@ Where exactly a print lies within a cell does not matter, so presses that slip s
 *Moved or edited*: cells. x averaged to 8 x 8 and to 16 x 16 cells of the middle 94 %, whitened.
 Queries are compared in 8 turns and mirrors, each with red and blue swapped, and moved by 3 % over
 their background; train also as if cropped and slightly turned, each with a mean of its own. An edit
-is admitted only where the whitened length of the query is plausible: the light tells which edit was
+is admitted only where the whitened length of the query is plausible: the light shows which edit was
 made.
 
 Measured in docs/studies/near_duplicates.md.

@@ -59,14 +59,14 @@ def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     if gray[queries].any() and not gray[base].all():
         kinds.append((True, gray))
     views: list[View] = []
-    for luma, asked in kinds:
+    for luma, wanted in kinds:
         for backgrounds in (None, images.backgrounds):
             known = ~images.blank if backgrounds is None else ~images.blank & (backgrounds >= 0)
             if backgrounds is None or (known[base].any() and known[queries].any()):
                 described = Whitened(
                     images.pixels, images.images, backgrounds, gray=luma, fit=both[known[both]]
                 )
-                views.append(View(described, known, asked))
+                views.append(View(described, known, wanted))
     return views
 
 

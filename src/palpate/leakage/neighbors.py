@@ -72,10 +72,10 @@ class Base:
         every = len(queries) * len(self._vectors) <= EXHAUSTIVE
         candidates = np.arange(len(self._vectors))[None].repeat(len(queries) if every else 0, 0)
         if not every:
-            asked, among = (
+            coarse, among = (
                 np.ascontiguousarray(x[:, :COARSE], np.float32) for x in (queries, self._vectors)
             )
-            candidates = nearest(asked, among, count + CANDIDATES, apart=apart, progress=progress)
+            candidates = nearest(coarse, among, count + CANDIDATES, apart=apart, progress=progress)
         vectors = self._vectors.astype(np.float32) if every else None
         for start in range(0, len(queries), BLOCK):
             part = slice(start, start + BLOCK)

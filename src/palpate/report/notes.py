@@ -305,7 +305,7 @@ def _no_null(params: Mapping[str, Any], _: Style) -> str:
         )
     else:
         why = "train images of other videos are as similar as equal ones"
-    return f"Cannot tell which similarity is chance: {why}. The most similar pairs are listed"
+    return f"Cannot tell which similarity is chance: {why}. The page and the table rank the pairs"
 
 
 #: Column whose groups train and test share -> what the test part then asks for.
@@ -388,8 +388,8 @@ LEAKAGE: dict[str, Sentence] = {
     ),
     "impact-not-by": "What known {group}s are worth could not be measured: {reason}",
     "impact-of-nothing": (
-        "What leaking costs was not measured: without contact, or with images that are all alike, "
-        "a classifier tells recordings by the drift of the sensor, not materials"
+        "What leaking costs was not measured: without contact, or with images that are similar, "
+        "a classifier recognizes recordings by the drift of the sensor, not materials"
     ),
     "impact-failed": "What leaking costs could not be measured: {reason}",
     "missing-materials": _listed(

@@ -189,9 +189,9 @@ class Audit:
         shared: column (video, session, object) that both parts know -> (test groups that are in
             train, test groups): whether the test part asks for new videos, or for new objects.
         verdict: ``leaks``, ``none``, or ``cannot tell``; '' in files of earlier versions.
-        reason: why a leak might not show: nothing was touched (``untouched``), all images are alike
-            (``alike``), or there are no images and equal names mean nothing (``names``), or ids
-            alone are known (``ids``).
+        reason: why a leak might not show: nothing was touched (``untouched``), images are similar
+            (``similar``), none are known to be unrelated (``chance``), there are none and equal
+            names mean nothing (``names``), or ids alone are known (``ids``).
         impact: what the leak does to scores, if requested.
         commands: command lines that say what to do next.
         others: audits of the same test part against other data (an encoder's pretraining list).

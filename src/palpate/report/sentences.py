@@ -92,7 +92,7 @@ def cause_notes(signal: Signal) -> list[str]:
 
 
 def chance_text(signal: Signal) -> str:
-    """Return a verdict on near-duplicates, beside what chance explains; '' for exact signals."""
+    """Return a verdict on near-duplicates, with what chance explains; '' for exact signals."""
     if not signal.verdict:
         return ""
     none = "no more than chance explains" if signal.flagged else "no leak"
@@ -108,7 +108,7 @@ def chance_text(signal: Signal) -> str:
 def threshold_line(signal: Signal) -> str:
     """Return how the threshold was set, and how many samples are at or above it."""
     if signal.verdict == CANNOT_TELL:
-        return "Which similarity is chance cannot be told: the most similar pairs are listed."
+        return "Which similarity is chance is not known: the most similar pairs are listed."
     line = f"The threshold is a score of {score_text(signal.threshold)}"
     share = percent(signal.fraction)
     verb = "is" if signal.flagged == 1 else "are"
@@ -123,10 +123,10 @@ def threshold_line(signal: Signal) -> str:
     return f"{line}): {verdicts[signal.verdict]}." if signal.verdict else f"{line})."
 
 
-#: Why it cannot be told whether a split leaks.
-UNTOLD = {
+#: Why it is not known whether a split leaks.
+UNKNOWN = {
     "untouched": "nothing was touched, so images cannot show what is new",
-    "alike": "images of different videos are all alike, so they cannot show what is new",
+    "similar": "images of different videos are all similar, so they cannot show what is new",
     "chance": "no images are known to be unrelated, so none show what similarity is chance",
     "ids": "ids alone could be compared, since no video, object or image is known",
     "names": "equal names of different roots mean nothing, and there are no images to compare",
@@ -137,11 +137,11 @@ def leak_line(audit: Audit) -> str:
     """Return how many test samples any signal flags, and what they ask for."""
     n, total = audit.leaking_samples, plural(audit.test_samples, "test sample")
     if not n:
-        several = len(audit.signals) != 1
-        signals = f"any of the {len(audit.signals)} signals" if several else "the one signal"
+        checked = sum(bool(signal.checked) for signal in audit.signals)
+        signals = "the one signal" if checked == 1 else f"any of the {checked} signals"
         line = f"None of {total} leaks by {signals} checked."
         if audit.verdict == CANNOT_TELL:
-            return f"Cannot be judged: {UNTOLD[audit.reason]}. {line}"
+            return f"Cannot be judged: {UNKNOWN[audit.reason]}. {line}"
         return " ".join(filter(None, [line, question_line(audit)]))
     return (
         f"{count(n)} of {total} {'leaks' if n == 1 else 'leak'} ({percent(audit.leaked_fraction)})."
@@ -149,14 +149,14 @@ def leak_line(audit: Audit) -> str:
 
 
 def share_of(audit: Audit) -> str:
-    """Return the leaking share of the test samples, or that it cannot be told."""
+    """Return the leaking share of the test samples, or that it is not known."""
     return CANNOT_TELL if audit.verdict == CANNOT_TELL else percent(audit.leaked_fraction)
 
 
 def question_line(audit: Audit) -> str:
     """Return what train and test share, and what the test part asks for; '' if nothing is known."""
-    asked = question(audit.shared)
-    if not asked or audit.against != "train":
+    purpose = question(audit.shared)
+    if not purpose or audit.against != "train":
         return ""
     things: list[str] = []
     for column, (n, of) in audit.shared.items():
@@ -165,7 +165,7 @@ def question_line(audit: Audit) -> str:
     known = next((c for c in ("object", "session") if audit.shared.get(c, (0, 0))[0]), "")
     other = f", not for new {known}s" if known else ""
     things[0] = things[0].capitalize()
-    return f"{', '.join(things)}: the split is for {asked}{other}."
+    return f"{', '.join(things)}: the split is for {purpose}{other}."
 
 
 def audit_line(audit: Audit) -> str:

@@ -361,7 +361,7 @@ def _difference(score: Score, footnotes: Footnotes) -> Difference:
 def rankings(table: Table) -> list[tuple[str, str]]:
     """Return (metric, generators from best to worst) where three or more are compared.
 
-    ``>`` stands between neighbors whose paired difference is decided (Holm's p under 0.05), ``~``
+    ``>`` separates neighbors whose paired difference is decided (Holm's p under 0.05), ``~``
     between the others. Metrics without a better direction have no row.
     """
     of_metric: dict[str, list[Difference]] = {}

@@ -16,8 +16,8 @@ from palpate.report.tables import BEST, Cell, Table, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
 NAMES = ("metric", "subject", "a", "b", "notes", "best first")
-#: Head of the rankings, which stand for the differences of more than two generators.
-RANKED = "Best first on the same samples: > decided, ~ not told apart"
+#: Head of the rankings, shown instead of the differences of more than two generators.
+RANKED = "Best first on the same samples: > decided, ~ not decided"
 
 
 def print_result(result: Results | Audit, console: Console, style: Style = COMMAND_LINE) -> None:

@@ -227,7 +227,7 @@ def _naming_videos(texts: Mapping[str, str]) -> dict[str, str]:
 
 
 def _named(rows: list[Fields], fields: tuple[str, ...], result: Scan) -> dict[str, _Video]:
-    """The recordings by name: the field ``video``, if it tells them apart, else all fields."""
+    """The recordings by name: the field ``video``, if it differs between them, else all fields."""
     names = [row.get("video", "") for row in rows]
     if "" in names or len(set(names)) < len(names):
         names = ["/".join(row[name] for name in fields if name in row) for row in rows]

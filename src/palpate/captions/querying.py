@@ -1,4 +1,4 @@
-"""Ask a model about many photos at once; every answer is kept, and no question is asked twice."""
+"""Query a model about many photos at once; every reply is kept, and no request is repeated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from palpate.core import PalpateError, Problem, Progress, digest_json
 from palpate.data.images import in_threads
 from palpate.data.manifest import Manifest
 
-#: How often a model is asked until its reply can be used; from the second time on it samples.
+#: Requests until a reply can be used; from the second on the model samples.
 ATTEMPTS = 3
 AGAIN_TEMPERATURE = 0.5
 #: So many requests that the server does not take, and no answer, are no matter of single photos.
@@ -34,7 +34,7 @@ class Question:
 
     Attributes:
         model: its name, as it was requested.
-        prompt: what is asked.
+        prompt: the instruction, with the schema of its reply.
         crop: part of the photo that is sent as well.
         max_tokens: longest reply.
         seed: of the first try.
@@ -61,7 +61,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Pending:
-    """A photo to ask about: the key of its reply, the sample's id, the file."""
+    """A photo without a reply: the key of the reply, the sample's id, the file."""
 
     key: str
     sample: str
@@ -89,8 +89,8 @@ class Photos:
         paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
         distinct = list(dict.fromkeys(path for path in paths if path is not None))
         digests = dict(in_threads(file_digest, distinct, "reading photos", progress))
-        found = [None if path is None else digests[path] for path in paths]
-        keys = [None if digest is None else question.key(digest) for digest in found]
+        of_paths = [None if path is None else digests[path] for path in paths]
+        keys = [None if digest is None else question.key(digest) for digest in of_paths]
         samples = ["" if row is None else ids[row] for row in units.described]
         return cls(samples, paths, keys)
 
@@ -114,11 +114,11 @@ class Photos:
             reply = replies[key]
             return again and prompt.read(reply.raw, refused=reply.refused).text is None
 
-        asked: dict[str, Pending] = {}
+        pending: dict[str, Pending] = {}
         for key, sample, path in zip(self.keys, self.samples, self.paths, strict=True):
-            if key is not None and path is not None and key not in asked and open_(key):
-                asked[key] = Pending(key, sample, path)
-        return list(asked.values())
+            if key is not None and path is not None and key not in pending and open_(key):
+                pending[key] = Pending(key, sample, path)
+        return list(pending.values())
 
     def answered(self, replies: Mapping[str, Reply]) -> int:
         """How many photos have a reply."""
@@ -149,7 +149,7 @@ class Photos:
         return result
 
 
-def ask_all(
+def query_all(
     pending: list[Pending],
     question: Question,
     describer: Describer,
@@ -158,7 +158,7 @@ def ask_all(
     threads: int,
     progress: Progress,
 ) -> list[Problem]:
-    """Ask about all photos; replies go to the log as they arrive.
+    """Send a request for every photo; replies go to the log as they arrive.
 
     Returns:
         The photos that cannot be read or that the server does not take.
@@ -173,7 +173,7 @@ def ask_all(
         except PalpateError as error:
             return Problem(str(photo.path), "bad-image", error.got)
         try:
-            reply = _ask(images, question, describer)
+            reply = _query(images, question, describer)
         except RejectedError as error:
             return Problem(str(photo.path), "rejected", str(error))
         log.append(photo.key, photo.sample, question.prompt.name, reply)
@@ -197,7 +197,7 @@ def ask_all(
     return sorted(problems, key=lambda problem: problem.where)
 
 
-def _ask(images: tuple[bytes, ...], question: Question, describer: Describer) -> Reply:
+def _query(images: tuple[bytes, ...], question: Question, describer: Describer) -> Reply:
     """The first reply that can be used, or the last one; tokens and seconds are of all tries."""
     request = Request(images, question.prompt, question.max_tokens, 0.0, question.seed)
     reply, tokens, seconds = None, (0, 0), 0.0
