@@ -28,11 +28,11 @@ SIGNATURES = {
         "photos * model output split part seed guidance steps batch skip_bad device progress"
     ),
     "load": "source * format images skip_bad progress **options",
-    "probe": "data split * encoder modality group balanced top seed cache progress",
+    "probe": "data split * encoder modality group balanced top seed allow_seen cache progress",
     "score": (
         "generated reference * encoder split names labels groups group background presets sigma "
         "estimator backend normalize companions controls inception clip lpips "
-        "permutations seed cache progress"
+        "permutations seed allow_seen cache progress"
     ),
     "split": (
         "data * by train val seed folds near noleak nulls tolerance cache reading skip_bad progress"

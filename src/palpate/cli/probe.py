@@ -37,6 +37,8 @@ class Options(Common):
     whole, else the video."""
     balanced: Switch = False
     """Average the accuracy over materials instead of samples."""
+    allow_seen: Switch = False
+    """Probe an encoder that was trained on some of the test images; every score says so."""
     output: OptionalOutPath = None
     """Write the scores as JSON, for `palpate report`."""
     cache: Path | None = None
@@ -52,7 +54,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         guard_output(options.output, [options.manifest, options.split])
     from palpate.evaluation.probing import probe
 
-    names = ("encoder", "modality", "group", "balanced", "cache", "seed")
+    names = ("encoder", "modality", "group", "balanced", "allow_seen", "cache", "seed")
     arguments = {name: getattr(options, name) for name in names}
     with terminal.progress() as progress:
         results = probe(options.manifest, options.split, progress=progress, **arguments)

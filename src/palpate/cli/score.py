@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OptionalOutPath, Terminal, guard_output
+from palpate.cli.terminal import Common, OptionalOutPath, Switch, Terminal, guard_output
 from palpate.core import PalpateError, is_stream
 
 Companion = Literal[
@@ -87,6 +87,8 @@ class Options(Common):
     split: Path | None = None
     """Split file: its test part is scored, its train part gives the floor of TMMD, a material probe
     and the controls."""
+    allow_seen: Switch = False
+    """Score with an encoder that was trained on some of the real images; every score says so."""
     output: OptionalOutPath = None
     """Write scores, gallery and settings as JSON, for `palpate report`."""
     latex: Path | None = None
@@ -106,6 +108,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     cache, metrics = _cache(options), options.metrics
     arguments: dict[str, Any] = {
         "encoder": options.encoder,
+        "allow_seen": options.allow_seen,
         "split": options.split,
         "background": options.background,
         **vars(options.samples),

@@ -52,6 +52,7 @@ from palpate.encoders.encoder_set import (
 )
 from palpate.encoders.models import move, pick_device
 from palpate.encoders.presets import Augment, EncoderPreset, Targets, preset
+from palpate.encoders.seen import digest_images, union
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
 from palpate.training.loop import LoopOptions, fit, work_folder
@@ -304,7 +305,9 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     card = _card(facts, options, log, place) | {"clip": clip.name, "clip_card": clip.card}
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
-    return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card)
+    card["seen_in_part"] = start is not None and start.seen is None
+    seen = union(digest_images(images), start.seen if start else None)
+    return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card, seen)
 
 
 def _first_weights(
@@ -412,6 +415,7 @@ def train_clip(
     log = fit(clip.model, loss, len(train), options, folder, what=what, key=key, progress=progress)
     clip.model.eval().requires_grad_(False)
     clip.card = _card(facts, options, log, place)
+    clip.seen = union(digest_images(images))
     return clip
 
 

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.core import PalpateError, Progress, quiet, require_choice
-from palpate.data.images import SUFFIXES, read_image, square
+from palpate.data.images import SUFFIXES, in_threads, read_image, square
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, Modality
 from palpate.encoders.models import pick_device
+from palpate.encoders.seen import digest_images
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Encoder:
 
         encoder = Encoder.from_pretrained("palpate/mini", modality="tactile")
         features = encoder.encode(["a.png", "b.png"])  # (2, 128) float32, L2-normalized
+        encoder.saw("test/")  # whether it was trained on these images
 
     Attributes:
         encoders: the set.
@@ -65,6 +67,45 @@ class Encoder:
     def digest(self) -> str:
         """SHA-256 of weights, architecture and preprocessing."""
         return self.encoders.digest(self.modality)
+
+    @property
+    def trained_on(self) -> tuple[str, ...]:
+        """Data sets that the encoder's authors trained it on, beyond what :meth:`saw` knows."""
+        return self.encoders.trained_on(self.modality)
+
+    @property
+    def knows_seen(self) -> bool:
+        """Whether all images of the training are known; else :meth:`saw` knows some or none."""
+        card = self.encoders.clip.card if self.modality == "vision" else self.encoders.card
+        return self.encoders.seen_by(self.modality) is not None and not card.get("seen_in_part")
+
+    def saw(
+        self, inputs: Any, *, batch: int = 128, progress: Progress = quiet
+    ) -> NDArray[np.bool_]:
+        """Whether the encoder was trained on images, by their decoded pixels, whatever their names.
+
+        Args:
+            inputs: images as for :meth:`encode`.
+            batch: images in memory at a time.
+            progress: called with the number of images done.
+
+        Returns:
+            (n,) booleans; all false where the encoder's images are not known (public ones).
+        """
+        seen = self.encoders.seen_by(self.modality)
+        if isinstance(inputs, Manifest):
+            inputs = inputs.paths(self.modality)
+        if seen is None:
+            return np.zeros(
+                len(inputs if hasattr(inputs, "__len__") else list_images(inputs)), bool
+            )
+        images, size = list_images(inputs), self.encoders.preprocess(self.modality).resize
+        found = np.empty(len(images), bool)
+        for start in range(0, len(images), batch):
+            pixels = squares(images[start : start + batch], size)
+            found[start : start + batch] = np.isin(digest_images(pixels), seen)
+            progress("looking for known images", start + len(pixels), len(images))
+        return found
 
     def encode(
         self, inputs: Any, *, batch: int = 128, progress: Progress = quiet
@@ -128,8 +169,13 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
 def squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
     """Decode images to center squares (n, size, size, 3)."""
     pixels = np.empty((len(images), size, size, 3), np.uint8)
-    for k, image in enumerate(images):
+
+    def decode(k: int) -> None:
+        image = images[k]
         pixels[k] = square(read_image(image) if isinstance(image, Path) else image, size)
+
+    for _ in in_threads(decode, range(len(images))):
+        pass
     return pixels
 
 

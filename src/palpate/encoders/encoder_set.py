@@ -13,6 +13,7 @@ A saved set is a folder::
     palpate.json   {"format": "palpate-encoders/2", "digests": {modality: sha256}, "card": {...}}
     clip/          CLIPModel, its tokenizer and preprocessor_config.json
     tactile/       CLIPVisionModelWithProjection and preprocessor_config.json
+    */seen.safetensors   digests of the images that an encoder was trained on, if they are known
     README.md      the card for people
 
 The digest of an encoder is SHA-256 over its architecture, preprocessing (text: tokenizer) and
@@ -52,6 +53,7 @@ from palpate.encoders.models import (
     save_model,
     silent,
 )
+from palpate.encoders.seen import Digests, load_seen, save_seen
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
 
@@ -176,6 +178,7 @@ class ClipEncoders:
         preprocess: for the vision encoder.
         name: hub id or folder it came from, or the preset that made it.
         card: how it was trained, if palpate trained it.
+        seen: digests of the images that the vision encoder was trained on; None: unknown.
     """
 
     model: CLIPModel
@@ -183,6 +186,7 @@ class ClipEncoders:
     preprocess: Preprocess
     name: str
     card: dict[str, Any] = field(default_factory=dict)
+    seen: Digests | None = None
 
     @property
     def dim(self) -> int:
@@ -239,7 +243,8 @@ class ClipEncoders:
         write_json(folder / "preprocessor_config.json", self.preprocess.to_config())
         digests = {modality: self.digest(modality) for modality in ("vision", "text")}
         about = {"format": CLIP_FORMAT, "name": self.name, "digests": digests, "card": self.card}
-        write_json(folder / "palpate.json", about)
+        write_json(folder / "palpate.json", about | _counts({"vision": self.seen}))
+        save_seen(self.seen, folder)
 
 
 def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
@@ -276,6 +281,7 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
         about = _read_card(folder, CLIP_FORMAT)
         clip.card = about["card"]
         clip.name = clip.name if is_shipped(source) else str(about["name"])
+        clip.seen = load_seen(folder, about.get("seen", {}).get("vision"))
         _require_digests(clip, about["digests"], folder)
     model.to(pick_device(device))
     return clip
@@ -290,12 +296,14 @@ class EncoderSet:
         tactile: the tactile encoder, or None.
         tactile_preprocess: for the tactile encoder, or None.
         card: how the tactile encoder was trained; ``{}`` if palpate did not train it.
+        seen: digests of the images that the tactile encoder was trained on; None: unknown.
     """
 
     clip: ClipEncoders
     tactile: CLIPVisionModelWithProjection | None = None
     tactile_preprocess: Preprocess | None = None
     card: dict[str, Any] = field(default_factory=dict)
+    seen: Digests | None = None
 
     @property
     def dim(self) -> int:
@@ -348,6 +356,14 @@ class EncoderSet:
         facts = {"preprocess": asdict(preprocess), **architecture(tactile.config)}
         return digest_modules({"touch": tactile}, facts)
 
+    def seen_by(self, modality: str) -> Digests | None:
+        """Digests of the images that one encoder was trained on; None: unknown, or of texts."""
+        return {"vision": self.clip.seen, "tactile": self.seen}.get(modality)
+
+    def trained_on(self, modality: str) -> tuple[str, ...]:
+        """Data sets that the authors of one encoder trained it on."""
+        return () if modality != "tactile" else tuple(getattr(self.tactile, "trained_on", ()))
+
     def halve(self) -> float:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""
         return round_to_half(self._modules())
@@ -371,9 +387,10 @@ class EncoderSet:
                 save_model(self.tactile, part / "tactile", half=half)
                 config = self.tactile_preprocess.to_config()
                 write_json(part / "tactile" / "preprocessor_config.json", config)
+                save_seen(self.seen, part / "tactile")
             digests = {m: self.digest(m) for m in self.modalities}
             about = {"format": FORMAT, "digests": digests, "card": self.card}
-            write_json(part / "palpate.json", about)
+            write_json(part / "palpate.json", about | _counts({"tactile": self.seen}))
             write_model_cards(part)
 
     @classmethod
@@ -401,6 +418,7 @@ class EncoderSet:
             encoders.tactile = tactile = load_model(kind, str(place), must, SAVE_AGAIN, **options)
             path, size = place / "preprocessor_config.json", _config(tactile).image_size
             encoders.tactile_preprocess = Preprocess.from_config(path, size)
+            encoders.seen = load_seen(place, about.get("seen", {}).get("tactile"))
         _require_digests(encoders, about["digests"], folder)
         return encoders.to(device)
 
@@ -456,6 +474,12 @@ def seeded(seed: int, purpose: str) -> Generator[None]:
 def _config(model: nn.Module) -> Any:
     """The model's configuration, whose fields transformers types too loosely."""
     return model.config
+
+
+def _counts(seen: Mapping[str, Digests | None]) -> dict[str, Any]:
+    """The number of images that each encoder was trained on, for the card; {} if unknown."""
+    counts = {name: len(digests) for name, digests in seen.items() if digests is not None}
+    return {"seen": counts} if counts else {}
 
 
 def _side(value: Any, default: int) -> int:

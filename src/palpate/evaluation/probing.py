@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from palpate.core import PalpateError, Progress, Score, Split, quiet
-from palpate.evaluation.scoring import encoder_notes, load_encoders
+from palpate.evaluation.guard import guard
+from palpate.evaluation.scoring import load_encoders
 from palpate.metrics.probe import fit_probe, material_accuracy, retrieval
 from palpate.report.results import Results
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 Modality = Literal["vision", "tactile"]
 
 
-def probe(
+def probe(  # noqa: PLR0913
     data: Manifest | str | Path,
     split: Split | str | Path,
     *,
@@ -28,6 +29,7 @@ def probe(
     balanced: bool = False,
     top: Sequence[int] = (1, 5),
     seed: int = 0,
+    allow_seen: bool = False,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Results:
@@ -47,6 +49,8 @@ def probe(
             modality (vision for tactile and the other way round); skipped where the data lack it,
             or if empty.
         seed: of the folds of the cross-validation.
+        allow_seen: probe an encoder that was trained on some of the test images; every score says
+            so.
         cache: folder for embeddings, which an interrupted run finds again.
         progress: called with what is done.
 
@@ -54,7 +58,8 @@ def probe(
         Material accuracy on the test part, with chance in its ``details``, and retrieval top-k.
 
     Raises:
-        PalpateError: if train has fewer than two materials, or images are missing or unreadable.
+        PalpateError: if train has fewer than two materials, images are missing or unreadable, or
+            the encoder was trained on test images.
     """
     from palpate.data.manifest import Manifest
     from palpate.encoders.embed import embed
@@ -72,6 +77,11 @@ def probe(
         "progress": progress,
     }
     train, test = (manifest.part(split, part) for part in ("train", "test"))
+    other = "vision" if modality == "tactile" else "tactile"
+    retrieves = top and len(test) > 1 and not test.table[other].null_count()
+    how: dict[str, Any] = {"split": split, "allow_seen": allow_seen, "progress": progress}
+    notes = guard(encoders, modality, test, **how)
+    notes += guard(encoders, other, test, **how) if retrieves else []
     train_set, test_set = (embed(part, encoders, modality, **options) for part in (train, test))
     fitted = fit_probe(train_set, balanced=balanced, seed=seed)
     scores: list[Score] = [
@@ -79,12 +89,10 @@ def probe(
             train_set, test_set, probe=fitted, balanced=balanced, seed=seed, split=split.digest
         )
     ]
-    other = "vision" if modality == "tactile" else "tactile"
-    if top and len(test) > 1 and not test.table[other].null_count():
+    if retrieves:
         keys = embed(test, encoders, other, **options)
         name = f"{modality} to {other}"
         scores += retrieval(test_set, keys, top=top, name=name, split=split.digest)
-    notes = encoder_notes(encoders, manifest, None) if modality == "tactile" else []
     return Results(
         title=f"Probe of the {modality} encoder",
         scores=[replace(s, notes=[*s.notes, *notes]) for s in scores],

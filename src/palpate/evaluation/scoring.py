@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -40,6 +40,7 @@ from palpate.evaluation.controls import (
     control_samples,
     material_accuracies,
 )
+from palpate.evaluation.guard import guard
 from palpate.evaluation.inputs import (
     REFERENCE,
     Inputs,
@@ -52,9 +53,6 @@ from palpate.metrics import PRESETS, Comparison, compare, compare_tmmd, distance
 from palpate.metrics.kernels import MOMENT_BYTES
 from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
 from palpate.report.results import GalleryItem, Results
-
-if TYPE_CHECKING:
-    from palpate.data.manifest import Manifest
 
 #: Bandwidth of the paper; the name of a metric says any other one where several are requested.
 SIGMA = 10.0
@@ -254,6 +252,7 @@ def score(  # noqa: PLR0913
     lpips: tuple[str | Path, str | Path] | None = None,
     permutations: int = 999,
     seed: int = 0,
+    allow_seen: bool = False,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Results:
@@ -296,6 +295,8 @@ def score(  # noqa: PLR0913
         lpips: the two files of LPIPS: AlexNet's weights and the heads.
         permutations: relabelings of the permutation test of TMMD; 0 for none.
         seed: of random halves, permutations and the choice of control images.
+        allow_seen: score with an encoder that was trained on some of the reference's images; every
+            score says so.
         cache: folder for embeddings and decoded images, which an interrupted run finds again.
         progress: called with what is done.
 
@@ -303,8 +304,8 @@ def score(  # noqa: PLR0913
         A table of scores: the TMMD family, companions, and paired differences between generators.
 
     Raises:
-        PalpateError: if arguments contradict each other, or inputs cannot be read, aligned or
-            compared.
+        PalpateError: if arguments contradict each other, inputs cannot be read, aligned or
+            compared, or the encoder was trained on the reference's images.
 
     Example:
         >>> import numpy as np
@@ -345,6 +346,11 @@ def score(  # noqa: PLR0913
         encoders = load_encoders(encoder, progress)
     elif used := [n for n, v in {"encoder": encoder, "cache": cache, **weights}.items() if v]:
         raise PalpateError("must go with images", "embeddings", "Drop it", argument=used[0])
+    of_encoder: list[Note] = []
+    if encoders is not None:
+        judged: Any = inputs.reference.manifest or inputs.reference.images
+        how: dict[str, Any] = {"split": split, "allow_seen": allow_seen, "progress": progress}
+        of_encoder = guard(encoders, "tactile", judged, **how)
     if any(s.streamed for s in (inputs.reference, *inputs.generators.values())):
         outcome = score_streamed(inputs, family, requested, progress)
     else:
@@ -361,7 +367,8 @@ def score(  # noqa: PLR0913
             run, of = run.clustered(clusters) if clusters else (run, "")
             outcome = run.score(requested, controls=controls)
             outcome = _with_clusters(outcome, clusters, of) if clusters else outcome
-    outcome.scores = with_warnings(outcome.scores, inputs, encoders, split)
+    digest = encoders.digest("tactile") if encoders is not None else ""
+    outcome.scores = with_warnings(outcome.scores, inputs, split, digest, of_encoder)
     settings = _settings(inputs, family, outcome, encoders)
     if split is not None:
         settings["split rule"] = dict(split.rule)
@@ -707,30 +714,14 @@ def _gallery(inputs: Inputs, seed: int) -> list[GalleryItem]:
     return items
 
 
-def encoder_notes(encoders: Any, manifest: Manifest | None, split: Split | None) -> list[Note]:
-    """What readers must know of every score that an encoder made of these images.
-
-    That it knows simulated images alone and these are real, or may be; and, with a split, that it
-    may have seen test samples (paper, section 5).
-    """
-    card, notes = getattr(encoders, "card", None), list[Note]()
-    if card is None:
-        return notes
-    simulated = manifest.synthetic if manifest is not None else None
-    if card.get("synthetic") and not simulated:
-        notes.append(Note("synthetic-encoder", {"real": simulated is False}))
-    if split is not None and card.get("split") != split.digest:
-        known = card.get("split") is not None
-        notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))
-    return notes
-
-
 def with_warnings(
-    scores: Sequence[Score], inputs: Inputs, encoders: Any, split: Split | None
+    scores: Sequence[Score],
+    inputs: Inputs,
+    split: Split | None,
+    digest: str,
+    of_encoder: Sequence[Note],
 ) -> list[Score]:
-    """The scores with :func:`encoder_notes`, and of a generator that may have seen test samples."""
-    digest = encoders.digest("tactile") if encoders is not None else ""
-    of_encoder = encoder_notes(encoders, inputs.reference.manifest, split)
+    """The scores with notes on the encoder, and on generators that may have seen test samples."""
     of_generator = {
         name: [Note("generator-of-other-split")]
         for name, s in inputs.generators.items()

@@ -507,6 +507,13 @@ EVALUATION: dict[str, Sentence] = {
         + ": what it sees in real ones is unproven. Train an encoder on real images, or trust the "
         "contact scores"
     ),
+    "seen-images": (
+        "The {modality} encoder was trained on {seen:,} of the {n:,} images that it judges here"
+    ),
+    "seen-dataset": (
+        "The {modality} encoder was trained on {dataset}: it may have seen the images that it "
+        "judges here"
+    ),
     "encoder-of-other-split": (
         "The tactile encoder was trained on another split: it may have seen test samples"
     ),

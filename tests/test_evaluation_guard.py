@@ -1,0 +1,167 @@
+"""The guard: an encoder does not judge images that it was trained on."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from safetensors.numpy import save_file
+
+from mini_fixtures import make_encoders
+from palpate import probe, score
+from palpate.core import PalpateError, Split
+from palpate.data.manifest import Manifest
+from palpate.encoders import Encoder, EncoderSet, train_encoder
+from palpate.encoders.seen import digest_images, union
+from palpate.evaluation.guard import guard
+
+
+def by_video(manifest, *train):
+    """A split with these videos in train and the others in test."""
+    videos = manifest.column("video")
+    ids = list(zip(manifest.ids, videos, strict=True))
+    parts = ([i for i, v in ids if (v in train) == part] for part in (True, False))
+    return Split.from_ids(train=next(parts), test=next(parts), manifest=manifest.digest)
+
+
+@pytest.fixture(scope="module")
+def encoders():
+    return make_encoders()
+
+
+@pytest.fixture
+def trained(small_manifest):
+    """Tiny encoders that were trained on the videos v0, v1 and v2, and their split."""
+    split = by_video(small_manifest, "v0", "v1", "v2")
+    return train_encoder(small_manifest, split, preset="tiny", device="cpu"), split
+
+
+def test_training_keeps_which_images_it_saw_by_pixels_not_by_names(
+    trained, small_manifest, tmp_path
+):
+    encoders, split = trained
+    encoders.save(tmp_path / "e")
+    again = EncoderSet.load(tmp_path / "e")
+    train, test = (small_manifest.part(split, part) for part in ("train", "test"))
+    renamed = tmp_path / "other lab"
+    renamed.mkdir()
+    for k, path in enumerate([*train.paths("tactile")[:2], *test.paths("tactile")[:1]]):
+        shutil.copy(path, renamed / f"{k}.png")
+    for modality in ("vision", "tactile"):  # the fresh vision encoder has seen the photos
+        encoder = Encoder(again, modality)
+        assert encoder.knows_seen
+        assert encoder.saw(train).all()
+        assert not encoder.saw(test).any()
+    assert encoder.saw(renamed).tolist() == [True, True, False]
+    pixels = np.asarray(Image.open(train.paths("tactile")[0]))
+    assert encoder.saw(np.stack([pixels, 255 - pixels])).tolist() == [True, False]
+    assert not Encoder(make_encoders(), "tactile").saw(train).any()  # nothing is known
+
+
+def test_seen_test_images_are_refused_in_probe_and_score_unless_allowed(
+    trained, small_manifest, tmp_path
+):
+    encoders, own = trained
+    some = by_video(small_manifest, "v0", "v1", "v3")
+    whole = by_video(small_manifest, "v3", "v4", "v5")
+    clean = by_video(small_manifest, "v0", "v1", "v2", "v3")
+    files = shutil.copytree(small_manifest.root, tmp_path / "g")
+    made = Manifest(small_manifest.table, files)
+    for split, refused in ((own, 0), (clean, 0), (some, 8), (whole, 24)):
+        n = len(split.ids("test"))
+        runs = {
+            "probe": lambda s=split, **k: probe(small_manifest, s, encoder=encoders, **k),
+            "score": lambda s=split, **k: score(
+                made, small_manifest, split=s, encoder=encoders, permutations=0, **k
+            ),
+        }
+        for name, run in runs.items():
+            if refused:
+                with pytest.raises(PalpateError, match=f"{refused} of {n} that it was trained on"):
+                    run()
+            results = run(allow_seen=bool(refused))
+            notes = [[x for x in s.notes if x.code == "seen-images"] for s in results if s.encoder]
+            assert notes, name
+            assert all(bool(x) == bool(refused) for x in notes), name
+            assert not [x for s in results for x in s.notes if x.code.startswith("encoder-")]
+            for note in (note for some in notes for note in some):
+                assert (note.params["seen"], note.params["n"]) == (refused, n)
+
+
+def test_a_declared_data_set_is_refused(encoders, small_manifest):
+    public = replace(encoders)
+    public.trained_on = lambda modality: ("Touch and Go", "YCB-Slide")
+    for dataset, refused in (("Touch and Go", 1), ("HCT + YCB-Slide", 1), ("VisGel", 0), ("", 0)):
+        manifest = Manifest(small_manifest.table, small_manifest.root, {"dataset": dataset})
+        if refused:
+            with pytest.raises(PalpateError, match="with which its authors trained it"):
+                guard(public, "tactile", manifest)
+        notes = guard(public, "tactile", manifest, allow_seen=True)
+        assert [n.code for n in notes] == ["seen-dataset"] * refused
+
+
+def test_an_encoder_of_another_split_is_doubted_only_where_its_images_are_unknown(
+    trained, small_manifest
+):
+    encoders, _ = trained
+    other = by_video(small_manifest, "v0", "v1", "v2", "v3")
+    test = small_manifest.part(other, "test")
+
+    def codes(**changes):
+        return [n.code for n in guard(replace(encoders, **changes), "tactile", test, split=other)]
+
+    assert codes() == []
+    assert codes(seen=None) == ["encoder-of-other-split"]
+    assert codes(card={**encoders.card, "seen_in_part": True}) == ["encoder-of-other-split"]
+    assert codes(seen=None, card={}) == ["encoder-without-split"]
+    assert codes(seen=None, card={"split": other.digest}) == []
+
+
+def test_going_on_from_an_encoder_keeps_what_it_saw(trained, small_manifest, tmp_path):
+    from palpate.encoders.contrastive import train_tactile
+    from palpate.encoders.presets import TINY
+
+    start, _ = trained
+    later = by_video(small_manifest, "v3")
+    options = {"epochs": 1, "device": "cpu"}
+    for known in (True, False):
+        begin = start if known else replace(start, seen=None)
+        folder = tmp_path / str(known)
+        result = train_tactile(
+            small_manifest, later, start.clip, TINY, folder, start=begin, **options
+        )
+        encoder = Encoder(result, "tactile")
+        assert encoder.knows_seen == known
+        videos = {v for v, s in zip(small_manifest.column("video"), encoder.saw(small_manifest),
+                                    strict=True) if s}  # fmt: skip
+        assert videos == ({"v0", "v1", "v2", "v3"} if known else {"v3"})
+
+
+@pytest.mark.parametrize("damage", ["gone", "cut", "fewer", "no file of tensors"])
+def test_a_lost_record_of_seen_images_is_an_error(trained, tmp_path, damage):
+    trained[0].save(tmp_path / "e")
+    file = tmp_path / "e" / "tactile" / "seen.safetensors"
+    match damage:
+        case "gone":
+            file.unlink()
+        case "cut":
+            file.write_bytes(file.read_bytes()[:-8])
+        case "fewer":
+            save_file({"digests": trained[0].seen[1:]}, file)
+        case _:
+            file.write_text("{}")
+    with pytest.raises(PalpateError, match="must hold the digests of the 24 images"):
+        EncoderSet.load(tmp_path / "e")
+
+
+def test_digests():
+    images = np.random.default_rng(0).integers(0, 256, (5, 8, 8, 3), dtype=np.uint8)
+    images[3] = images[1]
+    digests = digest_images(images)
+    assert digests[3] == digests[1]
+    assert len(union(digests, None)) == 4
+    assert union(None).shape == (0,)
+    changed = images[0].copy()
+    changed[7, 7, 2] ^= 1  # one bit
+    assert digest_images(changed[None])[0] != digests[0]
