@@ -1,14 +1,15 @@
 """What the shipped models can do, measured on worlds that they have not seen; the rows of their
 cards.
 
-Intervals are leave-one-video-out jackknives. Zero-shot prompts are the world's own sentences with a
-class name and no adjective; a class whose pieces have names of their own ("a leaf", "moss") is
-asked for by each of them. The probe's train side is every fourth sample of the world that the
+Intervals are leave-one-video-out jackknives. No caption names a material, so a class is asked for
+in the zero-shot rows by captions of its contacts in the world that the encoders were trained on:
+:data:`PROMPTS` different ones, evenly over that world. The probe's train side is every fourth sample of the world that the
 encoders were trained on, its test side the new world.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,6 @@ from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import EncoderSet
 from palpate.evaluation.scoring import score
 from palpate.metrics.probe import material_accuracy, retrieval
-from palpate.sim import MATERIALS, WorldOptions
-from palpate.sim.objects import make_object
-from palpate.sim.plan import ObjectRef
-from palpate.sim.text import NAMED
 
 #: Touches generated for the generator's scores, evenly over the new world.
 GENERATED = 400
@@ -38,8 +35,8 @@ GENERATED = 400
 POOL = 100
 #: Of the train side, for the probe.
 EVERY = 4
-#: Objects of each material whose names are asked for.
-NAMED_OBJECTS = 12
+#: Captions of the train side that stand for a material.
+PROMPTS = 200
 
 Rows = list[dict[str, Any]]
 
@@ -81,23 +78,22 @@ def score_all(
     }
 
 
-def prompts(options: WorldOptions) -> dict[str, list[str]]:
-    """Material -> the named sentences of the world, for each name that its pieces have."""
-    named: dict[str, list[str]] = {}
-    for material in MATERIALS:
-        nouns = {
-            make_object(options, ObjectRef(material, k)).surface.noun for k in range(NAMED_OBJECTS)
-        }
-        sentences = (t.format(phrase=noun) for noun in sorted(nouns) for t in NAMED)
-        named[material] = [f"{s[0].upper()}{s[1:]}." for s in sentences]
-    return named
+def prompts(manifest: Manifest) -> dict[str, list[str]]:
+    """Material -> up to PROMPTS different captions of it, evenly over the manifest."""
+    captions: dict[str, dict[str, None]] = {}
+    for material, text in manifest.table.select("material", "text").iter_rows():
+        captions.setdefault(material, {})[text] = None
+    return {
+        material: list(texts)[:: math.ceil(len(texts) / PROMPTS)]
+        for material, texts in captions.items()
+    }
 
 
 def score_encoders(
     encoders: EncoderSet, old: Manifest, new: Manifest, cache: Path, progress: Progress
 ) -> Rows:
     """Zero-shot and probe accuracy, and retrieval in the new world."""
-    names = prompts(WorldOptions(seed=900_050))
+    words = prompts(old)
     train = old.take(old.ids[::EVERY])
     sides = {
         t: [embed(part, encoders, t, cache=cache, progress=progress) for part in (train, new)]
@@ -105,11 +101,11 @@ def score_encoders(
     }
     vision, tactile = sides["vision"][1], sides["tactile"][1]
     text = embed(new, encoders, "text", cache=cache, progress=progress)
-    words = embed_texts(texts_of(new)[0], encoders)
-    same = words @ words.T > 0.999  # equal captions count as right
+    captions = embed_texts(texts_of(new)[0], encoders)
+    same = captions @ captions.T > 0.999  # equal captions count as right
     scores = [
-        ("zero-shot material, vision", zero_shot_accuracy(vision, names, encoders)),
-        ("zero-shot material, tactile", zero_shot_accuracy(tactile, names, encoders)),
+        ("zero-shot material, vision", zero_shot_accuracy(vision, words, encoders)),
+        ("zero-shot material, tactile", zero_shot_accuracy(tactile, words, encoders)),
         ("linear probe of material, vision", material_accuracy(*sides["vision"])),
         ("linear probe of material, tactile", material_accuracy(*sides["tactile"])),
     ]

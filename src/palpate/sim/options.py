@@ -109,8 +109,8 @@ class WorldOptions:
     objects_per_video: int = _number(3, 1, 14, "a mixed video has 2 to this many objects")
     mixed: float = _share(0.12, "share of the videos with several objects")
     sensors: int = _number(3, 1, 100, "gel units; each video uses one of them")
-    captions: Literal["label", "felt"] = _choice(
-        "the words of the drawn sub-type, or words for the measured surface", "label", "felt"
+    captions: Literal["felt", "label"] = _choice(
+        "words for the measured surface, or the words of the drawn sub-type", "felt", "label"
     )
     named: float = _share(0.5, "share of label captions that name the material")
     describer: float = _number(0.15, 0.0, 5.0, "noise of felt captions, in levels of a word scale")
@@ -311,7 +311,8 @@ def load_options(path: str | Path) -> WorldOptions:
         must = f"{path} must hold the options of a world"
         raise PalpateError(must, "none", "Name the world.json of a finished world")
     current = {old: new for new, old in _FORMAT_2.items()}
-    values: dict[str, Any] = {current.get(str(k), str(k)): v for k, v in options.items()}
+    values: dict[str, Any] = {"captions": "label"}  # where the record is from before felt ones
+    values |= {current.get(str(k), str(k)): v for k, v in options.items()}
     if values.get("leak") == "touch":
         values["leak"] = "contact"
     known = [option.name for option in dataclasses.fields(WorldOptions)]
