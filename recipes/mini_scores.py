@@ -3,8 +3,8 @@ cards.
 
 Intervals are leave-one-video-out jackknives. No caption names a material, so a class is asked for
 in the zero-shot rows by captions of its contacts in the world that the encoders were trained on:
-:data:`PROMPTS` different ones, evenly over that world. The probe's train side is every fourth sample of the world that the
-encoders were trained on, its test side the new world.
+:data:`PROMPTS` different ones, evenly over that world. The probe's train side is every fourth
+sample of that world, its test side the new world.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from PIL import Image
 from palpate.cli import main
 from palpate.core import rng_for
 from palpate.sim import MATERIALS, PRESETS, VERSION, plan_world
+from palpate.sim.felt import SCALES
 from palpate.sim.materials import draw_surface
 from palpate.sim.plan import written_frames
 
@@ -117,7 +118,8 @@ def test_the_table_of_materials_is_that_of_the_code():
             surface = draw_surface(name, MATERIALS[name], 64, rng_for(0, "docs", name, k))
             assert told[surface.subtype] == ", ".join(surface.words)
         words |= {word for listed in told.values() for word in listed.split(", ")}
-    assert f"a list of {len(words)};" in PAGE
+    felt = {word for scale in SCALES.values() for level in scale.words for word in level}
+    assert f"a list of {len(felt)}, those of label captions from a list of {len(words)};" in PAGE
 
 
 def test_the_table_of_costs_has_the_frames_of_the_presets():

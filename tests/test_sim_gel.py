@@ -155,7 +155,7 @@ def test_a_pad_shows_its_rows_of_markers(rows, pad):
 
 def test_units_of_other_options_are_other_units():
     plain = make_sensor(SMALL, 0)
-    assert make_sensor(dataclasses.replace(SMALL, named=0.1), 0) is plain  # not of the gel
+    assert make_sensor(dataclasses.replace(SMALL, describer=0.1), 0) is plain  # not of the gel
     assert make_sensor(dataclasses.replace(SMALL, markers=0), 0).ink is None
     assert make_sensor(dataclasses.replace(SMALL, pad_mm=28.0), 0).px == pytest.approx(2 * plain.px)
     clean = make_sensor(dataclasses.replace(SMALL, dirt=0.0, vignette=(0.1, 0.1)), 0).veil

@@ -35,8 +35,14 @@ from palpate.sim.plan import (
 
 FIELDS = {field.name: field.metadata for field in dataclasses.fields(WorldOptions)}
 #: Presets and their digests when the shipped models were trained.
-DIGESTS = {"tiny": "0220df4e2b2f", "demo": "5f36c0c26f0b", "pretrain": "656f0c971f58"}
-DIGESTS |= {"small": "3793c7e60638", "full": "dce313c96c4e"}
+#: Of the presets, and of the same with label captions, which were once the default.
+DIGESTS = {
+    "tiny": ("b8337572e22d", "0220df4e2b2f"),
+    "demo": ("b2192b9672b6", "5f36c0c26f0b"),
+    "pretrain": ("93b0208b0f78", "656f0c971f58"),
+    "small": ("38be6cd2b3a2", "3793c7e60638"),
+    "full": ("2bcc3fe740d5", "dce313c96c4e"),
+}
 
 
 def named(kind):
@@ -50,7 +56,7 @@ def test_numbers_have_a_range(name):
         with pytest.raises(PalpateError, match=f"`{name}` must be a .*number from") as error:
             WorldOptions(**{name: value})
         assert len(str(error.value)) < 400
-    extra = {"load_mm": (0.1, 0.2)} if name == "gel_mm" else {}
+    extra = {"gel_mm": {"load_mm": (0.1, 0.2)}, "named": {"captions": "label"}}.get(name, {})
     for value in (low, high):
         assert getattr(WorldOptions(**{**extra, name: value}), name) == value
 
@@ -94,6 +100,7 @@ def test_series_are_a_few_numbers(name):
         ({"layout": "videos", "free_written": "background"}, "`free_written` must be 'all'"),
         ({"size": 257}, r"from 16 to 256\. Got 257\. E\.g\. size=256"),
         ({"size": 64.4}, r"whole number.*size=64"),
+        ({"named": 1.0}, "must be left out for felt captions. Got 1.0. Only captions 'label'"),
         ({"view_mm": (40.0, 30.0)}, r"lower end first.*view_mm=\(30.0, 40.0\)"),
     ],
 )
@@ -119,8 +126,10 @@ def test_one_meaning_has_one_digest():
     assert WorldOptions(tile=512).digest != WorldOptions().digest
 
 
-def test_presets_are_those_that_models_were_trained_on():
-    assert {name: options.digest[:12] for name, options in PRESETS.items()} == DIGESTS
+def test_presets_keep_their_digests_and_lengths():
+    label = {name: dataclasses.replace(o, captions="label") for name, o in PRESETS.items()}
+    pairs = {name: (o.digest[:12], label[name].digest[:12]) for name, o in PRESETS.items()}
+    assert pairs == DIGESTS
     frames = {
         name: len(plan_world(o)) * o.contacts_per_video * o.frames_per_contact
         for name, o in PRESETS.items()
@@ -145,6 +154,11 @@ def test_options_are_read_from_the_record_of_a_world(tmp_path):
     assert {"touches_per_video", "frames_per_touch"} < set(old["options"])
     path.write_text(json.dumps(old))
     assert load_options(path) == options
+    label = dataclasses.replace(options, captions="label")  # as all were before felt captions
+    old = record_of(label)
+    del old["options"]["captions"], old["options"]["describer"]
+    path.write_text(json.dumps(old))
+    assert load_options(path) == label
 
 
 @pytest.mark.parametrize(

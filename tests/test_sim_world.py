@@ -203,7 +203,7 @@ def test_samples_rendered_alone_equal_written_files(options, tmp_path):
 
 
 def test_captions_and_objects_follow_the_object_in_contact():
-    options = dataclasses.replace(TINY, mixed=1.0, contacts_per_video=4)
+    options = dataclasses.replace(TINY, mixed=1.0, contacts_per_video=4, captions="label")
     for plan in plan_world(options):
         video, names = Video(options, plan), {ref.name for ref in plan.objects}
         assert 2 <= len(names) <= 3

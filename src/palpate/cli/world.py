@@ -116,4 +116,6 @@ def world_options(options: Options) -> WorldOptions:
         given.setdefault("free_written", "all")
     if given.get("layout") == "hct":
         given.setdefault("look", "digit")
+    if "named" in given:
+        given.setdefault("captions", "label")
     return dataclasses.replace(base, **given)

@@ -176,6 +176,9 @@ class WorldOptions:
         if self.pad_mm > self.view_mm[0]:
             must = f"must not exceed the lower end of view_mm, {self.view_mm[0]:g}"
             yield _error("pad_mm", must, self.pad_mm, "The pad must lie in the photo")
+        if self.captions == "felt" and self.named != 0.5:
+            must, fix = "must be left out for felt captions", "Only captions 'label' name materials"
+            yield _error("named", must, self.named, fix)
         if self.balance != "uniform" and self.objects_per_material < 2:
             must = f"must be 2 or more for balance {self.balance!r}"
             yield _error("objects_per_material", must, self.objects_per_material, "", 2)
