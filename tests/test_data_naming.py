@@ -130,11 +130,42 @@ def test_a_template_of_the_photos_is_held_against_the_photos(columns, tmp_path):
     table = tmp_path / "t.csv"
     lines = [f"rig/cup{k // 10}/photo/{k}.png,gel/{k}.png" for k in range(8, 12)]
     table.write_text("\n".join([columns, *lines]))
-    manifest, problems, _ = read_names(table, vision="rig/{video}/photo/{frame}.png")
-    assert problems == []
-    assert manifest.column("video") == ["cup0", "cup0", "cup1", "cup1"]
-    manifest, problems, _ = read_names(table, tactile="gel/{frame}.png")
-    assert (manifest.column("frame"), problems) == ([8, 9, 10, 11], [])
+    for side, template, column, values in (
+        ("vision", "rig/{video}/photo/{frame}.png", "video", ["cup0", "cup0", "cup1", "cup1"]),
+        ("tactile", "gel/{frame}.png", "frame", [8, 9, 10, 11]),
+    ):
+        manifest, problems, _ = read_names(table, **{side: template})
+        ((named,), _) = name_together([manifest], template)
+        assert (named.column(column), problems) == (values, [])
+
+
+def test_frames_that_begin_anew_in_every_contact_make_no_sample_of_two(tmp_path, capsys):
+    """wood/1_0003.png and wood/2_0003.png are two images, whatever the list they are in."""
+    paths = {
+        part: [f"{o}/{c}_{f:04}.png" for o, c in places for f in range(6)]
+        for part, places in (
+            ("train", (("wood", 1), ("wool", 2))),
+            ("test", (("wood", 2), ("wool", 1))),
+        )
+    }
+    (tmp_path / "all.json").write_text(json.dumps(paths))
+    for part, some in paths.items():
+        (tmp_path / f"{part}.csv").write_text("\n".join(["gel", *some]))
+
+    def audited(*words):
+        status = main(["audit", *map(str, words), "--json"])
+        data = json.loads(capsys.readouterr().out)
+        codes = {note["code"] for note in data["notes"]}
+        assert "split-of-other-manifest" not in codes
+        return status, data["group"], data["groups_shared"], data["identical_samples"]
+
+    lists = (tmp_path / "train.csv", tmp_path / "test.csv")
+    assert audited(tmp_path / "all.json") == (1, "video", 2, 0)
+    assert audited(*lists) == (1, "video", 2, 0)
+    for field in ("video", "contact"):
+        template = f"{{material}}/{{{field}}}_{{frame:d}}.png"
+        given = ("--tactile", template, "--by", field)
+        assert audited(*lists, *given) == (0, field, 0, 0)
 
 
 def test_bad_lines_and_wrong_options_are_named(tmp_path, capsys):

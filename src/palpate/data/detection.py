@@ -8,6 +8,7 @@ which. What the paths of a side have in common is written out; what varies becom
 - digits at the end of file names are the ``frame``;
 - a word before what varies names it (``press_3``: ``contact``), else its values do (``train``,
   ``Wood``);
+- a name before frames that begin anew for each such name within a video is that of a ``contact``;
 - of the other folders the innermost is the ``video`` of the images in it and the one around it the
   ``object``; folders at several depths are one ``video``.
 """
@@ -22,6 +23,7 @@ from dataclasses import dataclass
 
 from palpate.data.captions import ADJECTIVES
 from palpate.data.rows import PART_NAMES
+from palpate.data.templates import Template
 
 #: Column -> words that say that an image belongs there; those of ``_WEAK`` say so if no other does.
 ROLES = {
@@ -178,7 +180,16 @@ def template_of(files: Sequence[str], several: bool | None = None) -> str:
     stem = _stem([stem for stem, _ in names], fields)
     suffix = min(suffixes) if len(suffixes) == 1 else ".*"
     text = "/".join([*map(str, pieces), stem + suffix])
-    return re.sub(r"\**(\{\w+\})\**", r"\1", text)  # a field takes what is next to it
+    text = re.sub(r"\**(\{\w+\})\**", r"\1", text)  # a field takes what is next to it
+    return _with_contacts(text, files) if {"video", "name", "frame"} <= fields else text
+
+
+def _with_contacts(text: str, files: Sequence[str]) -> str:
+    """The template where a name whose frames begin anew is that of a contact."""
+    template = Template.parse(text)
+    rows = [template.match(path) or {} for path in files]
+    again = len({(row.get("video"), row.get("frame")) for row in rows}) < len(rows)
+    return text.replace("{name}", "{contact}") if again and "contact" not in text else text
 
 
 def _new(fields: set[str], *names: str) -> str:

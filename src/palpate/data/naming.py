@@ -30,13 +30,14 @@ from palpate.data.detection import ROLES, template_of
 from palpate.data.formats import hct
 from palpate.data.formats.intervals import NAMES as INTERVAL_NAMES
 from palpate.data.formats.intervals import NEEDED, ORDER
+from palpate.data.formats.pairs import name_apart
 from palpate.data.images import SUFFIXES
 from palpate.data.imported import require_some
 from palpate.data.manifest import SCHEMA, Manifest
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import PART_NAMES, manifest_rows, read_classes
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
-from palpate.data.templates import Template
+from palpate.data.templates import Fields, Template
 
 #: ``video start end [label]``, separated by spaces, tabs, commas or semicolons.
 INTERVAL = re.compile(r"\s*([^\s,;]+)[\s,;]+(\d{1,9})[\s,;]+(\d{1,9})(?:[\s,;]+([^\s,;]+))?\s*")
@@ -82,43 +83,58 @@ def read_names(path: Path, **options: Any) -> tuple[Manifest, list[Problem], Spl
     return _paths(path, table, records is not None, options)
 
 
-def name_together(manifests: Sequence[Manifest]) -> tuple[list[Manifest], str]:
+def name_together(
+    manifests: Sequence[Manifest], template: str | None = None
+) -> tuple[list[Manifest], str]:
     """Fill what the paths of several lists say of their samples.
+
+    Args:
+        manifests: of lists, or others, which stay as they are.
+        template: of the paths; without one they suggest it.
 
     Returns:
         The manifests, those without a column of paths as they are, and the template or names of
         the published lists, or ''.
     """
     tables = [m.table for m in manifests]
-    unread = [t for t in tables if PATH in t.columns and not t["video"].count()]
+    unread = [t for t in tables if PATH in t.columns and (template or not t["video"].count())]
     paths = [path for table in unread for path in table[PATH].drop_nulls()]
     if not paths:
         return list(manifests), ""
     lists = [
         next((name for name, p in KNOWN.items() if re.fullmatch(p, path)), "") for path in paths
     ]
-    known = [] if "" in lists else [name for name in KNOWN if name in lists]
-    text = ", ".join(known) or template_of(paths)
-    patterns = [re.compile(KNOWN[name]) for name in known] or [Template.parse(text).pattern]
+    known = [] if "" in lists or template else [name for name in KNOWN if name in lists]
+    text = ", ".join(known) or template or template_of(paths)
+    patterns = [re.compile(KNOWN[name]) for name in known]
+    parsed = None if known else Template.parse(text)
+    rows = [_fields(path, patterns, parsed) for path in paths]
+    if parsed is not None:
+        name_apart(rows, parsed.fields)
+    said = dict(zip(paths, rows, strict=True))
     named = [
-        replace(m, table=_filled(m.table, patterns)) if any(m.table is t for t in unread) else m
+        replace(m, table=_filled(m.table, said)) if any(m.table is t for t in unread) else m
         for m in manifests
     ]
     if "HCT" in known:
         sessions = hct.sessions_of({v for m in named for v in m.table["video"].drop_nulls()}, 60.0)
         session = pl.col("video").replace_strict(sessions, default=None, return_dtype=pl.String)
         named = [replace(m, table=m.table.with_columns(session=session)) for m in named]
-    return named, text
+    return named, "" if template else text
 
 
-def _filled(table: pl.DataFrame, patterns: Sequence[re.Pattern[str]]) -> pl.DataFrame:
-    """The table with what the first pattern of each path says in the columns that are empty."""
-    rows = [
-        next((m.groupdict() for p in patterns if (m := p.fullmatch(path or ""))), {})
-        for path in table[PATH].to_list()
-    ]
+def _fields(path: str, patterns: Sequence[re.Pattern[str]], template: Template | None) -> Fields:
+    """What the template, or the first pattern that fits, says of a path."""
+    if template is not None:
+        return template.match(path) or {}
+    return next((m.groupdict() for p in patterns if (m := p.fullmatch(path))), {})
+
+
+def _filled(table: pl.DataFrame, said: Mapping[str, Fields]) -> pl.DataFrame:
+    """The table with what its paths say in the columns that are empty."""
+    rows = [said.get(path, {}) for path in table[PATH].to_list()]
     columns: list[pl.Series] = []
-    for name in dict.fromkeys(name for pattern in patterns for name in pattern.groupindex):
+    for name in dict.fromkeys(name for row in rows for name in row):
         if name in SCHEMA and not table[name].count():
             values = pl.Series(name, [row.get(name) for row in rows], pl.String)
             columns.append(values.cast(SCHEMA[name], strict=False))
@@ -192,7 +208,7 @@ def _items(data: Any, split: str | None = None) -> Iterator[dict[str, Any]]:
                 yield from _items(value, PART_NAMES[str(key).lower()])
         else:
             yield dict(data) | ({"split": split} if split else {})
-    elif isinstance(data, list) and _scalars(data) and len(data) >= 2:
+    elif isinstance(data, list) and _scalars(data) and len(data) >= 2 and not _is_image(data[0]):
         group = "object" if str(data[0]).isdecimal() else "video"
         row = {group: data[0], "id": "/".join(map(str, data)), "split": split}
         yield row | ({"frame": data[1]} if group == "video" else {})
@@ -201,6 +217,10 @@ def _items(data: Any, split: str | None = None) -> Iterator[dict[str, Any]]:
             yield from _items(item, split)
     elif isinstance(data, str):
         yield {PATH: data, "split": split}
+
+
+def _is_image(item: Any) -> bool:
+    return str(item).lower().endswith(SUFFIXES)
 
 
 def _scalars(items: Sequence[Any]) -> bool:
@@ -242,11 +262,9 @@ def _paths(
     for k, row in rows:
         if place := paths[k] if paths else None:
             row[PATH] = place
-            fields = template.match(place) if template else {}
-            if fields is None:
+            if template and template.match(place) is None:
                 text = f"{place!r} is not like the template {options[side]}"
                 table.problems.append(Problem(table.where(k), "no-match", text))
-            row |= {n: v for n, v in (fields or {}).items() if n in SCHEMA and n not in row}
         if "frame" in row:
             row["frame"] = int(row["frame"])
         row.setdefault("id", _id(row, table.where(k)))
@@ -295,8 +313,8 @@ def _named_images(
     columns |= {n: frame[n].to_list() for n in _path_columns(frame.columns) if n not in columns}
     for name in _path_columns([*columns], side) if side else columns:
         values = columns[name]
-        some = [str(value).lower() for value in values[:100] if value is not None]
-        if some and all(value.endswith(SUFFIXES) for value in some):
+        some = [value for value in values[:100] if value is not None]
+        if some and all(map(_is_image, some)):
             return side, values
     return side, None
 

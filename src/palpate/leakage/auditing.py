@@ -36,6 +36,7 @@ from palpate.leakage.inputs import (
 from palpate.leakage.signals import (
     Flags,
     Gaps,
+    by_contact,
     identical_bytes,
     identical_samples,
     in_time,
@@ -310,7 +311,7 @@ def _compare(
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])
     in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
-    gaps = nearest_in_video(*(in_time(t) if options.ids_in_time else t for t in (a, b)))
+    gaps = nearest_in_video(*by_contact(*(in_time(t) if options.ids_in_time else t for t in (a, b))))
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
     reason = _reason(train, test, group, flags, options, named=not equal)

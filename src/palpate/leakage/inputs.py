@@ -129,17 +129,28 @@ def read_all(
             raise
     if problems:
         raise ProblemsError(problems, FIX)
-    named, template = name_together([part.manifest for part in parts])
+    given = next((t for t in map((reading or {}).get, ("tactile", "vision")) if t), None)
+    named, template = name_together([part.manifest for part in parts], given)
     notes = [Note("names-read", {"template": template})] if template else []
     return [
-        replace(part, manifest=manifest, notes=[*part.notes, *(notes if k == 0 else [])])
+        Source(
+            manifest,
+            {name: replace(s, manifest=manifest.digest) for name, s in part.splits.items()}
+            if manifest is not part.manifest
+            else part.splits,
+            [*part.notes, *(notes if k == 0 else [])],
+        )
         for k, (part, manifest) in enumerate(zip(parts, named, strict=True))
     ]
 
 
 def number_contacts(manifests: list[Manifest]) -> list[Manifest]:
     """Number the contacts of bare frame lists over all of them."""
-    bare = [k for k, manifest in enumerate(manifests) if set(manifest.facts) == {"source"}]
+    bare = [
+        k
+        for k, m in enumerate(manifests)
+        if set(m.facts) == {"source"} and "path" not in m.table.columns
+    ]
     numbered = iter(number_together(*(manifests[k] for k in bare)) if len(bare) > 1 else ())
     return [next(numbered, m) if k in bare else m for k, m in enumerate(manifests)]
 

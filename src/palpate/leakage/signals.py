@@ -67,6 +67,20 @@ def nearest_in_video(train: pl.DataFrame, test: pl.DataFrame) -> Gaps:
     return Gaps(row, gap)
 
 
+def by_contact(*tables: pl.DataFrame) -> list[pl.DataFrame]:
+    """The tables with contacts for videos, where frames begin anew in every contact of a video.
+
+    Contacts of two tables are compared only where the paths of both gave them their names.
+    """
+    named = [t.select("video", "frame", "contact").drop_nulls().unique() for t in tables]
+    if all("path" in t.columns for t in tables):
+        named = [pl.concat(named).unique()]
+    if not any(t.select("video", "frame").is_duplicated().any() for t in named):
+        return list(tables)
+    contact = pl.format("{}: {}", "video", "contact")
+    return [t.with_columns(video=pl.coalesce(contact, "video")) for t in tables]
+
+
 def in_time(table: pl.DataFrame) -> pl.DataFrame:
     """The table where the last number of an id is the frame, and the others are the video."""
     number = r"^(.*?)(\d{1,18})(\D*)$"
