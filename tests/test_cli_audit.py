@@ -316,7 +316,7 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
         ([one], "neither test samples nor a split"),
         ([one, one, "--split", split], "TRAIN and TEST"),
         ([lines, tmp_path / "gone.txt"], "nothing at"),
-        ([lines, lines, "--impact"], "--impact needs samples with a split"),
+        ([lines, lines, "--impact"], "--impact needs all samples and a split"),
         ([lines, lines, "--group", "video"], "--by"),
         ([one, "--split", split, "--false-positives", "0.7"], "--false-positives"),
         ([one, "--split", split, "--near-frames", "-1"], "--near-frames"),

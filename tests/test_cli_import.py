@@ -114,6 +114,24 @@ def test_validation_shows_facts_and_fails_on_what_is_requested(capsys, tag, tabl
     assert call(capsys, "validate")[0] == 2
 
 
+def test_an_import_of_one_side_is_validated_as_it_lies_there(capsys, table, tmp_path):
+    template = ("--tactile", "t/{frame}.png")
+    for k in range(4):
+        write_image(tmp_path / "own" / "t" / f"{k}.png", k)
+    assert call(capsys, "import", tmp_path / "own", *template, "-o", tmp_path / "m")[0] == 0
+    for source in (tmp_path / "m", tmp_path / "m" / "manifest.parquet"):
+        status, out, _ = call(capsys, "validate", source)
+        assert (status, "Complete." in out, "t/{frame}.png" in out) == (0, True, True), out
+    assert call(capsys, "validate", tmp_path / "m", *template)[0] == 2
+    (tmp_path / "own" / "t" / "3.png").write_bytes(b"")
+    status, out, _ = call(capsys, "validate", tmp_path / "m")
+    assert (status, "Invalid: 1" in out) == (1, True)
+    (tmp_path / "rows.csv").write_text("tactile,vision\nown/t/0.png,\nown/t/1.png,\n")
+    assert call(capsys, "validate", tmp_path / "rows.csv")[0] == 0
+    status, out, _ = call(capsys, "validate", tmp_path / "own" / "t", "--tactile", "{frame}.png")
+    assert "example 1" in out
+
+
 def test_problems_of_one_kind_are_one_line_and_all_are_in_json(capsys, table):
     table.write_text("vision,tactile\n" + "x.jpg,y.jpg\n" * 30)
     status, out, _ = call(capsys, "validate", table)

@@ -44,6 +44,30 @@ def frame_of(row):
     return int(row["background"].partition("/")[2][:3])
 
 
+def test_a_frame_may_be_named_as_the_reference_of_all_or_some_videos(folder, tmp_path, capsys):
+    manifest_of(folder, range(70)).save(folder / "manifest.parquet")
+    numbers = {(): (69, 69), ("v1=3",): (None, 3), ("v0=5", "v1=first"): (5, 0)}
+    for k, (words, expected) in enumerate(numbers.items()):
+        out = tmp_path / f"out{k}"
+        assert (
+            main(["background", str(folder), "-o", str(out), "--reference", *(words or ["69"])])
+            == 0
+        )
+        rows = Manifest.load(out).table.filter(pl.col("frame") == 69).to_dicts()
+        for row, frame in zip(rows, expected, strict=True):  # in no contact, so the reference
+            assert frame in (None, frame_of(row))
+    capsys.readouterr()
+    for words, text in {
+        ("70",): "must be the number of a frame of the video 'v0'. Got 70",
+        ("v7=0",): "--reference must be of a video without backgrounds. Got 'v7'",
+        ("fist",): "--reference must be one of found, first, a frame. Got 'fist'",
+        ("first", "v0=1"): "--reference must be one reference, or one for each of some videos",
+    }.items():
+        command = ["background", str(folder), "-o", str(tmp_path / "no"), "--reference", *words]
+        assert (main(command), text in (error := capsys.readouterr().err)) == (2, True), error
+        assert not (tmp_path / "no").exists()
+
+
 CASES = {
     "all frames": (range(70), {}, "contacts found, reference found"),
     "all frames, contacts named": (

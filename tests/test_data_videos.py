@@ -6,6 +6,7 @@ from PIL import Image
 
 import palpate.data.frames as frames
 from data_fixtures import write_image
+from palpate.cli import main
 from palpate.core import PalpateError, ProblemsError
 from palpate.data.importing import import_dataset, validate
 from palpate.data.reading import load
@@ -13,6 +14,20 @@ from palpate.data.stacks import StackReader
 from test_data_contacts import EVENTS, gel_video, photos
 
 PRESSES = ((20, 30), (45, 55))
+
+
+def test_a_gel_that_never_moves_says_why_it_has_no_contact(tmp_path, capsys):
+    save(tmp_path / "own" / "a.npy", gel_video(70, ()))
+    command = [str(tmp_path / "own"), "--tactile", "{video}.npy"]
+    assert main(["import", *command, "-o", str(tmp_path / "m")]) == 2
+    error = capsys.readouterr().err
+    assert "a: no contact was found: frames differ from frame" in error
+    assert "--every 10" in error
+    assert main(["validate", *command]) == 1
+    assert "no sample is usable" in capsys.readouterr().out
+    save(tmp_path / "own" / "b.npy", gel_video(70, PRESSES))
+    assert main(["import", *command, "-o", str(tmp_path / "m")]) == 0
+    assert "a: no contact was found" in capsys.readouterr().out
 
 
 def save(path, images, times=None):

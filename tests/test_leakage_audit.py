@@ -182,7 +182,7 @@ def test_rows_without_a_group_are_noted_and_mistakes_are_errors():
         ({"test": a, "near_frames": -1}, "`near_frames` must be at least 0"),
         ({"test": a, "false_positives": 0.5}, "`false_positives` must lie in"),
         ({"test": a, "modalities": ["smell"]}, "`modalities` must be among"),
-        ({"test": a, "impact": print}, "`impact` needs samples with a split"),
+        ({"test": a, "impact": print}, "`impact` needs all samples and a split"),
     ):
         with pytest.raises(PalpateError, match=words):
             audit(a, **options)

@@ -91,6 +91,7 @@ RENAMED: dict[tuple[str, str], str] = {
 OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "train_or_data"): "TRAIN",
     ("audit", "test"): "TEST",
+    ("background", "how"): "--reference",
     ("caption check", "captions"): "CAPTIONS",
     ("", "columns"): "--map",
     ("", "side"): "--as",

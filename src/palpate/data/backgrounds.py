@@ -5,7 +5,7 @@ images of the same folder that are no samples, where the names of all are frame 
 are those of the manifest, with all frames between their first and last; where it names none, they
 are found (:mod:`palpate.data.contacts`). A contact takes the last frame at rest before it, every
 other sample and every contact without such a frame the reference of the video: of the frames in no
-contact the one that most resembles the others, or the first of the video.
+contact the one that most resembles the others, the first, or the one that was named.
 
 A video whose frames are all in contact has no background: nothing is made up.
 """
@@ -13,7 +13,7 @@ A video whose frames are all in contact has no background: nothing is made up.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -49,7 +49,8 @@ from palpate.data.imported import Imported, removing_on_error
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 
-How = Literal["found", "first"]
+#: A number is that of a frame.
+How = Literal["found", "first"] | int
 #: (first, last) position of a contact, both included.
 Run = tuple[int, int]
 
@@ -103,7 +104,7 @@ def propose_backgrounds(
     source: Any,
     output: Path | str,
     *,
-    how: How = "found",
+    how: How | Mapping[str, How] = "found",
     replace_all: bool = False,
     progress: Progress = quiet,
     **options: Any,
@@ -113,16 +114,16 @@ def propose_backgrounds(
     Args:
         source: a manifest, or whatever :func:`palpate.load` reads, with its images as files.
         output: folder to write to, without a manifest; the images stay where they are.
-        how: the reference of a video: ``found``, or its ``first`` frame.
+        how: the reference of a video: ``found``, its ``first`` frame, or the number of a frame; by
+            name of the video for some, then the others' are found.
         replace_all: replace the backgrounds that are there, too.
         progress: progress callback.
         options: of :func:`palpate.load`.
 
     Raises:
         PalpateError: if the source cannot be read, has no tactile images, or the output holds a
-            manifest.
+            manifest; on a video that is not there, or that lacks the frame.
     """
-    require_choice("how", how, ("found", "first"))
     path = Path(output) / "manifest.parquet"
     if path.exists():
         fix = "Choose another folder"
@@ -138,16 +139,18 @@ def propose_backgrounds(
         raise PalpateError(must, got, fix, argument="source", example=example)
     chosen, before, methods, problems = list(given), 0, dict[str, str](), list[Problem]()
     groups = _videos(table, given)
+    how_of = _references(how, groups)
     for done, (name, rows) in enumerate(groups.items()):
         progress("finding backgrounds", done, len(groups), name)
         video = _Video.read(manifest, rows, problems)
-        methods[name], backgrounds = video.backgrounds(how, name, problems)
+        methods[name], backgrounds = video.backgrounds(how_of[name], name, problems)
         for k, place, before_contact in backgrounds:
             if given[k] is None:
                 chosen[k] = os.path.relpath(place, manifest.root).replace(os.sep, "/")
                 before += before_contact
     progress("finding backgrounds", len(groups), len(groups))
-    facts = {**manifest.facts, "backgrounds": f"proposed: {how}"}
+    ways = ", ".join(dict.fromkeys(map(str, how_of.values())))
+    facts = {**manifest.facts, "backgrounds": f"proposed: {ways}"}
     column = pl.Series("background", chosen, dtype=pl.String)
     proposed = Manifest(table.with_columns(column), manifest.root, facts)
     kept, without = len(given) - given.count(None), chosen.count(None)
@@ -166,12 +169,14 @@ class _Video:
         thumbnails: (n, 48, 64, 3).
         row_of: (n,) rows of the table that show each frame; none for further images of the folder.
         contact_of: (n,) the manifest's contact of each frame, if it is a sample.
+        numbers: (n,) frames, where they are known.
     """
 
     paths: list[Path]
     thumbnails: Pixels
     rows_of: list[list[int]]
     contact_of: list[str | None]
+    numbers: list[int | None]
 
     @classmethod
     def read(
@@ -195,12 +200,14 @@ class _Video:
         failed = {k: text for k, text in in_threads(decode, range(len(paths))) if text}
         problems += [Problem(str(paths[k]), "bad-image", text) for k, text in failed.items()]
         good = [k for k in range(len(paths)) if k not in failed]
-        shown = [samples.get(paths[k], []) for k in good]
+        kept = [paths[k] for k in good]
+        shown = [samples.get(path, []) for path in kept]
         return cls(
-            [paths[k] for k in good],
+            kept,
             images[good],
             [[row["row"] for row in some] for some in shown],
             [some[0]["contact"] if some else None for some in shown],
+            [samples[path][0]["frame"] if path in samples else int(path.stem) for path in kept],
         )
 
     def backgrounds(
@@ -210,11 +217,19 @@ class _Video:
         known = self._known()
         touched = {k for first, last in known for k in range(first, last + 1)}
         free = np.array([k for k in range(len(self.paths)) if k not in touched], np.int64)
-        if not len(free):
+        named = isinstance(how, int)
+        if named and how not in self.numbers:
+            must = f"must be the number of a frame of the video {name!r}"
+            fix = "Name a frame for each video"
+            raise PalpateError(must, str(how), fix, argument="how", example={"how": f"{name}=0"})
+        if not len(free) and not named:
             text = "all its images are in contact" if self.paths else "no image can be read"
             problems.append(Problem(name, "no-background", text))
             return "none", []
-        reference = int(free[find_reference(self.thumbnails[free])]) if how == "found" else 0
+        reference = self.numbers.index(how) if named else 0
+        if how == "found":
+            reference = int(free[find_reference(self.thumbnails[free])])
+        how = f"frame {how}" if named else how
         if known:
             energy = contact_energy(self.thumbnails, self.thumbnails[reference])
             runs, method = known, f"contacts of the manifest, reference {how}"
@@ -246,6 +261,22 @@ class _Video:
             if contact is not None:
                 ends[contact] = (ends.get(contact, (k, k))[0], k)
         return sorted(ends.values())
+
+
+def _references(how: How | Mapping[str, How], videos: Collection[str]) -> dict[str, How]:
+    """The reference of each video.
+
+    Raises:
+        PalpateError: on a video that is not there, or a word that is no reference.
+    """
+    given = how if isinstance(how, Mapping) else dict.fromkeys(videos, how)
+    for name, value in given.items():
+        if name not in videos:
+            must, fix = "must be of a video without backgrounds", f"E.g. {next(iter(videos))}"
+            raise PalpateError(must, repr(name), fix, argument="how")
+        if not isinstance(value, int):
+            require_choice("how", value, ("found", "first", "a frame"))
+    return {**dict.fromkeys(videos, "found"), **given}
 
 
 def _videos(table: pl.DataFrame, given: Sequence[str | None]) -> dict[str, list[dict[str, Any]]]:

@@ -53,6 +53,7 @@ class Contacts:
         method: how it was chosen: ``declared`` or ``found``.
         runs: (first, last) frame of each contact, both included.
         backgrounds: for each contact the frame that shows the gel before it.
+        height: how far a contact rises above the frames around it at least, in gray levels.
     """
 
     energy: Floats
@@ -60,6 +61,14 @@ class Contacts:
     method: str
     runs: list[tuple[int, int]]
     backgrounds: list[int]
+    height: float
+
+    def why_none(self) -> str:
+        """Why there is no contact, in words."""
+        return (
+            f"no contact was found: frames differ from frame {self.reference} by at most "
+            f"{self.energy.max():.1f} gray levels, and a contact stands out by {self.height:.1f}"
+        )
 
 
 def thumbnail(image: Any, size: tuple[int, int] = SIZE) -> Pixels:
@@ -86,8 +95,11 @@ def find_contacts(
     else:
         reference = find_reference(thumbnails) if reference is None else reference
         energy = contact_energy(thumbnails, thumbnails[reference])
-    runs, backgrounds = _contacts(energy, _noise(thumbnails), reference)
-    return Contacts(energy, reference, method, runs, backgrounds)
+    smooth = ndimage.median_filter(energy, 5, mode="nearest")
+    strong = PROMINENCE * float(np.quantile(smooth, 0.98))
+    height = max(strong, LEAST, TIMES_NOISE * _noise(thumbnails))
+    runs, backgrounds = _contacts(smooth, height, reference)
+    return Contacts(energy, reference, method, runs, backgrounds, height)
 
 
 def contact_energy(thumbnails: Pixels, reference: Pixels) -> Floats:
@@ -145,18 +157,16 @@ def _noise(thumbnails: Pixels) -> float:
 
 
 def _contacts(
-    energy: Floats, noise: float, reference: int
+    smooth: Floats, height: float, reference: int
 ) -> tuple[list[tuple[int, int]], list[int]]:
-    """First and last frame of each contact, and its background."""
-    smooth = ndimage.median_filter(energy, 5, mode="nearest")
-    height = max(PROMINENCE * float(np.quantile(smooth, 0.98)), LEAST, TIMES_NOISE * noise)
+    """First and last frame of each contact, and its background, by the smooth energy."""
     # The gel is taken as untouched before the video and after it.
     peaks: list[int] = []
     for peak in (signal.find_peaks(np.pad(smooth, 1), prominence=height)[0] - 1).tolist():
         # Equal peaks have no trough between them for scipy.
         if not peaks or smooth[peaks[-1] : peak].min() <= smooth[peak] - height:
             peaks.append(peak)
-    troughs = [0, *(a + int(smooth[a:b].argmin()) for a, b in pairwise(peaks)), len(energy) - 1]
+    troughs = [0, *(a + int(smooth[a:b].argmin()) for a, b in pairwise(peaks)), len(smooth) - 1]
     runs: list[tuple[int, int]] = []
     backgrounds: list[int] = []
     after = -1

@@ -92,7 +92,8 @@ class Imported:
 
     def __str__(self) -> str:
         lists = {"Skipped": self.skipped, "Suspicious, but imported": self.suspicious}
-        rows = self.summary() | _understood(self.manifest)
+        words = words_of(self.manifest.table)
+        rows = self.summary() | templates_of(self.manifest) | ({"captions": words} if words else {})
         return _text(f"Imported {self.facts.get('dataset', '')}", rows, lists)
 
 
@@ -107,6 +108,7 @@ class Validation:
         missing: listed but not there, or there without a partner.
         invalid: there but unusable.
         suspicious: usable, but a person should look.
+        templates: those of a folder, with three rows of what they give.
     """
 
     format: str
@@ -115,6 +117,7 @@ class Validation:
     missing: Sequence[Problem]
     invalid: Sequence[Problem]
     suspicious: Sequence[Problem]
+    templates: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def ok(self) -> bool:
@@ -124,25 +127,26 @@ class Validation:
     def to_json(self) -> dict[str, Any]:
         """Facts, counts and all problems as a JSON object."""
         kinds = ("format", "samples", "ok", "missing", "invalid", "suspicious", "facts")
-        return {kind: plain(getattr(self, kind)) for kind in kinds}
+        return {kind: plain(getattr(self, kind)) for kind in (*kinds, "templates")}
 
     def __str__(self) -> str:
         lists = {k: getattr(self, k.lower()) for k in ("Missing", "Invalid", "Suspicious")}
         counts = {kind.lower(): len(problems) for kind, problems in lists.items()}
-        rows = {"format": self.format, "samples": self.samples, **counts, **readable(self.facts)}
+        rows: dict[str, Any] = {"format": self.format, "samples": self.samples, **counts}
+        rows |= {**self.templates, **readable(self.facts)}
         verdict = "Complete." if self.ok else "Not complete."
         return f"{_text('Validated ' + self.facts.name, rows, lists)}\n{verdict}"
 
 
-def _understood(manifest: Manifest) -> dict[str, str]:
-    """The templates of a folder with three rows of what they gave; what words will be used."""
+def templates_of(manifest: Manifest) -> dict[str, str]:
+    """The templates of a folder, with three rows of what they gave."""
     table, facts = manifest.filled(), manifest.facts
     rows = {c: facts[f"template_{c}"] for c in IMAGE_COLUMNS if f"template_{c}" in facts}
     step = max(1, (len(table) - 1) // (EXAMPLES - 1))
     for k, row in enumerate(table.gather_every(step).head(EXAMPLES).iter_rows(named=True), 1):
         cells = (f"{name}={cell}" for name, cell in row.items() if name not in IMAGE_COLUMNS)
         rows |= {f"example {k}": ", ".join(cells)} if rows else {}
-    return rows | ({"captions": words} if (words := words_of(manifest.table)) else {})
+    return rows
 
 
 def words_of(table: pl.DataFrame) -> str:

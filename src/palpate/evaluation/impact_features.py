@@ -96,9 +96,9 @@ def pixel_sources(
     }
     present = [name for name in ("tactile", "vision") if nulls[name] < len(manifest)]
     if not present:
-        fix = "Fill one of the columns, or pass features by name"
+        fix = "Import the data set with its images (palpate import), and take the import"
         must = "Pixels as features need vision or tactile images"
-        raise PalpateError(must, "a manifest without either", fix)
+        raise PalpateError(must, "names alone", fix)
     sources: list[Source] = []
     notes = [Note("no-images", {"column": n}) for n in ("tactile", "vision") if n not in present]
     for name in present:

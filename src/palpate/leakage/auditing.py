@@ -161,7 +161,12 @@ def audit(  # noqa: PLR0913
         progress,
     )
     _check(options)
-    require(not (impact and test is not None), "impact", "needs samples with a split", "no split")
+    if impact is not None and test is not None:
+        must, fix = (
+            "needs all samples and a split",
+            "Import the data set, and audit it with a split",
+        )
+        raise PalpateError(must, "train and test apart", fix, argument="impact")
     sources = [x for x in (train_or_data, test, pretrain) if x is not None]
     read = read_all(sources, skip_bad, progress, root, reading)
     parts = [source.manifest for source in read]
@@ -311,7 +316,9 @@ def _compare(
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])
     in_shared = int(b[group].is_in(in_both).fill_null(False).sum()) if in_both else 0
-    gaps = nearest_in_video(*by_contact(*(in_time(t) if options.ids_in_time else t for t in (a, b))))
+    gaps = nearest_in_video(
+        *by_contact(*(in_time(t) if options.ids_in_time else t for t in (a, b)))
+    )
     flags = _signals(train, test, group, gaps, options, named=shared)
     leaks = leaking(flags, len(test))
     reason = _reason(train, test, group, flags, options, named=not equal)

@@ -162,6 +162,7 @@ def _read_table(
     cells = compiled.apply(frame)
     result.problems += table.problems
     _report_unchanged(result, compiled, frame, cells)
+    sides = [side for side in sides if any(cells[side])] or sides  # a column may be empty
     rows, result.inconclusive = manifest_rows(
         cells, len(table.lines), table.where, classes, result.problems
     )

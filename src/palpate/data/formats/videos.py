@@ -29,7 +29,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Problem, Progress, Split, quiet
+from palpate.core import PalpateError, Problem, ProblemsError, Progress, Split, quiet
 from palpate.data.contacts import Contacts, find_contacts, thumbnail
 from palpate.data.formats import touch_and_go
 from palpate.data.formats.base import Cells, Facts, Format, Scan, few
@@ -167,6 +167,7 @@ def run(  # noqa: PLR0913 (a public verb)
         contacts = _contacts(work, videos, progress)
         rows = _rows(work, videos, contacts, every)
         rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
+        _require_contact(work, rows)
         rows = extracted(work, rows, result.base, skip_bad=skip_bad, progress=progress)
         _copy_images(work, rows, videos)
         cells = _cells(work, rows, videos, sensor)
@@ -306,8 +307,16 @@ def _contacts(
         contacts[video] = found[0]
         work.suspicious += [Problem(video, *problem) for problem in found[1]]
         if found[0] is not None and not found[0].runs:
-            work.suspicious.append(Problem(video, "no-contact", "no contact was found in it"))
+            work.suspicious.append(Problem(video, "no-contact", found[0].why_none()))
     return contacts
+
+
+def _require_contact(work: Recordings, rows: list[Row]) -> None:
+    """Raise if no video has a contact, and nothing else is wrong."""
+    none = [problem for problem in work.suspicious if problem.kind == "no-contact"]
+    if none and not rows and not work.problems:
+        fix = "Give an image of the untouched gel, or take frames in contact or not"
+        raise ProblemsError(none, fix, example={"every": 10})
 
 
 def _rows(
