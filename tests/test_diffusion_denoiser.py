@@ -12,7 +12,7 @@ from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Schedule, UNetOptions, build_unet
 from palpate.diffusion.presets import MINI, PAPER, PRESETS, preset_named
 from palpate.diffusion.training import DiffusionLoss, train_denoiser
-from palpate.training.loop import LoopOptions
+from palpate.training.options import LoopOptions, Step
 
 UNET = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
 POLICY = ConditionPolicy(width=12)
@@ -148,15 +148,23 @@ def recorder(policy: ConditionPolicy) -> Recorder:
     )
 
 
+def diffusion_loss(z, tokens, policy=POLICY, schedule=None):
+    settings = {"stats": PLAIN, "schedule": schedule or Schedule(), "policy": policy}
+    return DiffusionLoss(z, tokens, None, **settings)
+
+
+def evaluate(loss, model, seed=0):
+    return loss(model, loss.load(Step(0, np.arange(len(loss.latents)), seed)))
+
+
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 def test_loss_is_equation_1(prediction):
     z = torch.randn(40, 3, 8, 8)
     tokens = torch.randn(40, 1, 12)
-    schedule = Schedule(prediction=prediction)
-    loss = DiffusionLoss(z, {"text": tokens}, None, PLAIN, schedule)
-    model = recorder(replace(POLICY, dropout=0.0))
-    rows = torch.arange(40)
-    value, logs = loss(model, rows, torch.Generator().manual_seed(5), 0)
+    policy = replace(POLICY, dropout=0.0)
+    loss = diffusion_loss(z, {"text": tokens}, policy, Schedule(prediction=prediction))
+    model = recorder(policy)
+    value, logs, _ = evaluate(loss, model, 5)
     x, t, seen, _ = model.seen
     assert torch.equal(seen, tokens)
     # The network sees sqrt(a) z + sqrt(1 - a) eps: recover eps. With answer 0 the loss is the mean
@@ -173,15 +181,10 @@ def test_loss_is_equation_1(prediction):
 
 
 def test_time_is_uniform_over_all_steps():
-    loss = DiffusionLoss(
-        torch.zeros(4000, 3, 2, 2),
-        {"text": torch.zeros(4000, 1, 12)},
-        None,
-        PLAIN,
-        Schedule(steps=10),
-    )
+    tokens = {"text": torch.zeros(4000, 1, 12)}
+    loss = diffusion_loss(torch.zeros(4000, 3, 2, 2), tokens, schedule=Schedule(steps=10))
     model = recorder(POLICY)
-    loss(model, torch.arange(4000), torch.Generator().manual_seed(0), 0)
+    evaluate(loss, model)
     counts = torch.bincount(model.seen[1], minlength=10)
     assert len(counts) == 10
     assert counts.min() > 320
@@ -193,9 +196,8 @@ def test_min_snr_weight():
     t = torch.tensor([0, 200, 999])
     snr = (alphas / (1 - alphas))[t]
     for prediction, extra in (("epsilon", 0), ("v_prediction", 1)):
-        loss = DiffusionLoss(
-            torch.zeros(1, 3, 2, 2), {}, None, PLAIN, Schedule(prediction=prediction, min_snr=5.0)
-        )
+        schedule = Schedule(prediction=prediction, min_snr=5.0)
+        loss = diffusion_loss(torch.zeros(1, 3, 2, 2), {}, schedule=schedule)
         assert loss.weight(t).tolist() == pytest.approx(
             (snr.clamp(max=5) / (snr + extra)).tolist(), rel=1e-5
         )
@@ -203,9 +205,10 @@ def test_min_snr_weight():
 
 def test_dropout_replaces_a_tenth_of_the_conditions_by_null():
     tokens = torch.ones(3000, 2, 12)
-    loss = DiffusionLoss(torch.zeros(3000, 3, 2, 2), {"text": tokens}, None, PLAIN, Schedule())
-    model = recorder(replace(POLICY, tokens=2))
-    loss(model, torch.arange(3000), torch.Generator().manual_seed(0), 0)
+    policy = replace(POLICY, tokens=2)
+    loss = diffusion_loss(torch.zeros(3000, 3, 2, 2), {"text": tokens}, policy)
+    model = recorder(policy)
+    evaluate(loss, model)
     dropped = (model.seen[2] == 0).all(-1)
     assert torch.equal(dropped[:, 0], dropped[:, 1])
     assert 0.08 < dropped[:, 0].float().mean() < 0.12
@@ -213,9 +216,10 @@ def test_dropout_replaces_a_tenth_of_the_conditions_by_null():
 
 def test_noise_moves_tokens_but_keeps_their_length():
     tokens = torch.nn.functional.normalize(torch.randn(200, 1, 12), dim=2) * 12**0.5
-    loss = DiffusionLoss(torch.zeros(200, 3, 2, 2), {"text": tokens}, None, PLAIN, Schedule())
-    model = recorder(replace(POLICY, dropout=0.0, noise=0.5))
-    loss(model, torch.arange(200), torch.Generator().manual_seed(0), 0)
+    policy = replace(POLICY, dropout=0.0, noise=0.5)
+    loss = diffusion_loss(torch.zeros(200, 3, 2, 2), {"text": tokens}, policy)
+    model = recorder(policy)
+    evaluate(loss, model)
     seen = model.seen[2]
     assert torch.allclose(seen.norm(dim=2), torch.full((200, 1), 12**0.5), atol=1e-4)
     cosine = torch.nn.functional.cosine_similarity(seen[:, 0], tokens[:, 0])
@@ -224,9 +228,10 @@ def test_noise_moves_tokens_but_keeps_their_length():
 
 def test_mixed_source_draws_from_both():
     tables = {"text": torch.zeros(2000, 1, 12), "vision": torch.ones(2000, 1, 12)}
-    loss = DiffusionLoss(torch.zeros(2000, 3, 2, 2), tables, None, PLAIN, Schedule())
-    model = recorder(replace(POLICY, dropout=0.0, source="mixed"))
-    loss(model, torch.arange(2000), torch.Generator().manual_seed(0), 0)
+    policy = replace(POLICY, dropout=0.0, source="mixed")
+    loss = diffusion_loss(torch.zeros(2000, 3, 2, 2), tables, policy)
+    model = recorder(policy)
+    evaluate(loss, model)
     share = model.seen[2][:, 0, 0].mean()
     assert 0.46 < share < 0.54
 

@@ -15,7 +15,7 @@ from palpate.diffusion.denoiser import ConditionPolicy, Schedule, UNetOptions
 from palpate.diffusion.presets import TINY
 from palpate.diffusion.training import train_denoiser, train_pipeline
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.training.loop import LoopOptions
+from palpate.training.options import LoopOptions
 
 
 def train(folder: Path, steps: int, start=None, **changes):

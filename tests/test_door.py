@@ -37,9 +37,13 @@ SIGNATURES = {
     "split": (
         "data * by train val seed folds near noleak nulls tolerance cache reading skip_bad progress"
     ),
-    "train_encoder": "data split * preset clip output epochs targets seed device progress",
+    "train_encoder": (
+        "data split * preset clip output epochs targets weights partners held_out seed device"
+        " compute progress"
+    ),
     "train_generator": (
-        "data split clip * preset autoencoder output source background steps seed device progress"
+        "data split clip * preset autoencoder output source background steps seed device compute"
+        " progress"
     ),
     "validate": "source * format check progress **options",
     "Encoder.from_pretrained": "source * modality device",

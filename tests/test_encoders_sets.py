@@ -25,8 +25,9 @@ from palpate.encoders.encoder_set import (
     to_unit,
 )
 from palpate.encoders.models import pick_device
-from palpate.encoders.presets import Augment, preset
+from palpate.encoders.presets import Augment, augmented, preset
 from palpate.encoders.tokenizer import train_tokenizer
+from palpate.training.options import Step
 
 TINY = preset("tiny")
 TEXTS = [
@@ -250,14 +251,18 @@ def test_preprocess_equals_transformers_processor():
 
 def test_augmentation():
     images = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
-    seeded = lambda s: torch.Generator().manual_seed(s)  # noqa: E731
+
+    def changed(augment, seed):
+        return augmented(images, augment.draw(Step(0, np.arange(len(images)), seed)))
+
     nothing = Augment(crop=0, gain=0, offset=0)
-    assert torch.allclose(nothing(images, seeded(1)), images, atol=1e-5)
+    assert torch.allclose(changed(nothing, 1), images, atol=1e-5)
     some = Augment()
-    assert torch.equal(some(images, seeded(1)), some(images, seeded(1)))
-    assert not torch.equal(some(images, seeded(1)), some(images, seeded(2)))
+    assert torch.equal(changed(some, 1), changed(some, 1))
+    assert not torch.equal(changed(some, 1), changed(some, 2))
     # only mirrors and turns: each result is one of the eight symmetries of its image
-    turned = Augment(crop=0, gain=0, offset=0, flips=True, quarter_turns=True)(images, seeded(3))
+    symmetries = Augment(crop=0, gain=0, offset=0, flips=True, quarter_turns=True)
+    turned = changed(symmetries, 3)
     seen = set()
     for image, result in zip(images, turned, strict=True):
         ways = [torch.rot90(p, k, (1, 2)) for p in (image, image.flip(2)) for k in range(4)]
@@ -265,7 +270,7 @@ def test_augmentation():
         assert len(match) == 1
         seen.update(match)
     assert len(seen) > 1
-    lit = Augment(crop=0, gain=0.3, offset=0.2)(images, seeded(4))
+    lit = changed(Augment(crop=0, gain=0.3, offset=0.2), 4)
     for image, result in zip(images, lit, strict=True):  # one straight line through all pixels
         line = np.polyfit(image.flatten().numpy(), result.flatten().numpy(), 1)
         assert np.allclose(

@@ -60,6 +60,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "tactile": encoders.digest("tactile"),
         "clip": encoders.clip.name,
         "split": encoders.card["split"],
+        "processes": encoders.card["processes"],
     }
     for row in encoders.card.get("scores", ()):
         facts["test_material_accuracy"] = row["value"]

@@ -100,6 +100,8 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("generate", "photos"): "PATH",
 }
 
+#: Of several processes that torchrun started, the first one writes; errors are everyone's.
+FIRST = os.environ.get("RANK", "0") == "0"
 #: What would break a line of the terminal, or color it.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 #: A flag without its negation: for options that are off by default.
@@ -125,10 +127,10 @@ class Terminal:
     def __init__(self, options: Common, command: str = "") -> None:
         self.command = command
         self.json = options.as_json
-        self.silent = options.quiet
+        self.silent = options.quiet or not FIRST
         # Piped text is not wrapped: digests and paths must stay whole.
         width = None if sys.stdout.isatty() else 400
-        self.out = Console(highlight=False, quiet=self.json, width=width)
+        self.out = Console(highlight=False, quiet=self.json or not FIRST, width=width)
         self.err = Console(stderr=True, highlight=False, quiet=self.silent)
 
     def print_line(self, line: str) -> None:
@@ -467,7 +469,7 @@ def run_verb(name: str, args: Sequence[str]) -> int:
             warnings.simplefilter("ignore", PalpateWarning)  # results carry them as notes
             _require_words(args)
             result, status = _call(name, args)
-        if as_json:
+        if as_json and FIRST:
             _write_json(result)
         return status
     except (PalpateError, OSError) as caught:

@@ -70,6 +70,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "steps": record["loop"]["steps"],
         "batch": record["loop"]["batch"],
         "learning_rate": record["loop"]["lr"],
+        "processes": record["processes"],
         "source": record["source"],
         "background": record["background"],
     }

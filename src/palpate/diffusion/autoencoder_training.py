@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +31,9 @@ from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
 from palpate.diffusion.autoencoder import Autoencoder, to_bytes
 from palpate.encoders.encoder_set import seeded, to_unit
 from palpate.metrics.images import psnr_per_image, ssim_per_image
-from palpate.training.loop import LoopOptions, fit
+from palpate.training.engine import Batch, Losses, Task, fit
+from palpate.training.options import Compute, LoopOptions, Step
+from palpate.training.processes import gather_rows
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,7 @@ def train_autoencoder(
     seed: int = 0,
     key: str = "",
     device: str | torch.device = "cpu",
+    compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> Autoencoder:
     """Trains an autoencoder; resumes if ``folder`` holds a part of the same run.
@@ -113,6 +115,7 @@ def train_autoencoder(
         seed: of weights, order, crops and noise.
         key: digest of the images.
         device: where to train.
+        compute: how to run it on the machine at hand.
         progress: called after each step.
 
     Returns:
@@ -128,12 +131,15 @@ def train_autoencoder(
     key = digest_json([key, asdict(options), seed])
     free = LoopOptions(options.steps_free, options.batch, options.lr, weight_decay=1e-4, seed=seed)
     last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
-    common: dict[str, Any] = {"key": key, "progress": progress}
-    loss = _Loss(images, options, quantize=False)
-    fit(model, loss, len(images), free, folder / "free", what="autoencoder", **common)
+
+    def run(what: str, course: LoopOptions, stage: str, *, quantize: bool) -> None:
+        loss = _Loss(images, options, quantize=quantize)
+        task = Task(what, len(images), loss.load, loss, key)
+        fit(model, task, course, folder / stage, compute=compute, progress=progress)
+
+    run("autoencoder", free, "free", quantize=False)
     _set_codebook(model, images, options, seed)
-    loss = _Loss(images, options, quantize=True)
-    fit(model, loss, len(images), last, folder / "quantized", what="codebook", **common)
+    run("codebook", last, "quantized", quantize=True)
     model.card = {"options": asdict(options), "seed": seed, "images": len(images), "key": key}
     if held_out is not None and len(held_out):
         model.card["held_out"] = asdict(measure_reconstruction(model, held_out))
@@ -148,34 +154,41 @@ class _Loss:
     ) -> None:
         self.images, self.options, self.quantize = images, options, quantize
 
-    def __call__(
-        self, module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
-    ) -> tuple[Tensor, dict[str, float]]:
+    def load(self, step: Step) -> Batch:
+        """Images, cropped in stage 1, and noise for their latents."""
+        options = self.options
+        x = torch.from_numpy(np.array(self.images[step.rows])).permute(0, 3, 1, 2)
+        if self.quantize:
+            return {"images": x}
+        x = _crops(x, options.crop, step)
+        factor = options.patch * 2 ** (len(options.widths) - 1)
+        sides = (side // factor for side in x.shape[2:])
+        return {"images": x, "noise": step.randn(options.channels, *sides)}
+
+    def __call__(self, module: nn.Module, batch: Batch) -> Losses:
         assert isinstance(module, Autoencoder)
-        options, device = self.options, next(module.parameters()).device
-        x = to_unit(self.images[rows.numpy()], signed=True)
-        x = (x if self.quantize else _crops(x, options.crop, generator)).to(device)
+        options = self.options
+        x = batch["images"].float() / 127.5 - 1
         z = module.latents(x)
         if not self.quantize and options.noise:
-            noise = torch.randn(z.shape, generator=generator).to(device)
-            z = z + options.noise * z.detach().std() * noise
+            z = z + options.noise * gather_rows(z.detach()).std() * batch["noise"]
         y, codebook = module.image(z, quantize=self.quantize)
-        error = y - x
+        error = y.float() - x
         edges = torch.diff(error, dim=3).square().mean() + torch.diff(error, dim=2).square().mean()
         square = error.square().mean()
         loss = options.l1 * error.abs().mean() + options.l2 * square + options.edge * edges
         if self.quantize:
             loss = loss + options.codebook * codebook
-        return loss, {"psnr": float(10 * torch.log10(4 / square.detach()))}
+        psnr = 10 * torch.log10(4 / square.detach())
+        return Losses(loss, {"psnr": psnr}, error.detach().mean((1, 2, 3)))
 
 
-def _crops(x: Tensor, side: int, generator: torch.Generator) -> Tensor:
+def _crops(x: Tensor, side: int, step: Step) -> Tensor:
     """A random square of ``side`` pixels from each image."""
     if not side or side == min(x.shape[2:]):
         return x
-    n, _, height, width = x.shape
-    top = torch.randint(0, height - side + 1, (n,), generator=generator).tolist()
-    left = torch.randint(0, width - side + 1, (n,), generator=generator).tolist()
+    height, width = x.shape[2:]
+    top, left = step.randint(height - side + 1).tolist(), step.randint(width - side + 1).tolist()
     corners = zip(x, top, left, strict=True)
     return torch.stack([image[:, t : t + side, c : c + side] for image, t, c in corners])
 

@@ -33,7 +33,7 @@ from palpate.core import require_choice
 from palpate.diffusion.autoencoder_training import AutoencoderOptions
 from palpate.diffusion.denoiser import ConditionPolicy, Schedule, UNetOptions
 from palpate.diffusion.pipeline import SamplerOptions
-from palpate.training.loop import LoopOptions
+from palpate.training.options import LoopOptions
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from palpate.core import (
     Split,
     atomic_path,
     digest_json,
+    digest_lines,
     quiet,
     read_json,
     write_json,
@@ -55,7 +56,9 @@ from palpate.encoders.contrastive import load_manifest, train_part
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, pick_device
-from palpate.training.loop import LoopOptions, fit, work_folder
+from palpate.training.engine import Batch, Losses, Task, fit
+from palpate.training.options import Compute, LoopOptions, Step
+from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
 
 CACHE_FORMAT = "palpate-latents/1"
 Sources = Literal["text", "vision", "mixed"]
@@ -74,6 +77,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
     steps: int | None = None,
     seed: int = 0,
     device: str = "auto",
+    compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> TactilePipeline:
     """Train a generator on the train part of a split; run again with one ``output`` to resume.
@@ -93,6 +97,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
         steps: optimizer steps; default: the preset's.
         seed: of weights, order, noise and condition dropout.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        compute: how to run it on the machine at hand.
         progress: called while the work goes on.
 
     Raises:
@@ -106,6 +111,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
     if autoencoder is None and chosen.autoencoder is None:
         must, fix = f"must be given for the preset {chosen.name}", "Pass a hub id or a folder"
         raise PalpateError(must, "none", fix, argument="autoencoder")
+    device = connect(device)
     manifest, split = load_manifest(data), Split.load(split)
     encoders = clip if isinstance(clip, EncoderSet) else EncoderSet(load_clip(clip))
     output = None if output is None else Path(output)
@@ -113,10 +119,11 @@ def train_generator(  # noqa: PLR0913 - a public verb
         cache = work / "cache"
         if autoencoder is None:
             train, others = train_part(manifest, split), manifest.part(split, "val", "test")
-            images, held_out = (
-                cached_images(part, "tactile", chosen.size, cache, progress) if len(part) else None
-                for part in (train, others)
-            )
+            with first_alone():
+                images, held_out = (
+                    cached_images(p, "tactile", chosen.size, cache, progress) if len(p) else None
+                    for p in (train, others)
+                )
             assert images is not None
             assert chosen.autoencoder is not None
             autoencoder = train_autoencoder(
@@ -127,6 +134,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
                 seed=seed,
                 key=image_stamp(train, "tactile"),
                 device=pick_device(device),
+                compute=compute,
                 progress=progress,
             )
         elif not isinstance(autoencoder, Autoencoder):
@@ -144,10 +152,12 @@ def train_generator(  # noqa: PLR0913 - a public verb
             background=background,
             cache=cache,
             device=device,
+            compute=compute,
             progress=progress,
         )
-        if output is not None:
+        if output is not None and place()[0] == 0:
             pipeline.save(output)
+            keep_logs(work, output)
     return pipeline
 
 
@@ -166,6 +176,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     start: TactilePipeline | None = None,
     cache: Path | None = None,
     device: str = "auto",
+    compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> TactilePipeline:
     """Train the denoiser of a pipeline on the train part of a split; run again to resume.
@@ -187,6 +198,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
             goes into the new one, so that the data it was trained on stays declared.
         cache: folder for decoded pixels and embeddings.
         device: see :func:`palpate.encoders.models.pick_device`.
+        compute: how to run it on the machine at hand.
         progress: called while the work goes on.
 
     Raises:
@@ -196,21 +208,25 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     train = train_part(manifest, split)
     if start is not None:
         _require_same(start, encoders, autoencoder, preset)
-    place = pick_device(device)
-    encoders.to(place)
-    autoencoder.to(place)
-    _, text_source = texts_of(train)
-    conditions: dict[Source, NDArray[Any]] = {
-        s: embed(train, encoders, s, cache=cache, progress=progress).features for s in SOURCES
-    }
+    where = pick_device(connect(device))
+    encoders.to(where)
+    autoencoder.to(where)
+    texts, text_source = texts_of(train)
+    keys = [digest_lines(texts), image_stamp(train, "vision"), autoencoder.digest]
+    keys += [encoders.digest(source) for source in SOURCES]
 
     def latents_of(column: str) -> NDArray[np.float32]:
         images = cached_images(train, column, preset.size, cache, progress)
-        key = digest_json([train.digest, image_stamp(train, column), preset.size])
-        place = folder / f"latents-{column}"
-        return encode_latents(autoencoder, images, train.ids, place, key=key, progress=progress)
+        keys.append(digest_json([train.digest, image_stamp(train, column), preset.size]))
+        work = folder / f"latents-{column}"
+        return encode_latents(autoencoder, images, train.ids, work, key=keys[-1], progress=progress)
 
-    latents = latents_of("tactile")
+    with first_alone():
+        conditions: dict[Source, NDArray[Any]] = {
+            s: embed(train, encoders, s, cache=cache, progress=progress).features for s in SOURCES
+        }
+        latents = latents_of("tactile")
+        ground = latents_of("background") if background else None
     stats = LatentStats.of(latents, preset.latent_scale) if start is None else start.stats
     policy = preset.condition_for(encoders.dim)
     policy = policy if source is None else replace(policy, source=source)
@@ -225,9 +241,12 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         schedule=preset.schedule,
         loop=loop,
         folder=folder / "denoiser",
-        background=latents_of("background") if background else None,
+        background=ground,
         start=start.denoiser if start else None,
-        device=place,
+        key=digest_json(keys),
+        names=train.ids,
+        device=where,
+        compute=compute,
         progress=progress,
     )
     record = {
@@ -244,6 +263,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         "loop": asdict(loop),
         "unet": asdict(preset.unet),
         "seed": seed,
+        "processes": place()[1],
         "palpate": __version__,
         "parameters": sum(p.numel() for p in denoiser.unet.parameters()),
         "synthetic": bool(manifest.synthetic),
@@ -333,7 +353,10 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     folder: Path,
     background: Tensor | NDArray[Any] | None = None,
     start: Denoiser | None = None,
+    key: str = "",
+    names: Sequence[str] | None = None,
     device: str | torch.device = "cpu",
+    compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> Denoiser:
     """Train a denoiser; resume if ``folder`` holds a checkpoint of the same run.
@@ -351,7 +374,10 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         background: latents (n, c, h, w) of the no-contact images, for the variant w/ BG.
         start: go on from these weights instead of random ones, in the same geometry. The modality
             means are those of ``conditions`` all the same.
+        key: digest of latents, conditions and background, which are not read for it.
+        names: of the rows, for errors.
         device: where to train.
+        compute: how to run it on the machine at hand.
         progress: called after each step.
 
     Returns:
@@ -378,15 +404,12 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         tokens: dict[Source, Tensor] = {
             s: model.tokens(tables[s], s).to("cpu") for s in policy.sources
         }
-    data = {f"tokens.{s}": value for s, value in tokens.items()}
-    data["latents"] = torch.tensor(np.asarray(latents))
-    if background is not None:
-        data["background"] = torch.tensor(np.asarray(background))
     facts = [asdict(settings) for settings in (stats, unet, policy, schedule)]
     begin = [] if start is None else [digest_tensors(start.unet.state_dict())]
-    key = digest_json(["", *facts, digest_tensors(data), *begin])
-    loss = DiffusionLoss(latents, tokens, background, stats, schedule)
-    fit(model, loss, len(latents), loop, folder, what="generator", key=key, progress=progress)
+    loss = DiffusionLoss(latents, tokens, background, stats=stats, schedule=schedule, policy=policy)
+    key = digest_json([key, background is not None, *facts, *begin])
+    task = Task("generator", len(latents), loss.load, loss, key, names)
+    fit(model, task, loop, folder, compute=compute, progress=progress)
     return model.eval().requires_grad_(False)
 
 
@@ -402,55 +425,64 @@ def _copy_weights(source: Denoiser, target: Denoiser) -> None:
 
 
 class DiffusionLoss:
-    """Eq. 1 for one batch; all draws come from the loop's generator of (seed, step)."""
+    """Eq. 1 for one batch; all draws are those of the step."""
 
     def __init__(
         self,
         latents: Tensor | NDArray[Any],
         tokens: Mapping[Source, Tensor],
         background: Tensor | NDArray[Any] | None,
+        *,
         stats: LatentStats,
         schedule: Schedule,
+        policy: ConditionPolicy,
     ) -> None:
         """Take latents and backgrounds (n, c, h, w), not normalized, and tokens (n, k, d)."""
         self.latents, self.tokens, self.background = latents, dict(tokens), background
-        self.stats, self.schedule, self.alphas = stats, schedule, schedule.alphas()
+        self.stats, self.schedule, self.policy = stats, schedule, policy
+        self.alphas = schedule.alphas()
 
-    def __call__(
-        self, module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
-    ) -> tuple[Tensor, dict[str, float]]:
-        """Return the weighted error of a batch, and the unweighted to log; see ``LossFunction``."""
-        assert isinstance(module, Denoiser)
-        policy, n, device = module.policy, len(rows), module.device
-        z = self.stats.normalize(_take(self.latents, rows))
-        t = torch.randint(0, self.schedule.steps, (n,), generator=generator)
-        noise = torch.randn(z.shape, generator=generator)
-        tokens = self._tokens(rows, policy, generator).to(device)
-        dropped = torch.rand(n, generator=generator) < policy.dropout
+    def load(self, step: Step) -> Batch:
+        """Noisy latents, their targets, tokens and which of these are dropped."""
+        z = self.stats.normalize(_take(self.latents, step.rows))
+        t = step.randint(self.schedule.steps)
+        noise = step.randn(*z.shape[1:])
+        tokens = self._tokens(step)
+        dropped = step.rand() < self.policy.dropout
         a = self.alphas[t].float().reshape(-1, 1, 1, 1)
-        noisy = a.sqrt() * z + (1 - a).sqrt() * noise
         epsilon = self.schedule.prediction == "epsilon"
-        target = noise if epsilon else a.sqrt() * noise - (1 - a).sqrt() * z
-        tokens = torch.where(dropped.reshape(-1, 1, 1).to(device), module.null_tokens(n), tokens)
-        ground = None
+        batch = {
+            "noisy": a.sqrt() * z + (1 - a).sqrt() * noise,
+            "target": noise if epsilon else a.sqrt() * noise - (1 - a).sqrt() * z,
+            "t": t,
+            "weight": self.weight(t),
+            "tokens": tokens,
+            "dropped": dropped.reshape(-1, 1, 1),
+        }
         if self.background is not None:
-            ground = self.stats.normalize(_take(self.background, rows)).to(device)
-        prediction = module(noisy.to(device), t.to(device), tokens, ground)
-        error = (prediction - target.to(device)).square().mean((1, 2, 3))
-        loss = (self.weight(t).to(device) * error).mean()
-        return loss, {"mse": float(error.detach().mean())}
+            batch["background"] = self.stats.normalize(_take(self.background, step.rows))
+        return batch
 
-    def _tokens(self, rows: Tensor, policy: ConditionPolicy, generator: torch.Generator) -> Tensor:
-        parts = [self.tokens[s][rows] for s in policy.sources]
+    def __call__(self, module: nn.Module, batch: Batch) -> Losses:
+        """Return the weighted error of a batch, and the unweighted to log."""
+        assert isinstance(module, Denoiser)
+        null = module.null_tokens(len(batch["t"]))
+        tokens = torch.where(batch["dropped"], null, batch["tokens"])
+        prediction = module(batch["noisy"], batch["t"], tokens, batch.get("background"))
+        error = (prediction.float() - batch["target"]).square().mean((1, 2, 3))
+        mse = error.detach().mean()
+        return Losses((batch["weight"] * error).mean(), {"mse": mse}, error.detach())
+
+    def _tokens(self, step: Step) -> Tensor:
+        parts = [self.tokens[s][step.rows] for s in self.policy.sources]
         tokens = parts[0]
         if len(parts) == 2:
-            coin = torch.rand(len(rows), 1, 1, generator=generator)
-            tokens = torch.where(coin < 0.5, parts[0], parts[1])
-        if policy.noise:
+            tokens = torch.where(step.rand(1, 1) < 0.5, parts[0], parts[1])
+        if self.policy.noise:
             # One draw per sample: the k tokens stay copies of each other.
-            noise = torch.randn(len(rows), 1, policy.width, generator=generator)
-            tokens = nn.functional.normalize(tokens + policy.noise * noise, dim=2)
-            tokens = tokens * policy.width**0.5
+            noise = step.randn(1, self.policy.width)
+            tokens = nn.functional.normalize(tokens + self.policy.noise * noise, dim=2)
+            tokens = tokens * self.policy.width**0.5
         return tokens
 
     def weight(self, t: Tensor) -> Tensor:
@@ -462,5 +494,5 @@ class DiffusionLoss:
         return snr.clamp(max=self.schedule.min_snr) / (snr if epsilon else snr + 1)
 
 
-def _take(table: Tensor | NDArray[Any], rows: Tensor) -> Tensor:
-    return torch.as_tensor(table[rows.numpy()])
+def _take(table: Tensor | NDArray[Any], rows: NDArray[np.int64]) -> Tensor:
+    return torch.as_tensor(table[rows])

@@ -1,67 +1,77 @@
-"""Contrastive training (paper section 3). Rows of a, b are L2-normalized and belong together:
+"""Training of encoders by contrast (paper section 3; the losses are in ``losses``).
 
-    L_ab = -1/(2N) sum_i [ log softmax_j(a_i.b_j / tau)_i + log softmax_j(b_i.a_j / tau)_i ],
-    L    = (w_1 L_tactile,text + w_2 L_vision,text + w_3 L_tactile,vision) / (w_1 + w_2 + w_3)
-
-1 / tau is learned, from 1 / 0.07, and kept at or below 100. Vision and text are frozen, so
-L_vision,text moves only the temperature; it stays in the loss and in the log because the paper has
-it there.
-
-Captions repeat: every frame of a video, and often every object of a kind, has the same one, so the
-plain diagonal calls equal texts negatives. ``targets="identical-text"`` spreads the target mass of
-the two text pairs equally over rows with equal text: the default of the preset mini; ``diagonal``
-is the paper's.
+Vision and text are frozen, so L_vision,text moves only the temperature; it stays in the loss and in
+the log because the paper has it there. With ``partners="trainable"`` both learn along.
 
 The tactile encoder trains on the train part of a split only, against embeddings of the frozen
-encoders that are computed once. With one process all negatives are in the loss.
+encoders that are computed once. The batch stays whole on any number of processes and however many
+rows the encoder sees at a time: every row is compared with all others of the batch.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 import transformers
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import cross_entropy
 from transformers import CLIPModel, CLIPVisionModelWithProjection
 
 from palpate import __version__
-from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet
+from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, rng_for
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     ClipEncoders,
     EncoderSet,
-    Modality,
     Preprocess,
     encode_tactile,
     load_clip,
     new_tactile,
     seeded,
-    to_unit,
+)
+from palpate.encoders.losses import (
+    ALL_PAIRS,
+    LOG_SCALE_START,
+    Labels,
+    Targets,
+    clamped_scale,
+    in_chunks,
+    require_weights,
+    three_way,
 )
 from palpate.encoders.models import move, pick_device
-from palpate.encoders.presets import Augment, EncoderPreset, Targets, preset
+from palpate.encoders.presets import EncoderPreset, augmented, preset
+from palpate.encoders.rows import Rows, numbers, unit
 from palpate.encoders.seen import digest_images, union
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
-from palpate.training.loop import LoopOptions, fit, work_folder
+from palpate.training.engine import Batch, Losses, Task, fit
+from palpate.training.options import Compute, LoopOptions, Step
+from palpate.training.processes import (
+    connect,
+    first_alone,
+    gather_rows,
+    keep_logs,
+    place,
+    work_folder,
+)
 
-#: The learned parameter is the logarithm of 1 / tau.
-LOG_SCALE_START, LOG_SCALE_MAX = math.log(1 / 0.07), math.log(100.0)
+Partners = Literal["frozen", "trainable"]
 
 
-def train_encoder(
+def train_encoder(  # noqa: PLR0913 - a public verb
     data: Manifest | str | Path,
     split: Split | str | Path,
     *,
@@ -70,14 +80,19 @@ def train_encoder(
     output: Path | str | None = None,
     epochs: float | None = None,
     targets: Targets | None = None,
+    weights: Sequence[float] = ALL_PAIRS,
+    partners: Partners = "frozen",
+    held_out: float = 0.0,
     seed: int = 0,
     device: str = "auto",
+    compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> EncoderSet:
-    """Train a tactile encoder on the train part of a split, against frozen vision and text.
+    """Train a tactile encoder on the train part of a split, against vision and text.
 
     The accuracy of a linear material probe on the test part goes into the card
-    (``card["scores"]``). Run again with the same ``output`` to resume.
+    (``card["scores"]``). Run again with the same ``output`` to resume. Under ``torchrun`` every
+    process calls this; the first one writes.
 
     Args:
         data: a manifest, or anything that :func:`palpate.data.load` reads.
@@ -87,9 +102,14 @@ def train_encoder(
             small one that is trained first on the same train part.
         output: folder for the encoders, new or empty; None keeps them in memory.
         epochs: of the tactile encoder; default: the preset's.
-        targets: ``diagonal`` or ``identical-text``; default: the preset's.
+        targets: see :data:`~palpate.encoders.losses.Targets`; default: the preset's.
+        weights: of the pairs tactile-text, vision-text, tactile-vision; 0 switches one off.
+        partners: ``trainable``: vision and text learn along with the tactile encoder.
+        held_out: share of the train part, by video, on which loss and probe are measured while it
+            trains, if the split has no part ``val``; which is taken where there is one.
         seed: of weights, order and augmentation.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        compute: how to run it on the machine at hand.
         progress: called while the work goes on.
 
     Returns:
@@ -101,30 +121,34 @@ def train_encoder(
     if epochs is not None and not 0 < epochs < math.inf:
         fix = "Leave it out for the preset's length"
         raise PalpateError("must be a positive number", str(epochs), fix, argument="epochs")
-    chosen = preset_of(preset)
+    require_weights(weights)
+    chosen, device = preset_of(preset), connect(device)
     manifest, split = load_manifest(data), Split.load(split)
     output = None if output is None else Path(output)
     with work_folder(output) as work:
         common: dict[str, Any] = {"seed": seed, "targets": targets, "cache": work / "cache"}
-        common |= {"device": device, "progress": progress}
+        common |= {"device": device, "compute": compute, "progress": progress}
         source = clip or chosen.pretrained
         if source is None:
             source = train_clip(manifest, split, chosen, work / "clip", **common)
         elif not isinstance(source, ClipEncoders):
             source = load_clip(source, device=device)
+        common |= {"weights": weights, "partners": partners, "held_out": held_out}
         encoders = train_tactile(
             manifest, split, source, chosen, work / "tactile", epochs=epochs, **common
         )
         parts = [manifest.part(split, part) for part in ("train", "test")]
         if len(parts[1]) and len(set(parts[0].column("material")) - {None}) > 1:
             cache = work / "cache"
-            features = [embed(p, encoders, cache=cache, progress=progress) for p in parts]
+            with first_alone():
+                features = [embed(p, encoders, cache=cache, progress=progress) for p in parts]
             score = material_accuracy(features[0], features[1], split=split.digest)
             row = {"score": "linear probe of material, tactile", "value": score.value}
             row |= {"interval": score.interval, "chance": score.details.get("chance"), "n": score.n}
             encoders.card["scores"] = json.loads(json.dumps([row]))
-        if output is not None:
+        if output is not None and place()[0] == 0:
             encoders.save(output)
+            keep_logs(work, output)
     return encoders
 
 
@@ -142,82 +166,59 @@ def preset_of(name: str | EncoderPreset) -> EncoderPreset:
     return name if isinstance(name, EncoderPreset) else preset(name)
 
 
-def soft_targets(texts: Tensor) -> Tensor:
-    """Spread each row's target mass equally over the rows with its text number: (n,) to (n, n)."""
-    same = (texts[:, None] == texts[None, :]).float()
-    return same / same.sum(dim=1, keepdim=True)
-
-
-def info_nce(a: Tensor, b: Tensor, scale: Tensor | float, targets: Tensor | None = None) -> Tensor:
-    """Symmetric InfoNCE of one pair of modalities.
-
-    Args:
-        a: (n, d), L2-normalized.
-        b: (n, d), L2-normalized; row i belongs to row i of ``a``.
-        scale: 1 / tau.
-        targets: symmetric (n, n) with rows that sum to 1, or None for the diagonal (paper section
-            3).
-
-    Returns:
-        The scalar loss in nats.
-    """
-    logits = scale * a @ b.T
-    target = torch.arange(len(a), device=a.device) if targets is None else targets
-    return (cross_entropy(logits, target) + cross_entropy(logits.T, target)) / 2
-
-
-def three_way(
-    tactile: Tensor,
-    text: Tensor,
-    vision: Tensor | None,
-    scale: Tensor | float,
-    *,
-    weights: Sequence[float] = (1.0, 1.0, 1.0),
-    text_targets: Tensor | None = None,
-) -> tuple[Tensor, dict[str, float]]:
-    """The paper's loss over three pairs.
-
-    Args:
-        tactile: (n, d), L2-normalized.
-        text: the same.
-        vision: the same, or None for data without photos: the first pair alone.
-        scale: 1 / tau.
-        weights: of tactile-text, vision-text, tactile-vision; the total is their weighted mean.
-        text_targets: for the two text pairs, see :func:`info_nce`.
-
-    Returns:
-        The total, and the three losses by name.
-
-    Raises:
-        PalpateError: on weights that are not three numbers of at least 0 with a positive sum.
-    """
-    if len(weights) != 3 or min(weights) < 0 or not sum(weights) > 0:
-        must, got = "must be three numbers >= 0 with a positive sum", f"{tuple(weights)}"
-        raise PalpateError(must, got, "", argument="weights", example={"weights": (1, 1, 1)})
-    pairs = {"tactile_text": info_nce(tactile, text, scale, text_targets)}
-    if vision is None:
-        return pairs["tactile_text"], {k: float(loss.detach()) for k, loss in pairs.items()}
-    pairs["vision_text"] = info_nce(vision, text, scale, text_targets)
-    pairs["tactile_vision"] = info_nce(tactile, vision, scale)
-    weighted = [w * loss for w, loss in zip(weights, pairs.values(), strict=True)]
-    total = torch.stack(weighted).sum() / sum(weights)
-    return total, {name: float(loss.detach()) for name, loss in pairs.items()}
-
-
 class TactileModel(nn.Module):
-    """What trains: the tactile encoder and the temperature."""
+    """What trains: the tactile encoder, the temperature, and the partners if they are trainable."""
 
-    def __init__(self, tactile: CLIPVisionModelWithProjection) -> None:
+    def __init__(
+        self, tactile: CLIPVisionModelWithProjection, partners: CLIPModel | None = None
+    ) -> None:
         super().__init__()
-        self.tactile = tactile
+        self.tactile, self.partners = tactile, partners
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_START))
 
 
-def clamped_scale(log_scale: Tensor) -> Tensor:
-    """Return 1 / tau; the parameter is clamped, as clamping the value alone ends its gradient."""
-    with torch.no_grad():
-        log_scale.clamp_(max=LOG_SCALE_MAX)
-    return log_scale.exp()
+@dataclass
+class TactileLoss:
+    """The loss of a batch of :class:`~palpate.encoders.rows.Rows`."""
+
+    rows: Rows
+    clip: ClipEncoders
+    preprocess: Preprocess
+    targets: Targets
+    weights: Sequence[float]
+    chunk: int | None = None
+
+    def encode(self, module: nn.Module, unit_images: Tensor) -> Tensor:
+        """Tactile images (b, 3, h, w) in [0, 1] to embeddings."""
+        assert isinstance(module, TactileModel)
+        return encode_tactile(module.tactile, self.preprocess.normalize(unit_images))
+
+    def __call__(self, module: nn.Module, batch: Batch) -> Losses:
+        """Return the loss of the three pairs, and each of them to log."""
+        assert isinstance(module, TactileModel)
+        scale, clip = clamped_scale(module.log_scale), self.clip
+        images = augmented(unit(batch["images"]), batch)
+        own = in_chunks(partial(self.encode, module), images, self.chunk)
+        text, vision = batch.get("text"), batch.get("vision")
+        if module.partners is not None:
+            text = gather_rows(_encode_phrases(clip, self.rows.phrases, batch["phrase"]))
+        if "photos" in batch:
+            photos = clip.preprocess(unit(batch["photos"]))
+            vision = gather_rows(in_chunks(clip.encode_vision, photos, self.chunk))
+        assert text is not None
+        labels = Labels(batch["texts"], batch["contacts"], batch.get("seen"))
+        how: dict[str, Any] = {"targets": self.targets, "weights": self.weights}
+        total, logs = three_way(gather_rows(own), text, vision, scale, labels, **how)
+        return Losses(total, {**logs, "scale": scale.detach()}, own.sum(dim=1))
+
+    def probe(self, others: Rows, module: nn.Module) -> dict[str, float]:
+        """Accuracy on the held-out part of a linear material probe of the train part."""
+        device = next(module.parameters()).device
+        encode = partial(self.encode, module)
+        train, test = (part.features(encode, device) for part in (self.rows, others))
+        if any(len(set(part.labels or ()) - {""}) < 2 for part in (train, test)):
+            return {}
+        return {"probe": float(material_accuracy(train, test))}
 
 
 def train_tactile(  # noqa: PLR0913 - one row per choice of the training
@@ -230,84 +231,124 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     epochs: float | None = None,
     seed: int = 0,
     targets: Targets | None = None,
-    weights: Sequence[float] = (1.0, 1.0, 1.0),
+    weights: Sequence[float] = ALL_PAIRS,
+    partners: Partners = "frozen",
+    held_out: float = 0.0,
     start: EncoderSet | None = None,
     cache: Path | None = None,
     device: str = "auto",
+    compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> EncoderSet:
-    """Train a tactile encoder against a frozen CLIP; run again to resume.
+    """Train a tactile encoder against a CLIP; run again to resume.
 
     Args:
-        manifest: samples with tactile images, and photos for all or for none.
-        split: only its part ``train`` is read; its digest goes into the card.
-        clip: the frozen encoders; moved to ``device``.
+        manifest: samples with tactile images; rows without a photo are left out of the vision
+            pairs.
+        split: its parts ``train`` and ``val`` are read; its digest goes into the card.
+        clip: the encoders to learn from; moved to ``device``. Trainable ones are copied.
         preset: size and course.
         folder: of the checkpoint and the log.
         epochs: default: the preset's.
         seed: of the initial weights, the order and the augmentation.
         targets: default: the preset's.
-        weights: of the pairs tactile-text, vision-text, tactile-vision.
+        weights: of the pairs tactile-text, vision-text, tactile-vision; 0 switches one off.
+        partners: see :func:`train_encoder`.
+        held_out: see :func:`train_encoder`.
         start: go on from this set's tactile encoder instead of random weights (the paper's); it
             must have the preset's size. Its card goes into the new card, so that the data it was
             trained on stays declared.
         cache: folder for decoded pixels and frozen embeddings.
         device: see :func:`palpate.encoders.models.pick_device`.
+        compute: how to run it on the machine at hand.
         progress: called after each step.
 
     Returns:
         All three encoders with a card.
 
     Raises:
-        PalpateError: if the train part is empty, or a sample lacks an image.
+        PalpateError: if the train part is empty, or a sample lacks a tactile image.
     """
-    place = pick_device(device)
-    train = train_part(manifest, split)
-    move(clip.model, place)
-    frozen = EncoderSet(clip)
-    texts, text_source = texts_of(train)
-    images = cached_images(train, "tactile", preset.image, cache, progress)
-    modalities: list[Modality] = ["text", *(["vision"] if _sides(train)[0] == "vision" else [])]
-    text, *photos = (
-        torch.from_numpy(embed(train, frozen, m, cache=cache, progress=progress).features).to(place)
-        for m in modalities
-    )
-    tactile, preprocess = _first_weights(preset, clip.dim, images, seed, start)
-    course = preset.tactile_course
+    where = pick_device(connect(device))
+    compute, trainable = compute or Compute(), partners == "trainable"
+    train, held = _parts(manifest, split, held_out, seed)
+    clip = copy.deepcopy(clip) if trainable else clip
+    move(clip.model, where)
+
+    def read(part: Manifest) -> Rows:
+        options: dict[str, Any] = {"cache": cache, "progress": progress, "trainable": trainable}
+        return Rows(part, clip, preset.image, subsets=preset.text_subsets, **options)
+
+    with first_alone():
+        rows, others = read(train), None if held is None else read(held)
+    tactile, preprocess = _first_weights(preset, clip.dim, rows.images, seed, start)
+    course, mode = preset.tactile_course, targets or preset.targets
     options = course.options(len(train), seed, epochs)
-    mode, numbers = targets or preset.targets, _numbers(texts).to(place)
-
-    def loss(
-        module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
-    ) -> tuple[Tensor, dict[str, float]]:
-        assert isinstance(module, TactileModel)
-        pixels = _augmented(images, rows, course.augment, preprocess, generator, place)
-        rows = rows.to(place)
-        soft = soft_targets(numbers[rows]) if mode == "identical-text" else None
-        scale = clamped_scale(module.log_scale)
-        embedded = encode_tactile(module.tactile, pixels)
-        vision = photos[0][rows] if photos else None
-        total, logs = three_way(
-            embedded, text[rows], vision, scale, weights=weights, text_targets=soft
-        )
-        return total, {**logs, "scale": float(scale.detach())}
-
-    model = TactileModel(tactile).to(place)
-    facts = _facts(preset, train, split, texts, text_source, options) | {
+    if options.batch == 1:
+        must, fix = "must be at least 2: the loss compares rows", "Pass a larger one"
+        raise PalpateError(must, f"1, of {len(train)} rows", fix, argument="batch")
+    facts = _facts(preset, train, split, (rows.captions, rows.text_source), options) | {
         "targets": mode,
         "weights": list(weights),
         "vision": clip.digest("vision"),
         "text": clip.digest("text"),
         "start": start.digest("tactile") if start else None,
     }
-    key, what = digest_json([facts, _stamps(train)]), "training the tactile encoder"
-    log = fit(model, loss, len(train), options, folder, what=what, key=key, progress=progress)
-    card = _card(facts, options, log, place) | {"clip": clip.name, "clip_card": clip.card}
+    facts |= {"partners": partners} if trainable else {}
+    facts |= {"held_out": held.digest} if held is not None else {}
+    facts |= {"without_photo": rows.without_photo} if rows.without_photo else {}
+
+    loss = TactileLoss(rows, clip, preprocess, mode, weights, compute.chunk)
+    if trainable:
+        clip.model.requires_grad_(True)
+    model = TactileModel(tactile, clip.model if trainable else None).to(where)
+    task = Task(
+        "training the tactile encoder",
+        len(train),
+        lambda step: rows.load(step, course.augment),
+        loss,
+        digest_json([facts, _stamps(train)]),
+        train.ids,
+        None if others is None else (len(others.captions), others.load),
+        None if others is None else partial(loss.probe, others),
+    )
+    log = fit(model, task, options, folder, compute=compute, progress=progress)
+    clip.model.eval().requires_grad_(False)
+    card = _card(facts, options, log, where) | {"clip": clip.name, "clip_card": clip.card}
     card["start_card"] = start.card if start else None
     card["synthetic"] = train.synthetic if not start or start.card.get("synthetic") else False
     card["seen_in_part"] = start is not None and start.seen is None
-    seen = union(digest_images(images), start.seen if start else None)
+    seen = union(digest_images(rows.images), start.seen if start else None)
+    if trainable and rows.photos is not None and clip.seen is not None:
+        clip.seen = union(digest_images(rows.photos), clip.seen)
     return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card, seen)
+
+
+def _parts(
+    manifest: Manifest, split: Split, share: float, seed: int
+) -> tuple[Manifest, Manifest | None]:
+    """The train part and the held-out part: ``val``, or a share of the videos of train, if any."""
+    train, held = train_part(manifest, split), manifest.part(split, "val")
+    if len(held) or not share:
+        return train, held if len(held) else None
+    if not 0 < share < 1:
+        raise PalpateError("must lie in [0, 1)", str(share), "", argument="held_out")
+    videos = sorted({str(v) for v in train.column("video")})
+    count = min(len(videos) - 1, max(1, round(share * len(videos))))
+    out = set(rng_for(seed, "held-out").permutation(videos)[:count]) if count else set[str]()
+    ids = [[], []]
+    for name, video in zip(train.ids, train.column("video"), strict=True):
+        ids[str(video) in out].append(name)
+    if not all(ids):
+        must, fix = "needs at least two videos in train", "Leave it out"
+        raise PalpateError(must, f"{len(videos)}", fix, argument="held_out")
+    return train.take(ids[0]), train.take(ids[1])
+
+
+def _encode_phrases(clip: ClipEncoders, phrases: Sequence[str], which: Tensor) -> Tensor:
+    """Embed the phrases of these numbers, each distinct one once: (n,) to (n, d)."""
+    some, inverse = torch.unique(which, return_inverse=True)
+    return clip.encode_text([phrases[int(k)] for k in some])[inverse]
 
 
 def _first_weights(
@@ -359,7 +400,7 @@ def new_clip(
     return ClipEncoders(model, tokenizer, preprocess, preset.name)
 
 
-def train_clip(
+def train_clip(  # noqa: PLR0913 - as train_tactile
     manifest: Manifest,
     split: Split,
     preset: EncoderPreset,
@@ -370,6 +411,7 @@ def train_clip(
     targets: Targets | None = None,
     cache: Path | None = None,
     device: str = "auto",
+    compute: Compute | None = None,
     progress: Progress = quiet,
 ) -> ClipEncoders:
     """Train a fresh vision and text encoder on the train part of a split, by InfoNCE of that pair.
@@ -383,38 +425,48 @@ def train_clip(
     Raises:
         PalpateError: if the train part is empty, or the preset takes a pretrained CLIP.
     """
-    place = pick_device(device)
+    where, compute = pick_device(connect(device)), compute or Compute()
     train = train_part(manifest, split)
-    texts, text_source = texts_of(train)
-    course = preset.clip_course
+    side, course = _sides(train)[0], preset.clip_course
     if course is None:
         must, got = "must describe a fresh CLIP", f"{preset.name}, which takes {preset.pretrained}"
         raise PalpateError(must, got, "Pass a clip, or use the preset mini", argument="preset")
-    images = cached_images(train, _sides(train)[0], preset.image, cache, progress)
+    missing = train.column(side).count(None)
+    has = zip(train.ids, train.column(side), strict=True)
+    train = train.take([i for i, image in has if image is not None])
+    texts, source = texts_of(train)
+    with first_alone():
+        images = cached_images(train, side, preset.image, cache, progress)
     clip = new_clip(preset, texts, seed, _preprocess(preset, images))
-    move(clip.model, place)
+    move(clip.model, where)
     clip.model.requires_grad_(True)
     options = course.options(len(train), seed, epochs)
-    mode, numbers, distinct = targets or preset.targets, _numbers(texts), sorted(set(texts))
+    mode, words, distinct = targets or preset.targets, numbers(texts), sorted(set(texts))
 
-    def loss(
-        module: nn.Module, rows: Tensor, generator: torch.Generator, step: int
-    ) -> tuple[Tensor, dict[str, float]]:
-        pixels = _augmented(images, rows, course.augment, clip.preprocess, generator, place)
-        vision = clip.encode_vision(pixels)
-        # Each distinct text goes through the encoder once.
-        some, inverse = torch.unique(numbers[rows], return_inverse=True)
-        text = clip.encode_text([distinct[int(k)] for k in some])[inverse.to(place)]
+    def load(step: Step) -> Batch:
+        pixels = torch.from_numpy(np.array(images[step.rows]))
+        every = words[torch.from_numpy(step.all_rows)]
+        own = {"images": pixels, "phrase": every[step.mine], **course.augment.draw(step)}
+        return {**own, "texts": every}
+
+    def loss(module: nn.Module, batch: Batch) -> Losses:
+        pixels = clip.preprocess.normalize(augmented(unit(batch["images"]), batch))
+        own = in_chunks(clip.encode_vision, pixels, compute.chunk)
+        text = gather_rows(_encode_phrases(clip, distinct, batch["phrase"]))
         scale = clamped_scale(clip.model.logit_scale)
-        soft = soft_targets(inverse.to(place)) if mode == "identical-text" else None
-        return info_nce(vision, text, scale, soft), {"scale": float(scale.detach())}
+        labels, vision = Labels(batch["texts"]), gather_rows(own)
+        how: dict[str, Any] = {"targets": mode, "weights": (1, 0, 0)}  # one pair alone
+        total, _ = three_way(vision, text, None, scale, labels, **how)
+        return Losses(total, {"scale": scale.detach()}, own.sum(dim=1))
 
-    facts = _facts(preset, train, split, texts, text_source, options) | {"targets": mode}
-    facts |= {} if _sides(train)[0] == "vision" else {"trained_on": "tactile images, not photos"}
-    key, what = digest_json([facts, _stamps(train)]), "training vision and text"
-    log = fit(clip.model, loss, len(train), options, folder, what=what, key=key, progress=progress)
+    facts = _facts(preset, train, split, (texts, source), options) | {"targets": mode}
+    facts |= {} if side == "vision" else {"trained_on": "tactile images, not photos"}
+    facts |= {"without_photo": missing} if missing else {}
+    key = digest_json([facts, image_stamp(train, side)])
+    task = Task("training vision and text", len(train), load, loss, key, train.ids)
+    log = fit(clip.model, task, options, folder, compute=compute, progress=progress)
     clip.model.eval().requires_grad_(False)
-    clip.card = _card(facts, options, log, place)
+    clip.card = _card(facts, options, log, where)
     clip.seen = union(digest_images(images))
     return clip
 
@@ -436,32 +488,18 @@ def _sides(train: Manifest) -> list[str]:
 
 def _stamps(train: Manifest) -> list[str]:
     """What must not have changed on disk for a checkpoint to be continued."""
-    return [image_stamp(train, column) for column in _sides(train)]
+    stamps: list[str] = []
+    for side in _sides(train):
+        cells = zip(train.ids, train.column(side), strict=True)
+        stamps.append(image_stamp(train.take([i for i, image in cells if image]), side))
+    return stamps
 
 
-def _numbers(texts: Sequence[str]) -> Tensor:
-    """Each text's index among the sorted distinct texts, (n,) int64."""
-    return torch.from_numpy(np.unique(np.array(texts, dtype=object), return_inverse=True)[1])
-
-
-def _augmented(  # noqa: PLR0917
-    images: NDArray[np.uint8],
-    rows: Tensor,
-    augment: Augment,
-    preprocess: Preprocess,
-    generator: torch.Generator,
-    device: torch.device,
-) -> Tensor:
-    """The pixels of one training batch, (b, 3, size, size)."""
-    return preprocess.normalize(augment(to_unit(images[rows.numpy()], device), generator))
-
-
-def _facts(  # noqa: PLR0917
+def _facts(
     preset: EncoderPreset,
     train: Manifest,
     split: Split,
-    texts: Sequence[str],
-    source: str,
+    texts: tuple[Sequence[str], str],
     options: LoopOptions,
 ) -> dict[str, Any]:
     """What decides the result of a training run; also the run's key."""
@@ -474,9 +512,9 @@ def _facts(  # noqa: PLR0917
         "train_samples": len(train),
         "split": split.digest,
         "split_rule": dict(split.rule),
-        "texts": digest_lines(texts),
-        "distinct_texts": len(set(texts)),
-        "text_source": source,
+        "texts": digest_lines(texts[0]),
+        "distinct_texts": len(set(texts[0])),
+        "text_source": texts[1],
     }
 
 
@@ -497,4 +535,5 @@ def _card(
         "python": platform.python_version(),
     }
     card = {**facts, "steps": options.steps, "device": device.type, "versions": versions}
+    card["processes"] = place()[1]
     return json.loads(json.dumps(card | {"loss": curve}))  # as it will be read back

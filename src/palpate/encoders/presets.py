@@ -8,8 +8,8 @@ to zero, learning rate 1.5e-4 x batch / 256 = 1.5e-4.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,9 +17,8 @@ from torch.nn.functional import affine_grid, grid_sample
 from transformers import CLIPConfig, CLIPVisionConfig
 
 from palpate.core import require_choice
-from palpate.training.loop import LoopOptions
-
-Targets = Literal["diagonal", "identical-text"]
+from palpate.encoders.losses import Targets
+from palpate.training.options import LoopOptions, Step
 
 
 @dataclass(frozen=True)
@@ -43,28 +42,32 @@ class Augment:
     flips: bool = False
     quarter_turns: bool = False
 
-    def __call__(self, images: Tensor, generator: torch.Generator) -> Tensor:
-        """Change images (b, 3, h, w) in [0, 1]; values may leave [0, 1], as over-exposure would.
-
-        Args:
-            images: the batch, on any device.
-            generator: on the CPU; the only source of randomness.
-        """
-        n, device = len(images), images.device
-        scale = 1 - self.crop * torch.rand(n, generator=generator)
-        shift = (2 * torch.rand(n, 2, generator=generator) - 1) * (1 - scale)[:, None]
-        turns = torch.randint(0, 4, (n,), generator=generator) * self.quarter_turns
-        mirror = 1.0 - 2.0 * torch.randint(0, 2, (n, 2), generator=generator) * self.flips
-        gain = torch.exp(self.gain * torch.randn(n, generator=generator))
-        offset = self.offset * torch.randn(n, generator=generator)
+    def draw(self, step: Step) -> dict[str, Tensor]:
+        """The random numbers of a batch: a window (b, 2, 3), a gain and an offset (b,) each."""
+        scale = 1 - self.crop * step.rand()
+        shift = (2 * step.rand(2) - 1) * (1 - scale)[:, None]
+        turns = step.randint(4) * self.quarter_turns
+        mirror = 1.0 - 2.0 * step.randint(2, 2) * self.flips
+        gain = torch.exp(self.gain * step.randn())
+        offset = self.offset * step.randn()
         angle = turns * (torch.pi / 2)
         cos, sin = scale * torch.cos(angle), scale * torch.sin(angle)
         rows = [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)]
         window = torch.stack(rows, 1)
         window[:, :, :2] *= mirror[:, None]
-        grid = affine_grid(window.to(device), list(images.shape), align_corners=False)
-        images = grid_sample(images, grid, align_corners=False, padding_mode="reflection")
-        return images * gain.to(device).view(n, 1, 1, 1) + offset.to(device).view(n, 1, 1, 1)
+        return {"window": window, "gain": gain, "offset": offset}
+
+
+def augmented(images: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
+    """Change images (b, 3, h, w) in [0, 1] as :meth:`Augment.draw` says; not at all without draws.
+
+    Values may leave [0, 1], as over-exposure would.
+    """
+    if "window" not in drawn:
+        return images
+    grid = affine_grid(drawn["window"], list(images.shape), align_corners=False)
+    images = grid_sample(images, grid, align_corners=False, padding_mode="reflection")
+    return images * drawn["gain"].view(-1, 1, 1, 1) + drawn["offset"].view(-1, 1, 1, 1)
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,9 @@ class Course:
     betas: tuple[float, float] = (0.9, 0.95)
     clip: float | None = 1.0
     augment: Augment = field(default_factory=Augment)
+    evaluations: int = 10
+    patience: int | None = None
+    keep: str = "last"
 
     def options(self, n: int, seed: int, epochs: float | None = None) -> LoopOptions:
         """Return the options for ``n`` rows; no batch is larger than the set."""
@@ -102,6 +108,9 @@ class Course:
             clip=self.clip,
             seed=seed,
             betas=self.betas,
+            evaluations=self.evaluations,
+            patience=self.patience,
+            keep=self.keep,
         )
 
 
@@ -118,9 +127,10 @@ class EncoderPreset:
         vision, text, dim, vocabulary, context: of a fresh CLIP; ``dim`` is the width of the shared
             space, ``context`` in tokens.
         tactile_course, clip_course: how each is trained; None without a fresh CLIP.
-        targets: ``diagonal`` is the paper's loss; ``identical-text`` counts rows with equal
-            captions as positives of each other in the two text pairs
-            (:func:`palpate.encoders.contrastive.soft_targets`).
+        targets: what rows with equal captions are to each other
+            (:data:`palpate.encoders.losses.Targets`); ``diagonal`` is the paper's loss.
+        text_subsets: in training, show a random non-empty part of a text that is a list of
+            adjectives (TVL).
         data_statistics: normalize pixels by the training part's mean and deviation instead of
             CLIP's constants.
         cost: what it takes, and where that was measured.
@@ -140,6 +150,7 @@ class EncoderPreset:
     vocabulary: int = 1024
     context: int = 32
     targets: Targets = "identical-text"
+    text_subsets: bool = False
     data_statistics: bool = True
 
     def tactile_config(self, dim: int) -> CLIPVisionConfig:

@@ -1,0 +1,523 @@
+"""The training engine of every model: steps in a fixed order, checkpoints, resume by running again.
+
+The rows and the noise of step k depend on (seed, k) alone, so a run that is stopped and started
+again takes the same steps as one that was not, on any number of processes. A checkpoint is one
+safetensors file (weights, moving average, both Adam moments) with the step and the log in its
+metadata: one rename replaces all of it, and no pickle is involved. It is written in the background.
+
+The moving average of the weights is ``a <- d a + (1 - d) w`` with ``d = min(ema, (1 + k) / (10 +
+k))``, the warm-up of latent diffusion (Rombach et al., CVPR 2022, public code).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet
+from palpate.training.options import Compute, LoopOptions, RowOrder, Step, Tracker, learning_rate
+from palpate.training.processes import average, barrier, place
+
+Batch = dict[str, Tensor]
+#: The data of a step, on the CPU; called in a thread, ahead of the step.
+Load = Callable[[Step], Batch]
+CHECKPOINT, BEST, LOG = "checkpoint.safetensors", "best.safetensors", "log.jsonl"
+MOMENTS = ("exp_avg", "exp_avg_sq")  # of AdamW
+DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
+EVERY = 10  # steps between two lines of the log
+
+
+class Losses(NamedTuple):
+    """The loss of a batch.
+
+    Attributes:
+        total: scalar, with its graph.
+        logs: scalars to log.
+        rows: a number for each row (n,), not finite where the row makes the loss so.
+    """
+
+    total: Tensor
+    logs: dict[str, Tensor] = {}  # noqa: RUF012 - never changed
+    rows: Tensor | None = None
+
+
+Loss = Callable[[nn.Module, Batch], Losses]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is trained on what.
+
+    Attributes:
+        what: name for progress and errors.
+        n: number of training rows.
+        load: the data of a step.
+        loss: the loss of what ``load`` gave, once it is on the module's device.
+        key: digest of the data and of settings outside :class:`LoopOptions`.
+        names: of the rows, for errors.
+        held_out: rows of the held-out part, and ``load`` of it.
+        probe: numbers to log at each evaluation, of the module in evaluation mode.
+    """
+
+    what: str
+    n: int
+    load: Load
+    loss: Loss
+    key: str = ""
+    names: Sequence[str] | None = None
+    held_out: tuple[int, Load] | None = None
+    probe: Callable[[nn.Module], dict[str, float]] | None = None
+
+
+def fit(
+    module: nn.Module,
+    task: Task,
+    options: LoopOptions,
+    folder: Path,
+    *,
+    compute: Compute | None = None,
+    progress: Progress = quiet,
+) -> list[dict[str, float]]:
+    """Train ``module`` in place; resume from ``folder`` if it holds a checkpoint of the same run.
+
+    Args:
+        module: parameters that require gradients are trained, on the module's device.
+        task: see :class:`Task`.
+        options: see :class:`LoopOptions`; no batch is larger than the set.
+        folder: receives ``checkpoint.safetensors`` and ``log.jsonl``, and ``best.safetensors``
+            where there is a held-out part. A checkpoint of other rows, options, shapes or ``key``
+            is ignored and then replaced. Several processes must share it.
+        compute: see :class:`Compute`.
+        progress: called after each step with the smoothed loss as remark.
+
+    Returns:
+        The log: dictionaries with ``step``, ``loss``, ``lr``, ``seconds`` (of a step) and what the
+        loss logged; ``held_out`` and the probe's numbers where the held-out part was evaluated.
+
+    Raises:
+        PalpateError: without rows or parameters to train, if the batch cannot be shared by the
+            processes, if another process ends, or if the loss or its gradient stops being finite.
+    """
+    compute = compute or Compute()
+    with _numerics(compute):
+        run = _Run(module, task, options, folder, compute)
+        start = run.restore()
+        module.train()
+        try:
+            run.steps(start, progress)
+        except KeyboardInterrupt:
+            # Only between two steps is the state one that an uninterrupted run passes through.
+            if run.step > start and not run.busy:
+                run.save(wait=True)
+            raise
+        finally:
+            run.close()
+        run.finish()
+    return run.log
+
+
+class _Run:
+    """A training under way, and all that a checkpoint holds.
+
+    Attributes:
+        step: whole steps done.
+        busy: an update has begun and is not finished.
+    """
+
+    def __init__(
+        self, module: nn.Module, task: Task, options: LoopOptions, folder: Path, compute: Compute
+    ) -> None:
+        self.part = place()
+        batch = _require(task, options, self.part[1])
+        self.module, self.task, self.options = module, task, options
+        self.folder, self.compute = folder, compute
+        self.parameters = {k: p for k, p in module.named_parameters() if p.requires_grad}
+        if not self.parameters:
+            fix = "Do not freeze the whole model"
+            raise PalpateError(f"{task.what} needs parameters that require gradients", "none", fix)
+        self.device = next(iter(self.parameters.values())).device
+        matrices = [p for p in self.parameters.values() if p.ndim >= 2]
+        vectors = [p for p in self.parameters.values() if p.ndim < 2]
+        groups = [{"params": matrices, "weight_decay": options.weight_decay}]
+        groups += [{"params": vectors, "weight_decay": 0.0}]
+        cuda = self.device.type == "cuda"
+        self.optimizer = torch.optim.AdamW(
+            [g for g in groups if g["params"]],
+            lr=options.lr,
+            betas=options.betas,
+            **({"fused": True} if cuda else {"foreach": True}),
+        )
+        self.scaler = torch.GradScaler(self.device.type, enabled=compute.precision == "fp16")
+        averaged = self.parameters if options.ema is not None else {}
+        self.average = {name: p.detach().clone() for name, p in averaged.items()}
+        shapes = {name: list(p.shape) for name, p in self.parameters.items()}
+        self.key = digest_json([task.key, task.n, shapes, options.facts])
+        self.order = RowOrder(task.n, batch, options.seed)
+        self.loss = torch.compile(task.loss) if compute.compile else task.loss
+        if compute.gradient_checkpointing:
+            _checkpoint_blocks(module)
+        if compute.channels_last:
+            module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.step, self.busy = 0, False
+        self.log: list[dict[str, float]] = []
+        self.reader, self.writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self.written: Future[None] | None = None
+        self.trackers: list[Any] = []
+        self.unchecked: list[_Values] = []
+
+    # --- the steps -----------------------------------------------------------------------------
+
+    def steps(self, start: int, progress: Progress) -> None:
+        """Take the steps from ``start`` on, and write what comes of it."""
+        options, what = self.options, self.task.what
+        if start >= options.steps or self.stopped:
+            return
+        self.open_log()
+        evaluations = self.evaluation_steps()
+        smooth, saved, began = math.nan, time.monotonic(), time.monotonic()
+        ahead = self.reader.submit(self.load, start)
+        logged = start
+        for step in range(start, options.steps):
+            batch = ahead.result()
+            if step + 1 < options.steps:
+                ahead = self.reader.submit(self.load, step + 1)
+            self.update(batch)
+            last = step == options.steps - 1
+            if self.device.type == "cpu" or step % EVERY == 0 or last:
+                values = self.check()
+                smooth = values["loss"] if math.isnan(smooth) else smooth
+                smooth = 0.95 * smooth + 0.05 * values["loss"]
+                if step % EVERY == 0 or last:
+                    each = (time.monotonic() - began) / (step + 1 - logged)
+                    facts = {"step": step, "loss": values.pop("loss")}
+                    self.write_log(
+                        facts | {"lr": learning_rate(step, options), "seconds": each} | values
+                    )
+                    began, logged = time.monotonic(), step + 1
+            if step + 1 in evaluations:
+                self.evaluate(step + 1)
+            self.busy = False
+            progress(what, step + 1, options.steps, f"loss {smooth:.4f}")
+            if self.stopped:
+                break
+            if time.monotonic() - saved > 60 * self.compute.checkpoint_minutes:
+                self.save()
+                saved = time.monotonic()
+        self.save(wait=True)
+
+    def load(self, step: int) -> Batch:
+        """The data of this process's rows, ready to be copied to the device."""
+        batch = self.task.load(Step(step, self.order(step), self.options.seed, self.part))
+        if self.device.type == "cuda":
+            return {name: value.pin_memory() for name, value in batch.items()}
+        return batch
+
+    def forward(self, batch: Batch) -> Losses:
+        """The loss of a batch, in the precision asked for."""
+        batch = {k: v.to(self.device, non_blocking=True) for k, v in batch.items()}
+        dtype = DTYPES.get(self.compute.precision)
+        with torch.autocast(self.device.type, dtype, enabled=dtype is not None):
+            return self.loss(self.module, batch)
+
+    def update(self, batch: Batch) -> None:
+        """One optimizer step and one step of the average, without waiting for the device."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate(self.step, self.options)
+        self.optimizer.zero_grad(set_to_none=True)
+        losses = self.forward(batch)
+        self.scaler.scale(losses.total).backward()
+        values = _stacked(losses)
+        gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
+        average([*gradients, values])
+        self.scaler.unscale_(self.optimizer)
+        limit = math.inf if self.options.clip is None else self.options.clip
+        norm = nn.utils.clip_grad_norm_(list(self.parameters.values()), limit)
+        self.busy = True
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        if self.options.ema is not None:
+            d = min(self.options.ema, (1 + self.step) / (10 + self.step))
+            with torch.no_grad():
+                torch._foreach_lerp_(
+                    list(self.average.values()), list(self.parameters.values()), 1 - d
+                )
+        rows = None if losses.rows is None else losses.rows.detach()
+        self.unchecked.append(_Values(self.step, tuple(losses.logs), values, norm.detach(), rows))
+        self.step += 1
+
+    def check(self) -> dict[str, float]:
+        """Raise if a loss or gradient since the last check is not finite; return the last values.
+
+        A checkpoint would keep the harm, so none is written before this.
+        """
+        last: dict[str, float] = {}
+        for step, names, values, norm, rows in self.unchecked:
+            last = dict(zip(("loss", *names), values.tolist(), strict=True))
+            if not math.isfinite(last["loss"]):
+                raise self.not_finite("loss", last["loss"], step, rows)
+            # In 16 bits, gradients overflow now and then: that step is skipped, the scale lowered.
+            if not (self.scaler.is_enabled() or math.isfinite(float(norm))):
+                raise self.not_finite("gradient", float(norm), step, rows)
+        self.unchecked.clear()
+        return last
+
+    def not_finite(self, name: str, value: float, step: int, rows: Tensor | None) -> PalpateError:
+        """Name the rows of this process's batch that make it so, or all of them."""
+        self.busy = True  # the weights may be harmed: nothing of them is kept
+        mine = Step(step, self.order(step), self.options.seed, self.part).rows
+        bad = mine if rows is None else mine[~torch.isfinite(rows.flatten()).cpu().numpy()]
+        bad = bad if len(bad) else mine
+        names = self.task.names
+        listed = [str(names[r]) if names is not None else f"row {r}" for r in bad[:5]]
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+        must = f"The {name} of {self.task.what} must be finite"
+        got = f"{value} at step {step}, with {', '.join(listed)}{more}"
+        fix = "Look at these samples, or lower the learning rate; the last checkpoint is kept"
+        return PalpateError(must, got, fix)
+
+    # --- the held-out part ---------------------------------------------------------------------
+
+    def evaluation_steps(self) -> set[int]:
+        """After how many steps the held-out part is evaluated."""
+        if self.task.held_out is None and self.task.probe is None:
+            return set()
+        k, steps = self.options.evaluations, self.options.steps
+        return {math.ceil(steps * i / k) for i in range(1, k + 1)} if k else set()
+
+    def evaluate(self, step: int) -> None:
+        """Log the held-out loss and the probe of the weights that would be the result now."""
+        self.check()
+        values: dict[str, float] = {}
+        with self.averaged(), torch.no_grad():
+            self.module.eval()
+            if self.task.held_out is not None:
+                values["held_out"] = self.held_out_loss(*self.task.held_out)
+            if self.task.probe is not None:
+                values |= self.task.probe(self.module)
+            if "held_out" in values and values["held_out"] < self.best[0] and not self.part[0]:
+                _save(_copies(self.module.state_dict()), self.folder / BEST)
+            self.module.train()
+        self.write_log({"step": step - 1} | values)
+
+    def held_out_loss(self, n: int, load: Load) -> float:
+        """The mean loss over the whole batches of the held-out rows, with the same draws always."""
+        size = min(self.order.batch, n // self.part[1] * self.part[1])
+        totals: list[Tensor] = []
+        for k in range(n // size if size else 0):
+            rows = np.arange(k * size, (k + 1) * size)
+            losses = self.forward(load(Step(k, rows, self.options.seed + 1, self.part)))
+            totals.append(losses.total.detach().float())
+        mean = torch.stack(totals).mean() if totals else torch.tensor(math.nan)
+        average([mean])
+        return float(mean)
+
+    @property
+    def best(self) -> tuple[float, int]:
+        """The lowest held-out loss so far, and how many evaluations ago it was."""
+        losses = [line["held_out"] for line in self.log if "held_out" in line]
+        low = min(losses, default=math.inf)
+        return low, len(losses) - 1 - losses.index(low) if losses else 0
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the held-out loss has not become better for long enough."""
+        patience = self.options.patience
+        return patience is not None and self.best[1] >= patience
+
+    @contextmanager
+    def averaged(self) -> Generator[None]:
+        """The averaged weights in place of the last ones, inside."""
+        last = {name: self.parameters[name].detach().clone() for name in self.average}
+        self.copy(self.average)
+        yield
+        self.copy(last)
+
+    def copy(self, weights: dict[str, Tensor]) -> None:
+        """Copy these weights into the module."""
+        with torch.no_grad():
+            for name, value in weights.items():
+                self.parameters[name].copy_(value)
+
+    def finish(self) -> None:
+        """Leave the weights that are the result in the module, in evaluation mode."""
+        if self.options.keep == "best" and self.best[0] < math.inf:
+            barrier()  # the first process writes it
+            best = load_file(self.folder / BEST, device=str(self.device))
+            self.module.load_state_dict(best)
+        else:
+            self.copy(self.average)
+        self.module.eval()
+
+    # --- files ---------------------------------------------------------------------------------
+
+    def open_log(self) -> None:
+        """Write the log so far, and start the trackers."""
+        if self.part[0]:
+            return
+        with atomic_path(self.folder / LOG) as part:
+            part.write_text("".join(json.dumps(line) + "\n" for line in self.log), "utf-8")
+        self.trackers = [_tracker(each, self.folder) for each in self.compute.trackers]
+
+    def write_log(self, line: dict[str, float]) -> None:
+        """Add a line to the log, its file and the trackers."""
+        self.log.append(line)
+        if self.part[0]:
+            return
+        with open(self.folder / LOG, "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+        for tracker in self.trackers:
+            tracker.log({k: v for k, v in line.items() if k != "step"}, step=int(line["step"]))
+
+    def save(self, *, wait: bool = False) -> None:
+        """Copy the state now and write it in the background; the first process alone does."""
+        self.check()
+        if self.part[0]:
+            return
+        if self.written is not None:
+            self.written.result()  # raises what went wrong with the one before
+        tensors = {f"model.{k}": v for k, v in self.module.state_dict().items()}
+        tensors |= {f"ema.{k}": v for k, v in self.average.items()}
+        for name, p in self.parameters.items():
+            moments = self.optimizer.state.get(p, {})  # none for a parameter that is not used yet
+            tensors |= {f"{m}.{name}": moments[m] for m in MOMENTS if m in moments}
+        tensors = _copies(tensors)
+        metadata = {"key": self.key, "step": str(self.step), "log": json.dumps(self.log)}
+        if self.scaler.is_enabled():
+            metadata["scaler"] = json.dumps(self.scaler.state_dict())
+        self.written = self.writer.submit(_save, tensors, self.folder / CHECKPOINT, metadata)
+        if wait:
+            self.written.result()
+
+    def close(self) -> None:
+        """Wait for the threads, and end the trackers."""
+        self.reader.shutdown(cancel_futures=True)
+        self.writer.shutdown()
+        for tracker in self.trackers:
+            tracker.finish()
+
+    def restore(self) -> int:
+        """Load a checkpoint of this run, if there is one; returns the step to go on from."""
+        path = self.folder / CHECKPOINT
+        if path.is_file():
+            self._read(path)
+        if self.part[1] > 1:
+            steps = torch.tensor([float(self.step)] * 2, device=self.device)
+            average([steps[:1]])
+            if steps[0] != steps[1]:
+                must = f"All processes must read the same checkpoint {path}"
+                fix = "Put the output on a disk that all machines share"
+                raise PalpateError(must, f"step {self.step} in one of them", fix)
+        return self.step
+
+    def _read(self, path: Path) -> None:
+        try:
+            with safe_open(path, framework="pt") as file:
+                meta = file.metadata() or {}
+                if meta.get("key") != self.key:
+                    return
+                tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 - no iterator
+        except SafetensorError as error:
+            must = f"The checkpoint {path} must be a whole safetensors file"
+            raise PalpateError(must, str(error), "Delete it to start anew") from None
+        model = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
+        self.module.load_state_dict(model)
+        for name, value in self.average.items():
+            value.copy_(tensors[f"ema.{name}"])
+        self.step, self.log = int(meta["step"]), json.loads(meta["log"])
+        if "scaler" in meta and self.scaler.is_enabled():
+            self.scaler.load_state_dict(json.loads(meta["scaler"]))
+        count = torch.tensor(float(self.step))
+        for name, p in self.parameters.items():
+            if f"{MOMENTS[0]}.{name}" in tensors:
+                moments = {m: tensors[f"{m}.{name}"].to(p.device) for m in MOMENTS}
+                where = p.device if self.device.type == "cuda" else "cpu"
+                self.optimizer.state[p] = {"step": count.to(where, copy=True), **moments}
+
+
+class _Values(NamedTuple):
+    """What a step gave, still on the device."""
+
+    step: int
+    names: tuple[str, ...]
+    values: Tensor
+    norm: Tensor
+    rows: Tensor | None
+
+
+def _require(task: Task, options: LoopOptions, processes: int) -> int:
+    """Check that there are rows, and that processes share a batch equally; return its size."""
+    if task.n < 1:
+        fix = "Check the split: is its train part empty?"
+        raise PalpateError(f"{task.what} needs at least one sample", "none", fix)
+    batch = min(options.batch, task.n)
+    if batch % processes:
+        must, got = f"must be a multiple of the {processes} processes", f"{batch}"
+        fix = "Choose another, or another number of processes"
+        raise PalpateError(must, got, fix, argument="batch")
+    return batch
+
+
+def _stacked(losses: Losses) -> Tensor:
+    """The loss and the logged numbers, (1 + logs,)."""
+    return torch.stack([v.detach().float() for v in (losses.total, *losses.logs.values())])
+
+
+def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Copies in memory; tied weights share storage, which safetensors rejects."""
+    return {k: v.detach().to("cpu", copy=True).contiguous() for k, v in tensors.items()}
+
+
+def _save(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None) -> None:
+    try:
+        with atomic_path(path) as part:
+            save_file(tensors, part, metadata=metadata)
+    except SafetensorError as error:  # of a full disk, too
+        must, fix = f"{path} must be writable", "Free some space and run the same command again"
+        raise PalpateError(must, str(error), fix) from None
+
+
+def _tracker(name: Tracker, folder: Path) -> Any:
+    """A started tracker of accelerate; TensorBoard's files lie in ``tensorboard`` in the folder."""
+    from accelerate.tracking import TensorBoardTracker, WandBTracker
+
+    try:
+        board = name == "tensorboard"
+        tracker = TensorBoardTracker(name, folder) if board else WandBTracker("palpate")
+        tracker.start()
+    except ImportError:
+        must, got = f"The tracker {name} must be installed", "no such package"
+        raise PalpateError(must, got, f"pip install {name}") from None
+    return tracker
+
+
+def _checkpoint_blocks(module: nn.Module) -> None:
+    """Switch on gradient checkpointing in the models of transformers and diffusers inside."""
+    for part in module.modules():
+        for name in ("gradient_checkpointing_enable", "enable_gradient_checkpointing"):
+            if hasattr(part, name):
+                getattr(part, name)()
+                break
+
+
+@contextmanager
+def _numerics(compute: Compute) -> Generator[None]:
+    """TF32 inside, where asked for; the setting is restored."""
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = compute.tf32
+    try:
+        yield
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = before

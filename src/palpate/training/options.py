@@ -1,0 +1,215 @@
+"""What a training does (:class:`LoopOptions`), how it is run (:class:`Compute`), and the random
+numbers of its steps.
+
+Everything random in step k depends on (seed, k) and on the position in the *global* batch: each of
+several processes draws the numbers of the whole batch and keeps those of its own rows, so N
+processes take the steps of one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from palpate.core import PalpateError, rng_for, seed_for
+
+Precision = Literal["float32", "bf16", "fp16"]
+Tracker = Literal["tensorboard", "wandb"]
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """What decides the result of a training.
+
+    Attributes:
+        steps: optimizer steps in all.
+        batch: rows per step, over all processes.
+        lr: peak learning rate (the effective one; nothing multiplies it later).
+        warmup: steps of linear warm-up.
+        decay: ``cosine`` to zero after the warm-up, or ``constant``.
+        weight_decay: of AdamW; applied to parameters of two or more dimensions.
+        clip: largest gradient norm, or None.
+        ema: decay of the moving average that becomes the result, or None for the last weights.
+        seed: of the order of rows and of the noise.
+        betas: decay rates of AdamW's two moments.
+        evaluations: how often the held-out part is evaluated, evenly spread over the steps.
+        patience: stop after as many evaluations without a better held-out loss; None: never.
+        keep: which weights become the result: the last, or those of the best held-out loss.
+
+    Raises:
+        PalpateError: if a number lies outside its range or a word is unknown.
+    """
+
+    steps: int
+    batch: int
+    lr: float
+    warmup: int = 20
+    decay: str = "cosine"
+    weight_decay: float = 0.01
+    clip: float | None = 1.0
+    ema: float | None = None
+    seed: int = 0
+    betas: tuple[float, float] = (0.9, 0.999)
+    evaluations: int = 10
+    patience: int | None = None
+    keep: str = "last"
+
+    def __post_init__(self) -> None:
+        valid = {
+            "steps": (self.steps >= 0, "must be at least 0"),
+            "batch": (self.batch >= 1, "must be at least 1"),
+            "lr": (0 < self.lr < math.inf, "must be positive and finite"),
+            "warmup": (self.warmup >= 0, "must be at least 0"),
+            "decay": (self.decay in ("cosine", "constant"), "must be cosine or constant"),
+            "weight_decay": (0 <= self.weight_decay < math.inf, "must be at least 0"),
+            "clip": (self.clip is None or self.clip > 0, "must be positive or None"),
+            "ema": (self.ema is None or 0 <= self.ema < 1, "must lie in [0, 1) or be None"),
+            "betas": (all(0 <= b < 1 for b in self.betas), "must lie in [0, 1)"),
+            "evaluations": (self.evaluations >= 0, "must be at least 0"),
+            "patience": (self.patience is None or self.patience >= 1, "must be at least 1"),
+            "keep": (self.keep in ("last", "best"), "must be last or best"),
+        }
+        for name, (holds, must) in valid.items():
+            if not holds:
+                got, fix = repr(getattr(self, name)), "Choose another value"
+                raise PalpateError(must, got, fix, argument=name)
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """All options, for the key of a checkpoint and for cards."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Compute:
+    """How to run a training on the machine at hand.
+
+    It changes rounding, speed and memory, not what is computed, so a run may go on with another.
+
+    Attributes:
+        precision: of matrix products: ``bf16`` and ``fp16`` by autocast, weights stay float32.
+        tf32: let float32 products on CUDA round their factors to 10 bits.
+        compile: compile the loss with ``torch.compile``: minutes at the start, faster steps.
+        channels_last: memory layout of convolutions.
+        gradient_checkpointing: keep no activations inside of blocks, compute them twice.
+        chunk: rows that a contrastive encoder sees at a time; the loss is over the whole batch all
+            the same (cached gradients). None: all.
+        checkpoint_minutes: time between checkpoints.
+        trackers: ``tensorboard``, ``wandb``: the log, also there.
+    """
+
+    precision: Precision = "float32"
+    tf32: bool = True
+    compile: bool = False
+    channels_last: bool = False
+    gradient_checkpointing: bool = False
+    chunk: int | None = None
+    checkpoint_minutes: float = 5.0
+    trackers: tuple[Tracker, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.chunk is not None and self.chunk < 1:
+            must, fix = "must be at least 1", "Leave it out for the whole batch at once"
+            raise PalpateError(must, str(self.chunk), fix, argument="chunk")
+        if not self.checkpoint_minutes >= 0:
+            got = str(self.checkpoint_minutes)
+            raise PalpateError("must be at least 0", got, "", argument="checkpoint_minutes")
+
+
+def learning_rate(step: int, options: LoopOptions) -> float:
+    """Linear warm-up, then cosine to zero or constant."""
+    if step < options.warmup:
+        return options.lr * (step + 1) / options.warmup
+    if options.decay == "constant":
+        return options.lr
+    through = (step - options.warmup) / max(1, options.steps - options.warmup)
+    return options.lr * 0.5 * (1 + math.cos(math.pi * min(1.0, through)))
+
+
+class RowOrder:
+    """The rows of each step: shuffled epochs end to end, no row twice in a batch.
+
+    A batch that crosses the border of two epochs takes from the next one the first rows that it
+    does not hold yet; the others follow in their order, so each epoch stays a permutation.
+    """
+
+    def __init__(self, n: int, batch: int, seed: int) -> None:
+        """Take the number of rows, and of rows a step: at most ``n``."""
+        self.n, self.batch, self.seed = n, batch, seed
+        self._last = (-1, np.empty(0, np.int64))  # an epoch and its order
+
+    def __call__(self, step: int) -> NDArray[np.int64]:
+        """Return the row numbers of a step, (batch,)."""
+        epoch, start = divmod(step * self.batch, self.n)
+        rows = self._epoch(epoch)[start : start + self.batch]
+        if len(rows) < self.batch:
+            rows = np.concatenate([rows, self._epoch(epoch + 1)[: self.batch - len(rows)]])
+        return rows
+
+    def _epoch(self, epoch: int) -> NDArray[np.int64]:
+        number, order = self._last
+        if number > epoch:
+            number = -1
+        if self.n >= 2 * self.batch and number < epoch - 1:
+            # So long an epoch ends in the same rows whatever its start was changed to.
+            number, order = epoch - 1, self._shuffled(epoch - 1)
+        while number < epoch:
+            number += 1
+            order = self._after(order, number)
+        self._last = number, order
+        return order
+
+    def _shuffled(self, epoch: int) -> NDArray[np.int64]:
+        return rng_for(self.seed, "order", epoch).permutation(self.n)
+
+    def _after(self, before: NDArray[np.int64], epoch: int) -> NDArray[np.int64]:
+        order = self._shuffled(epoch)
+        carried = epoch * self.n % self.batch  # rows of the epoch before in the open batch
+        if not carried:
+            return order
+        held = np.isin(order, before[-carried:])
+        first = np.flatnonzero(~held)[: self.batch - carried]
+        return np.concatenate([order[first], np.delete(order, first)])
+
+
+class Step:
+    """One step of one process: its rows, and its random numbers.
+
+    Attributes:
+        number: from 0.
+        all_rows: of the global batch, (batch,).
+        rows: those of this process.
+    """
+
+    def __init__(
+        self, number: int, rows: NDArray[np.int64], seed: int, part: tuple[int, int] = (0, 1)
+    ) -> None:
+        """Take the global batch, and as ``part`` this process's place among how many."""
+        size = len(rows) // part[1]
+        self.number, self.all_rows = number, rows
+        self.mine = slice(part[0] * size, (part[0] + 1) * size)
+        self.rows = rows[self.mine]
+        self.generator = torch.Generator().manual_seed(seed_for(seed, "step", number))
+
+    def rand(self, *shape: int) -> Tensor:
+        """Uniform numbers in [0, 1), (rows, *shape)."""
+        return torch.rand(len(self.all_rows), *shape, generator=self.generator)[self.mine]
+
+    def rand_all(self) -> Tensor:
+        """Uniform numbers in [0, 1) of the whole batch, (batch,)."""
+        return torch.rand(len(self.all_rows), generator=self.generator)
+
+    def randn(self, *shape: int) -> Tensor:
+        """Standard normal numbers, (rows, *shape)."""
+        return torch.randn(len(self.all_rows), *shape, generator=self.generator)[self.mine]
+
+    def randint(self, high: int, *shape: int) -> Tensor:
+        """Integers from 0 to ``high - 1``, (rows, *shape)."""
+        size = (len(self.all_rows), *shape)
+        return torch.randint(0, high, size, generator=self.generator)[self.mine]

@@ -1,0 +1,156 @@
+"""Several processes that train one model (``torchrun``), through Hugging Face accelerate.
+
+Each process holds the whole model and takes an equal part of every batch; gradients are averaged.
+One process needs no process group: everything here is then the identity.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import tempfile
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch import distributed as dist
+
+from palpate.core import PalpateError, locked, require_new_folder
+
+#: How long a process waits for another: the first one may decode a whole data set meanwhile.
+PATIENCE = timedelta(hours=12)
+
+
+def connect(device: str = "auto") -> str:
+    """Join the other processes that ``torchrun`` started, if any.
+
+    Returns:
+        the device of this process: its own GPU where several processes share a machine.
+
+    Raises:
+        PalpateError: if torch was built without ``torch.distributed``.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return device
+    if not dist.is_available():
+        must, fix = "torch must be built with torch.distributed", "Run it in one process"
+        raise PalpateError(must, "a build without it", fix)
+    from accelerate import PartialState
+
+    joined = dist.is_initialized()
+    state = PartialState(cpu=device == "cpu", timeout=PATIENCE)
+    if not joined:
+        atexit.register(state.destroy_process_group)
+    return str(state.device) if device in ("auto", "cuda") and state.device else device
+
+
+def place() -> tuple[int, int]:
+    """This process's number, and how many there are."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return 0, 1
+    return dist.get_rank(), dist.get_world_size()
+
+
+@contextmanager
+def first_alone() -> Generator[None]:
+    """Let one process of each machine go first: it fills caches that the others then read."""
+    if place()[1] == 1:
+        yield
+        return
+    from accelerate import PartialState
+
+    with PartialState().local_main_process_first():
+        yield
+
+
+def barrier() -> None:
+    """Wait until all processes are here."""
+    if place()[1] > 1:
+        dist.barrier()
+
+
+def average(tensors: Sequence[Tensor]) -> None:
+    """Replace each tensor by its mean over the processes.
+
+    Raises:
+        PalpateError: if another process has ended.
+    """
+    if (size := place()[1]) == 1:
+        return
+    try:
+        for work in [dist.all_reduce(t, async_op=True) for t in tensors]:
+            work.wait()  # type: ignore[union-attr]
+    except RuntimeError as error:
+        raise _ended(error) from None
+    torch._foreach_div_(list(tensors), size)
+
+
+def gather_rows(own: Tensor) -> Tensor:
+    """The rows of all processes, (processes * n, ...), differentiable.
+
+    Every process computes the same loss of all rows, and gradients are averaged over the processes:
+    so the gradient of the own rows counts as often as there are processes. Other rows' gradients
+    are computed where these rows are.
+    """
+    rank, size = place()
+    if size == 1:
+        return own
+    parts = [torch.empty_like(own, requires_grad=False) for _ in range(size)]
+    try:
+        dist.all_gather(parts, own.detach().contiguous())
+    except RuntimeError as error:
+        raise _ended(error) from None
+    parts[rank] = own.detach() + size * (own - own.detach())
+    return torch.cat(parts)
+
+
+def _ended(error: RuntimeError) -> PalpateError:
+    got = f"one has ended ({str(error).splitlines()[0][-80:]})"
+    return PalpateError("All processes must stay alive", got, "Run the same command again")
+
+
+@contextmanager
+def work_folder(output: Path | None) -> Generator[Path]:
+    """A folder for checkpoints and caches of a training whose result goes to ``output``.
+
+    ``.<name>.work`` next to the output, which the same call finds again after a stop and which is
+    removed on success; a temporary folder where there is no output. Of several processes the first
+    holds it.
+
+    Raises:
+        PalpateError: if the output exists already or is written by another run, before any work is
+            done.
+    """
+    rank = place()[0]
+    if output is None:
+        with tempfile.TemporaryDirectory(prefix="palpate-") as name:
+            yield Path(name)
+        return
+    require_new_folder(output)
+    work = output.absolute().parent / f".{output.name}.work"
+    barrier()  # all have looked at the output before it is written
+    if rank:
+        yield work
+        barrier()
+        return
+    try:
+        with locked(work, output):
+            yield work
+    except PalpateError:
+        if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
+            shutil.rmtree(work)
+        raise
+    barrier()
+    shutil.rmtree(work, ignore_errors=True)
+
+
+def keep_logs(work: Path, output: Path) -> None:
+    """Copy the logs of a training to its result: ``log-<stage>.jsonl``, and TensorBoard's files."""
+    for log in sorted(work.rglob("log.jsonl")):
+        shutil.copy(log, output / f"log-{log.parent.name}.jsonl")
+        if (board := log.parent / "tensorboard").is_dir():
+            shutil.copytree(board, output / "tensorboard" / log.parent.name)
