@@ -35,7 +35,7 @@ from threadpoolctl import threadpool_limits
 
 from palpate.core import FeatureSet, rng_for, short
 from palpate.metrics.intervals import mean_interval
-from palpate.metrics.probe import retrieval
+from palpate.metrics.retrieval import retrieval
 from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.options import BACKGROUND_OFFSET
 from palpate.sim.plan import contact_frames, first_contact
@@ -258,9 +258,8 @@ def across(vision, touch):
     )
     centered = FeatureSet(keys.ids, keys.features - y_mean, None, keys.groups, "ridge")
     pool = min(POOL, len(keys.ids))
-    return [
-        (s.value, s.interval, s.details["chance"]) for s in retrieval(guess, centered, pool=pool)
-    ]
+    result, _ = retrieval(guess, centered, top=(1, 5), pool=pool, repeats=20)
+    return [(m.score.value, m.score.interval, m.score.details["chance"]) for m in result.top]
 
 
 def measure(frames, images, protocol, fold, seed):

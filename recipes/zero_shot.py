@@ -14,7 +14,8 @@ import numpy as np
 from palpate.core import FeatureSet, PalpateError, Score
 from palpate.encoders.embed import embed_texts
 from palpate.encoders.encoder_set import EncoderSet
-from palpate.metrics.probe import mean_over_groups, recall_by_class
+from palpate.metrics.means import mean_over_groups
+from palpate.metrics.probe import recall_by_class
 
 
 def zero_shot_accuracy(

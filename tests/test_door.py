@@ -28,7 +28,10 @@ SIGNATURES = {
         "photos * model output split part seed guidance steps batch skip_bad device progress"
     ),
     "load": "source * format images skip_bad progress **options",
-    "probe": "data split * encoder modality group balanced top seed allow_seen cache progress",
+    "probe": (
+        "data split * encoder modality label group neighbors top pool text_threshold seed "
+        "allow_seen cache progress"
+    ),
     "score": (
         "generated reference * encoder split names labels groups group background presets sigma "
         "estimator backend normalize companions controls inception clip lpips "

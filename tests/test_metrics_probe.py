@@ -1,13 +1,11 @@
-"""The linear probe and retrieval against hand counts and slow loops."""
-
-from itertools import permutations
+"""The linear probe and k-NN against hand counts and slow loops."""
 
 import numpy as np
 import pytest
 from scipy.special import logsumexp
 
 from palpate.core import FeatureSet, PalpateError
-from palpate.metrics.probe import fit_probe, material_accuracy, retrieval
+from palpate.metrics.probe import class_accuracies, fit_probe, material_accuracy, neighbor_hits
 
 
 def features(x, labels=None, groups=None, encoder="e", start=0):
@@ -60,9 +58,6 @@ def test_accuracy_recall_and_unseen_classes_by_hand():
     assert score.details["recall"] == pytest.approx({"a": 1.0, "b": 2 / 3, "zinc": 0.0})
     assert score.details["unseen_classes"] == ["zinc"]
     assert (score.n, score.encoder, score.higher_is_better) == (5, "e", True)
-    balanced = material_accuracy(train, test, l2=1e-3, balanced=True)
-    assert balanced.value == pytest.approx((1 + 2 / 3 + 0) / 3)
-    assert balanced.metric != score.metric
 
 
 def test_the_interval_is_the_jackknife_over_groups():
@@ -99,9 +94,9 @@ def test_rows_without_a_label_are_skipped():
 @pytest.mark.parametrize(
     ("train", "test", "match"),
     [
-        (features([[0.0], [1.0]], ["a", "a"]), clusters(9), "two materials"),
+        (features([[0.0], [1.0]], ["a", "a"]), clusters(9), "two classes"),
         (clusters(), features(clusters(9).features), "test features must have rows"),
-        (clusters(), features(clusters(9).features, [""] * 9), "rows with a material"),
+        (clusters(), features(clusters(9).features, [""] * 9), "rows with a label"),
         (clusters(), features(np.ones((9, 6)), ["m0"] * 9, encoder="other"), "one encoder"),
     ],
 )
@@ -110,63 +105,61 @@ def test_the_probe_rejects_sets_it_cannot_use(train, test, match):
         material_accuracy(train, test)
 
 
-def slow_hit(similar, good, k):
-    """Share of the orders of the keys that agree with similarity and have a positive in top k."""
-    hits = []
-    for row, right in zip(similar, good, strict=True):
-        orders = [o for o in permutations(range(len(row))) if (np.diff(row[list(o)]) <= 0).all()]
-        hits.append(np.mean([right[list(o[:k])].any() for o in orders]))
-    return np.mean(hits)
+def test_both_classifiers_give_plain_and_balanced_accuracy_next_to_their_baselines():
+    x = [[0.0, 1.0], [0.1, 1.0], [1.0, 0.0], [1.0, 0.1]] * 3
+    train = features(
+        [*x, [1.0, 0.0]], ["a", "a", "b", "b"] * 3 + ["b"], [f"v{k}" for k in range(13)]
+    )
+    x = [[0, 1], [1, 0], [0, 1], [1, 0], [1, 0]]
+    test = features(x, ["a", "b", "b", "b", "zinc"], ["v", "v", "w", "w", "w"])
+    means = class_accuracies(train, test, label="metal", neighbors=3, subject="e")
+    assert {m.score.metric: m.score.value for m in means} == pytest.approx(
+        {
+            "metal accuracy": 3 / 5,
+            "metal accuracy, balanced": (1 + 2 / 3 + 0) / 3,
+            "metal accuracy, 3-NN": 3 / 5,
+            "metal accuracy, 3-NN, balanced": (1 + 2 / 3 + 0) / 3,
+        }
+    )
+    plain, balanced = (m.score.details for m in means[:2])
+    assert (plain["chance"], plain["majority"]) == (0.5, 3 / 5)
+    assert (balanced["chance"], balanced["majority"]) == (0.5, 1 / 3)
+    assert plain["classes"] == ["a", "b", "zinc"]
+    assert plain["matrix"][0] == [1, 0, 0]
+    assert plain["matrix"][1] == pytest.approx([1 / 3, 2 / 3, 0], abs=1e-4)
+    assert plain["matrix"][2] == [0, 1, 0]
 
 
+def slow_neighbors(train, labels, query, truth, k):
+    """Probability of a right vote over all orders of equally similar train rows."""
+    unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)  # noqa: E731
+    similar = (unit(train) @ unit(query)).round(6)
+    order = np.argsort(-similar, kind="stable")
+    last = similar[order[k - 1]]
+    weight = np.where(similar > last, 1.0, 0.0)
+    tied = similar == last
+    weight[tied] = (k - weight.sum()) / tied.sum()
+    votes = dict.fromkeys(labels, 0.0)
+    for w, s, name in zip(weight, similar, labels, strict=True):
+        votes[name] += w * np.exp(s / 0.07)
+    best = [name for name, v in votes.items() if v >= max(votes.values()) * (1 - 1e-5)]
+    return (truth in best) / len(best)
+
+
+@pytest.mark.parametrize("k", [1, 4, 9])
 @pytest.mark.parametrize("ties", [False, True])
-@pytest.mark.parametrize("many", [False, True])
-def test_retrieval_equals_all_orders(ties, many):
-    rng = np.random.default_rng(3)
-    keys = rng.normal(size=(6, 3)).astype(np.float32)
+def test_neighbors_vote_as_in_a_slow_loop(k, ties):
+    rng = np.random.default_rng(k)
+    train, test = rng.normal(size=(30, 3)), rng.normal(size=(12, 3))
     if ties:
-        keys[1] = keys[2] = keys[4]
-        keys[3] = keys[0]
-    queries = keys + 0.8 * rng.normal(size=(6, 3)).astype(np.float32)
-    good = rng.random((6, 6)) < (0.3 if many else 0)
-    unit = lambda x: x.astype(float) / np.linalg.norm(x.astype(float), axis=1)[:, None]  # noqa: E731
-    similar = (unit(queries) @ unit(keys).T).round(9)
-    positives = good if many else None
-    tops = (1, 2, 5, 6)
-    scores = retrieval(features(queries), features(keys), top=tops, positives=positives)
-    for k, score in zip(tops, scores, strict=True):
-        assert score.value == pytest.approx(slow_hit(similar, good | np.eye(6, dtype=bool), k))
-        assert score.metric == f"retrieval top-{k}"
-    assert scores[-1].value == pytest.approx(1.0)
+        train[5:15] = train[4]
+    labels, truth = [f"m{j % 3}" for j in range(30)], [f"m{j % 4}" for j in range(12)]
+    hits = neighbor_hits(train, labels, test, truth, k)
+    slow = [slow_neighbors(train, labels, q, t, k) for q, t in zip(test, truth, strict=True)]
+    assert hits == pytest.approx(slow)
 
 
-def test_equal_keys_score_chance():
-    same = features(np.ones((10, 4)))
-    scores = retrieval(same, same)
-    assert [s.value for s in scores] == pytest.approx([0.1, 0.5])
-    assert [s.details["chance"] for s in scores] == pytest.approx([0.1, 0.5])
-
-
-@pytest.mark.parametrize("n", [40, 160])
-def test_chance_of_a_pool_does_not_depend_on_n(n):
-    rng = np.random.default_rng(0)
-    a, b = (features(rng.normal(size=(n, 5))) for _ in range(2))
-    (top5,) = retrieval(a, b, top=(5,), pool=20, repeats=60)
-    assert top5.details["chance"] == pytest.approx(0.25)
-    assert top5.value == pytest.approx(0.25, abs=0.12)
-    assert retrieval(a, b, top=(5,), pool=20, repeats=60) == [top5]
-    assert retrieval(a, a, pool=20)[0].value == 1.0
-
-
-@pytest.mark.parametrize(
-    ("queries", "keys", "pool", "match"),
-    [
-        (np.eye(4), features(np.eye(4), start=1), None, "same ids"),
-        (np.eye(4), features(np.eye(4)), 5, "`pool` must lie in 2 to 4"),
-        (np.eye(1), features(np.eye(1)), None, "two samples"),
-        (np.eye(4), features(np.ones((4, 2))), None, "common space"),
-    ],
-)
-def test_retrieval_rejects_sets_that_do_not_pair(queries, keys, pool, match):
-    with pytest.raises(PalpateError, match=match):
-        retrieval(features(queries), keys, pool=pool)
+def test_more_neighbors_than_train_rows_are_all_of_them():
+    train, test = clusters(9), clusters(6, seed=1)
+    args = train.features, train.labels, test.features, test.labels
+    assert neighbor_hits(*args, 500) == pytest.approx(neighbor_hits(*args, 9))

@@ -24,7 +24,8 @@ from palpate.captions.reading import read_captions
 from palpate.captions.vocabulary import Vocabulary, visual_in, words_of
 from palpate.core import FeatureSet, Note, PalpateError, Progress, Score, Split, quiet, rng_for
 from palpate.data.manifest import Manifest
-from palpate.metrics.probe import fit_probe, mean_over_groups
+from palpate.metrics.means import mean_over_groups
+from palpate.metrics.probe import fit_probe
 from palpate.report.results import Results
 
 #: Words from which a caption is overlong.

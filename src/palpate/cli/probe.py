@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,50 +16,110 @@ from palpate.cli.terminal import (
     guard_output,
     require_extra,
 )
+from palpate.core import PalpateError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """Train an encoder on each split, in place of `--encoder`, and print what the first split is
+    worth over the others.
+    """
+
+    train: Switch = False
+    """Train and score one encoder for each split and seed. Run again to resume."""
+    preset: Literal["mini", "tiny", "paper"] = "mini"
+    """As in `palpate train encoder`."""
+    clip: str | None = None
+    """As in `palpate train encoder`."""
+    epochs: float | None = None
+    """Default: the preset's."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """One training each; intervals are over videos and seeds."""
+    work: Path = Path("runs/probe")
+    """Folder of the trained encoders and caches, kept for the next run."""
+    device: str = "auto"
+    """auto, cpu, cuda, mps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(Common):
-    """Score what an encoder's embeddings know: the material, by a linear probe fitted to the train
-    part, and the image of the other modality, by retrieval; on the test part of a split.
+    """Score what an encoder's embeddings know: classes, by a linear probe and k-NN fitted to the
+    train part, and which text and image belong to a sample, by retrieval within the test part.
+
+    Several encoders, or several splits, are compared with paired differences.
     """
 
     manifest: Annotated[Path, tyro.conf.Positional]
     """Manifest file or the folder of an import."""
-    split: Path
-    """Split file."""
-    encoder: str
-    """Folder of `palpate train encoder`, a hub id, or palpate/mini."""
+    split: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--splits"])]
+    """Split files; their order is that of the differences: `--splits orig.json noleak.json`."""
+    encoder: tuple[str, ...] = ()
+    """Folders of `palpate train encoder`, hub ids, or palpate/mini."""
     modality: Literal["tactile", "vision"] = "tactile"
     """Whose encoder."""
+    label: tuple[str, ...] = ("material",)
+    """Columns to predict."""
     group: Literal["auto", "video", "contact", "object"] = "auto"
     """What stays together in cross-validation and intervals; `auto` takes what the split kept
     whole, else the video."""
-    balanced: Switch = False
-    """Average the accuracy over materials instead of samples."""
+    neighbors: int = 20
+    """k of k-NN."""
+    top: tuple[int, ...] = (1, 5, 10)
+    """Ranks within which retrieval must find a right key."""
+    pool: int | None = None
+    """Rank among so many test samples drawn at random. Default: all; of several splits as many as
+    the smallest test part has."""
+    text_threshold: float = 0.6356
+    """Cosine from which another text counts as right, next to strict retrieval; the default is
+    TVL's."""
     allow_seen: Switch = False
     """Probe an encoder that was trained on some of the test images; every score says so."""
     output: OptionalOutPath = None
-    """Write the scores as JSON, for `palpate report`."""
+    """Write the results as JSON, for `palpate report`, or as a page (.html)."""
     cache: Path | None = None
     """Folder for embeddings, which an interrupted run finds again."""
     seed: int = 0
-    """Of the folds of the cross-validation."""
+    """Of the folds of the cross-validation, pools and the queries on the page."""
+    training: Training = field(default_factory=Training)
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
-    """Probe, print the scores, write JSON."""
+    """Probe, print the scores, write JSON or a page."""
     require_extra("palpate probe")
-    if options.output:
-        guard_output(options.output, [options.manifest, options.split])
-    from palpate.evaluation.probing import probe
-
-    names = ("encoder", "modality", "group", "balanced", "allow_seen", "cache", "seed")
-    arguments = {name: getattr(options, name) for name in names}
+    output, training = options.output, options.training
+    if bool(options.encoder) == training.train:
+        must, fix = "Either an encoder or training must be chosen", "Name one of the two"
+        example = {"encoder": "palpate/mini"}
+        raise PalpateError(must, "both" if training.train else "neither", fix, example=example)
+    page = output is not None and output.suffix == ".html"
+    if output:
+        marks = (b"palpate",) if page else (b'"format": "palpate-',)
+        guard_output(output, [options.manifest, *options.split], marks)
+    one_or_all = lambda values: values[0] if len(values) == 1 else list(values)  # noqa: E731
+    names = ("modality", "label", "group", "neighbors", "top", "pool", "text_threshold", "seed")
+    arguments: dict[str, Any] = {name: getattr(options, name) for name in names}
     with terminal.progress() as progress:
-        results = probe(options.manifest, options.split, progress=progress, **arguments)
+        if training.train:
+            from palpate.studies.split_study import compare_splits
+
+            more = ("preset", "clip", "epochs", "seeds", "work", "device")
+            arguments |= {name: getattr(training, name) for name in more}
+            arguments["print_line"] = terminal.print_line
+            results = compare_splits(
+                options.manifest, list(options.split), progress=progress, **arguments
+            )
+        else:
+            from palpate.evaluation.probing import probe
+
+            arguments |= {"encoder": one_or_all(options.encoder), "cache": options.cache}
+            arguments["allow_seen"] = options.allow_seen
+            results = probe(
+                options.manifest, one_or_all(options.split), progress=progress, **arguments
+            )
     results = replace(results, commands=[terminal.command])
     terminal.show(results)
-    if options.output:
-        results.save(options.output)
+    for fact in results.facts:
+        terminal.print(fact)
+    if output:
+        results.to_html(output) if page else results.save(output)
     return results.to_json()

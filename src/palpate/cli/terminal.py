@@ -78,6 +78,7 @@ RENAMED: dict[tuple[str, str], str] = {
     ("import", "--set"): "an option for each name, e.g. --labels train.txt",
     ("validate", "--set"): "an option for each name, e.g. --labels train.txt",
     ("import", "--max-per-touch"): "--max-per-contact",
+    ("probe", "--balanced"): "the default; both accuracies are printed",
     ("score", "--controls"): "the default; --no-controls turns it off",
     ("split", "--by touch"): "--by contact",
     ("audit", "--by touch"): "--by contact",

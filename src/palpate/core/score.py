@@ -145,10 +145,13 @@ class Score:
 def require_comparable(scores: Sequence[Score]) -> None:
     """Check that scores may share a column.
 
+    ``settings["axis"]``, the same in all of them, names what a column compares: it may differ.
+
     Raises:
         PalpateError: naming the first setting in which two of them differ.
     """
-    for name in COMPARABLE:
+    axis = scores[0].settings.get("axis") if scores else None
+    for name in (name for name in COMPARABLE if name != axis):
         # Running sums do not know their reference: it must agree where it is known.
         known = [s for s in scores if name != "reference" or s.reference is not None]
         for score in known[1:]:

@@ -1,108 +1,417 @@
-"""What an encoder's embeddings know: a linear probe of the material, and retrieval."""
+"""What an encoder's embeddings know: classes by a linear probe and k-NN, and retrieval.
+
+A classifier is trained on the train part of a split and scored on its test part; retrieval is
+within the test part. Several encoders, or several splits, become columns next to each other with
+paired differences: a video is left out of both at once. Under two splits the pools of retrieval get
+one size, that of the smaller test part, since chance depends on it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from palpate.core import PalpateError, Progress, Score, Split, quiet
+import numpy as np
+
+from palpate.core import (
+    FeatureSet,
+    Note,
+    PalpateError,
+    Progress,
+    Score,
+    Split,
+    quiet,
+    require_choice,
+    rng_for,
+)
+from palpate.core.digest import canonical_json
+from palpate.core.features import is_missing
 from palpate.evaluation.guard import guard
 from palpate.evaluation.scoring import load_encoders
-from palpate.metrics.probe import fit_probe, material_accuracy, retrieval
-from palpate.report.results import Results
+from palpate.metrics.means import Mean, over_seeds
+from palpate.metrics.paired import differences_of_means
+from palpate.metrics.probe import class_accuracies
+from palpate.metrics.retrieval import TIE, Floats, retrieval, unit_rows
+from palpate.report.results import Match, Results, Strip
 
 if TYPE_CHECKING:
     from palpate.data.manifest import Manifest
 
 Modality = Literal["vision", "tactile"]
+#: TVL's cosine of captions from which a text counts as right (its OpenCLIP ViT-L/14).
+TVL_THRESHOLD = 0.6356
+#: Queries shown for each direction, and keys shown for each of them.
+STRIPS, SHOWN = 4, 6
 
 
-def probe(  # noqa: PLR0913
+@dataclass(frozen=True)
+class Plan:
+    """What is measured.
+
+    Attributes: see :func:`probe`; ``axis`` is what several subjects differ in (``encoder``,
+    ``split``), '' for one; ``trained`` if each split has an encoder of its own.
+    """
+
+    modality: Modality = "tactile"
+    labels: Sequence[str] = ("material",)
+    group: str = "auto"
+    neighbors: int = 20
+    top: Sequence[int] = (1, 5, 10)
+    pool: int | None = None
+    text_threshold: float = TVL_THRESHOLD
+    seed: int = 0
+    allow_seen: bool = False
+    axis: str = ""
+    trained: bool = False
+
+
+@dataclass
+class Probed:
+    """What one encoder scores under one split: means, median ranks, retrieved keys, notes."""
+
+    means: list[Mean] = field(default_factory=list[Mean])
+    medians: list[Score] = field(default_factory=list[Score])
+    strips: list[Strip] = field(default_factory=list[Strip])
+    notes: list[Note] = field(default_factory=list[Note])
+
+
+def probe(  # noqa: PLR0913 - one argument a choice
     data: Manifest | str | Path,
-    split: Split | str | Path,
+    split: Any,
     *,
     encoder: Any,
     modality: Modality = "tactile",
+    label: str | Sequence[str] = "material",
     group: str = "auto",
-    balanced: bool = False,
-    top: Sequence[int] = (1, 5),
+    neighbors: int = 20,
+    top: Sequence[int] = (1, 5, 10),
+    pool: int | None = None,
+    text_threshold: float = TVL_THRESHOLD,
     seed: int = 0,
     allow_seen: bool = False,
     cache: str | Path | None = None,
     progress: Progress = quiet,
 ) -> Results:
-    """Score how well embeddings name the material and find the other modality's image.
+    """Score how well embeddings name classes, and find the text and image that belong to a sample.
 
     Args:
-        data: a manifest with materials and images of the modality, or its file or folder.
-        split: a split or its file; the probe is fitted to its train part and scored on its test
-            part.
-        encoder: name or folder of a set of encoders, or an ``EncoderSet``.
+        data: a manifest with images of the modality, or its file or folder.
+        split: a split or its file; classifiers are fitted to its train part and scored on its test
+            part. Several, as a list or name -> split, are compared.
+        encoder: name or folder of a set of encoders, or an ``EncoderSet``. Several, as a list or
+            name -> encoders, are compared; not together with several splits.
         modality: whose encoder.
+        label: columns to predict; those that the data lack are left out, with a note.
         group: column whose values stay together in cross-validation and intervals; ``auto`` takes
             what the split kept whole, else the video.
-        balanced: average the accuracy over materials instead of samples, and weight the probe's
-            rows so.
-        top: ranks within which retrieval must find the image of the same sample in the other
-            modality (vision for tactile and the other way round); skipped where the data lack it,
-            or if empty.
-        seed: of the folds of the cross-validation.
+        neighbors: k of k-NN.
+        top: ranks within which retrieval must find a right key; none skips retrieval.
+        pool: rank among so many test samples drawn at random. Default: all, and under several
+            splits as many as the smallest test part has.
+        text_threshold: cosine of two texts from which one counts as right for the other's sample,
+            next to strict retrieval; the default is TVL's, for its text encoder.
+        seed: of the folds of the cross-validation, the pools and the queries that are shown.
         allow_seen: probe an encoder that was trained on some of the test images; every score says
             so.
         cache: folder for embeddings, which an interrupted run finds again.
         progress: called with what is done.
 
     Returns:
-        Material accuracy on the test part, with chance in its ``details``, and retrieval top-k.
+        Accuracy and balanced accuracy by a linear probe and k-NN, next to chance and the commonest
+        class; retrieval in both directions within the test part; and paired differences.
 
     Raises:
-        PalpateError: if train has fewer than two materials, images are missing or unreadable, or
-            the encoder was trained on test images.
+        PalpateError: if train has fewer than two classes, nothing can be measured, images are
+            missing or unreadable, or the encoder was trained on test images.
     """
+    require_choice("modality", modality, ("tactile", "vision"))
+    manifest = load_manifest(data)
+    splits, encoders = named(split, "split"), named(encoder, "encoder")
+    if len(splits) > 1 and len(encoders) > 1:
+        must, fix = "must be one where several splits are compared", "Compare one at a time"
+        raise PalpateError(must, f"{len(encoders)}", fix, argument="encoder")
+    loaded = {name: Split.load(s) for name, s in splits.items()}
+    sets = {name: load_encoders(e, progress) for name, e in encoders.items()}
+    axis = "split" if len(splits) > 1 else "encoder" if len(sets) > 1 else ""
+    plan = plan_of(
+        manifest,
+        loaded,
+        Plan(
+            modality,
+            [label] if isinstance(label, str) else list(label),
+            group,
+            neighbors,
+            tuple(top),
+            pool,
+            text_threshold,
+            seed,
+            allow_seen,
+            axis,
+        ),
+    )
+    runs: dict[str, list[Probed]] = {}
+    for s, e in ((s, e) for s in loaded for e in sets):
+        subject = {"split": s, "encoder": e}.get(axis, "real")
+        runs[subject] = [
+            measure(manifest, loaded[s], sets[e], subject, plan, cache=cache, progress=progress)
+        ]
+    results = results_of(f"Probe of the {modality} encoder", runs, plan, manifest, loaded)
+    digests = {
+        f"{modality} encoder{f' {name}' if axis == 'encoder' else ''}": e.digest(modality)
+        for name, e in sets.items()
+    }
+    known: Any = results.settings["digests"]
+    return replace(results, settings={**results.settings, "digests": {**known, **digests}})
+
+
+def load_manifest(data: Manifest | str | Path) -> Manifest:
+    """A manifest as it is, or from its file or folder."""
     from palpate.data.manifest import Manifest
+
+    return Manifest.load(Path(data)) if isinstance(data, str | Path) else data
+
+
+def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan:
+    """The plan with its group chosen, and one pool size for all splits."""
+    for name in plan.labels:
+        manifest.column(name)  # raises for a column that is not there
+    if plan.neighbors < 1:
+        raise PalpateError("must be at least 1", f"{plan.neighbors}", "", argument="neighbors")
+    if plan.top and min(plan.top) < 1:
+        raise PalpateError("must be ranks from 1", f"{min(plan.top)}", "", argument="top")
+    groups = {str(split.rule.get("group", "video")) for split in splits.values()}
+    group = plan.group if plan.group != "auto" else groups.pop() if len(groups) == 1 else "video"
+    sizes = [len(split.ids("test")) for split in splits.values()]
+    pool = min(sizes) if plan.pool is None and len(sizes) > 1 else plan.pool
+    return replace(plan, group=group, pool=pool)
+
+
+def measure(
+    manifest: Manifest,
+    split: Split,
+    encoders: Any,
+    subject: str,
+    plan: Plan,
+    *,
+    cache: str | Path | None = None,
+    progress: Progress = quiet,
+) -> Probed:
+    """Everything that one set of encoders scores under one split.
+
+    Raises:
+        PalpateError: if nothing can be measured.
+    """
     from palpate.encoders.embed import embed
 
-    manifest = Manifest.load(Path(data)) if isinstance(data, str | Path) else data
-    split = Split.load(split)
-    encoders = load_encoders(encoder, progress)
-    if modality not in ("vision", "tactile"):
-        fix = "Choose one of the two"
-        raise PalpateError("must be vision or tactile", repr(modality), fix, argument="modality")
-    column = str(split.rule.get("group", "video")) if group == "auto" else group
-    options: dict[str, Any] = {
-        "groups": column,
-        "cache": None if cache is None else Path(cache),
-        "progress": progress,
+    options: dict[str, Any] = {"groups": plan.group, "progress": progress}
+    options["cache"] = None if cache is None else Path(cache)
+    how: dict[str, Any] = {"split": split, "allow_seen": plan.allow_seen, "progress": progress}
+    parts = [manifest.part(split, part) for part in ("train", "test")]
+    parts = [part.take(_with(part, plan.modality)) for part in parts]
+    notes = guard(encoders, plan.modality, parts[1], **how)
+    features = [embed(part, encoders, plan.modality, **options) for part in parts]
+    if plan.trained:  # the encoder belongs to the split, which is the axis
+        features = [replace(f, encoder=None) for f in features]
+    common: dict[str, Any] = {"subject": subject, "split": split.digest}
+    common["settings"] = {"axis": plan.axis} if plan.axis else {}
+    result = Probed()
+    for label in plan.labels:
+        _classify(result, parts, features, label, plan=plan, common=common)
+    others = ("text", "vision" if plan.modality == "tactile" else "tactile")
+    for other in others if plan.top else ():
+        ids = _with(parts[1], other) if other in encoders.modalities else []
+        if len(ids) < 2:
+            code = "no-partner" if other in encoders.modalities else "no-encoder"
+            result.notes.append(Note(f"probe-{code}", {"modality": other}))
+            continue
+        if missing := len(parts[1]) - len(ids):
+            result.notes.append(Note("probe-some-partners", {"modality": other, "count": missing}))
+        test = parts[1].take(ids)
+        notes += guard(encoders, other, test, **how) if other != "text" else []
+        pair = features[1].take(ids), embed(test, encoders, other, **options)
+        _retrieve(result, test, *pair, other, plan=plan, common=common)
+    if not result.means:
+        must = "There must be a label, or another modality to retrieve"
+        fix = "Name a column with labels, or add texts or photos"
+        raise PalpateError(must, "neither in the test part", fix, argument="label")
+    noted = lambda score: replace(score, notes=[*score.notes, *notes])  # noqa: E731
+    result.means = [replace(mean, score=noted(mean.score)) for mean in result.means]
+    result.medians = [noted(score) for score in result.medians]
+    return result
+
+
+def _classify(
+    result: Probed,
+    parts: Sequence[Manifest],
+    features: Sequence[FeatureSet],
+    label: str,
+    *,
+    plan: Plan,
+    common: Mapping[str, Any],
+) -> None:
+    """Add the accuracies of one label, or why there are none."""
+    values = [["" if is_missing(v) else str(v) for v in part.column(label)] for part in parts]
+    names = ("train", "test")
+    if lacking := [name for name, column in zip(names, values, strict=True) if not any(column)]:
+        note = {"label": label, "part": " and ".join(lacking)}
+        result.notes.append(Note("probe-no-label", note))
+        return
+    if without := values[1].count(""):
+        result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))
+    train, test = (replace(f, labels=v) for f, v in zip(features, values, strict=True))
+    result.means += class_accuracies(
+        train, test, label=label, neighbors=plan.neighbors, seed=plan.seed, **common
+    )
+
+
+def _retrieve(
+    result: Probed,
+    test: Manifest,
+    queries: FeatureSet,
+    keys: FeatureSet,
+    other: str,
+    *,
+    plan: Plan,
+    common: Mapping[str, Any],
+) -> None:
+    """Add both directions between the plan's modality and another one."""
+    pool = None if plan.pool is None else min(plan.pool, len(test))
+    options: dict[str, Any] = {"top": plan.top, "pool": pool, "seed": plan.seed, **common}
+    ways = list(retrieval(queries, keys, names=(plan.modality, other), **options))
+    if other == "text":
+        names = (plan.modality, "similar text")
+        options |= {"texts": keys.features, "threshold": plan.text_threshold}
+        ways += retrieval(queries, keys, names=names, **options)
+    for way in ways:
+        result.means += way.top
+        result.medians.append(way.median)
+    subject = str(common["subject"]) if plan.axis else ""
+    for x, y, names in (
+        (queries, keys, (plan.modality, other)),
+        (keys, queries, (other, plan.modality)),
+    ):
+        strips = _strips(test, unit_rows(x.features), unit_rows(y.features), names, plan.seed)
+        result.strips += [replace(strip, subject=subject) for strip in strips]
+
+
+def _strips(test: Manifest, a: Floats, b: Floats, names: tuple[str, str], seed: int) -> list[Strip]:
+    """What some queries retrieve; each of another video where there are enough."""
+    rows, texts = list(test.table.iter_rows(named=True)), test.column("text")
+    order = rng_for(seed, "strips", names[0]).permutation(len(rows))
+    by_video = {rows[k]["video"] or rows[k]["id"]: int(k) for k in order}
+    strips: list[Strip] = []
+    for k in list(by_video.values())[:STRIPS]:
+        similar = b @ a[k]
+        order = np.argsort(-similar, kind="stable").tolist()
+        if names[1] == "text":  # each text once
+            order = list({texts[j]: j for j in reversed(order)}.values())[::-1]
+        best = order[:SHOWN]
+        matches = [
+            Match(
+                test.ref(rows[j]),
+                float(similar[j]),
+                j == k or ("text" in names and texts[j] == texts[k]),
+                texts[j] if names[1] == "text" else "",
+            )
+            for j in best
+        ]
+        words = texts[k] if names[0] == "text" else ""
+        rank = 1 + int((similar > similar[k] + TIE).sum())
+        strips.append(Strip(test.ref(rows[k]), *names, matches, rank, query_text=words))
+    return strips
+
+
+def results_of(
+    title: str,
+    runs: Mapping[str, Sequence[Probed]],
+    plan: Plan,
+    manifest: Manifest,
+    splits: Mapping[str, Split],
+) -> Results:
+    """Scores of all subjects, of several trainings their mean, with paired differences.
+
+    Args:
+        title: of the page.
+        runs: subject -> what each of its trainings (one a seed) scores.
+        plan: what was measured.
+        manifest: the samples.
+        splits: by name.
+    """
+    scores: list[Score] = []
+    single = all(len(of) == 1 for of in runs.values())
+    by_metric: dict[str, dict[str, list[Mean]]] = {}
+    for subject, of in runs.items():
+        for run in of:
+            for mean in run.means:
+                by_metric.setdefault(mean.score.metric, {}).setdefault(subject, []).append(mean)
+        for means in (sets.get(subject) for sets in by_metric.values()):
+            scores += [means[0].score if single else over_seeds(means)] if means else []
+        scores += [median for run in of if single for median in run.medians]
+    differences = [d for sets in by_metric.values() for d in differences_of_means(sets)]
+    all_runs = [run for of in runs.values() for run in of]
+    notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())
+    if any("similar text" in metric for metric in by_metric):
+        notes.append(Note("probe-text-threshold", {"threshold": plan.text_threshold}))
+    names = ("modality", "labels", "group", "neighbors", "top", "pool", "text_threshold", "seed")
+    digests = {"manifest": manifest.digest}
+    digests |= {
+        f"split {name}" if len(splits) > 1 else "split": s.digest for name, s in splits.items()
     }
-    train, test = (manifest.part(split, part) for part in ("train", "test"))
-    other = "vision" if modality == "tactile" else "tactile"
-    retrieves = top and len(test) > 1 and not test.table[other].null_count()
-    how: dict[str, Any] = {"split": split, "allow_seen": allow_seen, "progress": progress}
-    notes = guard(encoders, modality, test, **how)
-    notes += guard(encoders, other, test, **how) if retrieves else []
-    train_set, test_set = (embed(part, encoders, modality, **options) for part in (train, test))
-    fitted = fit_probe(train_set, balanced=balanced, seed=seed)
-    scores: list[Score] = [
-        material_accuracy(
-            train_set, test_set, probe=fitted, balanced=balanced, seed=seed, split=split.digest
-        )
-    ]
-    if retrieves:
-        keys = embed(test, encoders, other, **options)
-        name = f"{modality} to {other}"
-        scores += retrieval(test_set, keys, top=top, name=name, split=split.digest)
+    rules = {name: dict(s.rule) for name, s in splits.items()}
     return Results(
-        title=f"Probe of the {modality} encoder",
-        scores=[replace(s, notes=[*s.notes, *notes]) for s in scores],
+        title=title,
+        facts=[_drop(d) for d in differences if plan.axis == "split"],
+        scores=[*scores, *differences],
+        strips=[strip for of in runs.values() for strip in of[0].strips],
+        notes=notes,
         settings={
-            "digests": {
-                "manifest": manifest.digest,
-                "split": split.digest,
-                f"{modality} encoder": encoders.digest(modality),
-            },
-            "split rule": dict(split.rule),
-            "options": {"group": column, "balanced": balanced, "seed": seed},
+            "digests": digests,
+            "split rule": rules if len(splits) > 1 else next(iter(rules.values())),
+            "options": {name: getattr(plan, name) for name in names},
         },
     )
+
+
+def _drop(difference: Score) -> str:
+    """What a score loses from the first split to the second, in one sentence."""
+    d, points = difference.details, 100 * float(difference)
+    line = (
+        f"{difference.metric.removesuffix(' difference')}, {d['a']} - {d['b']}: {points:.1f} points"
+    )
+    if difference.interval:
+        line += " [{:.1f}, {:.1f}]".format(*(100 * bound for bound in difference.interval))
+    if d.get("relative") is not None:
+        line += f", {100 * d['relative']:.0f} % of {d['a']}"
+        if d["relative_interval"]:
+            line += " [{:.0f}, {:.0f}]".format(*(100 * bound for bound in d["relative_interval"]))
+    return line
+
+
+def named(value: Any, argument: str) -> dict[str, Any]:
+    """One or several, by name; those of a list are named by the shortest distinct end of a path."""
+    if isinstance(value, Mapping):
+        named = {str(name): each for name, each in value.items()}
+    elif isinstance(value, list | tuple):
+        names = [
+            Path(v).stem if isinstance(v, str | Path) else f"{argument} {k + 1}"
+            for k, v in enumerate(value)
+        ]
+        if len(set(names)) < len(names):
+            names = [
+                str(v) if isinstance(v, str | Path) else name
+                for v, name in zip(value, names, strict=True)
+            ]
+        named = dict(zip(names, value, strict=True))
+    else:
+        named = {argument: value}
+    if not named or len(named) < (len(value) if isinstance(value, list | tuple) else 1):
+        must, fix = "must hold at least one, each once", "Name each of them once"
+        raise PalpateError(must, f"{value!r}", fix, argument=argument)
+    return named
+
+
+def _with(manifest: Manifest, modality: str) -> list[str]:
+    """Ids of the samples that have the modality."""
+    return [i for i, v in zip(manifest.ids, manifest.column(modality), strict=True) if v]

@@ -38,6 +38,7 @@ from palpate.metrics.intervals import (
     same_units,
     t_interval,
 )
+from palpate.metrics.means import Mean, spread_of
 from palpate.metrics.mmd import Options
 from palpate.metrics.tactile import (
     LOOSE_BOUND,
@@ -297,6 +298,43 @@ def _as_difference(
         details={"a": x.subject, "b": y.subject, **empty, **details},
         notes=(note,) if note else (),
     )
+
+
+def differences_of_means(sets: Mapping[str, Sequence[Mean]]) -> list[Score]:
+    """Paired differences of one metric between encoders or splits, each trained with several seeds.
+
+    Args:
+        sets: name -> the means of its trainings (one, or one a seed); a group is left out of all at
+            once, and the means need not share samples (:mod:`palpate.metrics.means`).
+
+    Returns:
+        One score a pair, ``details`` as in :func:`difference`, and ``relative``: (a - b) / a, with
+        ``relative_interval``.
+
+    Raises:
+        PalpateError: if the scores are of different settings.
+    """
+    return holm([_difference_of_means(sets[a], sets[b]) for a, b in combinations(sets, 2)])
+
+
+def _difference_of_means(a: Sequence[Mean], b: Sequence[Mean]) -> Score:
+    x, y = a[0].score, b[0].score
+    require_comparable([x, y])
+    spread = spread_of([a, b], lambda m: m[..., 0] - m[..., 1])
+    interval, below, above = spread.interval(-1.0, 1.0, x.level), 0.5, 0.5
+    if interval:
+        below, above = (
+            float(special.stdtr(spread.df, s * spread.value / spread.error)) for s in (-1, 1)
+        )
+    details = _verdict(x, y, spread.value, (interval, below, above))
+    if min(run.score.value or 0 for run in a) > 0:
+        with np.errstate(divide="ignore", invalid="ignore"):  # a mean may be 0 without one group
+            relative = spread_of([a, b], lambda m: 1 - m[..., 1] / m[..., 0])
+        bounds = relative.interval(-np.inf, 1.0, x.level)
+        details |= {"relative": relative.value, "relative_interval": bounds}
+    method = f"paired, {spread.method}" if interval else ""
+    note = None if interval else Note("no-interval", {"reason": "no-change"})
+    return _as_difference(x, y, spread.value, details, note=note, interval=interval, method=method)
 
 
 def mean_differences(

@@ -1,35 +1,36 @@
-"""What embeddings encode: class accuracy of a linear probe, and retrieval.
+"""What embeddings encode: class accuracy of a linear probe and of the nearest neighbors.
 
 Probe: multinomial logistic regression on standardized features,
 ``min_W -1/n sum_i log softmax(W x_i)_{y_i} + l2 ||W||^2``, solved by L-BFGS. l2 is chosen by
 cross-validation over whole groups: with rows left out, frames of one video would pick it.
 
-Retrieval: rank of the right key by cosine similarity. Ties count as a random order would, in
-expectation, so equal keys never look like hits. With several positives the first one counts.
+k-NN: the k train rows of highest cosine s vote with weight exp(s / 0.07) (Wu et al. 2018, as DINO);
+rows tied with the k-th share the places that are left, so the order of rows does not matter.
 
-Intervals are leave-one-group-out jackknives with Student's t.
+Balanced accuracy is the mean over classes of their recall, of the same classifier.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import gammaln, log_softmax
+from scipy.special import log_softmax
 
 from palpate.core import FeatureSet, PalpateError, Score, rng_for
-from palpate.metrics.intervals import jackknife_errors, t_interval
+from palpate.metrics.means import Mean, mean_of
+from palpate.metrics.retrieval import TIE, blocks, unit_rows
 
 Array = NDArray[np.float64]
 #: Penalties that cross-validation chooses from.
 GRID = (1e-4, 1e-3, 1e-2, 1e-1)
-#: Cosines that differ by less are ties: products of equal vectors may differ in the last bits.
-TIE = 1e-9
+#: Temperature of the votes of k-NN.
+VOTE = 0.07
 
 
 @dataclass(frozen=True)
@@ -50,19 +51,13 @@ class Probe:
 
 
 def fit_probe(
-    train: FeatureSet,
-    *,
-    l2: float | None = None,
-    balanced: bool = False,
-    folds: int = 3,
-    seed: int = 0,
+    train: FeatureSet, *, l2: float | None = None, folds: int = 3, seed: int = 0
 ) -> Probe:
     """Fit a linear probe to labeled features.
 
     Args:
         train: features with labels; rows without a label are skipped.
         l2: the penalty; None chooses among 1e-4 to 1e-1 by cross-validation over groups.
-        balanced: weight rows so that every class counts the same.
         folds: of the cross-validation.
         seed: of the folds.
 
@@ -72,15 +67,14 @@ def fit_probe(
     x, labels, groups = _labeled(train, "train")
     classes = sorted(set(labels))
     if len(classes) < 2:
-        must, fix = "A probe needs at least two materials in train", "Use another split"
+        must, fix = "A probe needs at least two classes in train", "Use another split"
         raise PalpateError(must, f"{len(classes)}", fix)
     y = np.searchsorted(classes, labels)
     mean, sd = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-8)
     z = (x - mean) / sd
-    weights = 1 / np.bincount(y)[y] if balanced else np.ones(len(y))
     if l2 is None:
-        l2 = _choose_penalty(z, y, weights, _folds(groups, folds, seed))
-    weight, bias = _logistic(z, y, weights, len(classes), l2)
+        l2 = _choose_penalty(z, y, _folds(groups, folds, seed))
+    weight, bias = _logistic(z, y, len(classes), l2)
     return Probe(tuple(classes), mean, sd, weight, bias, l2)
 
 
@@ -90,7 +84,6 @@ def material_accuracy(
     *,
     probe: Probe | None = None,
     l2: float | None = None,
-    balanced: bool = False,
     seed: int = 0,
     subject: str = "real",
     split: str | None = None,
@@ -102,7 +95,6 @@ def material_accuracy(
         test: features of the same encoder with labels, and groups for the interval.
         probe: a probe fitted to ``train`` before; None fits one.
         l2: see :func:`fit_probe`.
-        balanced: see :func:`fit_probe`; also averages the accuracy over classes.
         seed: see :func:`fit_probe`.
         subject: what is scored, kept in the score.
         split: digest of the split, kept in the score.
@@ -114,112 +106,79 @@ def material_accuracy(
     Raises:
         PalpateError: without labels in both sets, or on features of two encoders.
     """
-    if train.encoder != test.encoder:
-        must = "Train and test features must come from one encoder"
-        raise PalpateError(must, f"{train.encoder} and {test.encoder}", "Embed them again")
-    probe = probe or fit_probe(train, l2=l2, balanced=balanced, seed=seed)
-    x, labels, groups = _labeled(test, "test")
-    hits = np.array(probe.predict(x)) == np.array(labels)
-    counts = Counter(labels)
-    majority = Counter(_labeled(train, "train")[1]).most_common(1)[0][0]
-    share = counts[majority] / len(labels)
-    if balanced:
-        share = (majority in counts) / len(counts)
-    details = {
-        "chance": 1 / len(probe.classes),
-        "majority": share,
-        "recall": recall_by_class(hits, labels),
-        "l2": probe.l2,
-        "train_samples": len(train.ids),
-        "unseen_classes": sorted(set(labels) - set(probe.classes)),
-    }
-    return mean_over_groups(
-        "material accuracy (balanced)" if balanced else "material accuracy",
-        hits,
-        groups,
-        weights=np.array([1 / counts[label] for label in labels]) if balanced else None,
-        estimator="mean of class recalls" if balanced else "mean",
-        subject=subject,
-        split=split,
-        encoder=test.encoder,
-        seed=seed,
-        settings={"probe": "logistic regression"},
-        details=details,
-    )
+    _require_one_encoder(train, test)
+    probe = probe or fit_probe(train, l2=l2, seed=seed)
+    return _linear(probe, train, test, "material", seed=seed, subject=subject, split=split)[0].score
 
 
-def retrieval(
-    queries: FeatureSet,
-    keys: FeatureSet,
+def class_accuracies(
+    train: FeatureSet,
+    test: FeatureSet,
     *,
-    top: Sequence[int] = (1, 5),
-    pool: int | None = None,
-    repeats: int = 20,
-    positives: NDArray[np.bool_] | None = None,
+    label: str = "material",
+    neighbors: int = 20,
     seed: int = 0,
-    name: str = "retrieval",
-    subject: str = "real",
-    split: str | None = None,
-) -> list[Score]:
-    """How often the right key is among the k most similar ones.
+    **fields: Any,
+) -> list[Mean]:
+    """Accuracy and balanced accuracy of a linear probe and of k-NN, on new samples.
 
     Args:
-        queries: n rows, e.g. vision embeddings of the test samples.
-        keys: n rows with the same ids in the same order, e.g. tactile embeddings.
-        top: the values of k.
-        pool: rank among so many samples drawn at random instead of among all; chance is then
-            k / pool whatever n.
-        repeats: pools to average over.
-        positives: (n, n), keys that also count for a query: equal texts.
-        seed: of the pools.
-        name: start of the metric's name (``"vision to tactile"``).
-        subject: what is scored, kept in the scores.
-        split: digest of the split, kept in the scores.
+        train: features with labels, and groups to choose the probe's penalty.
+        test: features of the same encoder with labels, and groups for the intervals.
+        label: what the labels are, for the names of the scores.
+        neighbors: k of k-NN.
+        seed: of the folds that choose the penalty.
+        **fields: further fields of the scores.
 
     Returns:
-        One score a k, in [0, 1]; ``details`` holds the chance level.
+        Four means; ``details`` holds chance and what always naming the commonest class of train
+        scores, for the linear probe also the confusion matrix (rows: the true class; shares).
 
     Raises:
-        PalpateError: if ids differ, the pool is larger than the set, or n < 2.
+        PalpateError: as :func:`material_accuracy`.
     """
-    n = len(queries.ids)
-    _check_retrieval(queries, keys, pool)
-    right = np.eye(n, dtype=bool) if positives is None else positives | np.eye(n, dtype=bool)
-    draws = [np.arange(n)]
-    if pool is not None:
-        draws = [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(repeats)]
-    hits, seen = {k: np.zeros(n) for k in top}, np.zeros(n)
-    chance = dict.fromkeys(top, 0.0)
-    a, b = _unit(queries.features), _unit(keys.features)
-    for rows in draws:
-        similar, good = a[rows] @ b[rows].T, right[np.ix_(rows, rows)]
-        seen[rows] += 1
-        for k in top:
-            hits[k][rows] += _hit_probability(similar, good, k)
-            chance[k] += _hit_probability(np.zeros_like(similar), good, k).mean() / len(draws)
-    used = np.flatnonzero(seen)
-    groups = queries.ids if queries.groups is None else queries.groups
-    settings = {
-        "pool": pool,
-        "repeats": repeats if pool else None,
-        "positives": "diagonal" if positives is None else "given",
-    }
-    return [
-        mean_over_groups(
-            f"{name} top-{k}",
-            hits[k][used] / seen[used],
-            [groups[int(i)] for i in used],
-            weights=seen[used],
-            estimator="mean over pools" if pool else "mean",
-            subject=subject,
-            split=split,
-            encoder=queries.encoder,
-            seed=seed if pool else None,
-            settings=settings,
-            details={"chance": float(chance[k]), "key_encoder": keys.encoder},
-        )
-        for k in top
-    ]
+    _require_one_encoder(train, test)
+    probe = fit_probe(train, seed=seed)
+    means = _linear(probe, train, test, label, seed=seed, **fields)
+    x, labels, _ = _labeled(train, "train")
+    z, truth, _ = _labeled(test, "test")
+    hits = neighbor_hits(x, labels, z, truth, neighbors)
+    name = f"{label} accuracy, {neighbors}-NN"
+    return [*means, *_accuracies(name, hits, train, test, {"neighbors": neighbors}, **fields)]
+
+
+def neighbor_hits(
+    train: NDArray[Any],
+    train_labels: Sequence[str],
+    test: NDArray[Any],
+    test_labels: Sequence[str],
+    neighbors: int = 20,
+) -> Array:
+    """(m,) probability that weighted k-NN names each test row correctly, votes being tied or not.
+
+    Args:
+        train: (n, d).
+        train_labels: n classes.
+        test: (m, d).
+        test_labels: m classes; one that train lacks is never named.
+        neighbors: k; at most n count.
+    """
+    names, code = np.unique(np.array(train_labels), return_inverse=True)
+    one_hot = np.eye(len(names), dtype=np.float32)[code]
+    base, queries = unit_rows(train), unit_rows(test)
+    k, hits = min(neighbors, len(base)), np.zeros(len(queries))
+    truth = np.array(test_labels)
+    for rows in blocks(len(queries), len(base)):
+        similar = queries[rows] @ base.T
+        last = np.partition(similar, len(base) - k, axis=1)[:, len(base) - k, None]
+        inside, tied = similar > last + TIE, np.abs(similar - last) <= TIE
+        share = (k - inside.sum(axis=1)) / tied.sum(axis=1)
+        counted = np.where(inside, 1, np.where(tied, share[:, None], 0))
+        votes = (counted * np.exp((similar - 1) / VOTE)) @ one_hot
+        best = votes >= votes.max(axis=1, keepdims=True) * (1 - 1e-5)
+        right = best & (names == truth[rows, None])
+        hits[rows] = right.any(axis=1) / best.sum(axis=1)
+    return hits
 
 
 def recall_by_class(hits: NDArray[Any], labels: Sequence[str]) -> dict[str, float]:
@@ -228,69 +187,66 @@ def recall_by_class(hits: NDArray[Any], labels: Sequence[str]) -> dict[str, floa
     return {str(name): float(hits[names == name].mean()) for name in np.unique(names)}
 
 
-def mean_over_groups(
-    metric: str,
-    values: NDArray[Any],
-    groups: Sequence[str],
-    *,
-    weights: Array | None = None,
+def _linear(
+    probe: Probe, train: FeatureSet, test: FeatureSet, label: str, **fields: Any
+) -> list[Mean]:
+    """Accuracy and balanced accuracy of a linear probe, the first with the confusion matrix."""
+    x, truth, _ = _labeled(test, "test")
+    named = probe.predict(x)
+    classes = sorted({*probe.classes, *truth})
+    counts = np.zeros((len(classes), len(classes)))
+    np.add.at(counts, (np.searchsorted(classes, truth), np.searchsorted(classes, named)), 1)
+    of_class = counts.sum(axis=1, keepdims=True)
+    shares = np.divide(counts, of_class, where=of_class > 0, out=np.full(counts.shape, np.nan))
+    details = {"l2": probe.l2, "train_samples": len(train.ids)}
+    plain, balanced = _accuracies(
+        f"{label} accuracy", np.array(named) == np.array(truth), train, test, details, **fields
+    )
+    confusion = {"matrix": shares.round(4).tolist(), "classes": classes}
+    score = replace(plain.score, details={**plain.score.details, **confusion})
+    return [replace(plain, score=score), balanced]
+
+
+def _accuracies(
+    name: str,
+    hits: NDArray[Any],
+    train: FeatureSet,
+    test: FeatureSet,
+    details: dict[str, Any],
     **fields: Any,
-) -> Score:
-    """Weighted mean of values in [0, 1] as a score with a leave-one-group-out interval.
-
-    Args:
-        metric: its name.
-        values: (n,) one a sample.
-        groups: n group names.
-        weights: (n,); None weights all samples the same.
-        **fields: further fields of the score.
-    """
-    weights = np.ones(len(values)) if weights is None else weights
-    mean = float(weights @ values / weights.sum())
-    _, group = np.unique(np.array(groups, dtype=str), return_inverse=True)
-    above, below = np.bincount(group, weights * values), np.bincount(group, weights)
-    interval, method, g = None, "", len(above)
-    if g > 1:
-        without = (above.sum() - above) / (below.sum() - below)
-        error = float(jackknife_errors(without[:, None])[0])
-        if error > 0:  # no change without any group is no evidence of certainty
-            low, high = t_interval(mean, error, g - 1, 0.95)
-            interval = (max(0.0, low), min(1.0, high))
-            method = f"leave-one-group-out jackknife, t, {g - 1} df"
-    fields |= {"interval": interval, "interval_method": method, "n": len(values)}
-    return Score(metric, value=mean, higher_is_better=True, **fields)
-
-
-def _unit(x: NDArray[Any]) -> Array:
-    """Rows of length 1, float64; a row of zeros stays."""
-    x = x.astype(np.float64)
-    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+) -> list[Mean]:
+    """A classifier's accuracy and balanced accuracy, next to chance and the commonest class."""
+    _, known, _ = _labeled(train, "train")
+    _, truth, groups = _labeled(test, "test")
+    counts, majority = Counter(truth), Counter(known).most_common(1)[0][0]
+    details = {
+        "chance": 1 / len(set(known)),
+        "recall": recall_by_class(hits, truth),
+        "unseen_classes": sorted(set(truth) - set(known)),
+        **details,
+    }
+    fields |= {"encoder": test.encoder}
+    weights = np.array([1 / counts[label] for label in truth])
+    plain = {**details, "majority": counts[majority] / len(truth)}
+    equal = {**details, "majority": (majority in counts) / len(counts)}
+    return [
+        mean_of(name, hits, groups, estimator="mean", details=plain, **fields),
+        mean_of(
+            f"{name}, balanced",
+            hits,
+            groups,
+            weights=weights,
+            estimator="mean of class recalls",
+            details=equal,
+            **fields,
+        ),
+    ]
 
 
-def _hit_probability(similar: Array, good: NDArray[np.bool_], k: int) -> Array:
-    """(n,) probability that a positive is in the top k when ties are broken at random."""
-    best = np.where(good, similar, -np.inf).max(axis=1, keepdims=True)
-    tied = np.abs(similar - best) <= TIE
-    above = ((similar > best) & ~tied).sum(axis=1)
-    ties, wrong = tied.sum(axis=1), (tied & ~good).sum(axis=1)
-    slots = np.clip(k - above, 0, ties)  # places in the top k that the ties share
-    # C(wrong, slots) / C(ties, slots), only wrong ones in the slots; 0 where wrong < slots
-    log_miss = gammaln(wrong + 1) - gammaln(wrong - slots + 1)
-    return 1 - np.exp(log_miss - gammaln(ties + 1) + gammaln(ties - slots + 1))
-
-
-def _check_retrieval(queries: FeatureSet, keys: FeatureSet, pool: int | None) -> None:
-    n, widths = len(queries.ids), (queries.features.shape[1], keys.features.shape[1])
-    if list(queries.ids) != list(keys.ids):
-        must = "Queries and keys must have the same ids in the same order"
-        raise PalpateError(must, "different ids", "Take the same ids from both")
-    if n < 2 or widths[0] != widths[1]:
-        must = "Retrieval needs at least two samples in one common space"
-        got = f"{n} samples, widths {widths[0]} and {widths[1]}"
-        raise PalpateError(must, got, "Embed both with one set of encoders")
-    if pool is not None and not 2 <= pool <= n:
-        must, fix = f"must lie in 2 to {n}, the number of samples", "Choose a smaller pool"
-        raise PalpateError(must, f"{pool}", fix, argument="pool")
+def _require_one_encoder(train: FeatureSet, test: FeatureSet) -> None:
+    if train.encoder != test.encoder:
+        must = "Train and test features must come from one encoder"
+        raise PalpateError(must, f"{train.encoder} and {test.encoder}", "Embed them again")
 
 
 def _labeled(features: FeatureSet, part: str) -> tuple[Array, list[str], list[str]]:
@@ -298,28 +254,25 @@ def _labeled(features: FeatureSet, part: str) -> tuple[Array, list[str], list[st
     labels = features.labels or []
     keep = [k for k, label in enumerate(labels) if label]
     if not keep:
-        must = f"The {part} features must have rows with a material"
-        raise PalpateError(must, "none", "Check the split and the column material")
+        must = f"The {part} features must have rows with a label"
+        raise PalpateError(must, "none", "Check the split, and the column of the labels")
     groups = features.ids if features.groups is None else features.groups
     names = [groups[k] or features.ids[k] for k in keep]
     return features.features[keep].astype(np.float64), [labels[k] for k in keep], names
 
 
-def _logistic(
-    x: Array, y: NDArray[np.intp], weights: Array, classes: int, l2: float
-) -> tuple[Array, Array]:
+def _logistic(x: Array, y: NDArray[np.intp], classes: int, l2: float) -> tuple[Array, Array]:
     """Weight (d, classes) and bias (classes,) of the regression at the top of this file."""
     n, d = x.shape
     design = np.hstack([x, np.ones((n, 1))])
-    weights = weights / weights.sum()
     penalty = np.append(np.full(d, l2), 0)[:, None]  # none on the bias
     target = np.eye(classes)[y]
 
     def objective(flat: Array) -> tuple[float, Array]:
         w = flat.reshape(d + 1, classes)
         log_p = log_softmax(design @ w, axis=1)
-        gradient = design.T @ ((np.exp(log_p) - target) * weights[:, None]) + 2 * penalty * w
-        loss = (penalty * w**2).sum() - weights @ log_p[np.arange(n), y]
+        gradient = design.T @ ((np.exp(log_p) - target) / n) + 2 * penalty * w
+        loss = (penalty * w**2).sum() - log_p[np.arange(n), y].mean()
         return float(loss), gradient.ravel()
 
     start, options = np.zeros((d + 1) * classes), {"maxiter": 300}
@@ -335,16 +288,14 @@ def _folds(groups: Sequence[str], folds: int, seed: int) -> NDArray[np.intp] | N
     return np.argsort(order)[group] % folds if len(names) >= 2 * folds else None
 
 
-def _choose_penalty(
-    x: Array, y: NDArray[np.intp], weights: Array, fold: NDArray[np.intp] | None
-) -> float:
+def _choose_penalty(x: Array, y: NDArray[np.intp], fold: NDArray[np.intp] | None) -> float:
     """The penalty with the best accuracy in cross-validation; the stronger one of two equals."""
     if fold is None:
         return 1e-2
     right = dict.fromkeys(GRID, 0.0)
     for inside in (fold != f for f in range(fold.max() + 1)):
         for l2 in GRID:
-            w, b = _logistic(x[inside], y[inside], weights[inside], int(y.max()) + 1, l2)
+            w, b = _logistic(x[inside], y[inside], int(y.max()) + 1, l2)
             hits = (x[~inside] @ w + b).argmax(axis=1) == y[~inside]
-            right[l2] += float(weights[~inside] @ hits)
+            right[l2] += float(hits.sum())
     return max(GRID, key=lambda l2: (right[l2], l2))

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from palpate.core import short
 from palpate.report.notes import confidence, sentence
 from palpate.report.results import Results
-from palpate.report.tables import BEST, Cell, Column, Table, score_tables
+from palpate.report.tables import BASELINES, BEST, Cell, Column, Table, score_tables
 
 #: First line of the file: how the command recognizes its own file.
 MARK = "% palpate: tables of scores"
@@ -88,7 +88,15 @@ def _scores(table: Table, caption: Sequence[str]) -> list[str]:
             rows += [_row(["", *texts])] if any(texts) else []
     last = [
         *_baseline("floor (real images)", table, lambda cell: cell.score.floor),
-        *_baseline("no-contact image", table, lambda cell: cell.baseline),
+        *(
+            row
+            for name in BASELINES
+            for row in _baseline(
+                {"no contact": "no-contact image"}.get(name, name),
+                table,
+                lambda cell, name=name: cell.baselines.get(name),
+            )
+        ),
     ]
     rows += [r"\midrule", *last] if last else []
     if table.differences:

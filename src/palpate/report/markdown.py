@@ -29,7 +29,7 @@ from palpate.report.notes import (
     sentence,
     where,
 )
-from palpate.report.results import Audit, Impact, LeakPair, Results
+from palpate.report.results import Audit, Impact, LeakPair, Results, Strip
 from palpate.report.sentences import (
     cause_notes,
     cause_texts,
@@ -74,6 +74,7 @@ def render_markdown(results: Results) -> str:
         scores += _scores(table)
     for heat in heat_tables(results.scores):
         scores += _heat(heat)
+    scores += _strips(results.strips)
     sections = {
         "gallery": ("Gallery", _gallery(results)),
         "scores": ("Scores", scores if results.scores else []),
@@ -195,7 +196,7 @@ def _scores(table: Table) -> list[str]:
 
 def _cell(cell: Cell, column: Column) -> str:
     value = number(cell.score.value, column.digits)
-    known = {"floor": cell.score.floor, "no contact": cell.baseline}
+    known = {"floor": cell.score.floor, **cell.baselines}
     parts = [
         f"**{value}**" if cell.defined else "undefined",
         _pair(cell, column.digits),
@@ -221,7 +222,29 @@ def _marks(cell: Cell) -> str:
 
 def _heat(heat: Heat) -> list[str]:
     rows = [[esc(label), *values] for label, values in zip(heat.labels, heat.values, strict=True)]
-    return [f"### Matrix: {esc(heat.title)}", "", *pipe_table(["", *map(esc, heat.labels)], rows)]
+    table = pipe_table(["", *map(esc, heat.labels)], rows)
+    return [f"### Matrix: {esc(heat.title)}", "", esc(heat.meaning), "", *table]
+
+
+def _strips(strips: Sequence[Strip]) -> list[str]:
+    rows = [
+        [
+            esc(f"{strip.keys} by {strip.queries}, {strip.subject}"),
+            esc(strip.query_text or where(strip.query)),
+            count(strip.rank),
+            *(
+                ("**right** " if match.right else "") + esc(match.text or where(match.sample))
+                for match in strip.matches
+            ),
+        ]
+        for strip in strips[:LISTED]
+    ]
+    if not rows:
+        return []
+    places = [str(k + 1) for k in range(max(len(strip.matches) for strip in strips[:LISTED]))]
+    padded = [row + [""] * (3 + len(places) - len(row)) for row in rows]
+    head = ["", "query", "rank of its own", *places]
+    return ["### What was retrieved", "", *pipe_table(head, padded, right=False)]
 
 
 def _audit(audit: Audit) -> list[str]:

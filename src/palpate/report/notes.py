@@ -460,6 +460,18 @@ EVALUATION: dict[str, Sentence] = {
         "if anything"
     ),
     "materials-excluded": _materials_excluded,
+    "probe-no-label": "The samples have no {label} in {part}: nothing was predicted from it",
+    "probe-unlabeled": "{count} test samples without a {label} are excluded from its accuracy",
+    "probe-no-encoder": "These encoders include none of {modality}: no retrieval with it",
+    "probe-no-partner": "The test samples have no {modality}: no retrieval with it",
+    "probe-some-partners": (
+        "{count} test samples without {modality} are excluded from retrieval with it"
+    ),
+    "probe-text-threshold": (
+        "Similar texts: a key is right as well if its text has a cosine above {threshold:g} to the "
+        "query's. TVL derived 0.6356 for OpenCLIP ViT-L/14; the cosines of another text encoder "
+        "mean something else. The details say how many keys were right"
+    ),
     "no-background": (
         "{count} of {n} samples have no background: tactile images are used as they are only"
     ),

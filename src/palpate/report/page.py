@@ -33,7 +33,7 @@ from palpate.report.notes import (
     sentence,
     where,
 )
-from palpate.report.results import GalleryItem, LeakPair, Results
+from palpate.report.results import GalleryItem, LeakPair, Results, Strip
 from palpate.report.tables import heat_tables, score_tables, settings_of, table_facts
 from palpate.report.thumbnails import Album, Wanted, fit
 
@@ -136,7 +136,15 @@ def render_page(
         notes = [*map(sentence, results.notes), *_album_notes(album, len(rows))]
         page = environment().get_template("page.html.j2")
         return page.render(
-            **fixed, notes=notes, images=album.rows, gallery=_gallery(results, album)
+            **fixed,
+            notes=notes,
+            images=album.rows,
+            gallery=_gallery(results, album),
+            strips=[
+                (strip, album.rows[id(strip)])
+                for strip in results.strips
+                if id(strip) in album.rows
+            ],
         )
 
     bare = len(draw(Album({}, 0)).encode())
@@ -171,8 +179,9 @@ def image_rows(results: Results) -> tuple[dict[Hashable, list[Wanted]], int]:
             if rank < len(members):
                 target[a, k, rank] = _pair_images(members[rank], head)
     gallery = [(id(i), _gallery_images(i)) for i in in_turns(results.gallery)[:MAX_ROWS]]
-    rows = [*pairs.items(), *gallery[:OPEN_ROWS], *folded_pairs.items(), *gallery[OPEN_ROWS:]]
-    return dict(rows), len(pairs) + len(gallery[:OPEN_ROWS])
+    strips = [(id(strip), _strip_images(strip)) for strip in results.strips]
+    first = [*pairs.items(), *gallery[:OPEN_ROWS], *strips]
+    return dict([*first, *folded_pairs.items(), *gallery[OPEN_ROWS:]]), len(first)
 
 
 def _pair_images(pair: LeakPair, head: str) -> list[Wanted]:
@@ -203,6 +212,23 @@ def _gallery_images(item: GalleryItem) -> list[Wanted]:
     if item.background is not None:
         images.append(Wanted(item.background, f"Sensor without contact: {name}", "No contact"))
     return images
+
+
+def _strip_images(strip: Strip) -> list[Wanted]:
+    """The query, then what was retrieved; a text has no image."""
+    texts = (strip.query_text, *(match.text for match in strip.matches))
+    samples = (strip.query, *(match.sample for match in strip.matches))
+    kinds = (strip.queries, *[strip.keys] * len(strip.matches))
+    labels = ["Query"]
+    labels += [f"{m.similarity:.2f}{' right' if m.right else ''}" for m in strip.matches]
+    return [
+        Wanted(
+            None if text else getattr(sample, kind, None),
+            text or f"{kind} image: {where(sample)}",
+            label,
+        )
+        for text, sample, kind, label in zip(texts, samples, kinds, labels, strict=True)
+    ]
 
 
 def material_of(sample: SampleRef) -> str:

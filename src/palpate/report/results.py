@@ -300,6 +300,37 @@ class GalleryItem:
 
 
 @dataclass(frozen=True)
+class Match:
+    """A key that retrieval put high: its sample, or its text; ``similarity`` is the cosine."""
+
+    sample: SampleRef
+    similarity: float
+    right: bool
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One query and what an encoder finds most similar to it.
+
+    Attributes:
+        query: the sample; ``query_text`` its text, where that is the query.
+        queries, keys: the modalities: ``tactile``, ``vision`` or ``text``.
+        matches: the most similar keys, best first.
+        rank: of the query's own key, from 1; as many as are equal to it share one.
+        subject: which encoder, or split, this is of.
+    """
+
+    query: SampleRef
+    queries: str
+    keys: str
+    matches: Sequence[Match]
+    rank: int
+    subject: str = ""
+    query_text: str = ""
+
+
+@dataclass(frozen=True)
 class Results:
     """Scores, audits and images of a run: a table of scores that can also be drawn as a page.
 
@@ -310,7 +341,7 @@ class Results:
     Attributes:
         title: heading of the page.
         facts: the headline facts, one sentence each.
-        audits, scores, gallery: what the page shows.
+        audits, scores, gallery, strips: what the page shows.
         settings: nested JSON of settings, digests, seeds, versions and times.
         notes: what a reader must see first (synthetic data, fallbacks, skipped inputs).
         commands: command lines that reproduce the run or say what to do next.
@@ -321,6 +352,7 @@ class Results:
     audits: Sequence[Audit] = ()
     scores: Sequence[Score] = ()
     gallery: Sequence[GalleryItem] = ()
+    strips: Sequence[Strip] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[Note] = ()
     commands: Sequence[str] = ()
@@ -445,7 +477,16 @@ class Results:
             )
             for row in self.gallery
         ]
-        return replace(self, audits=[audit(a) for a in self.audits], gallery=gallery)
+        strips = [
+            replace(
+                strip,
+                query=sample(strip.query),
+                matches=[replace(m, sample=sample(m.sample)) for m in strip.matches],
+            )
+            for strip in self.strips
+        ]
+        audits = [audit(a) for a in self.audits]
+        return replace(self, audits=audits, gallery=gallery, strips=strips)
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object with ``format: palpate-results/2``."""

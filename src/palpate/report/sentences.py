@@ -202,6 +202,17 @@ def purpose(results: Results) -> str:
     parts: list[str] = []
     if any(family_of(score.metric).title == "Captions" for score in results.scores):
         parts.append("what captions give away about their labels, and whether they can be used")
+    elif results.strips or (
+        results.scores
+        and not results.gallery
+        and all(
+            family_of(score.metric).title in ("Recognition", "Retrieval")
+            for score in results.scores
+        )
+    ):
+        parts.append(
+            "what an encoder's embeddings know of a sample: its class, its text, its image"
+        )
     elif results.gallery or results.scores:
         parts.append("how close tactile images generated from photos come to real ones")
     if results.audits:

@@ -64,14 +64,31 @@ FAMILIES = (
     ),
     Family(
         "Recognition",
-        "What can be read from the image: its material, or the text and photo that belong to it?",
-        ("acc", "top", "retriev", "probe", "@"),
+        "What can be read from the image, by a classifier trained on the train part?",
+        ("acc", "probe", "@"),
+    ),
+    Family(
+        "Retrieval",
+        "Which text, photo or tactile image belongs to it? The share of samples for which a right "
+        "one is among the k most similar, and the median of its rank.",
+        ("top-", "rank of", "retriev"),
     ),
     Family("Other metrics"),
 )
+#: Column of a baseline -> its key in the details of a score.
+BASELINES = {"no contact": "empty", "chance": "chance", "majority": "majority"}
 BEST = (
-    "better than every other generator (metrics without reference: closer to the floor) by a "
+    "better than every other one compared (metrics without reference: closer to the floor) by a "
     "paired difference whose interval excludes 0"
+)
+#: What the cells of a matrix are.
+DIVERGENCE = (
+    "Row against column; the diagonal compares two halves of one class. Stronger color: farther "
+    "apart."
+)
+CONFUSION = (
+    "Rows: the true class of test samples. Columns: what the classifier called them, as a share of "
+    "the row."
 )
 #: What a preset of the TMMD family means, for the head of its table.
 PRESETS = {
@@ -109,10 +126,14 @@ class Cell:
         return self.score.details.get("p_value")
 
     @property
-    def baseline(self) -> float | None:
-        """What the no-contact image scores in place of a contact score."""
-        value = self.score.details.get("empty")
-        return value if isinstance(value, int | float) and math.isfinite(value) else None
+    def baselines(self) -> dict[str, float]:
+        """Name -> what it scores without a look at the sample: chance, the commonest class ..."""
+        known = {name: self.score.details.get(key) for name, key in BASELINES.items()}
+        return {
+            name: value
+            for name, value in known.items()
+            if isinstance(value, int | float) and math.isfinite(value)
+        }
 
 
 @dataclass(frozen=True)
@@ -199,9 +220,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Heat:
-    """A square matrix of divergences, e.g. D-TMMD's between classes; ``shares`` lie in [0, 1]."""
+    """A square matrix: D-TMMD's divergences, or confusions; ``shares`` lie in [0, 1]."""
 
     title: str
+    meaning: str
     labels: Sequence[str]
     values: Sequence[Sequence[str]]
     shares: Sequence[Sequence[float]]
@@ -225,7 +247,7 @@ def notes_of(score: Score) -> list[Note]:
         notes.append(Note("excluded-classes", {"excluded": excluded}))
     if score.higher_is_better is None and score.details.get("gap") is not None:
         notes.append(Note("nearer-to-floor"))
-    if Cell(score, ()).baseline is not None:
+    if "no contact" in Cell(score, ()).baselines:
         notes.append(Note("no-contact-baseline"))
     family = score.metric.split(" ")[0]
     lacks_floor = score.floor is None and not score.metric.endswith(DIFFERENCE)
@@ -260,7 +282,8 @@ def score_tables(scores: Sequence[Score]) -> list[Table]:
         metric = score.metric.removesuffix(DIFFERENCE)
         place = FAMILIES.index(family_of(metric))
         preset = str(score.settings.get("preset", ""))
-        key = (place, preset, score.split or "", _features(metric), reference)
+        split = "" if score.settings.get("axis") == "split" else score.split or ""
+        key = (place, preset, split, _features(metric), reference)
         groups.setdefault(key, []).append(score)
     several = [len({key[k] for key in groups} - {""}) > 1 for k in (2, 4)]
     tables: list[Table] = []
@@ -470,6 +493,7 @@ def heat_tables(scores: Sequence[Score]) -> list[Heat]:
         tables.append(
             Heat(
                 ", ".join(filter(None, parts)),
+                CONFUSION if "accuracy" in score.metric else DIVERGENCE,
                 [str(name) for name in names],
                 [[number(v, digits) for v in row] for row in matrix],
                 [[round(max(0.0, v or 0.0) / top, 3) for v in row] for row in matrix],

@@ -12,7 +12,7 @@ from rich.text import Text
 from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, count, percent, sentence
 from palpate.report.results import Audit, Results
 from palpate.report.sentences import audit_line, cause_texts, chance_text, threshold_text
-from palpate.report.tables import BEST, Cell, Table, rankings, score_tables
+from palpate.report.tables import BASELINES, BEST, Cell, Table, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
 NAMES = ("metric", "subject", "a", "b", "notes", "best first")
@@ -66,7 +66,7 @@ def _score_rows(table: Table) -> list[dict[str, str]]:
             "null": _pair(cell.score.null, column.digits),
             "p": _p(cell.p_value),
             "floor": _number(cell.score.floor, column.digits, ""),
-            "no contact": _number(cell.baseline, column.digits, ""),
+            **{name: _number(cell.baselines.get(name), column.digits, "") for name in BASELINES},
             "n": count(cell.score.n) if cell.score.n else "",
             "notes": _marks(cell),
         }

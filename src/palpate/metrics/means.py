@@ -1,0 +1,155 @@
+"""Means over samples, whose groups (videos) are left out in turn; one encoder or several trainings.
+
+A mean is ``theta = sum_i w_i v_i / sum_i w_i``; ``theta_g`` is the same without group g, and
+``SE_video^2 = (G-1)/G sum_g (theta_g - mean theta_g)^2`` the leave-one-group-out jackknife.
+
+A statistic of several means (a difference, a ratio) loses group g from all of them at once, so what
+is easy or hard about a video cancels. The means need not share samples: two splits test different
+frames of the same videos, and a group that a mean lacks does not change it.
+
+Of S trainings the mean over seeds counts, and ``SE^2 = SE_video^2 + s^2 / S`` with s the deviation
+between seeds: both videos and seeds are samples of what could have been. What the two share is
+counted twice, so the interval errs on the wide side. Degrees of freedom are Satterthwaite's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.core import Score
+from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
+
+Array = NDArray[np.float64]
+#: (..., K) means -> (...) their statistic.
+Statistic = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A score in [0, 1] and the samples that it is the weighted mean of.
+
+    Attributes:
+        score: the score; its value is the mean.
+        values, weights: (n,) one a sample.
+        groups: n names.
+    """
+
+    score: Score
+    values: Array
+    weights: Array
+    groups: NDArray[np.str_]
+
+    def without(self, names: NDArray[np.str_]) -> Array:
+        """(G,) the mean without each of the sorted ``names``; NaN where nothing is left."""
+        own = np.isin(self.groups, names)
+        at = np.searchsorted(names, self.groups[own])
+        above, below = (
+            part.sum() - np.bincount(at, part[own], len(names))
+            for part in (self.weights * self.values, self.weights)
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(below > 1e-9 * self.weights.sum(), above / below, np.nan)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A statistic with its standard error, degrees of freedom, and how they came about."""
+
+    value: float
+    error: float
+    df: float
+    method: str
+
+    @property
+    def known(self) -> bool:
+        """Whether there is an error: no change without any group is no evidence of certainty."""
+        return bool(1e-12 < self.error < np.inf)  # not for NaN
+
+    def interval(self, low: float, high: float, level: float = 0.95) -> Interval | None:
+        """The t interval within [low, high], or None."""
+        if not self.known:
+            return None
+        a, b = t_interval(self.value, self.error, self.df, level)  # type: ignore[arg-type]
+        return max(a, low), min(b, high)
+
+
+def mean_of(
+    metric: str,
+    values: NDArray[Any],
+    groups: Sequence[str],
+    *,
+    weights: Array | None = None,
+    **fields: Any,
+) -> Mean:
+    """Weighted mean of values in [0, 1] as a score with a leave-one-group-out interval.
+
+    Args:
+        metric: its name.
+        values: (n,) one a sample.
+        groups: n group names.
+        weights: (n,); None weights all samples the same.
+        **fields: further fields of the score.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    weights = np.ones(len(values)) if weights is None else weights
+    value = float(weights @ values / weights.sum())
+    score = Score(metric, value=value, **{"higher_is_better": True, "n": len(values), **fields})
+    mean = Mean(score, values, weights, np.array(groups, dtype=str))
+    spread = spread_of([[mean]])
+    interval = spread.interval(0.0, 1.0)
+    method = spread.method if interval else ""
+    return replace(mean, score=replace(score, interval=interval, interval_method=method))
+
+
+def mean_over_groups(
+    metric: str, values: NDArray[Any], groups: Sequence[str], **fields: Any
+) -> Score:
+    """The score of :func:`mean_of`."""
+    return mean_of(metric, values, groups, **fields).score
+
+
+def over_seeds(runs: Sequence[Mean]) -> Score:
+    """The mean of several trainings as one score, with the interval over videos and seeds."""
+    spread = spread_of([runs])
+    first = runs[0].score
+    interval = spread.interval(0.0, 1.0)
+    return replace(
+        first,
+        value=spread.value,
+        interval=interval,
+        interval_method=spread.method if interval else "",
+        encoder=None,
+        seed=None,
+        details={**first.details, "by_seed": [run.score.value for run in runs]},
+    )
+
+
+def spread_of(
+    terms: Sequence[Sequence[Mean]], statistic: Statistic = lambda m: m[..., 0]
+) -> Spread:
+    """A statistic of K means, each over S trainings, with its error over groups and seeds.
+
+    Args:
+        terms: K terms of S means each.
+        statistic: of an array (..., K).
+    """
+    names = np.unique(np.concatenate([run.groups for runs in terms for run in runs]))
+    by_seed = np.array([[run.score.value for run in runs] for runs in terms]).T  # (S, K)
+    without = np.array([[run.without(names) for run in runs] for runs in terms])  # (K, S, G)
+    g, s = len(names), len(by_seed)
+    value = float(statistic(by_seed.mean(axis=0)))
+    replicates = statistic(without.mean(axis=1).T)
+    of_groups = float(jackknife_errors(replicates[:, None])[0]) ** 2 if g > 1 else np.nan
+    if s == 1:
+        method = f"leave-one-group-out jackknife, t, {g - 1} df"
+        return Spread(value, float(np.sqrt(of_groups)), g - 1, method)
+    of_seeds = float(np.var(statistic(by_seed), ddof=1)) / s
+    parts = of_groups**2 / max(g - 1, 1) + of_seeds**2 / (s - 1)
+    df = (of_groups + of_seeds) ** 2 / parts if parts > 0 else g - 1
+    method = f"jackknife over {g} groups and deviation of {s} seeds, t, {df:.1f} df"
+    return Spread(value, float(np.sqrt(of_groups + of_seeds)), df, method)

@@ -1,0 +1,301 @@
+"""Retrieval: how high the right key ranks by cosine similarity, in both directions.
+
+Row i of a belongs to row i of b. Ties count as a random order would, in expectation, so equal keys
+never look like hits. Strictly, only the key of the same sample is right; with texts, keys whose
+text has a cosine above a threshold to the query's are right as well (TVL), and the first counts.
+
+No matrix of all pairs is held: rows are taken a block at a time, and one product gives both
+directions, since the strict rank of a key's query needs only counts over the column.
+
+With a above the best right key, t tied with it (itself included) and w of these wrong,
+``P(top k) = 1 - C(w, s) / C(t, s)`` with ``s = min(max(k - a, 0), t)`` places that the ties share,
+and the expected rank is ``a + (t + 1) / (t - w + 1)``.
+
+The interval of the median rank is Woodruff's (1952): that of the share of ranks up to the median,
+by jackknife over groups, turned back into ranks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from palpate.core import FeatureSet, PalpateError, Score, rng_for
+from palpate.metrics.means import Array, Mean, mean_of
+
+#: Cosines that differ by less are ties: products of equal vectors differ in the last bits.
+TIE = 1e-6
+#: Similarities in memory at a time (16 MB).
+CELLS = 1 << 22
+#: Similarities that random pools may take in all; each needs one pool at least.
+POOLED = 4e8
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Where the first right key of each query stands: (n,) arrays of counts, in float64.
+
+    Attributes:
+        above: keys of higher similarity than the best right one.
+        ties: keys that are equal to it, itself included.
+        wrong: those of them that are not right.
+        right: right keys in all.
+        pool: keys in all.
+    """
+
+    above: Array
+    ties: Array
+    wrong: Array
+    right: Array
+    pool: int
+
+    @property
+    def expected(self) -> Array:
+        """(n,) expected rank, from 1."""
+        return self.above + (self.ties + 1) / (self.ties - self.wrong + 1)
+
+    def within(self, k: int) -> Array:
+        """(n,) probability that a right key is among the first k."""
+        slots = np.clip(k - self.above, 0, self.ties)
+        log_miss = gammaln(self.wrong + 1) - gammaln(self.wrong - slots + 1)  # -inf: cannot miss
+        return 1 - np.exp(log_miss - gammaln(self.ties + 1) + gammaln(self.ties - slots + 1))
+
+    def shuffled(self) -> Ranks:
+        """The same where all keys are equal: chance."""
+        all_tied = np.full(len(self.right), float(self.pool))
+        return Ranks(
+            np.zeros(len(all_tied)), all_tied, all_tied - self.right, self.right, self.pool
+        )
+
+
+class Retrieved(NamedTuple):
+    """One direction: a mean for each k, and the median rank."""
+
+    top: list[Mean]
+    median: Score
+
+    @property
+    def scores(self) -> list[Score]:
+        """All of them as scores."""
+        return [*(mean.score for mean in self.top), self.median]
+
+
+def retrieval(  # noqa: PLR0913 - one argument a choice
+    a: FeatureSet,
+    b: FeatureSet,
+    *,
+    names: tuple[str, str] = ("a", "b"),
+    top: Sequence[int] = (1, 5, 10),
+    pool: int | None = None,
+    repeats: int | None = None,
+    texts: NDArray[Any] | None = None,
+    threshold: float = 0.999,
+    seed: int = 0,
+    subject: str = "real",
+    split: str | None = None,
+    settings: dict[str, Any] | None = None,
+) -> tuple[Retrieved, Retrieved]:
+    """How often the right key is among the k most similar ones, and the median of its rank.
+
+    Args:
+        a: n rows, e.g. tactile embeddings of the test samples.
+        b: n rows with the same ids in the same order, e.g. text embeddings.
+        names: of both, e.g. ``("tactile", "text")``.
+        top: the values of k; those over the pool's size are skipped.
+        pool: rank among so many samples drawn at random instead of among all; chance is then
+            k / pool whatever n.
+        repeats: pools to average over; default: at most 20, and fewer the larger they are.
+        texts: (n, d) embeddings of the samples' texts: keys count as right as well if their text
+            has a cosine above ``threshold`` to the query's. None counts the sample's own key only.
+        threshold: see ``texts``; 0.999 takes equal texts.
+        seed: of the pools.
+        subject: what is scored, kept in the scores.
+        split: digest of the split, kept in the scores.
+        settings: more to keep in the scores.
+
+    Returns:
+        b found by a (``"top-1 of 356 (text by tactile)"``), and a found by b; ``details`` holds the
+        chance level, and the mean number of right keys.
+
+    Raises:
+        PalpateError: if ids differ, the pool is larger than the set, or n < 2.
+    """
+    n = len(a.ids)
+    _check(a, b, pool)
+    draws = [np.arange(n)]
+    if pool is not None and pool < n:
+        repeats = repeats or int(np.clip(POOLED // pool**2, 1, 20))
+        draws = [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(repeats)]
+    size, left, right = len(draws[0]), unit_rows(a.features), unit_rows(b.features)
+    words = None if texts is None else unit_rows(texts)
+    by_draw = [
+        both_ranks(left[rows], right[rows], None if words is None else words[rows], threshold)
+        for rows in draws
+    ]
+    groups = np.array(a.ids if a.groups is None else a.groups, dtype=str)
+    fields = {
+        "subject": subject,
+        "split": split,
+        "encoder": a.encoder,
+        "estimator": "mean",
+        "seed": seed if len(draws) > 1 else None,
+        "settings": {
+            "pool": size,
+            "right": "the sample's own" if texts is None else f"text cosine > {threshold:g}",
+            **(settings or {}),
+        },
+    }
+    forth, back = (
+        _retrieved(
+            [pair[way] for pair in by_draw], draws, groups, name, top=top, fields=dict(fields)
+        )
+        for way, name in enumerate((f"{names[1]} by {names[0]}", f"{names[0]} by {names[1]}"))
+    )
+    return forth, back
+
+
+def both_ranks(
+    a: Floats, b: Floats, texts: Floats | None = None, threshold: float = 0.999
+) -> tuple[Ranks, Ranks]:
+    """Ranks of b's rows for a's rows as queries, and the other way round.
+
+    Args:
+        a: (n, d) rows of length 1.
+        b: the same.
+        texts: (n, e), see :func:`retrieval`.
+        threshold: see :func:`retrieval`.
+    """
+    if texts is None:
+        return _own_ranks(a, b)
+    distinct, code = np.unique(texts, axis=0, return_inverse=True)
+    code = code.reshape(-1)
+    return tuple(_similar_ranks(x, y, distinct, code, threshold) for x, y in ((a, b), (b, a)))  # type: ignore[return-value]
+
+
+def unit_rows(x: NDArray[Any]) -> Floats:
+    """Rows of length 1 in float32; a row of zeros stays."""
+    x = np.asarray(x, dtype=np.float32)
+    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+
+
+def blocks(rows: int, columns: int) -> Generator[slice]:
+    """Slices of rows, of at most ``CELLS`` cells each."""
+    step = max(1, CELLS // columns)
+    for start in range(0, rows, step):
+        yield slice(start, min(start + step, rows))
+
+
+def _own_ranks(a: Floats, b: Floats) -> tuple[Ranks, Ranks]:
+    n = len(a)
+    own = np.einsum("ij,ij->i", a, b)
+    high, low = own + np.float32(TIE), own - np.float32(TIE)
+    counts = np.zeros((2, 2, n))  # direction, (above, not below)
+    for rows in blocks(n, n):
+        similar = a[rows] @ b.T
+        for k, bound in enumerate((high, low)):
+            counts[0, k, rows] = _count(similar > bound[rows, None], 1)
+            counts[1, k] += _count(similar > bound, 0)
+    one = np.ones(n)
+    forth, back = (Ranks(c[0], c[1] - c[0], c[1] - c[0] - 1, one, n) for c in counts)
+    return forth, back
+
+
+def _similar_ranks(
+    a: Floats, b: Floats, texts: Floats, code: NDArray[np.intp], threshold: float
+) -> Ranks:
+    n = len(a)
+    above, ties, wrong, right = np.zeros((4, n))
+    for rows in blocks(n, n):
+        similar = a[rows] @ b.T
+        good = (texts[code[rows]] @ texts.T > threshold)[:, code]
+        good[np.arange(len(good)), np.arange(rows.start, rows.stop)] = True
+        best = np.where(good, similar, -np.inf).max(axis=1, keepdims=True)
+        over = similar > best + TIE
+        tied = (similar > best - TIE) & ~over
+        above[rows], ties[rows] = _count(over, 1), _count(tied, 1)
+        wrong[rows], right[rows] = _count(tied & ~good, 1), _count(good, 1)
+    return Ranks(above, ties, wrong, right, n)
+
+
+def _count(mask: NDArray[np.bool_], axis: int) -> NDArray[np.int64]:
+    """Number of true cells along an axis."""
+    return mask.view(np.uint8).sum(axis=axis, dtype=np.int32).astype(np.int64)
+
+
+def _retrieved(
+    by_draw: Sequence[Ranks],
+    draws: Sequence[NDArray[np.intp]],
+    groups: NDArray[np.str_],
+    name: str,
+    *,
+    top: Sequence[int],
+    fields: dict[str, Any],
+) -> Retrieved:
+    """Scores of one direction, averaged over the pools that a query was in."""
+    seen, chance = np.zeros(len(groups)), [ranks.shuffled() for ranks in by_draw]
+    for rows in draws:
+        seen[rows] += 1
+    used = np.flatnonzero(seen)
+
+    def averaged(values: Sequence[Array]) -> Array:
+        total = np.zeros(len(groups))
+        for rows, part in zip(draws, values, strict=True):
+            total[rows] += part
+        return total[used] / seen[used]
+
+    size, queries = by_draw[0].pool, groups[used].tolist()
+    details = {"pools": len(draws)}
+    details |= {"right_keys": float(np.mean([ranks.right.mean() for ranks in by_draw]))}
+    means = [
+        mean_of(
+            f"top-{k} of {size} ({name})",
+            averaged([ranks.within(k) for ranks in by_draw]),
+            queries,
+            weights=seen[used],
+            details={"chance": float(np.mean([c.within(k) for c in chance])), **details},
+            **fields,
+        )
+        for k in top
+        if k < size
+    ]
+    ranks = averaged([r.expected for r in by_draw])
+    details["chance"] = float(np.median(averaged([c.expected for c in chance])))
+    median = _median(f"median rank of {size} ({name})", ranks, queries, details, fields)
+    return Retrieved(means, median)
+
+
+def _median(
+    metric: str, ranks: Array, groups: Sequence[str], details: dict[str, Any], fields: Any
+) -> Score:
+    value = float(np.median(ranks))
+    share = mean_of("share", ranks <= value, groups, subject="").score
+    interval, method = None, ""
+    if share.interval is not None:
+        half = (share.interval[1] - share.interval[0]) / 2
+        bounds = np.clip([0.5 - half, 0.5 + half], 0, 1)
+        low, high = np.quantile(ranks, bounds, method="inverted_cdf").tolist()
+        interval, method = (low, high), f"Woodruff, from the {share.interval_method}"
+    fields |= {"estimator": "median", "interval": interval, "interval_method": method}
+    return Score(
+        metric, value=value, n=len(ranks), higher_is_better=False, details=details, **fields
+    )
+
+
+def _check(a: FeatureSet, b: FeatureSet, pool: int | None) -> None:
+    n, widths = len(a.ids), (a.features.shape[1], b.features.shape[1])
+    if list(a.ids) != list(b.ids):
+        must = "Queries and keys must have the same ids in the same order"
+        raise PalpateError(must, "different ids", "Take the same ids from both")
+    if n < 2 or widths[0] != widths[1]:
+        must = "Retrieval needs at least two samples in one common space"
+        got = f"{n} samples, widths {widths[0]} and {widths[1]}"
+        raise PalpateError(must, got, "Embed both with one set of encoders")
+    if pool is not None and not 2 <= pool <= n:
+        must, fix = f"must lie in 2 to {n}, the number of samples", "Choose a smaller pool"
+        raise PalpateError(must, f"{pool}", fix, argument="pool")

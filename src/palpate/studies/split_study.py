@@ -1,0 +1,132 @@
+"""What a split is worth to an encoder that is trained on it (the paper's tables 1 and 2, left).
+
+One encoder is trained for each split and seed and scored on the test part of its own split. Every
+training is a stage of a run folder (:mod:`palpate.studies.stages`): a killed study goes on where it
+was, within a training as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from palpate.core import PalpateError, Progress, Split, locked, quiet
+from palpate.encoders import EncoderSet, train_encoder
+from palpate.evaluation.probing import (
+    TVL_THRESHOLD,
+    Modality,
+    Plan,
+    Probed,
+    load_manifest,
+    measure,
+    named,
+    plan_of,
+    results_of,
+)
+from palpate.report.results import Results
+from palpate.studies.stages import Run
+
+
+def compare_splits(  # noqa: PLR0913 - those of training and of probing
+    data: Any,
+    splits: Any,
+    *,
+    work: str | Path,
+    preset: Any = "mini",
+    clip: str | None = None,
+    epochs: float | None = None,
+    seeds: Sequence[int] = (0, 1, 2),
+    modality: Modality = "tactile",
+    label: str | Sequence[str] = "material",
+    group: str = "auto",
+    neighbors: int = 20,
+    top: Sequence[int] = (1, 5, 10),
+    pool: int | None = None,
+    text_threshold: float = TVL_THRESHOLD,
+    seed: int = 0,
+    device: str = "auto",
+    print_line: Callable[[str], None] = lambda line: None,
+    progress: Progress = quiet,
+) -> Results:
+    """Train a tactile encoder on each split with each seed, and score it under that split.
+
+    Args:
+        data: a manifest, or its file or folder.
+        splits: split files, as a list or name -> split; the first is compared with the others.
+        work: run folder of the encoders; run again with the same folder to resume.
+        preset: see :func:`palpate.train_encoder`.
+        clip: see :func:`palpate.train_encoder`.
+        epochs: see :func:`palpate.train_encoder`.
+        seeds: one training each.
+        modality: see :func:`palpate.probe`.
+        label: see :func:`palpate.probe`.
+        group: see :func:`palpate.probe`.
+        neighbors: see :func:`palpate.probe`.
+        top: see :func:`palpate.probe`.
+        pool: see :func:`palpate.probe`.
+        text_threshold: see :func:`palpate.probe`.
+        seed: of probing; see :func:`palpate.probe`.
+        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        print_line: called with one line a training.
+        progress: called with what is done.
+
+    Returns:
+        Scores that are means over seeds, with intervals over videos and seeds, and the paired
+        differences of the splits; ``facts`` says what each score drops by.
+
+    Raises:
+        PalpateError: without seeds, or as training and probing do.
+    """
+    if not seeds or len(set(seeds)) < len(seeds):
+        must, example = "must hold at least one seed, each once", {"seeds": (0, 1, 2)}
+        raise PalpateError(must, f"{list(seeds)}", "", argument="seeds", example=example)
+    manifest, folder = load_manifest(data), Path(work)
+    loaded = {name: Split.load(split) for name, split in named(splits, "split").items()}
+    labels = [label] if isinstance(label, str) else list(label)
+    # A leaking split may hold a test image in train as well: that is what is measured.
+    plan = Plan(
+        modality,
+        labels,
+        group,
+        neighbors,
+        tuple(top),
+        pool,
+        text_threshold,
+        seed,
+        allow_seen=True,
+        axis="split" if len(loaded) > 1 else "",
+        trained=True,
+    )
+    plan = plan_of(manifest, loaded, plan)
+    training = {"preset": preset, "clip": clip, "epochs": epochs, "device": device}
+    runs: dict[str, list[Probed]] = {}
+    facts: dict[str, dict[str, Any]] = {}
+    with locked(folder):
+        run = Run(folder, print_line)
+        for name, split in loaded.items():
+            for number in seeds:
+                stage = f"{name}-{number}"
+
+                def build(
+                    place: Path, split: Split = split, number: int = number
+                ) -> dict[str, Any]:
+                    output = place / "encoders"
+                    encoders = train_encoder(
+                        manifest, split, output=output, seed=number, progress=progress, **training
+                    )
+                    return {"tactile": encoders.digest("tactile")}
+
+                inputs = {"manifest": manifest.digest, "split": split.digest, "seed": number}
+                done = run.stage(stage, inputs | training, build)
+                encoders = EncoderSet.load(done.folder / "encoders")
+                facts[stage] = {"encoder": done.facts["tactile"], "seconds": done.seconds}
+                probed = measure(
+                    manifest, split, encoders, name, plan, cache=folder / "cache", progress=progress
+                )
+                runs.setdefault(name, []).append(probed)
+    results = results_of("Encoders trained on each split", runs, plan, manifest, loaded)
+    settings = {**training, "preset": getattr(preset, "name", preset), "seeds": list(seeds)}
+    more = {"training": settings, "trainings": facts}
+    return replace(results, settings={**results.settings, **more})

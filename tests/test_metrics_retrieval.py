@@ -1,0 +1,138 @@
+"""Retrieval against all orders of the keys, on hand counts, and without a matrix of all pairs."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from palpate.core import FeatureSet, PalpateError
+from palpate.metrics import retrieval as module
+from palpate.metrics.retrieval import both_ranks, retrieval, unit_rows
+
+
+def features(x, groups=None, start=0):
+    ids = [f"s{start + k}" for k in range(len(x))]
+    return FeatureSet(ids, np.asarray(x, np.float32), None, groups, "e")
+
+
+def all_orders(similar, good, measure):
+    """Mean of a measure of (row's goodness in order) over the orders that agree with similarity."""
+    means = []
+    for row, right in zip(similar, good, strict=True):
+        orders = [o for o in permutations(range(len(row))) if (np.diff(row[list(o)]) <= 0).all()]
+        means.append(np.mean([measure(right[list(o)]) for o in orders]))
+    return np.array(means)
+
+
+def random_rows(ties, n=6):
+    rng = np.random.default_rng(3)
+    keys = rng.normal(size=(n, 3))
+    if ties:
+        keys[1] = keys[2] = keys[4]
+        keys[3] = keys[0]
+    return unit_rows(keys + 0.8 * rng.normal(size=(n, 3))), unit_rows(keys)
+
+
+@pytest.mark.parametrize("ties", [False, True])
+@pytest.mark.parametrize("many", [False, True])
+def test_ranks_equal_all_orders_in_both_directions(ties, many):
+    a, b = random_rows(ties)
+    texts = unit_rows(np.random.default_rng(4).normal(size=(6, 2))) if many else None
+    good = (
+        np.eye(6, dtype=bool) if texts is None else (texts @ texts.T > 0.6) | np.eye(6, dtype=bool)
+    )
+    forth, back = both_ranks(a, b, texts, 0.6)
+    similar = (a.astype(float) @ b.T.astype(float)).round(6)
+    for ranks, matrix in ((forth, similar), (back, similar.T)):
+        for k in (1, 2, 5, 6):
+            slow = all_orders(matrix, good, lambda order, k=k: order[:k].any())
+            assert ranks.within(k) == pytest.approx(slow)
+        first = all_orders(matrix, good, lambda order: 1 + np.argmax(order))
+        assert ranks.expected == pytest.approx(first)
+        assert (ranks.right == good.sum(axis=1)).all()
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_blocks_of_any_size_give_the_same_ranks(many, monkeypatch):
+    a, b = random_rows(True, 40)
+    texts = unit_rows(np.random.default_rng(4).normal(size=(40, 2))) if many else None
+    whole = both_ranks(a, b, texts, 0.9)
+    monkeypatch.setattr(module, "CELLS", 150)
+    parts = both_ranks(a, b, texts, 0.9)
+    for x, y in zip(whole, parts, strict=True):
+        for name in ("above", "ties", "wrong", "right"):
+            assert (getattr(x, name) == getattr(y, name)).all()
+
+
+def test_equal_keys_score_chance():
+    same = features(np.ones((10, 4)))
+    forth, _ = retrieval(same, same, names=("tactile", "text"), top=(1, 5))
+    assert [s.metric for s in forth.scores] == [
+        "top-1 of 10 (text by tactile)",
+        "top-5 of 10 (text by tactile)",
+        "median rank of 10 (text by tactile)",
+    ]
+    assert [s.value for s in forth.scores] == pytest.approx([0.1, 0.5, 5.5])
+    assert [s.details["chance"] for s in forth.scores] == pytest.approx([0.1, 0.5, 5.5])
+
+
+def test_equal_texts_count_with_a_threshold_and_chance_follows():
+    keys = np.eye(4)[[0, 1, 2, 3]]
+    queries = keys[[1, 0, 2, 3]]  # the first two are swapped
+    texts = np.eye(3)[[0, 0, 1, 2]]  # and have one text
+    strict, _ = retrieval(features(queries), features(keys), top=(1,))
+    similar, _ = retrieval(features(queries), features(keys), top=(1,), texts=texts)
+    assert strict.top[0].score.value == 0.5
+    assert similar.top[0].score.value == 1.0
+    assert similar.top[0].score.details["chance"] == pytest.approx(
+        (2 / 4 + 2 / 4 + 1 / 4 + 1 / 4) / 4
+    )
+    assert similar.top[0].score.details["right_keys"] == 1.5
+    assert strict.top[0].score.settings != similar.top[0].score.settings
+
+
+@pytest.mark.parametrize("n", [40, 160])
+def test_chance_of_a_pool_does_not_depend_on_n(n):
+    rng = np.random.default_rng(0)
+    a, b = (features(rng.normal(size=(n, 5))) for _ in range(2))
+    top5 = retrieval(a, b, top=(5,), pool=20, repeats=60)[0].top[0].score
+    assert top5.metric.startswith("top-5 of 20")
+    assert top5.details["chance"] == pytest.approx(0.25)
+    assert top5.value == pytest.approx(0.25, abs=0.12)
+    assert retrieval(a, b, top=(5,), pool=20, repeats=60)[0].top[0].score == top5
+    assert retrieval(a, a, pool=20)[0].top[0].score.value == 1.0
+
+
+def test_a_pool_of_all_is_no_pool_and_ranks_over_the_pool_are_skipped():
+    a, b = (features(rows) for rows in random_rows(False))
+    assert [s.value for s in retrieval(a, b, pool=6)[0].scores] == [
+        s.value for s in retrieval(a, b)[0].scores
+    ]
+    assert [m.score.metric for m in retrieval(a, b, top=(1, 5, 6, 10))[0].top] == [
+        "top-1 of 6 (b by a)",
+        "top-5 of 6 (b by a)",
+    ]
+
+
+def test_the_interval_of_the_median_rank_holds_it_as_often_as_promised():
+    rng, hits = np.random.default_rng(1), []
+    for _ in range(150):  # ranks of 20 videos of 8 frames; a video shifts all of its own
+        groups = np.repeat([f"v{k}" for k in range(20)], 8)
+        ranks = np.exp(2 + np.repeat(0.7 * rng.normal(size=20), 8) + rng.normal(size=160))
+        score = module._median("median", ranks, groups.tolist(), {}, {"subject": "x"})
+        hits.append(score.interval[0] <= np.exp(2) <= score.interval[1])
+    assert 0.88 <= np.mean(hits) <= 1
+
+
+@pytest.mark.parametrize(
+    ("queries", "keys", "pool", "match"),
+    [
+        (np.eye(4), features(np.eye(4), start=1), None, "same ids"),
+        (np.eye(4), features(np.eye(4)), 5, "`pool` must lie in 2 to 4"),
+        (np.eye(1), features(np.eye(1)), None, "two samples"),
+        (np.eye(4), features(np.ones((4, 2))), None, "common space"),
+    ],
+)
+def test_retrieval_rejects_sets_that_do_not_pair(queries, keys, pool, match):
+    with pytest.raises(PalpateError, match=match):
+        retrieval(features(queries), keys, pool=pool)
