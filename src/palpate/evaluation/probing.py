@@ -185,6 +185,9 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     group = plan.group if plan.group != "auto" else groups.pop() if len(groups) == 1 else "video"
     sizes = [len(split.ids("test")) for split in splits.values()]
     pool = min(sizes) if plan.pool is None and len(sizes) > 1 else plan.pool
+    if plan.pool is not None and not 2 <= plan.pool <= min(sizes):
+        must = f"must lie in 2 to {min(sizes)}, the number of test samples"
+        raise PalpateError(must, f"{plan.pool}", "Choose a smaller pool", argument="pool")
     return replace(plan, group=group, pool=pool)
 
 

@@ -341,10 +341,11 @@ class Results:
     Attributes:
         title: heading of the page.
         facts: the headline facts, one sentence each.
-        audits, scores, gallery, strips: what the page shows.
+        audits, scores, gallery: what the page shows.
         settings: nested JSON of settings, digests, seeds, versions and times.
         notes: what a reader must see first (synthetic data, fallbacks, skipped inputs).
         commands: command lines that reproduce the run or say what to do next.
+        strips: what an encoder retrieved for some queries.
     """
 
     title: str
@@ -352,10 +353,10 @@ class Results:
     audits: Sequence[Audit] = ()
     scores: Sequence[Score] = ()
     gallery: Sequence[GalleryItem] = ()
-    strips: Sequence[Strip] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[Note] = ()
     commands: Sequence[str] = ()
+    strips: Sequence[Strip] = ()
 
     def __iter__(self) -> Iterator[Score]:
         return iter(self.scores)

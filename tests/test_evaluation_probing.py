@@ -1,0 +1,188 @@
+"""`palpate.probe`: what it measures, for one, several encoders and several splits."""
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from palpate import probe
+from palpate.core import PalpateError, Split
+from palpate.report.results import Results
+
+pytest.importorskip("torch")
+from mini_fixtures import make_encoders
+
+DIRECTIONS = [
+    "text by tactile",
+    "tactile by text",
+    "similar text by tactile",
+    "tactile by similar text",
+    "vision by tactile",
+    "tactile by vision",
+]
+
+
+def with_columns(manifest, **columns):
+    return replace(manifest, table=manifest.table.with_columns(**columns))
+
+
+@pytest.fixture
+def manifest(small_manifest):
+    """Six videos of three materials; each contact has a text."""
+    texts = [f"number {contact}" for contact in small_manifest.column("contact")]
+    return with_columns(small_manifest, text=pl.Series(texts))
+
+
+def split_of(manifest, *test, name="s"):
+    """A split with the given videos in test."""
+    part = ["test" if v in test else "train" for v in manifest.column("video")]
+    return Split(dict(zip(manifest.ids, part, strict=True)), {"name": name, "group": "video"})
+
+
+@pytest.fixture
+def split(manifest):
+    return split_of(manifest, "v3", "v4", "v5")
+
+
+@pytest.fixture(scope="module")
+def encoders():
+    return make_encoders()
+
+
+def test_one_call_gives_both_classifiers_and_retrieval_in_all_directions(
+    manifest, split, encoders, tmp_path
+):
+    results = probe(manifest, split, encoder=encoders, neighbors=3, cache=tmp_path / "cache")
+    names = ["material accuracy", "material accuracy, balanced"]
+    names += ["material accuracy, 3-NN", "material accuracy, 3-NN, balanced"]
+    for direction in DIRECTIONS:
+        names += [f"top-{k} of 24 ({direction})" for k in (1, 5, 10)]
+    medians = [f"median rank of 24 ({direction})" for direction in DIRECTIONS]
+    assert [s.metric for s in results] == names + medians
+    assert {s.subject for s in results} == {"real"}
+    assert all(s.details["chance"] > 0 for s in results)
+    accuracy = results["material accuracy", "real"]
+    assert (accuracy.n, accuracy.split) == (24, split.digest)
+    assert accuracy.details["majority"] == pytest.approx(1 / 3)
+    # Each strip is one query with the most similar keys, among which its own may be right.
+    kinds = {(s.queries, s.keys) for s in results.strips}
+    assert kinds == {
+        ("tactile", "text"),
+        ("text", "tactile"),
+        ("tactile", "vision"),
+        ("vision", "tactile"),
+    }
+    for strip in results.strips:
+        similar = [m.similarity for m in strip.matches]
+        assert similar == sorted(similar, reverse=True)
+        for match in strip.matches:
+            own = match.sample.id == strip.query.id
+            assert match.right >= own
+            assert match.right == own or "text" in (strip.queries, strip.keys)
+    results.save(tmp_path / "p.json")
+    assert Results.load(tmp_path / "p.json").strips == [*results.with_paths(lambda p: p).strips]
+
+
+def test_a_page_shows_confusions_and_what_was_retrieved(manifest, split, encoders, tmp_path):
+    results = probe(manifest, split, encoder=encoders)
+    results.to_html(tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "Rows: the true class of test samples" in page
+    assert page.count('<figure class="strip">') == len(results.strips) > 0
+    assert "number v3#0" in page
+    assert page.count("data:image/png") > 10
+    markdown = (tmp_path / "page.md").read_text()
+    assert "### What was retrieved" in markdown
+    assert "chance" in results.to_latex()
+
+
+def test_encoders_are_compared_on_the_same_videos(manifest, split, encoders):
+    results = probe(manifest, split, encoder={"a": encoders, "b": make_encoders(7)}, top=(1,))
+    assert {s.subject for s in results if " difference" not in s.metric} == {"a", "b"}
+    difference = results["material accuracy difference", "a - b"]
+    a, b = (results["material accuracy", name] for name in "ab")
+    assert difference.value == pytest.approx(a.value - b.value)
+    assert a.encoder != b.encoder
+    # An encoder is no worse than itself, in any score.
+    same = probe(manifest, split, encoder={"a": encoders, "b": encoders}, top=(1,))
+    assert {s.value for s in same if s.metric.endswith(" difference")} == {0.0}
+
+
+def test_splits_are_compared_with_pools_of_one_size(manifest, encoders):
+    splits = {
+        "Orig": split_of(manifest, "v3", "v4", "v5"),
+        "NoLeak": split_of(manifest, "v0", "v5"),
+    }
+    results = probe(manifest, splits, encoder=encoders, top=(1,))
+    assert {
+        s.metric for s in results if s.metric.startswith("top-1") and "difference" not in s.metric
+    } == {f"top-1 of 16 ({direction})" for direction in DIRECTIONS}
+    pools = {s.details["pools"] for s in results["top-1 of 16 (text by tactile)"]}
+    assert pools == {20, 1}
+    assert any("points" in fact for fact in results.facts)
+    assert len(str(results)) > 100  # both stand in one column
+
+
+def test_several_labels_and_rows_without_one(manifest, split, encoders):
+    rng = np.random.default_rng(0)
+    hard = [None if k % 5 == 0 else str(rng.integers(2)) for k in range(len(manifest))]
+    table = with_columns(manifest, hardness=pl.Series(hard, dtype=pl.String))
+    results = probe(table, split, encoder=encoders, label=["material", "hardness"], top=())
+    known = sum(
+        v is not None for v, i in zip(hard, table.ids, strict=True) if split.parts[i] == "test"
+    )
+    assert results["hardness accuracy", "real"].n == known
+    assert "probe-unlabeled" in {note.code for note in results.notes}
+    assert results["material accuracy", "real"].n == 24
+
+
+def test_samples_without_a_partner_are_left_out_and_counted(manifest, split, encoders):
+    photos = [None if k % 4 == 3 else v for k, v in enumerate(manifest.column("vision"))]
+    some = with_columns(
+        manifest,
+        vision=pl.Series(photos),
+        text=pl.lit(None, pl.String),
+        material=pl.lit(None, pl.String),
+    )
+    results = probe(some, split, encoder=encoders, top=(1,))
+    assert [s.metric for s in results] == [
+        "top-1 of 18 (vision by tactile)",
+        "top-1 of 18 (tactile by vision)",
+        "median rank of 18 (vision by tactile)",
+        "median rank of 18 (tactile by vision)",
+    ]
+    codes = [note.code for note in results.notes]
+    assert codes == ["probe-no-label", "probe-no-partner", "probe-some-partners"]
+
+
+def test_a_vision_encoder_needs_no_tactile_encoder(manifest, split):
+    from palpate.encoders.encoder_set import EncoderSet
+
+    results = probe(
+        manifest, split, encoder=EncoderSet(make_encoders().clip), modality="vision", top=(1,)
+    )
+    assert "probe-no-encoder" in {note.code for note in results.notes}
+    assert results["top-1 of 24 (text by vision)", "real"].n == 24
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"label": "color"}, "A column must be one of"),
+        ({"modality": "text"}, "modality"),
+        ({"neighbors": 0}, "`neighbors` must be at least 1"),
+        ({"top": (0, 1)}, "`top` must be ranks from 1"),
+        ({"pool": 100}, "`pool` must lie in 2 to 24"),
+        ({"encoder": []}, "`encoder` must hold at least one"),
+        ({"label": "session", "top": ()}, "a label, or another modality"),
+    ],
+)
+def test_what_cannot_be_probed_is_refused(manifest, split, encoders, options, match):
+    with pytest.raises(PalpateError, match=match):
+        probe(manifest, split, **{"encoder": encoders, **options})
+
+
+def test_several_splits_and_several_encoders_at_once_are_refused(manifest, split, encoders):
+    with pytest.raises(PalpateError, match="one where several splits"):
+        probe(manifest, [split, split], encoder=[encoders, encoders])

@@ -1,0 +1,112 @@
+"""Encoders trained on each split: what the leak is worth, resuming, and the command line."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from palpate.cli import main
+from palpate.core import PalpateError, Split
+from palpate.data import Manifest
+
+pytest.importorskip("torch")
+from palpate.studies.split_study import compare_splits
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Twelve videos, each of one look, its material at random: only remembering a video helps."""
+    rng, rows = np.random.default_rng(0), []
+    for v in range(12):
+        look = rng.integers(0, 255, (4, 4, 3))
+        for k in range(8):
+            paths = {}
+            for kind in ("vision", "tactile"):
+                path = tmp_path / "root" / f"v{v}" / kind / f"{k}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                pixels = np.kron(look, np.ones((8, 8, 1))) + rng.normal(0, 8, (32, 32, 3))
+                Image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path)
+                paths[kind] = path.relative_to(tmp_path / "root").as_posix()
+            row = {"id": f"v{v}/{k}", "video": f"v{v}", "frame": k, "contact": f"v{v}#{k // 2}"}
+            rows.append({**row, "material": "ab"[v % 2], "text": f"look {v}", **paths})
+    manifest = Manifest.from_rows(rows, tmp_path / "root")
+    manifest.save(tmp_path / "tag" / "manifest.parquet")
+    tests = {"orig": [i for i in manifest.ids if int(i[-1]) % 4 == 3]}
+    tests["noleak"] = [i for i in manifest.ids if i.split("/")[0] in ("v8", "v9", "v10", "v11")]
+    for name, test in tests.items():
+        train = [i for i in manifest.ids if i not in test]
+        split = Split.from_ids(train=train, test=test, rule={"group": "video"})
+        split.save(tmp_path / f"{name}.json")
+    return manifest
+
+
+ARGS = [
+    "tag",
+    "--splits",
+    "orig.json",
+    "noleak.json",
+    "--train",
+    "--preset",
+    "tiny",
+    "--seeds",
+    "0",
+    "1",
+]
+
+
+@pytest.mark.slow
+def test_a_planted_leak_costs_what_it_is_worth(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["probe", *ARGS, "--work", "run", "--neighbors", "1", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    values = {(s["metric"], s["subject"]): s for s in made["scores"]}
+    orig, clean = (values["material accuracy, 1-NN", name] for name in ("orig", "noleak"))
+    assert orig["value"] > 0.95  # a frame of every test video is in train
+    assert clean["value"] < 0.8  # a new video says nothing of its material
+    drop = values["material accuracy, 1-NN difference", "orig - noleak"]
+    assert drop["value"] == pytest.approx(orig["value"] - clean["value"])
+    assert len(orig["details"]["by_seed"]) == 2
+    assert "2 seeds" in drop["interval_method"]
+    assert any("material accuracy, orig - noleak" in fact for fact in made["facts"])
+    # The same command again trains nothing; a page comes from it.
+    stages = {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("model.safetensors")}
+    assert len(stages) == 4 * 2
+    assert main(["probe", *ARGS, "--work", "run", "-o", "drop.html"]) == 0
+    assert "points" in capsys.readouterr().out
+    assert {p: p.stat().st_mtime_ns for p in stages} == stages
+    assert "noleak" in (tmp_path / "drop.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_killed_study_ends_as_one_that_was_not(data, tmp_path):
+    command = [sys.executable, "-m", "palpate", "probe", *ARGS, "--work", "killed", "--json"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, **pipes) as process:
+        for line in process.stderr:
+            if line.startswith("orig-1: ..."):
+                os.kill(process.pid, signal.SIGKILL)
+                break
+        process.wait()
+    assert process.returncode == -signal.SIGKILL
+    again = subprocess.run(command, cwd=tmp_path, env=environment, check=True, **pipes)
+    assert "orig-0: already done" in again.stderr
+    scores = json.loads(again.stdout)["scores"]
+    splits = [tmp_path / "orig.json", tmp_path / "noleak.json"]
+    whole = compare_splits(data, splits, work=tmp_path / "whole", preset="tiny", seeds=(0, 1))
+    assert [s["value"] for s in scores] == [s.value for s in whole]
+
+
+def test_a_study_needs_seeds_and_either_encoders_or_training(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PalpateError, match="`seeds` must hold at least one"):
+        compare_splits(data, ["orig.json"], work="run", seeds=(0, 0))
+    assert main(["probe", "tag", "--split", "orig.json"]) == 2
+    assert "Either an encoder or training must be chosen" in capsys.readouterr().err
+    assert main(["probe", *ARGS, "--encoder", "palpate/mini"]) == 2
+    assert "both" in capsys.readouterr().err
