@@ -18,8 +18,8 @@ from palpate.diffusion.autoencoder_training import (
     train_autoencoder,
 )
 from palpate.diffusion.training import encode_latents
-from palpate.encoders.encoder_set import to_unit
 from palpate.encoders.models import digest_tensors
+from palpate.encoders.preprocess import to_unit
 
 SMALL = AutoencoderOptions(
     patch=4,

@@ -42,7 +42,10 @@ def count(encoders, monkeypatch):
     monkeypatch.setattr(
         EncoderSet,
         "encode",
-        lambda self, encoder, batch: (rows.append(len(batch)), real(self, encoder, batch))[1],
+        lambda self, encoder, batch, *sensors: (
+            rows.append(len(batch)),
+            real(self, encoder, batch, *sensors),
+        )[1],
     )
     return rows
 

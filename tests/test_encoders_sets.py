@@ -15,16 +15,9 @@ from palpate.core import PalpateError
 from palpate.encoders import encoder_set as module
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.embed import embed_images, embed_texts
-from palpate.encoders.encoder_set import (
-    CLIP_MEAN,
-    CLIP_STD,
-    EncoderSet,
-    Preprocess,
-    load_clip,
-    new_tactile,
-    to_unit,
-)
+from palpate.encoders.encoder_set import EncoderSet, Preprocess, load_clip, new_tactile
 from palpate.encoders.models import pick_device
+from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, to_unit
 from palpate.encoders.presets import Augment, augmented, preset
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.training.options import Step

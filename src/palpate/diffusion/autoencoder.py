@@ -30,7 +30,6 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from palpate.core import PalpateError, digest_json, read_record, write_json
-from palpate.encoders.encoder_set import to_unit
 from palpate.encoders.models import (
     architecture,
     digest_tensors,
@@ -39,6 +38,7 @@ from palpate.encoders.models import (
     round_to_half,
     save_model,
 )
+from palpate.encoders.preprocess import to_unit
 from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-autoencoder/1"

@@ -29,7 +29,8 @@ from torch import Tensor, nn
 
 from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
 from palpate.diffusion.autoencoder import Autoencoder, to_bytes
-from palpate.encoders.encoder_set import seeded, to_unit
+from palpate.encoders.encoder_set import seeded
+from palpate.encoders.preprocess import to_unit
 from palpate.metrics.images import psnr_per_image, ssim_per_image
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions, Step

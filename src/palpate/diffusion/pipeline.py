@@ -55,7 +55,7 @@ from palpate.core import (
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats
 from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Schedule, Source
 from palpate.encoders.encoder import list_images, squares
-from palpate.encoders.encoder_set import EncoderSet, load_clip, to_unit
+from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import (
     FIX_MODEL,
     SHIPPED,
@@ -64,6 +64,7 @@ from palpate.encoders.models import (
     find_model,
     pick_device,
 )
+from palpate.encoders.preprocess import to_unit
 from palpate.training.cards import write_model_cards
 
 FORMAT = "palpate-pipeline/2"

@@ -7,6 +7,7 @@ row is therefore another key; the root and the batch size are not part of it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,9 +29,10 @@ from palpate.core import (
     short,
 )
 from palpate.data.captions import NAMED, caption
-from palpate.data.images import REFETCH, cached_images, file_stamp, load_images
+from palpate.data.images import REFETCH, cached_images, file_stamp
 from palpate.data.manifest import Manifest
-from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality, to_unit
+from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
+from palpate.encoders.preprocess import Frames, load_frames, to_unit
 
 
 def texts_of(manifest: Manifest, *, seed: int = 0) -> tuple[list[str], str]:
@@ -52,7 +54,7 @@ def texts_of(manifest: Manifest, *, seed: int = 0) -> tuple[list[str], str]:
     return texts, " and ".join(sorted(sources, key=lambda s: (s != default, s)))
 
 
-def embed(
+def embed(  # noqa: PLR0913
     manifest: Manifest,
     encoders: EncoderSet,
     modality: Modality = "tactile",
@@ -62,6 +64,7 @@ def embed(
     groups: str = "video",
     cache: Path | None = None,
     keep_pixels: bool = True,
+    still: bool = False,
     batch: int = 128,
     progress: Progress = quiet,
 ) -> FeatureSet:
@@ -76,6 +79,7 @@ def embed(
         groups: the same, as groups.
         cache: folder for ``<modality>-<key>.npz`` and the decoded pixels; None computes anew.
         keep_pixels: keep the decoded pixels in the cache, for another encoder or other labels.
+        still: take each image alone, also for encoders that look at an earlier frame, too.
         batch: images at a time; changes the result by rounding only (1e-5).
         progress: called with the number of samples done.
 
@@ -94,7 +98,10 @@ def embed(
     column = modality if column is None or modality == "text" else column
     digest = encoders.digest(modality)
     texts = texts_of(manifest)[0] if modality == "text" else []
+    plain = modality == "text" or encoders.preprocess(modality).plain
     inputs = texts or _stamps(manifest, column)
+    frames = None if plain else encoders.preprocess(modality).frames(manifest, column, still=still)
+    inputs = [inputs, _frame_stamps(frames, manifest.root)] if frames else inputs
     label, group = _column(manifest, labels), _column(manifest, groups)
     key = digest_json(["palpate-embedding/1", digest, manifest.ids, column, inputs, label, group])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
@@ -103,12 +110,15 @@ def embed(
         return cached
     if modality == "text":
         features = embed_texts(texts, encoders, batch=batch, progress=progress)
+    elif frames is not None:
+        features = _embed_frames(frames, encoders, modality, batch, progress)
     elif cache is not None and keep_pixels:
         size = encoders.preprocess(modality).resize
         pixels = cached_images(manifest, column, size, cache, progress)
         features = embed_images(pixels, encoders, modality, batch=batch, progress=progress)
     else:
-        features = _embed_files(manifest.paths(column), encoders, modality, batch, progress)
+        frames = encoders.preprocess(modality).frames(manifest, column)
+        features = _embed_frames(frames, encoders, modality, batch, progress)
     result = FeatureSet(manifest.ids, features, label, group, digest)
     if file is not None:
         result.save(file)
@@ -142,7 +152,7 @@ def embed_images(
     _require(modality, batch)
     require_rgb(images)
     preprocess = encoders.preprocess(modality)
-    features = np.empty((len(images), encoders.dim), np.float32)
+    features = np.empty((len(images), encoders.width(modality)), np.float32)
     for start in range(0, len(images), batch):
         stop = min(start + batch, len(images))
         squares = preprocess.fit(images[start:stop])
@@ -156,7 +166,7 @@ def embed_texts(
 ) -> NDArray[np.float32]:
     """Embeddings of texts, (n, dim) float32, L2-normalized; each distinct text is computed once."""
     distinct = sorted(set(texts), key=lambda t: (len(t), t))  # equal lengths together: less padding
-    rows = np.empty((len(distinct), encoders.dim), np.float32)
+    rows = np.empty((len(distinct), encoders.width("text")), np.float32)
     with exact():
         for start in range(0, len(distinct), batch):
             part = encoders.encode("text", distinct[start : start + batch])
@@ -181,33 +191,37 @@ def exact() -> Generator[None]:
         yield
 
 
-def _embed_files(
-    paths: Sequence[Path], encoders: EncoderSet, modality: Modality, batch: int, progress: Progress
+def _embed_frames(
+    frames: Frames, encoders: EncoderSet, modality: Modality, batch: int, progress: Progress
 ) -> NDArray[np.float32]:
     """Embed files, a batch in memory at a time; report all unreadable files together."""
-    size = encoders.preprocess(modality).resize
-    features = np.empty((len(paths), encoders.dim), np.float32)
+    preprocess, n = encoders.preprocess(modality), len(frames.files)
+    features = np.empty((n, encoders.width(modality)), np.float32)
     problems: list[Problem] = []
-    for start in range(0, len(paths), batch):
+    for start in range(0, n, batch):
+        rows = slice(start, start + batch)
         try:
-            images = load_images(paths[start : start + batch], size)
+            images = load_frames(frames.files[rows], preprocess)
         except ProblemsError as error:
             problems += error.problems
             continue
         if not problems:
-            features[start : start + batch] = _forward(images, encoders, modality)
-        progress(f"embedding {modality}", min(start + batch, len(paths)), len(paths))
+            features[rows] = _forward(images, encoders, modality, frames.sensors[rows])
+        progress(f"embedding {modality}", min(start + batch, n), n)
     if problems:
         raise ProblemsError(problems, REFETCH)
     return features
 
 
 def _forward(
-    images: NDArray[np.uint8], encoders: EncoderSet, modality: Modality
+    images: NDArray[np.uint8],
+    encoders: EncoderSet,
+    modality: Modality,
+    sensors: Sequence[str] | None = None,
 ) -> NDArray[np.float32]:
     with exact():
         pixels = encoders.preprocess(modality)(to_unit(images, encoders.device))
-        return encoders.encode(modality, pixels).float().cpu().numpy()
+        return encoders.encode(modality, pixels, sensors).float().cpu().numpy()
 
 
 def _require(modality: str, batch: int) -> None:
@@ -224,6 +238,14 @@ def _stamps(manifest: Manifest, column: str) -> list[list[object]]:
     stamps = {path: file_stamp(path) for path in dict.fromkeys(paths)}
     names = manifest.column(column)
     return [[name, *stamps[path]] for name, path in zip(names, paths, strict=True)]
+
+
+def _frame_stamps(frames: Frames, root: Path) -> list[object]:
+    """What :func:`_stamps` does not name: no-contact images, earlier frames and sensors."""
+    more = {path for _, *further in frames.files for path in further if path is not None}
+    stamps = {path: [os.path.relpath(path, root), *file_stamp(path)] for path in more}
+    further = [[stamps.get(path) for path in paths] for _, *paths in frames.files]  # type: ignore[arg-type]
+    return [further, frames.sensors]
 
 
 def _column(manifest: Manifest, name: str) -> list[str] | None:

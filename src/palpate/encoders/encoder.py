@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.core import PalpateError, Progress, quiet, require_choice
-from palpate.data.images import SUFFIXES, in_threads, read_image, square
+from palpate.data.images import SUFFIXES, in_threads, read_image
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_images, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, Modality
 from palpate.encoders.models import pick_device
+from palpate.encoders.preprocess import Frame, Preprocess
 from palpate.encoders.seen import digest_images
 
 
@@ -48,8 +49,9 @@ class Encoder:
         """Load one encoder of a saved set.
 
         Args:
-            source: a shipped name (``palpate/mini``), a folder of ``palpate train encoder`` or a
-                hub id.
+            source: a shipped name (``palpate/mini``), a folder of ``palpate train encoder`` or of
+                transformers, a file of a public tactile encoder, or a hub id; see
+                :meth:`EncoderSet.load`.
             modality: ``vision``, ``text`` or ``tactile``.
             device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
 
@@ -61,7 +63,7 @@ class Encoder:
     @property
     def dim(self) -> int:
         """Width of the embeddings."""
-        return self.encoders.dim
+        return self.encoders.width(self.modality)
 
     @property
     def digest(self) -> str:
@@ -69,9 +71,21 @@ class Encoder:
         return self.encoders.digest(self.modality)
 
     @property
+    def preprocess(self) -> Preprocess:
+        """How it prepares images; not of a text encoder."""
+        return self.encoders.preprocess(self.modality)
+
+    @property
+    def license(self) -> str | None:
+        """The license of its weights, if it is known."""
+        public = self.encoders.public(self.modality)
+        return public.license if public else None
+
+    @property
     def trained_on(self) -> tuple[str, ...]:
         """Data sets that the encoder's authors trained it on, beyond what :meth:`saw` knows."""
-        return self.encoders.trained_on(self.modality)
+        public = self.encoders.public(self.modality)
+        return public.trained_on if public else ()
 
     @property
     def knows_seen(self) -> bool:
@@ -131,10 +145,10 @@ class Encoder:
         if self.modality == "text":
             texts = [inputs] if isinstance(inputs, str) else list(inputs)
             return embed_texts(texts, self.encoders, batch=batch, progress=progress)
-        images, size = list_images(inputs), self.encoders.preprocess(self.modality).resize
+        images, preprocess = list_images(inputs), self.preprocess
         features = np.empty((len(images), self.dim), np.float32)
         for start in range(0, len(images), batch):
-            pixels = squares(images[start : start + batch], size)
+            pixels = prepared(images[start : start + batch], preprocess)
             features[start : start + batch] = embed_images(pixels, self.encoders, self.modality)
             progress(f"embedding {self.modality}", start + len(pixels), len(images))
         return features
@@ -168,11 +182,21 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
 
 def squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
     """Decode images to center squares (n, size, size, 3)."""
-    pixels = np.empty((len(images), size, size, 3), np.uint8)
+    return prepared(images, Preprocess(size, size))
+
+
+def prepared(
+    images: Sequence[Path | Image.Image | Frame], preprocess: Preprocess
+) -> NDArray[np.uint8]:
+    """Decode and prepare images, (n, height, width, channels)."""
+    pixels = np.empty((len(images), *preprocess.shape), np.uint8)
 
     def decode(k: int) -> None:
         image = images[k]
-        pixels[k] = square(read_image(image) if isinstance(image, Path) else image, size)
+        parts = image if isinstance(image, tuple) else (image,)
+        pixels[k] = preprocess.prepare(
+            *(read_image(p) if isinstance(p, Path) else p for p in parts)
+        )
 
     for _ in in_threads(decode, range(len(images))):
         pass

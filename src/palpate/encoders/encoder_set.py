@@ -25,35 +25,41 @@ from __future__ import annotations
 import json
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 from transformers import AutoTokenizer, CLIPModel, CLIPVisionConfig, CLIPVisionModelWithProjection
 
-from palpate.core import PalpateError, atomic_folder, digest_json, read_record, seed_for, write_json
-from palpate.data.images import square
+from palpate.core import (
+    PalpateError,
+    atomic_folder,
+    digest_json,
+    read_record,
+    require_choice,
+    seed_for,
+    write_json,
+)
 from palpate.encoders.models import (
-    FIX_ENCODERS,
     architecture,
     digest_modules,
-    find_model,
+    find_encoder,
     find_single,
     first_line,
     is_shipped,
     load_model,
+    parts_of,
     pick_device,
     round_to_half,
     save_model,
     silent,
 )
+from palpate.encoders.preprocess import SAVE_AGAIN, Preprocess
 from palpate.encoders.seen import Digests, load_seen, save_seen
+from palpate.encoders.tactile import Format, TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
 
@@ -75,97 +81,6 @@ CLIP_FILES = {
     "preprocessor_config.json": ("preprocessor_config.json",),
 }
 CLIP_FIX = f"Pass a folder that holds {', '.join(CLIP_FILES)}"
-SAVE_AGAIN = "Save the encoders again"
-CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
-CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
-
-
-@dataclass(frozen=True)
-class Preprocess:
-    """How one encoder prepares its images, in training and in evaluation.
-
-    Attributes:
-        size: side of what the encoder sees, in pixels.
-        resize: side of the square before the center crop, in pixels (``size`` for CLIP).
-        mean, std: per channel, of values in [0, 1].
-    """
-
-    size: int
-    resize: int
-    mean: tuple[float, ...] = CLIP_MEAN
-    std: tuple[float, ...] = CLIP_STD
-
-    @classmethod
-    def from_config(cls, path: Path, size: int) -> Preprocess:
-        """Read a ``preprocessor_config.json`` of transformers, in old or new spelling.
-
-        Args:
-            path: the file; CLIP's constants are the defaults of its entries.
-            size: the encoder's image side, which the crop must agree with.
-
-        Raises:
-            PalpateError: if the crop has another size than the encoder, or an entry is malformed.
-        """
-        config = read_record(path, "image processor")
-        try:
-            crop = _side(config.get("crop_size"), size)
-            resize = _side(config.get("size"), crop)
-            mean, std = config.get("image_mean") or CLIP_MEAN, config.get("image_std") or CLIP_STD
-            (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
-        except (AttributeError, TypeError, ValueError) as error:
-            must = f"Size, crop and statistics in {path} must be those of an image processor"
-            raise PalpateError(must, str(error), SAVE_AGAIN) from None
-        if not config.get("do_center_crop", True):
-            crop = resize
-        if crop != size or resize < size:
-            must, got = f"{path} must give the encoder's {size} px", f"{crop} px from {resize} px"
-            raise PalpateError(must, got, "Set size and crop_size to the encoder's")
-        if not config.get("do_normalize", True):
-            return cls(size, resize, (0.0,) * 3, (1.0,) * 3)
-        return cls(size, resize, (r, g, b), (sr, sg, sb))
-
-    def to_config(self) -> dict[str, Any]:
-        """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
-        return {
-            "image_processor_type": "CLIPImageProcessor",
-            "do_convert_rgb": True,
-            "do_resize": True,
-            "size": {"shortest_edge": self.resize},
-            "resample": 3,
-            "do_center_crop": True,
-            "crop_size": {"height": self.size, "width": self.size},
-            "do_rescale": True,
-            "rescale_factor": 1 / 255,
-            "do_normalize": True,
-            "image_mean": list(self.mean),
-            "image_std": list(self.std),
-        }
-
-    def fit(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Images (n, h, w, 3) as squares (n, resize, resize, 3)."""
-        if images.shape[1:3] == (self.resize, self.resize):
-            return images
-        squares = [square(Image.fromarray(image), self.resize) for image in images]
-        return np.stack(squares) if squares else images.reshape(0, self.resize, self.resize, 3)
-
-    def normalize(self, unit: Tensor) -> Tensor:
-        """``(x - mean) / std`` for x in [0, 1], (b, 3, h, w)."""
-        mean, std = (unit.new_tensor(v).view(1, 3, 1, 1) for v in (self.mean, self.std))
-        return (unit - mean) / std
-
-    def __call__(self, unit: Tensor) -> Tensor:
-        """Center crop and normalization of squares in [0, 1], (b, 3, resize, resize)."""
-        edge = (self.resize - self.size) // 2
-        return self.normalize(unit[..., edge : edge + self.size, edge : edge + self.size])
-
-
-def to_unit(
-    images: NDArray[np.uint8], device: torch.device | str = "cpu", *, signed: bool = False
-) -> Tensor:
-    """8-bit images (b, h, w, 3) as float32 (b, 3, h, w) in [0, 1], or in [-1, 1] if ``signed``."""
-    # np.array copies: a mapped cache is read-only, which torch warns about.
-    pixels = torch.from_numpy(np.array(images)).to(device).permute(0, 3, 1, 2).float()
-    return pixels / 127.5 - 1 if signed else pixels / 255
 
 
 @dataclass
@@ -297,28 +212,48 @@ class EncoderSet:
         tactile_preprocess: for the tactile encoder, or None.
         card: how the tactile encoder was trained; ``{}`` if palpate did not train it.
         seen: digests of the images that the tactile encoder was trained on; None: unknown.
+        sensor: name of the sensor of all tactile images; None takes the manifest's.
     """
 
     clip: ClipEncoders
-    tactile: CLIPVisionModelWithProjection | None = None
+    tactile: CLIPVisionModelWithProjection | TactileModule | None = None
     tactile_preprocess: Preprocess | None = None
     card: dict[str, Any] = field(default_factory=dict)
     seen: Digests | None = None
+    sensor: str | None = None
 
     @property
     def dim(self) -> int:
-        """Width of the shared space."""
-        return self.clip.dim
+        """Width of the shared space; of a set without one, that of its only encoder."""
+        return self.clip.dim if self._has_clip else self.width("tactile")
+
+    def width(self, modality: str) -> int:
+        """Width of one encoder's embeddings."""
+        if modality != "tactile":
+            return self._clip(modality).dim
+        tactile = self._tactile(modality)[0]
+        foreign = isinstance(tactile, TactileModule)
+        return tactile.dim if foreign else int(_config(tactile).projection_dim)
 
     @property
     def device(self) -> torch.device:
         """Where the encoders are."""
-        return self.clip.model.device
+        return next(p for module in self._modules().values() for p in module.parameters()).device
 
     @property
     def modalities(self) -> list[Modality]:
         """The modalities of this set."""
-        return [m for m in MODALITIES if m != "tactile" or self.tactile is not None]
+        text = self._has_clip and self.clip.tokenizer is not None
+        has = {"vision": self._has_clip, "text": text, "tactile": self.tactile is not None}
+        return [m for m in MODALITIES if has[m]]
+
+    @property
+    def _has_clip(self) -> bool:
+        return getattr(self, "clip", None) is not None
+
+    def _clip(self, modality: str) -> ClipEncoders:
+        require_choice("modality", modality, self.modalities)
+        return self.clip
 
     def to(self, device: str | torch.device) -> EncoderSet:
         """Move all encoders; returns self."""
@@ -332,37 +267,48 @@ class EncoderSet:
         Raises:
             PalpateError: for another modality, or if there is no tactile encoder.
         """
-        return self.clip.preprocess if modality == "vision" else self._tactile(modality)[1]
+        clip = modality == "vision"
+        return self._clip(modality).preprocess if clip else self._tactile(modality)[1]
 
-    def encode(self, modality: str, batch: Tensor | Sequence[str]) -> Tensor:
+    def encode(
+        self, modality: str, batch: Tensor | Sequence[str], sensors: Sequence[str] | None = None
+    ) -> Tensor:
         """One batch to (n, dim), projected and L2-normalized; differentiable.
 
         Args:
             modality: ``vision``, ``text`` or ``tactile``.
             batch: preprocessed pixels (n, 3, size, size) on the encoders' device, or texts.
+            sensors: names of the sensors (n), for tactile encoders that take them.
         """
         if modality == "text":
-            return self.clip.encode_text([str(text) for text in batch])
+            return self._clip(modality).encode_text([str(text) for text in batch])
         pixels = torch.as_tensor(batch)
         if modality == "vision":
-            return self.clip.encode_vision(pixels)
-        return encode_tactile(self._tactile(modality)[0], pixels)
+            return self._clip(modality).encode_vision(pixels)
+        tactile = self._tactile(modality)[0]
+        if isinstance(tactile, TactileModule):
+            names = [self.sensor] * len(pixels) if self.sensor else sensors
+            return tactile.encode(pixels, names)
+        return encode_tactile(tactile, pixels)
 
     def digest(self, modality: str) -> str:
         """SHA-256 of one encoder: weights, architecture, preprocessing."""
         if modality in ("vision", "text"):
-            return self.clip.digest(modality)
+            return self._clip(modality).digest(modality)
         tactile, preprocess = self._tactile(modality)
-        facts = {"preprocess": asdict(preprocess), **architecture(tactile.config)}
+        facts = {"preprocess": preprocess.facts, **architecture(getattr(tactile, "config", {}))}
+        facts |= {"sensor": self.sensor} if self.sensor else {}
         return digest_modules({"touch": tactile}, facts)
 
     def seen_by(self, modality: str) -> Digests | None:
         """Digests of the images that one encoder was trained on; None: unknown, or of texts."""
-        return {"vision": self.clip.seen, "tactile": self.seen}.get(modality)
+        clip = self.clip.seen if self._has_clip else None
+        return {"vision": clip, "tactile": self.seen}.get(modality)
 
-    def trained_on(self, modality: str) -> tuple[str, ...]:
-        """Data sets that the authors of one encoder trained it on."""
-        return () if modality != "tactile" else tuple(getattr(self.tactile, "trained_on", ()))
+    def public(self, modality: str) -> Format | None:
+        """What is known of a public tactile encoder."""
+        known = modality == "tactile" and isinstance(self.tactile, TactileModule)
+        return self.tactile.format if known and self.tactile is not None else None  # type: ignore[return-value]
 
     def halve(self) -> float:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""
@@ -405,7 +351,19 @@ class EncoderSet:
             PalpateError: if the folder is of another kind, incomplete, or changed since, or the hub
                 is out of reach.
         """
-        folder = find_model(source, "encoders", "set of encoders", FIX_ENCODERS)
+        if len(parts := parts_of(source)) == 2:
+            tactile, clip = (cls.load(part, device=device) for part in parts)
+            return tactile.with_clip(clip)
+        folder, sensor = find_encoder(source)
+        if folder.is_file():
+            module = load_tactile(folder)
+            card = {"name": str(source), "license": module.format.license}
+            foreign = cls(None, module, module.preprocess, card, sensor=sensor)  # type: ignore[arg-type]
+            return foreign.to(device)
+        kind = read_record(folder / "palpate.json", "card").get("format") if (
+            folder / "palpate.json").is_file() else None  # fmt: skip
+        if kind not in (FORMAT, FORMAT_1) and (folder / "config.json").is_file():
+            return cls(load_clip(source, device=device))
         about = _read_card(folder, (FORMAT, FORMAT_1))
         # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
         clip = load_clip(source if is_shipped(source) else folder / "clip")
@@ -422,11 +380,25 @@ class EncoderSet:
         _require_digests(encoders, about["digests"], folder)
         return encoders.to(device)
 
-    def _modules(self) -> dict[str, nn.Module]:
-        tactile = {} if self.tactile is None else {"tactile": self.tactile}
-        return {"clip": self.clip.model, **tactile}
+    def with_clip(self, other: EncoderSet) -> EncoderSet:
+        """This tactile encoder with another set's vision and text, whose space it was trained for.
 
-    def _tactile(self, modality: str) -> tuple[CLIPVisionModelWithProjection, Preprocess]:
+        Raises:
+            PalpateError: if the widths of the spaces differ.
+        """
+        widths = self.width("tactile"), other.width("vision")
+        if widths[0] != widths[1]:
+            must, got = "Encoders of one space must have one width", " and ".join(map(str, widths))
+            raise PalpateError(must, got, "Join an encoder with the CLIP that it was trained with")
+        return replace(self, clip=other.clip).to(other.device)
+
+    def _modules(self) -> dict[str, nn.Module]:
+        modules = {"clip": self.clip.model if self._has_clip else None, "tactile": self.tactile}
+        return {name: module for name, module in modules.items() if module is not None}
+
+    def _tactile(
+        self, modality: str
+    ) -> tuple[CLIPVisionModelWithProjection | TactileModule, Preprocess]:
         if modality != "tactile":
             must, fix = "must be vision or tactile for images", "Pass texts to the text encoder"
             raise PalpateError(must, repr(modality), fix, argument="modality")
@@ -450,7 +422,7 @@ def encode_tactile(tactile: nn.Module, pixels: Tensor) -> Tensor:
 def vision_digest(model: Any, config: Any, preprocess: Preprocess) -> str:
     """SHA-256 of a CLIP vision encoder with its projection."""
     parts = {"tower": model.vision_model, "projection": model.visual_projection}
-    return digest_modules(parts, {"preprocess": asdict(preprocess), **architecture(config)})
+    return digest_modules(parts, {"preprocess": preprocess.facts, **architecture(config)})
 
 
 def require_files(folder: Path, files: Mapping[str, Sequence[str]], fix: str) -> None:
@@ -480,13 +452,6 @@ def _counts(seen: Mapping[str, Digests | None]) -> dict[str, Any]:
     """The number of images that each encoder was trained on, for the card; {} if unknown."""
     counts = {name: len(digests) for name, digests in seen.items() if digests is not None}
     return {"seen": counts} if counts else {}
-
-
-def _side(value: Any, default: int) -> int:
-    """A side in pixels from a number, ``{"shortest_edge": s}`` or ``{"height": s, "width": s}``."""
-    if isinstance(value, Mapping):
-        value = value.get("shortest_edge", value.get("height"))
-    return default if value is None else int(value)
 
 
 def _read_card(folder: Path, form: str | tuple[str, ...]) -> dict[str, Any]:

@@ -139,6 +139,46 @@ def find_model(source: str | Path, part: Part, what: str, fix: str) -> Path:
     return Path(source)
 
 
+def parts_of(source: str | Path) -> list[str | Path]:
+    """The sources of ``tactile.pth+clip``: a tactile encoder, and the CLIP of its space."""
+    parts = str(source).split("+")
+    return [source] if len(parts) != 2 or Path(source).exists() else [*parts]
+
+
+def find_encoder(source: str | Path) -> tuple[Path, str | None]:
+    """The local folder or file of an encoder of any kind, and the sensor that its name gives.
+
+    Args:
+        source: a shipped name, a folder, a file of weights, a hub id, or ``owner/name:file`` for
+            one file of a hub id; behind a file ``#digit`` names the sensor of all images.
+
+    Raises:
+        PalpateError: if there is none of that name, a folder holds none, or the hub is out of
+            reach.
+    """
+    what = "encoder"
+    name, _, sensor = str(source).partition("#")
+    owner, colon, file = name.partition(":")
+    if Path(source).exists() and not is_shipped(source):
+        path, sensor = Path(source), ""
+    elif colon and is_hub_id(owner):
+        path = _fetch(owner, [file], what, FIX_ENCODERS) / file
+    elif Path(name).is_file():
+        path = Path(name)
+    else:
+        path = find_model(
+            name if isinstance(source, str) else source, "encoders", what, FIX_ENCODERS
+        )
+    if path.is_dir() and not any((path / f).is_file() for f in ("palpate.json", "config.json")):
+        files = sorted(path.glob("*.safetensors")) or sorted(path.glob("*.pth"))
+        if len(files) != 1:
+            must = f"The folder {path} must hold a set of encoders, a CLIP, or one file of weights"
+            got = ", ".join(p.name for p in files) or "none of these"
+            raise PalpateError(must, got, "Pass the file" if files else FIX_ENCODERS)
+        path = files[0]
+    return path, sensor.lower() or None
+
+
 def find_single(source: str | Path, part: Part, what: str, fix: str) -> tuple[str, Path]:
     """Return what ``from_pretrained`` takes, and the local folder of the small files."""
     if is_hub_id(source):  # small files first: a hub out of reach is queried once, not many times

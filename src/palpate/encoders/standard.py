@@ -37,14 +37,9 @@ from palpate.core import (
     require_choice,
 )
 from palpate.encoders.embed import exact, require_rgb
-from palpate.encoders.encoder_set import (
-    CLIP_FILES,
-    Preprocess,
-    require_files,
-    to_unit,
-    vision_digest,
-)
+from palpate.encoders.encoder_set import CLIP_FILES, Preprocess, require_files, vision_digest
 from palpate.encoders.models import find_single, first_line, load_model, pick_device
+from palpate.encoders.preprocess import to_unit
 
 Kind = Literal["inception", "clip"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -65,12 +65,20 @@ def guard(
             "Judge other images or use another encoder, or allow it: every score then says so",
             example={"allow_seen": True},
         )
+    if public := encoders.public(modality):
+        params = {"modality": modality, "name": public.name, "license": public.license}
+        notes.append(Note("encoder-license", params))
     if modality != "tactile":
         return notes
     card, simulated = encoders.card, getattr(manifest, "synthetic", None)
     if card.get("synthetic") and not simulated:
         notes.append(Note("synthetic-encoder", {"real": simulated is False}))
-    if split is not None and not encoder.knows_seen and card.get("split") != split.digest:
+    public = bool(encoder.trained_on)
+    if (
+        split is not None
+        and not (encoder.knows_seen or public)
+        and card.get("split") != split.digest
+    ):
         known = card.get("split") is not None
         notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))
     return notes

@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -53,6 +53,9 @@ from palpate.metrics import PRESETS, Comparison, compare, compare_tmmd, distance
 from palpate.metrics.kernels import MOMENT_BYTES
 from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
 from palpate.report.results import GalleryItem, Results
+
+if TYPE_CHECKING:
+    from palpate.data.manifest import Manifest
 
 #: Bandwidth of the paper; the name of a metric says any other one where several are requested.
 SIGMA = 10.0
@@ -443,10 +446,10 @@ def load_encoders(encoder: Any, progress: Progress) -> Any:
     if encoder is None or not isinstance(encoder, str | Path):
         return encoder
     progress(f"loading {encoder}", 0, 1)
-    from palpate.encoders.models import FIX_ENCODERS, find_model
+    from palpate.encoders.models import find_encoder, parts_of
 
-    # A wrong name answers at once; torch takes seconds to import.
-    find_model(encoder, "encoders", "set of encoders", FIX_ENCODERS)
+    for part in parts_of(encoder):
+        find_encoder(part)  # a wrong name answers at once; torch takes seconds to import
     from palpate.encoders.encoder_set import EncoderSet
 
     return EncoderSet.load(encoder)
@@ -567,10 +570,26 @@ class _Run:
             x = embed_images(samples.images, self.encoders, "tactile", progress=self.progress)
             return samples.feature_set(x, digest)
         folder = samples.folder(self.cache) if self.keep else None
-        options: dict[str, Any] = {"keep_pixels": False, "progress": self.progress}
-        assert samples.manifest is not None
-        x = embed(samples.manifest, self.encoders, "tactile", cache=folder, **options)
+        # Generated images have no earlier frame, so none is taken for real ones.
+        options: dict[str, Any] = {"keep_pixels": False, "still": True, "progress": self.progress}
+        x = embed(self._in_context(samples), self.encoders, "tactile", cache=folder, **options)
         return samples.feature_set(x.features, digest)
+
+    def _in_context(self, samples: Samples) -> Manifest:
+        """The images with what is known of the reference's sample of the same id: its sensor, and
+        its no-contact image.
+        """
+        import polars as pl
+
+        real, manifest = self.inputs.reference.manifest, samples.manifest
+        assert manifest is not None
+        needy = self.encoders.preprocess("tactile").subtract or self.encoders.public("tactile")
+        if real is None or not needy or "sensor" in manifest.filled().columns:
+            return manifest
+        gels = [gel and str(real.path(gel).resolve()) for gel in real.column("background")]
+        context = real.table.select("id", "sensor", pl.Series("background", gels, pl.String))
+        table = manifest.table.drop("sensor", "background").join(context, "id", "left")
+        return replace(manifest, table=table.select(manifest.table.columns))
 
     def _can_pair(self, default: bool) -> bool:
         """Whether every generated image has its reference; some without one are a mistake."""

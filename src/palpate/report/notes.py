@@ -526,6 +526,7 @@ EVALUATION: dict[str, Sentence] = {
         "The {modality} encoder was trained on {dataset}: it may have seen the images that it "
         "judges here"
     ),
+    "encoder-license": "The {modality} encoder is {name}, whose weights are under {license}",
     "encoder-of-other-split": (
         "The tactile encoder was trained on another split: it may have seen test samples"
     ),

@@ -1,0 +1,277 @@
+"""How an encoder prepares its images; part of the encoder's identity.
+
+An image is turned, fitted to the encoder's shape (the center of it, or the whole of it between
+black borders, or the whole of it squashed), and resized; for some encoders the sensor's image
+without contact is subtracted first, and an earlier frame of the video follows in three further
+channels. What results is 8-bit and may be cached. Then ``(x / 255 - mean) / std`` per channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from palpate.core import PalpateError, Problem, ProblemsError, read_record
+from palpate.data.images import REFETCH, in_threads, read_image
+from palpate.data.manifest import Manifest
+
+SAVE_AGAIN = "Save the encoders again"
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+#: What an image of a manifest is prepared from: itself, no-contact image, earlier frame.
+Frame = tuple[Path, Path | None, Path | None]
+
+
+class Frames(NamedTuple):
+    """The files of samples, and the names of their sensors ('' if unknown)."""
+
+    files: list[Frame]
+    sensors: list[str]
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """How one encoder prepares its images, in training and in evaluation.
+
+    Attributes:
+        size: side of what the encoder sees, in pixels; its width if ``height`` is given.
+        resize: side of the square before the center crop, in pixels (``size`` for CLIP).
+        mean, std: per channel, of values in [0, 1].
+        fitting: ``crop`` takes the center, ``pad`` the whole between black borders, ``squash`` the
+            whole, whatever its aspect.
+        resample: Pillow's number of the filter: 3 bicubic, 2 bilinear.
+        turn: ``left`` turns by 90 degrees counterclockwise, ``portrait`` turns images that are
+            wider than high clockwise.
+        height: in pixels, of encoders that see no square.
+        subtract: words in the names of sensors whose no-contact image is subtracted: 127 + image -
+            no-contact image, cut to 0..255; ('',) is all sensors.
+        lag: frames between the image and the earlier one whose channels follow; 0: none.
+    """
+
+    size: int
+    resize: int
+    mean: tuple[float, ...] = CLIP_MEAN
+    std: tuple[float, ...] = CLIP_STD
+    _: KW_ONLY
+    fitting: Literal["crop", "pad", "squash"] = "crop"
+    resample: int = 3
+    turn: Literal["none", "left", "portrait"] = "none"
+    height: int | None = None
+    subtract: tuple[str, ...] = ()
+    lag: int = 0
+
+    @classmethod
+    def from_config(cls, path: Path, size: int | None) -> Preprocess:
+        """Read a ``preprocessor_config.json`` of transformers, in old or new spelling.
+
+        Args:
+            path: the file; CLIP's constants are the defaults of its entries.
+            size: the encoder's image side, which the crop must agree with; None: any.
+
+        Raises:
+            PalpateError: if the crop has another size than the encoder, or an entry is malformed.
+        """
+        config = read_record(path, "image processor")
+        try:
+            crop = _side(config.get("crop_size"), size or 224)
+            resize = _side(config.get("size"), crop)
+            mean, std = config.get("image_mean") or CLIP_MEAN, config.get("image_std") or CLIP_STD
+            (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
+            whole = isinstance(config.get("size"), Mapping) and "height" in config["size"]
+            more: dict[str, Any] = {"resample": int(config.get("resample") or 3)}
+            more |= {"fitting": "squash"} if whole else {}
+            more |= config.get("palpate") or {}
+            more |= {"subtract": tuple(more.get("subtract", ()))}
+        except (AttributeError, TypeError, ValueError) as error:
+            must = f"Size, crop and statistics in {path} must be those of an image processor"
+            raise PalpateError(must, str(error), SAVE_AGAIN) from None
+        if not config.get("do_center_crop", "crop_size" in config or not whole):
+            crop = resize
+        size = size or crop
+        if crop != size or resize < size:
+            must, got = f"{path} must give the encoder's {size} px", f"{crop} px from {resize} px"
+            raise PalpateError(must, got, "Set size and crop_size to the encoder's")
+        if not config.get("do_normalize", True):
+            return cls(size, resize, (0.0,) * 3, (1.0,) * 3, **more)
+        return cls(size, resize, (r, g, b), (sr, sg, sb), **more)
+
+    def to_config(self) -> dict[str, Any]:
+        """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
+        more = {k: v for k, v in self.facts.items() if k not in ("size", "resize", "mean", "std")}
+        return {
+            "image_processor_type": "CLIPImageProcessor",
+            "do_convert_rgb": True,
+            "do_resize": True,
+            "size": {"shortest_edge": self.resize},
+            "resample": self.resample,
+            "do_center_crop": True,
+            "crop_size": {"height": self.size, "width": self.size},
+            "do_rescale": True,
+            "rescale_factor": 1 / 255,
+            "do_normalize": True,
+            "image_mean": list(self.mean),
+            "image_std": list(self.std),
+            **({"palpate": more} if more else {}),
+        }
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What belongs into the encoder's digest: all that is not the center square of a CLIP."""
+        usual = asdict(Preprocess(self.size, self.resize))
+        keep = ("size", "resize", "mean", "std")
+        return {k: v for k, v in asdict(self).items() if k in keep or v != usual[k]}
+
+    @property
+    def plain(self) -> bool:
+        """Whether the center square is all, as :func:`palpate.data.images.square` cuts it."""
+        return self.facts.keys() == {"size", "resize", "mean", "std"}
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Height, width and channels of what :meth:`prepare` gives."""
+        return self.height or self.resize, self.resize, 6 if self.lag else 3
+
+    def prepare(
+        self,
+        image: Image.Image,
+        background: Image.Image | None = None,
+        previous: Image.Image | None = None,
+    ) -> NDArray[np.uint8]:
+        """One RGB image as 8-bit (height, width, channels).
+
+        Args:
+            image: the image.
+            background: of the sensor without contact, to be subtracted.
+            previous: the earlier frame; None takes the image twice where there must be one.
+        """
+        frames = [image, previous or image] if self.lag else [image]
+        fitted = [self._fitted(_minus(frame, background)) for frame in frames]
+        return np.concatenate(fitted, axis=2)
+
+    def _fitted(self, image: Image.Image) -> NDArray[np.uint8]:
+        if self.turn == "left" or (self.turn == "portrait" and image.width > image.height):
+            left = self.turn == "left"
+            turn = Image.Transpose.ROTATE_90 if left else Image.Transpose.ROTATE_270
+            image = image.transpose(turn)
+        (width, height), (rows, columns, _) = image.size, self.shape
+        if self.fitting == "pad":
+            side = max(width, height)
+            canvas = Image.new("RGB", (side, side))
+            canvas.paste(image, ((side - width) // 2, (side - height) // 2))
+            image = canvas
+        elif self.fitting == "crop":
+            w = min(width, round(height * columns / rows))
+            h = min(height, round(width * rows / columns))
+            left, top = (width - w) // 2, (height - h) // 2
+            image = image.crop((left, top, left + w, top + h))
+        return np.asarray(image.resize((columns, rows), Image.Resampling(self.resample)))
+
+    def fit(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Images (n, h, w, 3) as :meth:`prepare` gives them; those that are so stay."""
+        if self.plain and images.shape[1:3] == self.shape[:2]:
+            return images
+        fitted = [self.prepare(Image.fromarray(image)) for image in images]
+        return np.stack(fitted) if fitted else images.reshape(0, *self.shape)
+
+    def frames(self, manifest: Manifest, column: str, *, still: bool = False) -> Frames:
+        """The files that samples are prepared from.
+
+        Args:
+            manifest: the samples; an earlier frame is looked for among them.
+            column: of the images.
+            still: take no earlier frames.
+
+        Raises:
+            PalpateError: if a sample lacks its image, or the no-contact image of its sensor.
+        """
+        paths, names = manifest.paths(column), manifest.column("sensor")
+        places = list(zip(manifest.column("video"), manifest.column("frame"), strict=True))
+        at = dict(zip(places, paths, strict=True)) if self.lag and not still else {}
+        sensors = [(name or "").lower() for name in names]
+        files: list[Frame] = []
+        for k, (path, gel) in enumerate(zip(paths, manifest.column("background"), strict=True)):
+            need = column == "tactile" and any(word in sensors[k] for word in self.subtract)
+            if need and gel is None:
+                must = f"The encoder subtracts the no-contact image of {names[k] or 'every sensor'}"
+                got, fix = f"none for {path.name}", "Fill the column background: palpate background"
+                raise PalpateError(must, got, fix)
+            video, frame = places[k]
+            known = None not in (video, frame)
+            before = at.get((video, (frame or 0) - self.lag)) if known else None
+            files.append((path, manifest.path(gel) if need else None, before))
+        return Frames(files, sensors)
+
+    def normalize(self, unit: Tensor) -> Tensor:
+        """``(x - mean) / std`` for x in [0, 1], (b, channels, h, w)."""
+        times = unit.shape[1] // len(self.mean)
+        mean, std = (unit.new_tensor(v * times).view(1, -1, 1, 1) for v in (self.mean, self.std))
+        return (unit - mean) / std
+
+    def __call__(self, unit: Tensor) -> Tensor:
+        """Center crop and normalization of prepared images in [0, 1], (b, channels, h, w)."""
+        edge = 0 if self.height else (self.resize - self.size) // 2
+        rows = self.height or self.size
+        return self.normalize(unit[..., edge : edge + rows, edge : edge + self.size])
+
+
+def load_frames(files: Sequence[Frame], preprocess: Preprocess) -> NDArray[np.uint8]:
+    """Decode and prepare images: (n, height, width, channels), 0 to 255.
+
+    Raises:
+        ProblemsError: naming every unreadable file.
+    """
+    images = np.empty((len(files), *preprocess.shape), np.uint8)
+    background = lru_cache(64)(read_image)  # many samples share one
+
+    def decode(k: int) -> Problem | None:
+        path, gel, before = files[k]
+        now = path
+        try:
+            image = read_image(now)
+            empty = background(now := gel) if gel else None
+            images[k] = preprocess.prepare(
+                image, empty, read_image(now := before) if before else None
+            )
+        except PalpateError as error:
+            return Problem(str(now), "bad-image", error.got)
+        return None
+
+    problems = [problem for _, problem in in_threads(decode, range(len(files))) if problem]
+    if problems:
+        raise ProblemsError(sorted(problems, key=lambda p: p.where), REFETCH)
+    return images
+
+
+def to_unit(
+    images: NDArray[np.uint8], device: torch.device | str = "cpu", *, signed: bool = False
+) -> Tensor:
+    """8-bit images (b, h, w, c) as float32 (b, c, h, w) in [0, 1], or in [-1, 1] if ``signed``."""
+    # np.array copies: a mapped cache is read-only, which torch warns about.
+    pixels = torch.from_numpy(np.array(images)).to(device).permute(0, 3, 1, 2).float()
+    return pixels / 127.5 - 1 if signed else pixels / 255
+
+
+def _minus(image: Image.Image, background: Image.Image | None) -> Image.Image:
+    """127 + image - background, cut to 0..255."""
+    if background is None:
+        return image
+    if background.size != image.size:
+        background = background.resize(image.size, Image.Resampling.BICUBIC)
+    difference = np.asarray(image, np.int16) - np.asarray(background, np.int16) + 127
+    return Image.fromarray(difference.clip(0, 255).astype(np.uint8))
+
+
+def _side(value: Any, default: int) -> int:
+    """A side in pixels from a number, ``{"shortest_edge": s}`` or ``{"height": s, "width": s}``."""
+    if isinstance(value, Mapping):
+        value = value.get("shortest_edge", value.get("height"))
+    return default if value is None else int(value)

@@ -1,0 +1,391 @@
+"""Public tactile encoders, recognized by the names of their weights.
+
+==========  ===================================  ==============================================
+format      recognized by                        features
+==========  ===================================  ==============================================
+Sparsh      ``pos_embed.frequency_bands``        mean of the patch tokens after ``norm``
+TVL         ``tactile_encoder.*``                ``head`` of the mean patch token after ``fc_norm``
+AnyTouch 1  ``touch_mae_model.touch_model.*``    ``touch_projection`` of the class token
+==========  ===================================  ==============================================
+
+All are L2-normalized. A vision transformer of L blocks (width d, heads d / 64, LayerNorm before):
+
+    x = patches W + positions, further tokens in front,
+    x = x + s_1 * attention(norm_1(x)),  x = x + s_2 * mlp(norm_2(x)),  mlp with GELU,
+
+with learned scales s in Sparsh, else 1. Sparsh's positions of a patch at (row, column) are sines
+and cosines of row and column times ``frequency_bands``; TVL's are learned. AnyTouch is the CLIP
+vision encoder of transformers with five learned tokens of the sensor behind the class token.
+
+Weights are read as weights only; every name must be there with its shape, and no other. Names,
+shapes and preprocessing are facts of the published files and their loaders; two public loaders of
+one Sparsh file disagree in size and background, so that preprocessing is part of the digest here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.functional import gelu, normalize, scaled_dot_product_attention
+from transformers import CLIPVisionConfig, CLIPVisionModel
+
+from palpate.core import PalpateError
+from palpate.encoders.models import UNREADABLE, first_line
+from palpate.encoders.preprocess import Preprocess
+
+State = Mapping[str, Tensor]
+NC = "CC-BY-NC-4.0"
+IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+SPARSH = "the .safetensors file of facebook/sparsh-{mae,dino,dinov2,ijepa}-{small,base}"
+KNOWN = f"{SPARSH}, tvl_enc_vit{{t,s,b}}.pth of TVL, or checkpoint.pth of AnyTouch 1"
+#: Words in the names of sensors, in the order in which they are looked for -> AnyTouch's number.
+SENSORS = {"digit": 1, "gelslim": 2, "mini": 3, "duragel": 4, "gelsight": 0}
+#: Width of a head of every vision transformer here; a narrower model has one head.
+HEAD = 64
+
+
+@dataclass(frozen=True)
+class Format:
+    """A public encoder.
+
+    Attributes:
+        name: of the encoder.
+        license: of its weights.
+        trained_on: data sets whose images it has seen, by its authors.
+        prefix: of the names of its weights; others are not read. '' reads all.
+        mark: a name after the prefix by which it is recognized.
+        build: makes the module for given weights.
+    """
+
+    name: str
+    license: str
+    trained_on: tuple[str, ...]
+    prefix: str
+    mark: str
+    build: Callable[[State], TactileModule]
+
+
+class TactileModule(nn.Module):
+    """A frozen tactile encoder of others: ``(pixels, sensors) -> (n, dim)``, not normalized.
+
+    Attributes:
+        dim: width of the features.
+        preprocess: for its images.
+        sensors: whether it needs the sensors' numbers.
+        format: whose it is.
+    """
+
+    dim: int
+    preprocess: Preprocess
+    sensors = False
+    format: Format
+
+    def encode(self, pixels: Tensor, sensors: Sequence[str] | None = None) -> Tensor:
+        """Prepared pixels (n, channels, h, w), and names of sensors, to (n, dim), L2-normalized."""
+        names = [""] * len(pixels) if sensors is None else list(sensors)
+        numbers = sensor_numbers(names, pixels.device) if self.sensors else None
+        return normalize(self(pixels, numbers), dim=-1)
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention with one matrix for queries, keys and values."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.heads = max(1, width // HEAD)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, tokens, width) to the same."""
+        q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        return self.proj(scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class Mlp(nn.Module):
+    """Two layers with GELU."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(width, hidden), nn.Linear(hidden, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, tokens, width) to the same."""
+        return self.fc2(gelu(self.fc1(x)))
+
+
+class Scale(nn.Module):
+    """A learned factor per channel."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, tokens, width) to the same."""
+        return x * self.gamma
+
+
+class Block(nn.Module):
+    """One block of a vision transformer."""
+
+    def __init__(self, width: int, hidden: int, *, scaled: bool) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = (nn.LayerNorm(width, eps=1e-6) for _ in range(2))
+        self.attn, self.mlp = Attention(width), Mlp(width, hidden)
+        self.ls1, self.ls2 = (Scale(width) if scaled else nn.Identity() for _ in range(2))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, tokens, width) to the same."""
+        x = x + self.ls1(self.attn(self.norm1(x)))
+        return x + self.ls2(self.mlp(self.norm2(x)))
+
+
+class Patches(nn.Module):
+    """The image's patches as tokens."""
+
+    def __init__(self, weight: Tensor) -> None:
+        super().__init__()
+        width, channels, rows, columns = weight.shape
+        self.proj = nn.Conv2d(channels, width, (rows, columns), (rows, columns))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, channels, h, w) to (n, width, h', w')."""
+        return self.proj(x)
+
+
+class Waves(nn.Module):
+    """Sparsh's positions: sines and cosines of row and column."""
+
+    def __init__(self, bands: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("frequency_bands", torch.empty_like(bands))
+
+    def forward(self, rows: int, columns: int) -> Tensor:
+        """(rows * columns, 4 * bands)."""
+        bands = self.get_buffer("frequency_bands")
+        axes = [torch.arange(n, device=bands.device) for n in (rows, columns)]
+        angles = torch.cartesian_prod(*axes)[:, :, None] * bands
+        return torch.cat([angles.sin(), angles.cos()], dim=2).flatten(1)
+
+
+def _blocks(state: State, *, scaled: bool) -> nn.ModuleList:
+    hidden, width = state["blocks.0.mlp.fc1.weight"].shape
+    depth = len({name.split(".")[1] for name in state if name.startswith("blocks.")})
+    return nn.ModuleList(Block(width, hidden, scaled=scaled) for _ in range(depth))
+
+
+class Sparsh(TactileModule):
+    """Sparsh's ViT of six channels: the image, and that of five frames before."""
+
+    preprocess = Preprocess(
+        240,
+        240,
+        (0.0,) * 3,
+        (1.0,) * 3,
+        resample=2,
+        turn="portrait",
+        height=320,
+        subtract=("digit", "mini"),
+        lag=5,
+    )
+
+    def __init__(self, state: State) -> None:
+        super().__init__()
+        weight = state["patch_embed.proj.weight"]
+        self.dim = weight.shape[0]
+        self.patch_embed, self.pos_embed = (
+            Patches(weight),
+            Waves(state["pos_embed.frequency_bands"]),
+        )
+        if "register_tokens" in state:  # all but MAE
+            self.register_tokens = nn.Parameter(torch.empty_like(state["register_tokens"]))
+        self.blocks, self.norm = _blocks(state, scaled=True), nn.LayerNorm(self.dim, eps=1e-6)
+
+    def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
+        """(n, 6, 320, 240) to (n, width)."""
+        patches = self.patch_embed(pixels)
+        x = patches.flatten(2).transpose(1, 2)
+        x = x + self.pos_embed(*patches.shape[2:])[:, : self.dim].to(x.dtype)
+        registers = getattr(self, "register_tokens", x[:1, :0])
+        x = torch.cat([registers.expand(len(x), -1, -1), x], dim=1)
+        for block in self.blocks:
+            x = block(x)
+        return self.norm(x)[:, registers.shape[1] :].mean(dim=1)
+
+
+class Tvl(TactileModule):
+    """TVL's ViT with the mean patch token and a head into the space of its CLIP."""
+
+    preprocess = Preprocess(
+        224,
+        224,
+        (0.29174602, 0.29713256, 0.29104045),
+        (0.18764469, 0.19467652, 0.21871583),
+        fitting="pad",
+        resample=2,
+        turn="left",
+    )
+
+    def __init__(self, state: State) -> None:
+        super().__init__()
+        weight = state["patch_embed.proj.weight"]
+        width, self.dim = weight.shape[0], state["head.weight"].shape[0]
+        size = round((state["pos_embed"].shape[1] - 1) ** 0.5) * weight.shape[3]
+        self.preprocess = replace(self.preprocess, size=size, resize=size)
+        self.patch_embed = Patches(weight)
+        self.cls_token = nn.Parameter(torch.empty(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.empty_like(state["pos_embed"]))
+        self.blocks, self.fc_norm = _blocks(state, scaled=False), nn.LayerNorm(width, eps=1e-6)
+        self.head = nn.Linear(width, self.dim)
+
+    def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
+        """(n, 3, 224, 224) to (n, dim)."""
+        x = self.patch_embed(pixels).flatten(2).transpose(1, 2)
+        x = torch.cat([self.cls_token.expand(len(x), -1, -1), x], dim=1) + self.pos_embed
+        for block in self.blocks:
+            x = block(x)
+        return self.head(self.fc_norm(x[:, 1:].mean(dim=1)))
+
+
+class AnyTouch(TactileModule):
+    """AnyTouch 1: a CLIP vision encoder with tokens of the sensor."""
+
+    preprocess = Preprocess(224, 224, *IMAGENET, fitting="squash", resample=2)
+    sensors = True
+
+    def __init__(self, state: State) -> None:
+        super().__init__()
+        weight = state["touch_model.embeddings.patch_embedding.weight"]
+        width, _, patch, _ = weight.shape
+        numbers = re.findall(r"encoder\.layers\.(\d+)\.", " ".join(state))
+        tokens = len(state["touch_model.embeddings.position_embedding.weight"])
+        size = round((tokens - 1) ** 0.5) * patch
+        self.preprocess = replace(self.preprocess, size=size, resize=size)
+        config = CLIPVisionConfig(
+            hidden_size=width,
+            intermediate_size=len(state["touch_model.encoder.layers.0.mlp.fc1.weight"]),
+            num_hidden_layers=len(set(numbers)),
+            num_attention_heads=max(1, width // HEAD),
+            image_size=size,
+            patch_size=patch,
+            hidden_act="gelu",
+            layer_norm_eps=1e-5,
+        )
+        model: Any = CLIPVisionModel(config)
+        self.touch_model = getattr(model, "vision_model", model)  # a level less in transformers 5
+        self.sensor_token = nn.Parameter(torch.empty_like(state["sensor_token"]))
+        self.dim = len(state["touch_projection.weight"])
+        self.touch_projection = nn.Linear(width, self.dim, bias=False)
+
+    def forward(self, pixels: Tensor, sensors: Tensor | None = None) -> Tensor:
+        """(n, 3, 224, 224) and the sensors' numbers (n,) to (n, dim)."""
+        assert sensors is not None
+        model: Any = self.touch_model
+        x = model.embeddings(pixels)
+        x = torch.cat([x[:, :1], self.sensor_token[sensors], x[:, 1:]], dim=1)
+        x = model.encoder(inputs_embeds=model.pre_layrnorm(x)).last_hidden_state
+        return self.touch_projection(model.post_layernorm(x[:, 0]))
+
+
+FORMATS = (
+    Format(
+        "AnyTouch 1",
+        "MIT",
+        ("Touch and Go", "VisGel", "Cloth", "ObjectFolder", "HCT", "SSVTP", "YCB-Slide", "TacQuad"),
+        "touch_mae_model.",
+        "touch_model.embeddings.class_embedding",
+        AnyTouch,
+    ),
+    Format("TVL", NC, ("HCT", "SSVTP"), "tactile_encoder.", "patch_embed.proj.weight", Tvl),
+    Format(
+        "Sparsh",
+        NC,
+        ("YCB-Slide", "Touch-Slide", "Touch and Go", "ObjectFolder"),
+        "",
+        "pos_embed.frequency_bands",
+        Sparsh,
+    ),
+)
+#: Parts of AnyTouch 1 under its prefix that pretrain the encoder and are no part of it.
+DECODERS = re.compile(r"(?!touch_model\.|sensor_token$|touch_projection\.)")
+
+
+def load_tactile(path: Path) -> TactileModule:
+    """Load a public tactile encoder.
+
+    Args:
+        path: a ``.safetensors`` file, or a torch file of weights.
+
+    Raises:
+        PalpateError: for a file that holds more than weights, of no known format, or whose weights
+            lack a name, have one more, or another shape.
+    """
+    state = _read(path)
+    form = next((f for f in FORMATS if f.prefix + f.mark in state), None)
+    if form is None:
+        must = f"{path} must be a tactile encoder that is recognized by the names of its weights"
+        got = f"{len(state)} weights, first {', '.join(list(state)[:3]) or 'none'}"
+        raise PalpateError(must, got, f"Pass {KNOWN}")
+    state = {k.removeprefix(form.prefix): v for k, v in state.items() if k.startswith(form.prefix)}
+    if form.name == "AnyTouch 1":
+        state = {k: v for k, v in state.items() if not DECODERS.match(k)}
+    must = f"{path} must hold the weights of {form.name}"
+    try:
+        module = form.build(state)
+        wanted = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+        given = {name: tuple(value.shape) for name, value in state.items()}
+        given = {k: v for k, v in given.items() if not k.endswith("position_ids")}
+    except (KeyError, ValueError, IndexError, RuntimeError) as error:
+        raise PalpateError(must, f"other names or shapes: {first_line(error)}", "") from None
+    wrong = [f"no {name}" for name in wanted if name not in given]
+    wrong += [f"also {name}" for name in given if name not in wanted]
+    wrong += [f"{k} of shape {given[k]}, not {wanted[k]}" for k in wanted if k in given
+              and given[k] != wanted[k]]  # fmt: skip
+    if wrong:
+        got = f"{len(wrong)} of them otherwise, first {', '.join(wrong[:3])}"
+        raise PalpateError(must, got, "Fetch the file again; weights are never filled in")
+    if bad := [name for name in wanted if not bool(state[name].isfinite().all())]:
+        raise PalpateError(f"{must}, all finite", f"NaN or infinity in {bad[0]}", "")
+    module.load_state_dict({name: state[name].float() for name in wanted}, assign=True)
+    module.format = form
+    return module.eval().requires_grad_(False)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    """All tensors of a file, by name; those under ``model`` or ``state_dict`` if it nests them."""
+    must, fix = f"{path} must hold weights and nothing else", f"Pass {KNOWN}"
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        with torch.serialization.safe_globals([argparse.Namespace]):  # TVL keeps its options so
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (*UNREADABLE, EOFError) as error:
+        raise PalpateError(must, first_line(error)[:160], fix) from None
+    for key in ("model", "state_dict"):
+        content = content.get(key, content) if isinstance(content, Mapping) else content
+    if not isinstance(content, Mapping):
+        raise PalpateError(must, type(content).__name__, fix)
+    return {str(k): v for k, v in content.items() if isinstance(v, Tensor)}
+
+
+def sensor_numbers(names: list[str], device: torch.device) -> Tensor:
+    """AnyTouch's numbers (n,) of sensors.
+
+    Raises:
+        PalpateError: for a name without one.
+    """
+    numbers = {n: next((v for word, v in SENSORS.items() if word in n), None) for n in set(names)}
+    if unknown := sorted(n for n, number in numbers.items() if number is None):
+        must = f"AnyTouch must be given sensors whose names have one of {', '.join(SENSORS)}"
+        got = f"{unknown[0]!r} for {names.count(unknown[0])} of {len(names)} images"
+        fix = "Fill the manifest's column sensor, or name one for all: checkpoint.pth#digit"
+        raise PalpateError(must, got, fix)
+    return torch.tensor([numbers[name] for name in names], device=device)
