@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -91,14 +92,16 @@ def test_seen_test_images_are_refused_in_probe_and_score_unless_allowed(
 
 def test_a_declared_data_set_is_refused(encoders, small_manifest):
     public = replace(encoders)
-    public.trained_on = lambda modality: ("Touch and Go", "YCB-Slide")
+    facts = SimpleNamespace(name="X", license="MIT", trained_on=("Touch and Go", "YCB-Slide"))
+    public.public = lambda modality: facts
     for dataset, refused in (("Touch and Go", 1), ("HCT + YCB-Slide", 1), ("VisGel", 0), ("", 0)):
         manifest = Manifest(small_manifest.table, small_manifest.root, {"dataset": dataset})
         if refused:
             with pytest.raises(PalpateError, match="with which its authors trained it"):
                 guard(public, "tactile", manifest)
         notes = guard(public, "tactile", manifest, allow_seen=True)
-        assert [n.code for n in notes] == ["seen-dataset"] * refused
+        codes = [n.code for n in notes]
+        assert codes == ["seen-dataset"] * refused + ["encoder-license"]
 
 
 def test_an_encoder_of_another_split_is_doubted_only_where_its_images_are_unknown(
