@@ -32,7 +32,13 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
-from transformers import AutoTokenizer, CLIPModel, CLIPVisionConfig, CLIPVisionModelWithProjection
+from transformers import (
+    AutoModel,
+    AutoTokenizer,
+    CLIPModel,
+    CLIPVisionConfig,
+    CLIPVisionModelWithProjection,
+)
 
 from palpate.core import (
     PalpateError,
@@ -68,6 +74,15 @@ MODALITIES: tuple[Modality, ...] = get_args(Modality)
 FORMAT, CLIP_FORMAT = "palpate-encoders/2", "palpate-clip/1"
 #: Format 1 called the tactile encoder ``touch`` and a set of encoders ``towers``; it is still read.
 FORMAT_1 = "palpate-towers/1"
+#: Kinds of transformers' models that see, and whether they read, too.
+FAMILIES = {
+    "clip": True,
+    "siglip": True,
+    "siglip2": True,
+    "dinov2": False,
+    "dinov2_with_registers": False,
+    "dinov3_vit": False,
+}
 #: What a local CLIP folder must hold, as alternatives.
 CLIP_FILES = {
     "config.json": ("config.json",),
@@ -85,18 +100,19 @@ CLIP_FIX = f"Pass a folder that holds {', '.join(CLIP_FILES)}"
 
 @dataclass
 class ClipEncoders:
-    """A CLIP whose vision and text encoders are used as they are.
+    """A CLIP, SigLIP or SigLIP 2 whose vision and text encoders are used as they are, or a DINO.
 
     Attributes:
         model: in evaluation mode; its parameters do not require gradients.
-        tokenizer: a transformers tokenizer that ends every text with the end token.
+        tokenizer: a transformers tokenizer that ends every text with the end token; None of a
+            vision encoder alone.
         preprocess: for the vision encoder.
         name: hub id or folder it came from, or the preset that made it.
         card: how it was trained, if palpate trained it.
         seen: digests of the images that the vision encoder was trained on; None: unknown.
     """
 
-    model: CLIPModel
+    model: Any
     tokenizer: Any
     preprocess: Preprocess
     name: str
@@ -106,15 +122,26 @@ class ClipEncoders:
     @property
     def dim(self) -> int:
         """Width of the shared space."""
-        return int(_config(self.model).projection_dim)
+        config = _config(self.model)
+        if self.family == "clip":
+            return int(config.projection_dim)
+        return int(getattr(config, "vision_config", config).hidden_size)
+
+    @property
+    def family(self) -> str:
+        """The model's kind in transformers, a key of :data:`FAMILIES`."""
+        return str(_config(self.model).model_type)
 
     def tokens(self, texts: Sequence[str]) -> dict[str, Tensor]:
         """``input_ids`` and ``attention_mask`` (n, length), cut to the encoder's context."""
         context = int(_config(self.model).text_config.max_position_embeddings)
-        encoded = self.tokenizer(
-            list(texts), padding=True, truncation=True, max_length=context, return_tensors="pt"
-        )
-        return {k: encoded[k].to(self.model.device) for k in ("input_ids", "attention_mask")}
+        names, how = ("input_ids", "attention_mask"), {"padding": True}
+        if self.family != "clip":  # SigLIP was trained on lower case, and on padding without a mask
+            names, how = ("input_ids",), {"padding": "max_length"}
+            texts = [text.lower() for text in texts]
+        options: dict[str, Any] = {"truncation": True, "max_length": context, **how}
+        encoded = self.tokenizer(list(texts), return_tensors="pt", **options)
+        return {k: encoded[k].to(self.model.device) for k in names}
 
     def encode_text(self, texts: Sequence[str]) -> Tensor:
         """Texts to (n, dim), L2-normalized; differentiable."""
@@ -123,15 +150,27 @@ class ClipEncoders:
 
     def encode_vision(self, pixels: Tensor) -> Tensor:
         """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalized; differentiable."""
-        return normalize(_projected(self.model.get_image_features(pixel_values=pixels)), dim=-1)
+        if not hasattr(self.model, "get_image_features"):  # a DINO: its class token
+            model: Any = self.model
+            return normalize(model(pixel_values=pixels).pooler_output, dim=-1)
+        inputs = _patches(pixels, self.model) if self.family == "siglip2" else {}
+        inputs = {"pixel_values": pixels, **inputs}
+        return normalize(_projected(self.model.get_image_features(**inputs)), dim=-1)
 
     def digest(self, modality: str) -> str:
         """SHA-256 of the vision or the text encoder."""
+        config, model = _config(self.model), self.model
+        if modality == "vision" and self.family == "clip":
+            return vision_digest(model, config.vision_config, self.preprocess)
         if modality == "vision":
-            return vision_digest(self.model, _config(self.model).vision_config, self.preprocess)
+            facts = {"preprocess": self.preprocess.facts, "family": self.family}
+            facts |= architecture(getattr(config, "vision_config", config))
+            return digest_modules({"tower": getattr(model, "vision_model", model)}, facts)
         facts = {"tokenizer": _tokenizer_digest(self.tokenizer)}
-        facts |= architecture(_config(self.model).text_config)
-        parts = {"tower": self.model.text_model, "projection": self.model.text_projection}
+        facts |= architecture(config.text_config)
+        parts = {"tower": model.text_model}
+        if self.family == "clip":
+            parts |= {"projection": model.text_projection}
         return digest_modules(parts, facts)
 
     def save(self, folder: Path, *, half: bool = False) -> None:
@@ -153,17 +192,19 @@ class ClipEncoders:
     def write(self, folder: Path, *, half: bool) -> None:
         """Write the files into ``folder``; see :meth:`save`, which does so atomically."""
         save_model(self.model, folder, half=half)
-        with silent():
-            save_tokenizer(self.tokenizer, folder)
+        modalities = ("vision", "text") if self.tokenizer is not None else ("vision",)
+        if self.tokenizer is not None:
+            with silent():
+                save_tokenizer(self.tokenizer, folder)
         write_json(folder / "preprocessor_config.json", self.preprocess.to_config())
-        digests = {modality: self.digest(modality) for modality in ("vision", "text")}
+        digests = {modality: self.digest(modality) for modality in modalities}
         about = {"format": CLIP_FORMAT, "name": self.name, "digests": digests, "card": self.card}
         write_json(folder / "palpate.json", about | _counts({"vision": self.seen}))
         save_seen(self.seen, folder)
 
 
 def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
-    """Load a frozen CLIP; only one from the hub needs a network, once.
+    """Load a frozen CLIP, SigLIP or DINO; only one from the hub needs a network, once.
 
     Args:
         source: a shipped name (``palpate/mini``), a folder as :meth:`ClipEncoders.save` or
@@ -181,15 +222,25 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
     note = folder / "palpate.json"
     if note.is_file() and read_record(note, "card of the CLIP").get("format") in (FORMAT, FORMAT_1):
         return EncoderSet.load(source, device=device).clip
+    config = folder / "config.json"
+    family = read_record(config, "model").get("model_type") if config.is_file() else "clip"
+    if family not in FAMILIES:
+        got = f"model_type {family!r} in {config}"
+        raise PalpateError(f"{source} must be one of {', '.join(FAMILIES)}", got, CLIP_FIX)
     if local:
-        require_files(folder, CLIP_FILES, CLIP_FIX)
-    model = load_model(CLIPModel, name, must, CLIP_FIX, local_files_only=local)
+        names = {k: v for k, v in CLIP_FILES.items() if FAMILIES[family] or "tokenizer" not in k}
+        require_files(folder, names, CLIP_FIX)
+    kind = CLIPModel if family == "clip" else AutoModel
+    model = load_model(kind, name, must, CLIP_FIX, local_files_only=local)
+    tokenizer = None
     try:
         with silent():
-            tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
+            if FAMILIES[family]:
+                tokenizer = AutoTokenizer.from_pretrained(name, local_files_only=local)
     except Exception as error:  # tokenizers raises bare ones
         raise PalpateError(must, first_line(error), CLIP_FIX) from None
-    size = int(model.config.vision_config.image_size)
+    sized = family in ("clip", "siglip")  # the others take images of any size
+    size = int(model.config.vision_config.image_size) if sized else None
     preprocess = Preprocess.from_config(folder / "preprocessor_config.json", size)
     clip = ClipEncoders(model, tokenizer, preprocess, str(source))
     if note.is_file():
@@ -341,10 +392,15 @@ class EncoderSet:
 
     @classmethod
     def load(cls, source: str | Path, *, device: str = "cpu") -> EncoderSet:
-        """Read what :meth:`save` wrote and compare every encoder with its digest.
+        """Load encoders of any kind: own ones, a CLIP, SigLIP or DINO, a public tactile encoder.
+
+        What :meth:`save` wrote is compared with its digests.
 
         Args:
-            source: a shipped name (``palpate/mini``), a folder or a hub id.
+            source: a shipped name (``palpate/mini``); a folder of palpate or transformers, or its
+                hub id; a file of a public tactile encoder (:mod:`palpate.encoders.tactile`),
+                ``owner/name:file`` for one on the hub, ``file#digit`` to name the sensor of all
+                images; or ``tactile+clip``, two of these that share a space.
             device: see :func:`palpate.encoders.models.pick_device`.
 
         Raises:
@@ -360,9 +416,8 @@ class EncoderSet:
             card = {"name": str(source), "license": module.format.license}
             foreign = cls(None, module, module.preprocess, card, sensor=sensor)  # type: ignore[arg-type]
             return foreign.to(device)
-        kind = read_record(folder / "palpate.json", "card").get("format") if (
-            folder / "palpate.json").is_file() else None  # fmt: skip
-        if kind not in (FORMAT, FORMAT_1) and (folder / "config.json").is_file():
+        note = folder / "palpate.json"
+        if not note.is_file() or read_record(note, "card").get("format") == CLIP_FORMAT:
             return cls(load_clip(source, device=device))
         about = _read_card(folder, (FORMAT, FORMAT_1))
         # A shipped CLIP keeps its name, so that cards of what is trained with it say so.
@@ -481,6 +536,17 @@ def _tokenizer_digest(tokenizer: Any) -> str:
     # Truncation and padding are state of the last call, not of the tokenizer.
     table = json.loads(backend.to_str())
     return digest_json({k: v for k, v in table.items() if k not in ("truncation", "padding")})
+
+
+def _patches(pixels: Tensor, model: Any) -> dict[str, Tensor]:
+    """Images (n, 3, side, side) as the rows of patches that SigLIP 2 of any aspect takes."""
+    patch = int(model.config.vision_config.patch_size)
+    n, side = len(pixels), pixels.shape[2] // patch
+    cells = pixels.unflatten(3, (side, patch)).unflatten(2, (side, patch))
+    rows = cells.permute(0, 2, 4, 3, 5, 1).reshape(n, side * side, -1)
+    shapes = torch.full((n, 2), side, device=pixels.device)
+    mask = torch.ones(rows.shape[:2], dtype=torch.int32, device=pixels.device)
+    return {"pixel_values": rows, "pixel_attention_mask": mask, "spatial_shapes": shapes}
 
 
 def _projected(output: Any) -> Tensor:

@@ -70,7 +70,7 @@ SMALL_FILES = ("config.json", "palpate.json", "preprocessor_config.json")
 ARCHITECTURE = """
     hidden_size intermediate_size num_hidden_layers num_attention_heads image_size patch_size
     num_channels vocab_size max_position_embeddings eos_token_id projection_dim hidden_act
-    layer_norm_eps
+    layer_norm_eps num_register_tokens layerscale_value use_swiglu_ffn mlp_ratio qkv_bias
 
     act_fn attention_head_dim block_out_channels class_embed_type cross_attention_dim
     down_block_types downsample_padding flip_sin_to_cos freq_shift in_channels latent_channels

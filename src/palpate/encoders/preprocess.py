@@ -84,14 +84,17 @@ class Preprocess:
         try:
             crop = _side(config.get("crop_size"), size or 224)
             resize = _side(config.get("size"), crop)
+            if (patches := config.get("max_num_patches")) is not None:  # SigLIP 2 of any aspect
+                resize = crop = round(int(patches) ** 0.5) * int(config["patch_size"])
             mean, std = config.get("image_mean") or CLIP_MEAN, config.get("image_std") or CLIP_STD
             (r, g, b), (sr, sg, sb) = map(float, mean), map(float, std)
             whole = isinstance(config.get("size"), Mapping) and "height" in config["size"]
+            whole = whole or patches is not None
             more: dict[str, Any] = {"resample": int(config.get("resample") or 3)}
             more |= {"fitting": "squash"} if whole else {}
             more |= config.get("palpate") or {}
             more |= {"subtract": tuple(more.get("subtract", ()))}
-        except (AttributeError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             must = f"Size, crop and statistics in {path} must be those of an image processor"
             raise PalpateError(must, str(error), SAVE_AGAIN) from None
         if not config.get("do_center_crop", "crop_size" in config or not whole):

@@ -1,0 +1,138 @@
+"""Vision and text of SigLIP, SigLIP 2 and DINO, from tiny folders as transformers writes them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.nn.functional import normalize
+from transformers import (
+    Dinov2Config,
+    Dinov2Model,
+    DINOv3ViTConfig,
+    DINOv3ViTModel,
+    Siglip2Config,
+    Siglip2Model,
+    SiglipConfig,
+    SiglipModel,
+)
+
+from palpate.core import PalpateError
+from palpate.encoders import Encoder, EncoderSet
+from palpate.encoders.tokenizer import save_tokenizer, train_tokenizer
+
+SIZE = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
+SIZE |= {"num_attention_heads": 2}
+HALF = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
+IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+TEXT = SIZE | {"vocab_size": 300, "max_position_embeddings": 16, "projection_size": 32}
+
+
+def siglip():
+    vision = SIZE | {"image_size": 32, "patch_size": 8}
+    config = {"size": {"height": 32, "width": 32}, "resample": 3, **HALF}
+    return SiglipModel(SiglipConfig(text_config=TEXT, vision_config=vision)), config
+
+
+def siglip2():
+    vision = SIZE | {"patch_size": 8, "num_patches": 16}
+    config = {"max_num_patches": 16, "patch_size": 8, "resample": 2, **HALF}
+    return Siglip2Model(Siglip2Config(text_config=TEXT, vision_config=vision)), config
+
+
+def dinov2():
+    more = {"num_hidden_layers": 2, "mlp_ratio": 2, "image_size": 56, "patch_size": 14}
+    sizes = {k: v for k, v in SIZE.items() if k != "intermediate_size"}
+    config = {"size": {"shortest_edge": 48}, "crop_size": {"height": 42, "width": 42}}
+    config |= {"do_center_crop": True, "resample": 3, **IMAGENET}
+    return Dinov2Model(Dinov2Config(**(sizes | more))), config
+
+
+def dinov3():
+    config = {"size": {"height": 32, "width": 32}, "resample": 2, "do_center_crop": None}
+    model = DINOv3ViTModel(DINOv3ViTConfig(**SIZE, image_size=32, patch_size=8))
+    return model, config | {"crop_size": None, **IMAGENET}
+
+
+FAMILIES = {"siglip": siglip, "siglip2": siglip2, "dinov2": dinov2, "dinov3": dinov3}
+
+
+def write(name, folder):
+    torch.manual_seed(0)
+    model, config = FAMILIES[name]()
+    model.eval().save_pretrained(folder)
+    (folder / "preprocessor_config.json").write_text(json.dumps(config))
+    if name.startswith("siglip"):
+        save_tokenizer(train_tokenizer(["rough wood", "soft cloth"], vocabulary=300), folder)
+    return model, config
+
+
+def by_hand(name, model, config, image):
+    """The features of one image, prepared by Pillow and NumPy."""
+    filters = Image.Resampling(config["resample"])
+    if name == "dinov2":
+        (width, height), side = image.size, min(image.size)
+        left, top = (width - side) // 2, (height - side) // 2
+        square = image.crop((left, top, left + side, top + side)).resize((48, 48), filters)
+        image = square.crop((3, 3, 45, 45))
+    else:
+        image = image.resize((32, 32), filters)
+    x = (np.asarray(image) / 255 - config["image_mean"]) / config["image_std"]
+    more = {}
+    if name == "siglip2":
+        rows = x.reshape(4, 8, 4, 8, 3).transpose(0, 2, 1, 3, 4).reshape(16, 192)
+        pixels = torch.tensor(rows[None], dtype=torch.float32)
+        more = {"pixel_attention_mask": torch.ones(1, 16), "spatial_shapes": torch.tensor([[4, 4]])}
+    else:
+        pixels = torch.tensor(x.transpose(2, 0, 1)[None], dtype=torch.float32)
+    with torch.no_grad():
+        if name.startswith("siglip"):
+            made = model.get_image_features(pixel_values=pixels, **more)
+        else:
+            made = model(pixel_values=pixels)
+    return normalize(made if isinstance(made, torch.Tensor) else made.pooler_output, dim=-1)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_folder_of_transformers_gives_its_own_features(tmp_path, name):
+    model, config = write(name, tmp_path / "model")
+    pixels = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+    encoders = EncoderSet.load(tmp_path / "model")
+    encoder = Encoder(encoders, "vision")
+    made = encoder.encode(Image.fromarray(pixels))
+    assert made.shape == (1, encoder.dim) == (1, 32)
+    assert np.allclose(made, by_hand(name, model, config, Image.fromarray(pixels)), atol=1e-5)
+    encoders.save(tmp_path / "saved")
+    again = EncoderSet.load(tmp_path / "saved")
+    assert again.modalities == encoders.modalities
+    assert [again.digest(m) for m in again.modalities] == [
+        encoders.digest(m) for m in encoders.modalities
+    ]
+    assert np.allclose(Encoder(again, "vision").encode(Image.fromarray(pixels)), made, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["siglip", "siglip2"])
+def test_texts_of_siglip_are_lower_case_and_padded_without_a_mask(tmp_path, name):
+    model, _ = write(name, tmp_path / "model")
+    encoders = EncoderSet.load(tmp_path / "model")
+    ids = encoders.clip.tokenizer(
+        ["rough wood"], padding="max_length", max_length=16, return_tensors="pt"
+    )["input_ids"]
+    with torch.no_grad():
+        made = model.get_text_features(input_ids=ids)
+    want = normalize(made if isinstance(made, torch.Tensor) else made.pooler_output, dim=-1)
+    assert np.allclose(Encoder(encoders, "text").encode("ROUGH wood"), want, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["dinov2", "dinov3"])
+def test_a_dino_has_no_text(tmp_path, name):
+    write(name, tmp_path / "model")
+    with pytest.raises(PalpateError, match="`modality` must be one of vision"):
+        Encoder.from_pretrained(tmp_path / "model", modality="text")
+
+
+def test_other_models_are_named(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
+    with pytest.raises(PalpateError, match=r"must be one of clip, siglip, .*'bert'"):
+        EncoderSet.load(tmp_path)
