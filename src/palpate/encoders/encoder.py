@@ -194,9 +194,8 @@ def prepared(
     def decode(k: int) -> None:
         image = images[k]
         parts = image if isinstance(image, tuple) else (image,)
-        pixels[k] = preprocess.prepare(
-            *(read_image(p) if isinstance(p, Path) else p for p in parts)
-        )
+        read: list[Any] = [read_image(p) if isinstance(p, Path) else p for p in parts]
+        pixels[k] = preprocess.prepare(*read)
 
     for _ in in_threads(decode, range(len(images))):
         pass

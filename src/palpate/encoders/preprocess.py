@@ -99,13 +99,13 @@ class Preprocess:
             raise PalpateError(must, str(error), SAVE_AGAIN) from None
         if not config.get("do_center_crop", "crop_size" in config or not whole):
             crop = resize
-        size = size or crop
-        if crop != size or resize < size:
-            must, got = f"{path} must give the encoder's {size} px", f"{crop} px from {resize} px"
+        side = size or crop
+        if crop != side or resize < side:
+            must, got = f"{path} must give the encoder's {side} px", f"{crop} px from {resize} px"
             raise PalpateError(must, got, "Set size and crop_size to the encoder's")
         if not config.get("do_normalize", True):
-            return cls(size, resize, (0.0,) * 3, (1.0,) * 3, **more)
-        return cls(size, resize, (r, g, b), (sr, sg, sb), **more)
+            return cls(side, resize, (0.0,) * 3, (1.0,) * 3, **more)
+        return cls(side, resize, (r, g, b), (sr, sg, sb), **more)
 
     def to_config(self) -> dict[str, Any]:
         """The same as a ``preprocessor_config.json`` for transformers' ``CLIPImageProcessor``."""
