@@ -107,9 +107,12 @@ def page(studies, command, seeds):
         )
         seconds = [row["seconds"] for row in results.settings["trainings"].values()]
         videos = len(set(manifest.column("video")))
+        drops = [s for s in results if s.metric.endswith(" difference")]
+        sure = sum(bool(s.details["decided"]) and s.value > 0 for s in drops)
         parts.append(
             f"## {look}, {LOOKS[look]['leak']} leak\n\n{len(manifest)} contact frames, {len(set(manifest.column('contact')))} contacts, {videos} videos "
-            f"(manifest {manifest.digest[:12]}). {counts}. {len(seconds)} trainings, {min(seconds):.0f} to {max(seconds):.0f} s each.\n\n{table(results)}\n"
+            f"(manifest {manifest.digest[:12]}). {counts}. {len(seconds)} trainings, {min(seconds):.0f} to {max(seconds):.0f} s each. "
+            f"{sure} of {len(drops)} drops have an interval above 0.\n\n{table(results)}\n"
         )
     return f"""# What a split is worth to an encoder trained on it
 

@@ -98,7 +98,8 @@ def mean_of(
     values = np.asarray(values, dtype=np.float64)
     weights = np.ones(len(values)) if weights is None else weights
     value = float(weights @ values / weights.sum())
-    score = Score(metric, value=value, **{"higher_is_better": True, "n": len(values), **fields})
+    fields = {"higher_is_better": True, "n": len(values)} | fields
+    score = Score(metric, value=value, **fields)
     mean = Mean(score, values, weights, np.array(groups, dtype=str))
     spread = spread_of([[mean]])
     interval = spread.interval(0.0, 1.0)

@@ -185,8 +185,8 @@ def unit_rows(x: NDArray[Any]) -> Floats:
 
 
 def blocks(rows: int, columns: int) -> Generator[slice]:
-    """Slices of rows, of at most ``CELLS`` cells each."""
-    step = max(1, CELLS // columns)
+    """Slices of rows, of at most ``CELLS`` cells and 255 rows each: counts fit into a byte."""
+    step = min(255, max(1, CELLS // columns))
     for start in range(0, rows, step):
         yield slice(start, min(start + step, rows))
 
@@ -199,8 +199,9 @@ def _own_ranks(a: Floats, b: Floats) -> tuple[Ranks, Ranks]:
     for rows in blocks(n, n):
         similar = a[rows] @ b.T
         for k, bound in enumerate((high, low)):
-            counts[0, k, rows] = _count(similar > bound[rows, None], 1)
-            counts[1, k] += _count(similar > bound, 0)
+            counts[0, k, rows] = _by_row(similar > bound[rows, None])
+            # Bytes are added without a wider copy.
+            counts[1, k] += (similar > bound).view(np.uint8).sum(axis=0, dtype=np.uint8)
     one = np.ones(n)
     forth, back = (Ranks(c[0], c[1] - c[0], c[1] - c[0] - 1, one, n) for c in counts)
     return forth, back
@@ -215,17 +216,19 @@ def _similar_ranks(
         similar = a[rows] @ b.T
         good = (texts[code[rows]] @ texts.T > threshold)[:, code]
         good[np.arange(len(good)), np.arange(rows.start, rows.stop)] = True
-        best = np.where(good, similar, -np.inf).max(axis=1, keepdims=True)
-        over = similar > best + TIE
-        tied = (similar > best - TIE) & ~over
-        above[rows], ties[rows] = _count(over, 1), _count(tied, 1)
-        wrong[rows], right[rows] = _count(tied & ~good, 1), _count(good, 1)
+        right[rows] = _by_row(good)
+        cells = np.flatnonzero(good)
+        row, values = cells // n, similar.reshape(-1)[cells]
+        best = np.maximum.reduceat(values, np.searchsorted(row, np.arange(len(good))))
+        above[rows] = _by_row(similar > (best + TIE)[:, None])
+        ties[rows] = _by_row(similar > (best - TIE)[:, None]) - above[rows]
+        wrong[rows] = ties[rows] - np.bincount(row, values > best[row] - TIE)
     return Ranks(above, ties, wrong, right, n)
 
 
-def _count(mask: NDArray[np.bool_], axis: int) -> NDArray[np.int64]:
-    """Number of true cells along an axis."""
-    return mask.view(np.uint8).sum(axis=axis, dtype=np.int32).astype(np.int64)
+def _by_row(mask: NDArray[np.bool_]) -> Array:
+    """(rows,) number of true cells of each row."""
+    return np.array([np.count_nonzero(row) for row in mask], dtype=np.float64)
 
 
 def _retrieved(

@@ -170,7 +170,7 @@ def _scores(table: Table) -> list[str]:
         ]
         lines += pipe_table(["", *map(esc, heads)], rows)
     if table.differences:
-        lines += ["Differences on the same samples, a − b:", ""]
+        lines += ["Paired differences, a − b:", ""]
         head = ["metric", "a", "b", "a − b", "a better", "Holm p", "notes"]
         lines += pipe_table(
             head,

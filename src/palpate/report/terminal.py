@@ -34,7 +34,7 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
             _print_rows([{"metric": m, "best first": order} for m, order in ranked], console)
         elif table.differences:
             marked += [d.cell for d in table.differences]
-            console.print(Text("Differences on the same samples, a - b", "bold"))
+            console.print(Text("Paired differences, a - b", "bold"))
             _print_rows(_difference_rows(table), console)
         notes = {k: table.notes[k - 1] for cell in marked for k in cell.footnotes}
         lines = [f"({k}) {sentence(note, style)}" for k, note in sorted(notes.items())]

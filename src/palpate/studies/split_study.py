@@ -100,7 +100,7 @@ def compare_splits(  # noqa: PLR0913 - those of training and of probing
         trained=True,
     )
     plan = plan_of(manifest, loaded, plan)
-    training = {"preset": preset, "clip": clip, "epochs": epochs, "device": device}
+    training: dict[str, Any] = {"preset": preset, "clip": clip, "epochs": epochs, "device": device}
     runs: dict[str, list[Probed]] = {}
     facts: dict[str, dict[str, Any]] = {}
     with locked(folder):
