@@ -5,7 +5,8 @@
 Random unit vectors, whose pairs correlate; all keys are ranked. `strict` is one direction and the
 other with the sample's own key right; `similar text` counts keys whose text has a cosine above
 0.6356 as well, all texts being distinct (the slowest case). Each row runs in a process of its own,
-whose peak resident memory, packages and inputs included, is shown.
+whose peak resident memory, packages and inputs included, is shown. Time is the processor's: with
+one thread, what it takes on a core that nothing else uses. At most 60 s and 1,024 MB pass.
 """
 
 import argparse
@@ -20,7 +21,7 @@ import time
 from pathlib import Path
 
 ROWS = [(10_000, 128, False), (40_000, 128, False), (40_000, 768, False), (40_000, 128, True)]
-HEAD = "| samples | width | right keys | threads | seconds | CPU seconds | peak memory, MB |"
+HEAD = "| samples | width | right keys | CPU seconds | elapsed seconds | peak memory, MB |"
 
 
 def measure(n, width, similar):
@@ -46,17 +47,32 @@ def measure(n, width, similar):
     }
 
 
+def page(lines, command):
+    """The whole Markdown file."""
+    about = "\n".join(__doc__.splitlines()[4:])
+    return f"""# Retrieval: speed and memory
+
+Made by a committed command; do not edit by hand. {platform.machine()}, {os.cpu_count()} cores that
+others used as well; {datetime.date.today().isoformat()}.
+
+    python benchmarks/{command}
+
+{about}
+
+{chr(10).join(lines)}
+"""
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--write", type=Path, help="Markdown file to write")
-    parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--row", type=json.loads, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.row:
         print(json.dumps(measure(*chosen.row)))
         return
-    lines = [HEAD, "|---|---|---|---|---|---|---|"]
-    threads = {f"{x}_NUM_THREADS": str(chosen.threads) for x in ("OMP", "OPENBLAS")}
+    lines, passed = [HEAD, "|---|---|---|---|---|---|"], True
+    threads = {f"{x}_NUM_THREADS": "1" for x in ("OMP", "OPENBLAS")}
     for n, width, similar in ROWS:
         row = json.dumps([n, width, int(similar)])
         command = [sys.executable, __file__, "--row", row]
@@ -65,25 +81,13 @@ def main():
         )
         result = json.loads(done.stdout)
         kind = "similar text" if similar else "strict"
-        numbers = f"{result['seconds']:.1f} | {result['cpu']:.1f} | {result['memory']:.0f}"
-        lines.append(f"| {n:,} | {width} | {kind} | {chosen.threads} | {numbers} |")
+        numbers = f"{result['cpu']:.1f} | {result['seconds']:.1f} | {result['memory']:.0f}"
+        lines.append(f"| {n:,} | {width} | {kind} | {numbers} |")
         print(lines[-1], flush=True)
-        within = result["seconds"] < 60 and result["memory"] < 1024
-        if not within:
-            print("over 60 s or 1 GB", flush=True)
+        passed = passed and result["cpu"] < 60 and result["memory"] < 1024
     if chosen.write:
-        about = "\n".join(__doc__.splitlines()[4:])
-        words = sys.argv[1:]
-        page = f"""# Retrieval: speed and memory
-
-Made by a committed command; do not edit by hand. {platform.machine()}, {os.cpu_count()} cores that
-others used as well; {datetime.date.today().isoformat()}.
-
-    python benchmarks/retrieval_speed.py {" ".join(words)}
-{about}
-{chr(10).join(lines)}
-"""
-        chosen.write.write_text(page)
+        chosen.write.write_text(page(lines, f"{Path(__file__).name} {' '.join(sys.argv[1:])}"))
+    sys.exit(not passed)
 
 
 if __name__ == "__main__":
