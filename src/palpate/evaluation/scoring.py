@@ -339,22 +339,24 @@ def score(  # noqa: PLR0913
         reserved=(REFERENCE,) if split is None else (REFERENCE, BACKGROUND, SAME_MATERIAL, REAL),
     )
     weights: dict[str, Any] = {"inception": inception, "clip": clip, "lpips": lpips}
-    encoders = None
-    if inputs.reference.features is None:
+    images = inputs.reference.features is None
+    if images:
         if encoder is None and not requested:
             fix = "Pass an encoder, or request only companions that compare pixels, e.g. ssim"
             example = {"encoder": "palpate/mini"}
             got, must = "none", "must be given for images"
             raise PalpateError(must, got, fix, argument="encoder", example=example)
-        encoders = load_encoders(encoder, progress)
     elif used := [n for n, v in {"encoder": encoder, "cache": cache, **weights}.items() if v]:
         raise PalpateError("must go with images", "embeddings", "Drop it", argument=used[0])
+    streamed = any(s.streamed for s in (inputs.reference, *inputs.generators.values()))
+    chosen, pairs = _companions(inputs, requested, Weights(**weights), encoder, streamed=streamed)
+    encoders = load_encoders(encoder, progress) if images else None
     of_encoder: list[Note] = []
     if encoders is not None:
         judged: Any = inputs.reference.manifest or inputs.reference.images
         how: dict[str, Any] = {"split": split, "allow_seen": allow_seen, "progress": progress}
         of_encoder = guard(encoders, "tactile", judged, **how)
-    if any(s.streamed for s in (inputs.reference, *inputs.generators.values())):
+    if streamed:
         outcome = score_streamed(inputs, family, requested, progress)
     else:
         with tempfile.TemporaryDirectory() if cache is None else nullcontext(cache) as folder:
@@ -368,7 +370,7 @@ def score(  # noqa: PLR0913
                 progress,
             )
             run, of = run.clustered(clusters) if clusters else (run, "")
-            outcome = run.score(requested, controls=controls)
+            outcome = run.score(chosen, pairs=pairs, controls=controls)
             outcome = _with_clusters(outcome, clusters, of) if clusters else outcome
     digest = encoders.digest("tactile") if encoders is not None else ""
     outcome.scores = with_warnings(outcome.scores, inputs, split, digest, of_encoder)
@@ -441,6 +443,42 @@ def _with_clusters(outcome: Outcome, clusters: int, of: str) -> Outcome:
     return outcome
 
 
+def _companions(
+    inputs: Inputs,
+    requested: Sequence[str] | None,
+    weights: Weights,
+    encoder: Any,
+    *,
+    streamed: bool,
+) -> tuple[Chosen, bool]:
+    """What is compared beside the TMMD family, and whether every image has its reference.
+
+    Raises:
+        PalpateError: on a companion whose inputs are not there; where some images have no
+            reference, which is a mistake.
+    """
+    real, made = inputs.reference, inputs.generators
+    images, background = real.features is None, real.has_background
+    able = {"images": images, "encoder": encoder is not None or not images}
+    names = [] if streamed else requested
+    chosen = choose(names, weights, **able, background=background)
+    if not chosen.pairs:
+        return chosen, False
+    if real.numbered:  # pairs by position are taken on request alone
+        alike = all(s.numbered and len(s) == len(real) for s in made.values())
+        return chosen, not chosen.default and alike
+    if chosen.default and not any({*s.ids} & {*real.ids} for s in made.values()):
+        return chosen, False
+    for name, samples in made.items():
+        try:
+            paired_by_id(samples.ids, real.ids)
+        except PalpateError as error:
+            fix = "Score the same samples on both sides, or request companions without pairs"
+            example = {"companions": ["fid", "kid", "prdc"]}
+            raise PalpateError(f"{name}: {error.must}", error.got, fix, example=example) from None
+    return chosen, True
+
+
 def load_encoders(encoder: Any, progress: Progress) -> Any:
     """An ``EncoderSet``, loaded where it is a name or a folder."""
     if encoder is None or not isinstance(encoder, str | Path):
@@ -467,15 +505,11 @@ class _Run:
     keep: bool
     progress: Progress
 
-    def score(self, companions: Sequence[str] | None, *, controls: bool) -> Outcome:
+    def score(self, chosen: Chosen, *, pairs: bool, controls: bool) -> Outcome:
         """Everything that is scored."""
         real, made = self.inputs.reference, self.inputs.generators
         images = real.features is None
         encoder = self.encoders is not None or not images
-        chosen = choose(
-            companions, self.weights, images=images, encoder=encoder, background=real.has_background
-        )
-        pairs = self._can_pair(chosen.default) if chosen.pairs else False
         controls = controls and encoder and images and self.inputs.train is not None
         extra: dict[str, Samples] = {}
         if controls:
@@ -590,23 +624,6 @@ class _Run:
         context = real.table.select("id", "sensor", pl.Series("background", gels, pl.String))
         table = manifest.table.drop("sensor", "background").join(context, "id", "left")
         return replace(manifest, table=table.select(manifest.table.columns))
-
-    def _can_pair(self, default: bool) -> bool:
-        """Whether every generated image has its reference; some without one are a mistake."""
-        real, made = self.inputs.reference, self.inputs.generators
-        if real.numbered:  # pairs by position are taken on request alone
-            return not default and all(s.numbered and len(s) == len(real) for s in made.values())
-        if default and not any({*s.ids} & {*real.ids} for s in made.values()):
-            return False
-        for name, samples in made.items():
-            try:
-                paired_by_id(samples.ids, real.ids)
-            except PalpateError as error:
-                fix = "Score the same samples on both sides, or request companions without pairs"
-                example = {"companions": ["fid", "kid", "prdc"]}
-                must = f"{name}: {error.must}"
-                raise PalpateError(must, error.got, fix, example=example) from None
-        return True
 
     def _size(self) -> int:
         """The side of the generated images, the same for all generators."""
