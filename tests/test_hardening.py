@@ -29,6 +29,15 @@ def zip_named_npy(path: Path) -> None:
         file.writestr("a", "b")
 
 
+def bomb_of_zeros(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        header = np.lib.format.header_data_from_array_1_0(np.zeros((1, 64), "f4"))
+        with file.open("features.npy", "w") as entry:
+            np.lib.format.write_array_header_1_0(entry, header | {"shape": (5 << 18, 64)})
+            for _ in range(5):
+                entry.write(bytes(1 << 26))
+
+
 def whole_manifest(path: Path) -> None:
     rows = [{"id": i, "video": i, "text": i} for i in "ab"]
     Manifest.from_rows(rows, path.parent).save(path)
@@ -47,6 +56,18 @@ def typed_manifest(path: Path) -> None:
     ("name", "content", "command", "words"),
     [
         ("a.npy", zip_named_npy, "score --generated a.npy --reference a.npy", "named .npz"),
+        ("a.npz", bomb_of_zeros, "score --generated a.npz --reference a.npz", "unpacks to 0.3 GB"),
+        *(
+            (name, os.mkfifo, command, "a pipe or a device")
+            for name, command in (
+                ("p.txt", "audit p.txt p.txt"),
+                ("p.parquet", "validate p.parquet"),
+                ("p.parquet", "background p.parquet -o o"),
+                ("p.json", "report p.json -o page.html"),
+                ("p.npy", "score p.npy --reference p.npy"),
+            )
+        ),
+        ("p.jpg", os.mkfifo, "generate p.jpg -o t.png", "an image that can be read"),
         *(
             ("g/index.json", INDEX + f'"skipped": [], "images": {images}}}', command, words)
             for command in ("score --generated g --reference g", "generate a.jpg -o g")

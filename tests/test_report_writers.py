@@ -10,12 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from palpate.core import Note
+from palpate.core import Note, SampleRef
 from palpate.report import notes
+from palpate.report.audits import pair_lists
 from palpate.report.latex import LONG, escape
-from palpate.report.results import Results
+from palpate.report.results import LeakPair, Results, Signal
 from palpate.report.terminal import as_text, print_result
-from report_fixtures import difference, full_audit, full_results, score, text_note
+from report_fixtures import difference, full_audit, full_results, score, small_audit, text_note
 
 NASTY = r"100% & {x} $_#^~ <b> \input{a} | `c` [d]"
 
@@ -92,6 +93,18 @@ def test_an_audit_is_a_readable_summary():
     assert "29,611 of 29,879 test samples leak (99.10 %)." in text
     assert "  near-duplicate vision   5,210 of 29,879 (17.4 %), score 0.812" in text
     assert "2 test samples have no video." in text
+
+
+def test_a_note_of_several_signals_is_one_line_and_pairs_of_a_group_are_named_so():
+    note = Note("cannot-tell-no-null", {"images": 87, "threshold": None})
+    kinds = ("near-duplicate vision", "near-duplicate tactile")
+    signals = [Signal(kind, 1, 0, 0.9, notes=[note]) for kind in kinds]
+    audit = small_audit(signals=signals)
+    (line,) = (line for line in str(audit).splitlines() if "Cannot tell" in line)
+    assert line.startswith("  near-duplicate vision, near-duplicate tactile: ")
+    for gap, title in ((3, "nearest in time: 1 pair"), (None, "same object: 1 pair")):
+        pair = LeakPair(SampleRef("a"), SampleRef("b"), gap)
+        assert pair_lists(small_audit([pair], group="object"))[0].title == title
 
 
 def test_markdown_tables_are_rectangular_and_hold_every_section(tmp_path):

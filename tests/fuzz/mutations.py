@@ -327,7 +327,7 @@ def change_content(rng: Rng, files: list[Path]) -> None:
 def change_place(rng: Rng, files: list[Path]) -> None:
     """A file is lost, swapped, renamed, or something else than a file."""
     file, another = pick(rng, files), pick(rng, files)
-    kind = int(rng.integers(8))
+    kind = int(rng.integers(9))
     if kind == 0:
         file.rename(file.with_name("swap"))
         shutil.copy(another if another.exists() else file.with_name("swap"), file)
@@ -346,6 +346,8 @@ def change_place(rng: Rng, files: list[Path]) -> None:
             file.mkdir()
         elif kind == 6:
             file.symlink_to(pick(rng, [file, file.parent, "missing", "/", another.resolve()]))
+        elif kind == 7:
+            os.mkfifo(file)
 
 
 # --- options

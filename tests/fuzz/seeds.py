@@ -20,9 +20,8 @@ from palpate.cli import main
 from palpate.data.manifest import Manifest
 
 MINI = Path(palpate.__file__).parent / "mini"
-#: Command -> how often it is drawn next to the others; those that load models are slow. Missing are
-#: ``demo``, whose stages are the other verbs and take minutes, and ``caption``, which needs a
-#: server.
+#: Command -> how often it is drawn next to the others; those that load models are slow. ``demo``
+#: gets no further than its data, since its other stages are the other verbs.
 COMMANDS: dict[str, int] = {
     "import IN/touch-and-go -o OUT/m": 3,
     "import IN/touch-and-go -o OUT/m --labels IN/touch-and-go/train.txt --max-per-contact 2": 1,
@@ -92,6 +91,9 @@ COMMANDS: dict[str, int] = {
     "--epochs 0.1 --preset tiny -o OUT/e": 1,
     "train generator IN/manifest --split IN/split/split.json --clip IN/models/encoders "
     "--autoencoder IN/models/autoencoder --steps 1 --preset tiny -o OUT/g": 1,
+    "caption IN/manifest --template {material} -o OUT/c": 2,
+    "caption IN/manifest --server http://127.0.0.1:9/v1 --model x --dry-run -o OUT/c": 1,
+    "demo --data IN/vectors --preset tiny -o OUT/d": 1,
     "completion bash": 1,
 }
 

@@ -31,6 +31,7 @@ from palpate.core.files import (
     read_record,
     reading_entry,
     require_new_folder,
+    require_regular,
     write_json,
     write_text,
 )
@@ -74,6 +75,7 @@ __all__ = [
     "require_choice",
     "require_comparable",
     "require_new_folder",
+    "require_regular",
     "rng_for",
     "seed_for",
     "short",

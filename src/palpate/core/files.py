@@ -164,6 +164,7 @@ def read_json(path: Path, what: str) -> Any:
     Raises:
         PalpateError: if the file is missing or is not JSON.
     """
+    require_regular(Path(path))
     try:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
         # No NaN and no infinity, which JSON has not, and no halves of characters.
@@ -219,6 +220,17 @@ def reading_entry(path: Path, key: str) -> Generator[None]:
             f"{type(error).__name__}: {error}",
         )
         raise PalpateError(must, got, "Copy the whole folder again") from None
+
+
+def require_regular(path: Path) -> None:
+    """Check that an input is no pipe or device, which cannot be read twice.
+
+    Raises:
+        PalpateError: if it is one.
+    """
+    if not path.is_file() and not path.is_dir() and path.exists():
+        got, fix = f"{path}, a pipe or a device", "Write it to a file first"
+        raise PalpateError("An input must be a file or a folder", got, fix)
 
 
 def inside(root: Path, relative: str) -> Path | None:

@@ -56,6 +56,8 @@ def opened(source: Path | BinaryIO) -> Image.Image:
         Image.DecompressionBombError: if there are more than ``LARGEST``.
         OSError: with most other broken files; see ``BROKEN``.
     """
+    if isinstance(source, Path) and source.is_fifo():
+        raise OSError("a pipe, which is no file")
     image = Image.open(source)
     if image.width * image.height > LARGEST:
         size = f"{image.width} x {image.height} pixels"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, Split, locked, quiet
+from palpate.core import PalpateError, Progress, Split, locked, quiet, require_regular
 from palpate.data.formats import FORMATS, Format
 from palpate.data.formats.base import (
     MISSING,
@@ -185,6 +185,7 @@ def recognized(
     if name != "auto" and name not in FORMATS:
         must = f"must be auto or one of {', '.join(FORMATS)}"
         raise PalpateError(must, repr(name), "Choose one of these", argument="format")
+    require_regular(source)
     if not source.exists() and (name == "auto" or not FORMATS[name].remote):
         fix = "Check the path; a data set on the hub needs the format hf"
         raise PalpateError("must exist", f"nothing at {source}", fix, argument="source")

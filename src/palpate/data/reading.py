@@ -9,7 +9,7 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Progress, quiet
+from palpate.core import PalpateError, Problem, Progress, quiet, require_regular
 from palpate.data.formats import Format
 from palpate.data.formats.base import Scan, finished, manifest_of
 from palpate.data.imported import raise_if, require_some
@@ -89,6 +89,7 @@ def read_samples(
     if not isinstance(source, (str, Path)):
         return _of_table(table_of(source), Path(), skip_bad, options)
     path = Path(source)
+    require_regular(path)
     if format == "auto" and path.exists():
         if is_manifest(path):
             return Manifest.load(path, options.get("root")), []
@@ -112,7 +113,7 @@ def is_manifest(path: Path) -> bool:
     """Whether this is a manifest file or a folder that holds one."""
     if path.is_dir():
         return (path / "manifest.parquet").is_file()
-    if path.suffix.lower() != ".parquet":
+    if path.suffix.lower() != ".parquet" or not path.is_file():
         return False
     try:
         with open(path, "rb") as file, reading_parquet():

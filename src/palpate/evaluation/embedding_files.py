@@ -17,6 +17,7 @@ file              content
 from __future__ import annotations
 
 import json
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     import polars as pl
 
 SUFFIXES = (".npy", ".npz", ".safetensors", ".parquet")
+#: Bytes that an array of an archive may unpack to, and times its packed size on top: floats hardly
+#: shrink, so more is a decompression bomb.
+UNPACKED, MOST_TIMES = 1 << 28, 20
 #: Names of the columns of labels and groups; the first that is there is used.
 LABELS, GROUPS = ("material", "label"), ("video", "group")
 #: Types of safetensors that are read; BF16 has no NumPy type and is widened.
@@ -120,6 +124,11 @@ def _read_npy(path: Path) -> Embeddings:
 
 
 def _read_npz(path: Path) -> Embeddings:
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            if entry.file_size > UNPACKED + MOST_TIMES * entry.compress_size:
+                size, of = entry.file_size / 1e9, entry.compress_size / 1e6
+                raise ValueError(f"{entry.filename} unpacks to {size:.1f} GB from {of:.1f} MB")
     with np.load(path, allow_pickle=False) as data:
         arrays = {name: data[name] for name in data if name in Embeddings.__annotations__}
     encoder = arrays["encoder"].reshape(-1) if "encoder" in arrays else np.zeros(0)

@@ -34,6 +34,7 @@ from palpate.core import (
     digest_file,
     digest_json,
     read_json,
+    require_regular,
     short,
 )
 from palpate.core.digest import to_numpy
@@ -268,6 +269,7 @@ def _strings(column: Sequence[Any] | None) -> list[str] | None:
 def _read_path(path: Path, group: str) -> Samples:
     if not path.exists():
         raise PalpateError("What is scored must exist", f"nothing at {path}", f"Pass {KINDS}")
+    require_regular(path)
     if path.is_file() and not _is_manifest(path):
         if path.suffix.lower() not in SUFFIXES:
             fix = "Pass one of these; pickles are never loaded"

@@ -11,7 +11,7 @@ from palpate.report.sentences import HARMLESS
 
 
 class PairList(NamedTuple):
-    """The pairs of one signal (``kind``), or the nearest in time where ``kind`` is ''."""
+    """The pairs of one signal; where ``kind`` is '', those nearest in time or of a shared group."""
 
     kind: str
     title: str
@@ -20,13 +20,15 @@ class PairList(NamedTuple):
 
 
 def pair_lists(audit: Audit) -> list[PairList]:
-    """Return the pairs of each signal; the nearest in time first unless a signal has them."""
+    """Return the pairs of each signal; first the nearest in time unless a signal has them."""
+    timed = any(pair.gap is not None for pair in audit.worst)
+    unnamed = "nearest in time" if timed else f"same {audit.group}"
     kinds = [(s.kind, s.worst, s.flagged) for s in audit.signals if s.worst]
     if audit.worst and not any(kind == "time gap" for kind, _, _ in kinds):
         kinds.insert(0, ("", audit.worst, 1))
     lists: list[PairList] = []
     for kind, pairs, flagged in kinds:
-        title = f"{kind or 'nearest in time'}: {plural(len(pairs), 'pair')}"
+        title = f"{kind or unnamed}: {plural(len(pairs), 'pair')}"
         images = any(s.vision or s.tactile for p in pairs for s in (p.test, p.train))
         lists.append(PairList(kind, title + ("" if flagged else ", none flagged"), pairs, images))
     return lists

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from palpate.core import Score
+from palpate.core import Note, Score
 from palpate.report.notes import count, number, percent, plural, question, score_text
 from palpate.report.results import CANNOT_TELL, Audit, Results, Signal
 from palpate.report.tables import Table, family_of, score_tables
@@ -89,6 +89,16 @@ def cause_notes(signal: Signal) -> list[str]:
         for cause, why in HARMLESS.items()
         if signal.causes.get(cause)
     ]
+
+
+def signal_notes(audit: Audit) -> list[tuple[str, Note]]:
+    """Return the notes of signals, each once, with the kinds that have it."""
+    kinds: dict[str, list[str]] = {}
+    notes = {repr(note): note for s in audit.signals for note in s.notes}
+    for signal in audit.signals:
+        for note in signal.notes:
+            kinds.setdefault(repr(note), []).append(signal.kind)
+    return [(", ".join(kinds[key]), note) for key, note in notes.items()]
 
 
 def chance_text(signal: Signal) -> str:

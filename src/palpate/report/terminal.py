@@ -11,7 +11,13 @@ from rich.text import Text
 
 from palpate.report.notes import COMMAND_LINE, PYTHON, Style, confidence, count, percent, sentence
 from palpate.report.results import Audit, Results
-from palpate.report.sentences import audit_line, cause_texts, chance_text, threshold_text
+from palpate.report.sentences import (
+    audit_line,
+    cause_texts,
+    chance_text,
+    signal_notes,
+    threshold_text,
+)
 from palpate.report.tables import BASELINES, BEST, Cell, Table, rankings, score_tables
 
 #: Columns that are text; all others are numbers, flush right.
@@ -146,8 +152,7 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
         facts = [share, threshold_text(signal), *cause_texts(signal), chance_text(signal)]
         facts = facts if signal.checked else ["none could be checked"]
         lines.append(f"  {signal.kind:<{width}}  {', '.join(filter(None, facts))}")
-    for signal in audit.signals:
-        lines += [f"  {signal.kind}: {sentence(note, style)}" for note in signal.notes]
+    lines += [f"  {kinds}: {sentence(note, style)}" for kinds, note in signal_notes(audit)]
     lines += [sentence(note, style) for note in audit.notes]
     if audit.impact is not None:
         lines.append(audit.impact.headline)

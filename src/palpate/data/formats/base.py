@@ -286,7 +286,8 @@ def _checked_images(scan: Scan, rows: list[Row], how: Check, progress: Progress)
         if reason:
             bad.add(path)
             users = f" (used by {uses[path]} rows)" if uses[path] > 1 else ""
-            scan.problem(first[path], "bad-image", f"{path}: {reason}{users}")
+            name = "" if first[path] == path else f"{path}: "
+            scan.problem(first[path], "bad-image", f"{name}{reason}{users}")
     return [row for row in rows if bad.isdisjoint(map(row[1].get, IMAGE_COLUMNS))]
 
 
