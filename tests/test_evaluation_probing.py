@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 
 from palpate import probe
+from palpate.cli import main
 from palpate.core import PalpateError, Split
 from palpate.report.results import Results
 
@@ -95,6 +96,11 @@ def test_a_page_shows_confusions_and_what_was_retrieved(manifest, split, encoder
     markdown = (tmp_path / "page.md").read_text()
     assert "### What was retrieved" in markdown
     assert "chance" in results.to_latex()
+    results.save(tmp_path / "p.json")
+    assert main(["report", str(tmp_path / "p.json"), "-o", str(tmp_path / "report.html")]) == 0
+    report = (tmp_path / "report.html").read_text()
+    assert report.count('<figure class="strip">') == len(results.strips)
+    assert report.count("data:image/png") == page.count("data:image/png")
 
 
 def test_encoders_are_compared_on_the_same_videos(manifest, split, encoders):

@@ -93,7 +93,7 @@ def read(path: Path, folders: Sequence[Path] = ()) -> Results:
 
 def join(first: Results, second: Results) -> Results:
     """Return both, one after the other; the first title of its own stays."""
-    names = ("facts", "audits", "scores", "gallery", "notes", "commands")
+    names = ("facts", "audits", "scores", "gallery", "strips", "notes", "commands")
     lists: dict[str, Any] = {n: [*getattr(first, n), *getattr(second, n)] for n in names}
     title = second.title if first.title == TITLE and second.title else first.title
     return Results(title=title, settings={**first.settings, **second.settings}, **lists)
