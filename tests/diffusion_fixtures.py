@@ -7,7 +7,8 @@ import torch
 
 from palpate.diffusion.autoencoder import LatentStats
 from palpate.diffusion.autoencoder_training import build_autoencoder
-from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, build_unet
+from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import TINY
 

@@ -11,12 +11,12 @@ from diffusers import VQModel
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats, to_bytes
 from palpate.diffusion.autoencoder_training import (
-    AutoencoderOptions,
     build_autoencoder,
     k_means,
     measure_reconstruction,
     train_autoencoder,
 )
+from palpate.diffusion.options import AutoencoderOptions
 from palpate.diffusion.training import encode_latents
 from palpate.encoders.models import digest_tensors
 from palpate.encoders.preprocess import to_unit

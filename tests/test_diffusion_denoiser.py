@@ -9,10 +9,12 @@ from safetensors.torch import load_file, save_file
 
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Schedule, UNetOptions, build_unet
+from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.options import ConditionPolicy, Schedule, UNetOptions
 from palpate.diffusion.presets import MINI, PAPER, PRESETS, preset_named
 from palpate.diffusion.training import DiffusionLoss, train_denoiser
-from palpate.training.options import LoopOptions, Step
+from palpate.training.options import LoopOptions
+from palpate.training.steps import Step
 
 UNET = UNetOptions(widths=(8, 16), attention=(False, True), layers=1, head_width=8, groups=4)
 POLICY = ConditionPolicy(width=12)

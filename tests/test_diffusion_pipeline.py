@@ -12,7 +12,7 @@ from PIL import Image
 from diffusion_fixtures import arrays, make_pipeline, photos
 from palpate.core import PalpateError
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import ConditionPolicy
+from palpate.diffusion.options import ConditionPolicy
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.encoders.contrastive import new_clip
 from palpate.encoders.encoder_set import EncoderSet

@@ -5,14 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Schedule, UNetOptions, build_unet
-from palpate.diffusion.pipeline import (
-    SamplerOptions,
-    build_scheduler,
-    guided,
-    sample,
-    starting_noise,
-)
+from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule, UNetOptions
+from palpate.diffusion.pipeline import build_scheduler, guided, sample, starting_noise
 
 SHAPE = (3, 4, 4)
 TOKENS = torch.zeros(1, 1, 1)

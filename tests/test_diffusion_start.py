@@ -11,7 +11,7 @@ from mini_fixtures import make_encoders
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import LatentStats
-from palpate.diffusion.denoiser import ConditionPolicy, Schedule, UNetOptions
+from palpate.diffusion.options import ConditionPolicy, Schedule, UNetOptions
 from palpate.diffusion.presets import TINY
 from palpate.diffusion.training import train_denoiser, train_pipeline
 from palpate.encoders.encoder_set import EncoderSet

@@ -19,8 +19,16 @@ from palpate.encoders.contrastive import (
     train_tactile,
 )
 from palpate.encoders.encoder_set import EncoderSet, encode_tactile, new_tactile
-from palpate.encoders.losses import Labels, clamped_scale, info_nce, soft_targets, three_way
+from palpate.encoders.losses import (
+    Labels,
+    clamped_scale,
+    in_chunks,
+    info_nce,
+    soft_targets,
+    three_way,
+)
 from palpate.encoders.presets import preset
+from palpate.encoders.rows import subsets_of
 
 TINY = preset("tiny")
 FEELS = {
@@ -124,6 +132,99 @@ def test_soft_targets_of_distinct_texts_are_the_diagonal():
     assert float(info_nce(a, b, 3.0, soft_targets(torch.arange(5)))) == pytest.approx(
         float(info_nce(a, b, 3.0)), abs=1e-6
     )
+
+
+def test_rows_of_one_contact_or_caption_are_no_negatives_of_each_other():
+    a, b = unit(5, 4, seed=1), unit(5, 4, seed=2)
+    texts, contacts = torch.tensor([0, 1, 0, 2, 3]), torch.tensor([0, 1, 2, 1, 3])
+    excluded = Labels(texts, contacts).excluded("exclude")
+    expect = 0.0
+    for x, y in ((a, b), (b, a)):
+        for i in range(5):
+            others = [
+                j
+                for j in range(5)
+                if j == i or (texts[i] != texts[j] and contacts[i] != contacts[j])
+            ]
+            logits = [7.0 * float(x[i] @ y[j]) for j in others]
+            expect += math.log(sum(map(math.exp, logits))) - logits[others.index(i)]
+    assert float(info_nce(a, b, 7.0, None, excluded)) == pytest.approx(expect / 10, abs=1e-5)
+
+
+def test_rows_without_a_photo_are_left_out_of_the_vision_pairs():
+    a, b, c = unit(6, 4, seed=1), unit(6, 4, seed=2), unit(6, 4, seed=3)
+    seen = torch.tensor([1, 1, 0, 1, 0, 1]).bool()
+    _, logs = three_way(a, b, c, 7.0, Labels(torch.arange(6), photos=seen))
+    _, some = three_way(a[seen], b[seen], c[seen], 7.0, Labels(torch.arange(4)))
+    _, every = three_way(a, b, c, 7.0, Labels(torch.arange(6)))
+    for name, expect in (("vision_text", some), ("tactile_vision", some), ("tactile_text", every)):
+        assert float(logs[name]) == pytest.approx(float(expect[name]), abs=1e-6)
+
+
+def test_soft_text_targets_are_tvl_s():
+    a, b = unit(4, 3, seed=1), unit(4, 3, seed=2)
+    soft = (b @ b.T / 0.05).softmax(1)
+    labels = Labels(torch.arange(4))
+    expect = -(soft * (7 * a @ b.T).log_softmax(1)).sum(1).mean() / 2
+    expect -= (soft * (7 * b @ a.T).log_softmax(1)).sum(1).mean() / 2
+    total, _ = three_way(a, b, None, 7.0, labels, targets="soft-text")
+    assert float(total) == pytest.approx(float(expect), abs=1e-5)
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 7, 12, 99])
+def test_cached_gradients_are_those_of_the_whole_batch(chunk):
+    model = new_tactile(TINY.tactile_config(8), seed=1)
+    pixels = torch.randn(12, 3, 16, 16, generator=torch.Generator().manual_seed(1))
+    text, vision = unit(12, 8, seed=2), unit(12, 8, seed=3)
+    results = []
+    for size in (None, chunk):
+        model.zero_grad()
+        rows = in_chunks(lambda x: encode_tactile(model, x), pixels, size)
+        total, _ = three_way(rows, text, vision, 7.0, Labels(torch.arange(12)))
+        total.backward()
+        results.append(
+            [total.detach(), *(p.grad for p in model.parameters() if p.grad is not None)]
+        )
+    for a, b in zip(*results, strict=True):
+        assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_parts_of_a_list_of_adjectives():
+    assert subsets_of("soft, flat, warm.")[0] == "soft, flat, warm."
+    assert set(subsets_of("soft, flat, warm")[1:]) == {
+        "soft, flat",
+        "soft, warm",
+        "flat, warm",
+        "soft",
+        "flat",
+        "warm",
+    }
+    assert subsets_of("soft grass") == ["soft grass"]
+
+
+def test_photos_may_be_missing_partners_may_learn_and_videos_may_be_held_out(world, clip, tmp_path):
+    rows = world.table.to_dicts()
+    for row in rows[:5]:
+        row["vision"] = None
+    manifest, split = Manifest.from_rows(rows, world.root), by_video(world)
+    before = clip.digest("vision"), clip.digest("text")
+    how = {"device": "cpu", "partners": "trainable", "held_out": 0.34, "weights": (1, 0, 1)}
+    preset = quick(text_subsets=True)
+    encoders = train_tactile(manifest, split, clip, preset, tmp_path, **how)
+    assert encoders.card["without_photo"] > 0
+    assert encoders.card["train_samples"] == 12  # four of six videos
+    assert (clip.digest("vision"), clip.digest("text")) == before
+    assert encoders.digest("vision") != before[0]
+    assert encoders.digest("text") != before[1]
+    assert not {"vision_text"} & set(encoders.card["loss"][0])
+    lines = (tmp_path / "log.jsonl").read_text()
+    assert lines.count("held_out") == lines.count("probe") > 1
+
+
+def test_a_batch_of_one_is_rejected(world, clip, tmp_path):
+    one = Split.from_ids(train=world.ids[:1])
+    with pytest.raises(PalpateError, match="`batch` must be at least 2"):
+        train_tactile(world, one, clip, TINY, tmp_path, device="cpu")
 
 
 @pytest.mark.parametrize("weights", [(1, 1), (0, 0, 0), (1, -1, 1), (math.nan,) * 3])
@@ -332,5 +433,5 @@ def test_paper_preset_is_the_paper():
     assert (
         sum(p.numel() for p in tactile.parameters()) == 303_966_208
     )  # ViT-L/14 at 224 px with a 768-wide projection
-    with pytest.raises(PalpateError, match="tiny, mini, paper"):
+    with pytest.raises(PalpateError, match="tiny, mini, tvl-tiny"):
         preset("huge")

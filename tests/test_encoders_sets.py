@@ -18,9 +18,10 @@ from palpate.encoders.embed import embed_images, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, Preprocess, load_clip, new_tactile
 from palpate.encoders.models import pick_device
 from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, to_unit
-from palpate.encoders.presets import Augment, augmented, preset
+from palpate.encoders.presets import Augment, preset
+from palpate.encoders.rows import augmented, draw
 from palpate.encoders.tokenizer import train_tokenizer
-from palpate.training.options import Step
+from palpate.training.steps import Step
 
 TINY = preset("tiny")
 TEXTS = [
@@ -246,7 +247,7 @@ def test_augmentation():
     images = torch.rand(6, 3, 16, 16, generator=torch.Generator().manual_seed(0))
 
     def changed(augment, seed):
-        return augmented(images, augment.draw(Step(0, np.arange(len(images)), seed)))
+        return augmented(images, draw(augment, Step(0, np.arange(len(images)), seed)))
 
     nothing = Augment(crop=0, gain=0, offset=0)
     assert torch.allclose(changed(nothing, 1), images, atol=1e-5)

@@ -2,10 +2,8 @@
 
 import json
 import math
+import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -268,13 +266,13 @@ def test_finite_loss_with_infinite_gradient_is_reported(tmp_path, clip):
         return losses._replace(total=losses.total + harm)
 
     with pytest.raises(PalpateError, match="gradient"):
-        fit(Net(), bad, N, options(clip=clip), tmp_path)
+        fit(Net(), bad, N, options(clip_norm=clip), tmp_path)
 
 
 def test_no_clip_leaves_gradients_alone(tmp_path):
     a, b = Net(), Net()
-    fit(a, loss, N, options(clip=None), tmp_path / "a")
-    fit(b, loss, N, options(clip=1e9), tmp_path / "b")
+    fit(a, loss, N, options(clip_norm=None), tmp_path / "a")
+    fit(b, loss, N, options(clip_norm=1e9), tmp_path / "b")
     assert same(weights(a), weights(b))
 
 
@@ -290,7 +288,7 @@ def test_no_rows_no_parameters_bad_options(tmp_path):
         {"lr": math.inf},
         {"decay": "linear"},
         {"ema": 1.0},
-        {"clip": 0.0},
+        {"clip_norm": 0.0},
         {"warmup": -1},
     ):
         with pytest.raises(PalpateError, match=f"`{next(iter(change))}` must"):
@@ -339,32 +337,88 @@ def test_log_file_is_the_log(tmp_path):
     assert all(line["step_again"] == line["step"] for line in log)
 
 
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from test_training_engine import ALWAYS, N, Net, fit, loss, options
+def test_runs_killed_at_ten_random_steps_end_as_one_that_was_not(tmp_path, whole):
+    """Each time a forked process trains in the same folder until SIGKILL ends it."""
+    rng = np.random.default_rng(0)
+    for step in np.sort(rng.choice(STEPS, 10, replace=False)):
 
-def until(module, batch):
-    if batch["step"] == int(sys.argv[2]):
-        os.kill(os.getpid(), signal.SIGKILL)
-    return loss(module, batch)
+        def until(module, batch, last=step):
+            if batch["step"] == last:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return loss(module, batch)
 
-fit(Net(), until, N, options(), Path(sys.argv[1]), ALWAYS)
-"""
+        if (child := os.fork()) == 0:
+            fit(Net(), until, N, options(), tmp_path, ALWAYS)
+            os._exit(1)  # it was not killed
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    again = Net()
+    log = fit(again, loss, N, options(), tmp_path, ALWAYS)
+    assert same(weights(again), whole[0])
+    assert without_time(log) == without_time(whole[1])
 
 
-@pytest.mark.slow
-def test_a_run_that_gets_sigkill_in_mid_training_ends_as_one_that_did_not(tmp_path):
-    whole, again = Net(), Net()
-    fit(whole, loss, N, options(), tmp_path / "whole", ALWAYS)
-    for step in (6, 11):
-        command = [sys.executable, "-c", KILLED, str(tmp_path / "killed"), str(step)]
-        done = subprocess.run(
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == -signal.SIGKILL, done.stderr
-        with safe_open(tmp_path / "killed" / "checkpoint.safetensors", framework="pt") as file:
-            # The last one may still have been on its way to the disk.
-            assert step - 2 <= int(file.metadata()["step"]) <= step
-    fit(again, loss, N, options(), tmp_path / "killed", ALWAYS)
-    assert same(weights(again), weights(whole))
+def held_out(**change):
+    steps = []
+
+    def counted(module, batch):
+        steps.append(module.training)
+        return loss(module, batch)
+
+    net = Net()
+    return net, steps, counted, options(evaluations=7, **change)
+
+
+def test_held_out_loss_is_logged_and_its_best_weights_are_kept(tmp_path):
+    last, steps, counted, how = held_out()
+    log = fit(last, counted, N, how, tmp_path / "last", held_out=(9, load))
+    losses = [line["held_out"] for line in log if "held_out" in line]
+    assert len(losses) == 7
+    assert steps.count(False) == 7 * 2  # two whole batches of nine rows
+    assert same(weights(last), weights_of_a_plain_run(tmp_path))
+    best, _, counted, how = held_out(keep="best", lr=0.5)
+    log = fit(best, counted, N, how, tmp_path / "best", held_out=(9, load))
+    losses = [line["held_out"] for line in log if "held_out" in line]
+    assert losses.index(min(losses)) < 6  # at this rate it became worse again
+    again, steps, counted, how = held_out(keep="best", lr=0.5, patience=1)
+    log = fit(again, counted, N, how, tmp_path / "stopped", held_out=(9, load))
+    stopped = [line["held_out"] for line in log if "held_out" in line]
+    assert stopped == losses[: len(stopped)]
+    assert stopped[-1] >= stopped[-2] == min(stopped)
+    count = len(steps)
+    fit(Net(), counted, N, how, tmp_path / "stopped", held_out=(9, load))
+    assert len(steps) == count  # a run that has stopped stays so
+
+
+def weights_of_a_plain_run(tmp_path):
+    net = Net()
+    fit(net, loss, N, options(evaluations=7), tmp_path / "plain")
+    return weights(net)
+
+
+def test_a_full_disk_ends_in_one_line_and_keeps_the_last_checkpoint(tmp_path, whole):
+    calls = []
+    real = engine.save_file
+
+    def full(*args, **kwargs):
+        calls.append(1)
+        if len(calls) == 4:
+            raise engine.SafetensorError("No space left on device")
+        real(*args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "save_file", full)
+        with pytest.raises(
+            PalpateError, match=r"checkpoint.safetensors must be writable.*No space"
+        ):
+            fit(Net(), loss, N, options(), tmp_path, ALWAYS)
+    net = Net()
+    fit(net, loss, N, options(), tmp_path)
+    assert same(weights(net), whole[0])
+
+
+@pytest.mark.parametrize(("precision", "lines"), [("bf16", 3), ("fp16", 2)])
+def test_half_precision_learns(tmp_path, whole, precision, lines):
+    compute = Compute(precision=precision, checkpoint_minutes=1e9)
+    log = fit(Net(), loss, N, options(), tmp_path, compute)
+    for row, plain in list(zip(log, whole[1], strict=True))[:lines]:
+        assert row["loss"] == pytest.approx(plain["loss"], rel=0.01)

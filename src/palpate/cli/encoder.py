@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.terminal import Common, OutPath, Terminal, require_extra
+from palpate.cli.presets import Machine, preset_flags, print_plan, with_flags
+from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.encoders.presets import PRESETS, EncoderPreset
+
+_FLAGS = ("tactile_course", ("name", "cost", "pretrained", "tactile_course.epochs", "targets"))
+_Preset = preset_flags("Preset", EncoderPreset, *_FLAGS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,35 +29,56 @@ class Options(Common):
     clip: str | None = None
     """Hub id or folder of a pretrained CLIP, or palpate/mini. Default: the preset's, or a small one
     that is trained first on the same train part."""
-    preset: Literal["mini", "tiny", "paper"] = "mini"
-    """Size and course; `paper` is the paper's, for GPUs."""
+    preset: Literal["mini", "tiny", "tvl-tiny", "tvl-small", "tvl-base", "paper"] = "mini"
+    """Size and course; `tvl-*` are TVL's and `paper` is the paper's, for GPUs."""
     epochs: float | None = None
     """Default: the preset's."""
-    targets: Literal["diagonal", "identical-text"] | None = None
-    """`diagonal` is the paper's loss; `identical-text` counts equal captions as positives. Default:
-    the preset's."""
+    targets: Literal["diagonal", "identical-text", "soft-text", "exclude"] | None = None
+    """`diagonal` is the paper's loss; `identical-text` counts equal captions as positives;
+    `soft-text` is TVL's; with `exclude` rows of one contact or with equal captions are no negatives
+    of each other. Default: the preset's."""
+    weights: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Of the pairs tactile-text, vision-text, tactile-vision; 0 switches one off."""
+    partners: Literal["frozen", "trainable"] = "frozen"
+    """Whether vision and text learn along."""
+    held_out: float = 0.0
+    """Share of the train videos on which loss and probe are measured in training, where the split
+    has no part val (which is taken otherwise)."""
     seed: int = 0
     """Of weights, order and augmentation."""
-    device: str = "auto"
-    """auto, cpu, cuda, mps."""
+    dry_run: Switch = False
+    """Print parameters, memory, operations and time, and stop."""
+    machine: Machine = field(default_factory=Machine)
+    """How to run it on the machine at hand."""
+    fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
+    """Fields of the preset; `--clip-...` are of the vision and text encoders trained first."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train, and print the accuracy of a linear material probe on the test part."""
     require_extra("palpate train encoder")
-    from palpate.encoders.contrastive import train_encoder
+    from palpate.encoders.contrastive import plan_encoder, train_encoder
 
+    preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
+    data, machine = (options.data, options.split), options.machine
+    if options.dry_run:
+        how = {"held_out": options.held_out, "device": machine.device}
+        plan = plan_encoder(*data, preset=preset, epochs=options.epochs, **how)
+        return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
         encoders = train_encoder(
-            options.data,
-            options.split,
-            preset=options.preset,
+            *data,
+            preset=preset,
             clip=options.clip,
             output=options.output,
             epochs=options.epochs,
             targets=options.targets,
+            weights=options.weights,
+            partners=options.partners,
+            held_out=options.held_out,
             seed=options.seed,
-            device=options.device,
+            device=machine.device,
+            compute=machine.compute,
             progress=progress,
         )
     facts: dict[str, Any] = {
@@ -61,7 +87,10 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "clip": encoders.clip.name,
         "split": encoders.card["split"],
         "processes": encoders.card["processes"],
+        "learning_rate": encoders.card["options"]["lr"],
     }
+    if missing := encoders.card.get("without_photo"):
+        facts["samples_without_photo"] = missing
     for row in encoders.card.get("scores", ()):
         facts["test_material_accuracy"] = row["value"]
         facts |= {"interval": row["interval"], "chance": row["chance"]}

@@ -95,6 +95,8 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("background", "how"): "--reference",
     ("caption check", "captions"): "CAPTIONS",
     ("", "columns"): "--map",
+    ("train encoder", "batch"): "--batch-size",
+    ("train generator", "batch"): "--batch-size",
     ("", "side"): "--as",
     ("", "data"): "PATH",
     ("", "source"): "PATH",

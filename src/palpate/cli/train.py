@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
+from palpate.cli.presets import Machine, preset_flags, print_plan, with_flags
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
+from palpate.diffusion.presets import PRESETS, DiffusionPreset
+
+_SKIP = ("name", "loop.steps", "loop.seed", "condition.width", "condition.source")
+_FLAGS = ("loop", _SKIP)
+_Preset = preset_flags("Preset", DiffusionPreset, *_FLAGS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,28 +44,38 @@ class Options(Common):
     """Optimizer steps. Default: the preset's."""
     seed: int = 0
     """Of weights, order, noise and condition dropout."""
-    device: str = "auto"
-    """auto, cpu, cuda, mps."""
+    dry_run: Switch = False
+    """Print parameters, memory, operations and time, and stop."""
+    machine: Machine = field(default_factory=Machine)
+    """How to run it on the machine at hand."""
+    fields: _Preset = field(default_factory=_Preset)  # pyright: ignore[reportInvalidTypeForm]
+    """Fields of the preset; `--autoencoder-...` are of the autoencoder that is trained first."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Train the autoencoder, if none is given, then the denoiser, and save the pipeline."""
     require_extra("palpate train generator")
-    from palpate.diffusion.training import train_generator
+    from palpate.diffusion.training import plan_generator, train_generator
 
+    preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
+    data, machine = (options.data, options.split), options.machine
+    if options.dry_run:
+        how = {"background": options.background, "device": machine.device}
+        plan = plan_generator(*data, preset=preset, steps=options.steps, **how)
+        return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:
         pipeline = train_generator(
-            options.data,
-            options.split,
+            *data,
             options.clip,
-            preset=options.preset,
+            preset=preset,
             autoencoder=options.autoencoder,
             output=options.output,
             source=options.source,
             background=options.background,
             steps=options.steps,
             seed=options.seed,
-            device=options.device,
+            device=machine.device,
+            compute=machine.compute,
             progress=progress,
         )
     record = pipeline.training
@@ -70,6 +86,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "steps": record["loop"]["steps"],
         "batch": record["loop"]["batch"],
         "learning_rate": record["loop"]["lr"],
+        "learning_rate_if_the_batch_is_each_of_two_gpus": 2 * record["loop"]["lr"],
         "processes": record["processes"],
         "source": record["source"],
         "background": record["background"],

@@ -29,50 +29,14 @@ from torch import Tensor, nn
 
 from palpate.core import PalpateError, Progress, digest_json, quiet, rng_for
 from palpate.diffusion.autoencoder import Autoencoder, to_bytes
+from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.encoders.preprocess import to_unit
 from palpate.metrics.images import psnr_per_image, ssim_per_image
 from palpate.training.engine import Batch, Losses, Task, fit
-from palpate.training.options import Compute, LoopOptions, Step
+from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import gather_rows
-
-
-@dataclass(frozen=True)
-class AutoencoderOptions:
-    """Shape and training of a VQ autoencoder.
-
-    Attributes:
-        patch: side of the patches of the stem (1: none).
-        widths: channels of each resolution level; each level after the first halves the size.
-        layers: residual blocks a level.
-        codes: entries of the codebook.
-        channels: latent channels.
-        groups: of the group normalization.
-        attention: whether the middle block attends.
-        steps_free, steps_quantized: optimizer steps of the two stages.
-        batch, lr: of both stages; the last starts at half the rate.
-        crop: side of the random crops of stage 1 in pixels (0: whole images).
-        noise: standard deviation of the noise of stage 1, as a share of the latents'.
-        l1, l2, edge, codebook: weights in the loss.
-    """
-
-    patch: int = 4
-    widths: tuple[int, ...] = (64,)
-    layers: int = 1
-    codes: int = 4096
-    channels: int = 3
-    groups: int = 16
-    attention: bool = False
-    steps_free: int = 1700
-    steps_quantized: int = 200
-    batch: int = 8
-    lr: float = 2e-3
-    crop: int = 32
-    noise: float = 0.02
-    l1: float = 0.25
-    l2: float = 10.0
-    edge: float = 10.0
-    codebook: float = 0.25
+from palpate.training.steps import Step
 
 
 def build_autoencoder(options: AutoencoderOptions) -> Autoencoder:
@@ -180,8 +144,8 @@ class _Loss:
         loss = options.l1 * error.abs().mean() + options.l2 * square + options.edge * edges
         if self.quantize:
             loss = loss + options.codebook * codebook
-        psnr = 10 * torch.log10(4 / square.detach())
-        return Losses(loss, {"psnr": psnr}, error.detach().mean((1, 2, 3)))
+        errors = error.detach().square().mean((1, 2, 3))
+        return Losses(loss, {"psnr": (10 * torch.log10(4 / errors)).mean()}, errors)
 
 
 def _crops(x: Tensor, side: int, step: Step) -> Tensor:

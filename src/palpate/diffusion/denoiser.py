@@ -19,9 +19,8 @@ concatenates the latent of the no-contact image to the noisy latent along channe
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
@@ -29,93 +28,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from palpate.core import PalpateError, atomic_path
+from palpate.diffusion.options import SOURCES, ConditionPolicy, Source, UNetOptions
 from palpate.encoders.models import UNREADABLE, first_line, load_model, round_to_half, save_model
-
-Source = Literal["text", "vision"]
-SOURCES: tuple[Source, ...] = ("text", "vision")
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """The forward process z_t = sqrt(a_t) z + sqrt(1 - a_t) eps, and what the network predicts.
-
-    Attributes:
-        beta_start, beta_end: first and last beta; sqrt(beta) is linear between them
-            (diffusers' ``scaled_linear``).
-        steps: T.
-        prediction: ``epsilon`` (the paper) or ``v_prediction``.
-        min_snr: g of the min-SNR weight, or None for Eq. 1's uniform weight.
-    """
-
-    beta_start: float = 0.0015
-    beta_end: float = 0.0195
-    steps: int = 1000
-    prediction: Literal["epsilon", "v_prediction"] = "epsilon"
-    min_snr: float | None = None
-
-    def alphas(self) -> Tensor:
-        """a_t = prod_{s<=t} (1 - beta_s) for t = 1..T as float64 (T,)."""
-        ends = self.beta_start**0.5, self.beta_end**0.5
-        betas = torch.linspace(*ends, self.steps, dtype=torch.float64) ** 2
-        return torch.cumprod(1 - betas, dim=0)
-
-
-@dataclass(frozen=True)
-class ConditionPolicy:
-    """How an embedding becomes tokens.
-
-    Attributes:
-        width: d, length of the embeddings and of the tokens.
-        tokens: k, how often the token is repeated.
-        null: the unconditional token, ``zeros`` or ``learned``.
-        gap: ``none``, or ``mean-shift`` (subtract the mean of the source's training embeddings).
-        noise: standard deviation, in units of the token's typical entry, of Gaussian noise added in
-            training.
-        dropout: probability that training replaces the condition by the unconditional token.
-        source: what training conditions on: ``text`` (the paper), ``vision`` (the GVST baseline),
-            ``mixed`` (half each).
-    """
-
-    width: int
-    tokens: int = 1
-    null: Literal["zeros", "learned"] = "zeros"
-    gap: Literal["none", "mean-shift"] = "none"
-    noise: float = 0.0
-    dropout: float = 0.1
-    source: Literal["text", "vision", "mixed"] = "text"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.dropout < 1:
-            must, got = "must lie in [0, 1)", str(self.dropout)
-            raise PalpateError(must, got, "", argument="dropout", example={"dropout": 0.1})
-
-    @property
-    def sources(self) -> tuple[Source, ...]:
-        """The sources that training needs."""
-        return SOURCES if self.source == "mixed" else (self.source,)
-
-
-@dataclass(frozen=True)
-class UNetOptions:
-    """Geometry of the U-Net.
-
-    Attributes:
-        widths: channels of each resolution level.
-        attention: whether each level attends (to itself and to the condition); the middle block
-            always does.
-        layers: residual blocks per level.
-        head_width: channels of an attention head.
-        groups: of the group normalization.
-        modulate: also add the (first) token to the time embedding; the paper has cross-attention
-            alone.
-    """
-
-    widths: tuple[int, ...]
-    attention: tuple[bool, ...]
-    layers: int = 2
-    head_width: int = 32
-    groups: int = 32
-    modulate: bool = False
 
 
 def build_unet(
@@ -164,6 +78,9 @@ class Denoiser(nn.Module):
     ) -> None:
         """Take, for ``gap="mean-shift"``, the training mean (d,) of each source as ``means``."""
         super().__init__()
+        if not 0 <= policy.dropout < 1:
+            must, got = "must lie in [0, 1)", str(policy.dropout)
+            raise PalpateError(must, got, "", argument="dropout", example={"dropout": 0.1})
         self.unet, self.policy = unet, policy
         self.background = unet.config["in_channels"] == 2 * unet.config["out_channels"]
         # A source without a mean is marked by NaN, and raises when it is used.

@@ -53,7 +53,8 @@ if TYPE_CHECKING:  # torch takes seconds to import, and what is checked first ne
     from torch import Tensor
 
     from palpate.data.manifest import Manifest
-    from palpate.diffusion.pipeline import SamplerOptions, TactilePipeline
+    from palpate.diffusion.options import SamplerOptions
+    from palpate.diffusion.pipeline import TactilePipeline
 
 FORMAT = "palpate-generated/1"
 Photos = str | Path | Sequence[str | Path] | Mapping[str, Path]

@@ -53,7 +53,8 @@ from palpate.core import (
     write_json,
 )
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats
-from palpate.diffusion.denoiser import ConditionPolicy, Denoiser, Schedule, Source
+from palpate.diffusion.denoiser import Denoiser
+from palpate.diffusion.options import ConditionPolicy, SamplerOptions, Schedule, Source
 from palpate.encoders.encoder import list_images, squares
 from palpate.encoders.encoder_set import EncoderSet, load_clip
 from palpate.encoders.models import (
@@ -80,26 +81,6 @@ SYNTHETIC = (
 EMBED = 32
 #: (z_t (n, c, h, w), t (n,), tokens (n, k, d), background or None) -> prediction (n, c, h, w).
 Predictor = Callable[[Tensor, Tensor, Tensor, Tensor | None], Tensor]
-
-
-@dataclass(frozen=True)
-class SamplerOptions:
-    """How to sample.
-
-    Attributes:
-        method: ``ddim`` (eta 0) or ``dpm`` (DPM-Solver++ of order 2).
-        steps: network evaluations per sample (two each under guidance).
-        guidance: s; 1 means none.
-        batch: samples at once; results do not depend on it (up to rounding).
-        rescale: share phi of the guidance rescaling of Lin et al. (2024), which pulls the spread of
-            the guided prediction back to that of the conditional one; 0 is the plain formula.
-    """
-
-    method: Literal["ddim", "dpm"] = "ddim"
-    steps: int = 200
-    guidance: float = 7.5
-    batch: int = 16
-    rescale: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -30,9 +30,13 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from palpate.core import require_choice
-from palpate.diffusion.autoencoder_training import AutoencoderOptions
-from palpate.diffusion.denoiser import ConditionPolicy, Schedule, UNetOptions
-from palpate.diffusion.pipeline import SamplerOptions
+from palpate.diffusion.options import (
+    AutoencoderOptions,
+    ConditionPolicy,
+    SamplerOptions,
+    Schedule,
+    UNetOptions,
+)
 from palpate.training.options import LoopOptions
 
 
@@ -136,7 +140,7 @@ PAPER = DiffusionPreset(
         warmup=0,
         decay="constant",
         weight_decay=0.01,
-        clip=None,
+        clip_norm=None,
         ema=0.9999,
     ),
     epochs=30,

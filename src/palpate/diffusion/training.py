@@ -16,9 +16,9 @@ Options beyond the paper: v-prediction (Salimans & Ho 2022), whose target is ``s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import torch
@@ -41,15 +41,8 @@ from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats
 from palpate.diffusion.autoencoder_training import train_autoencoder
-from palpate.diffusion.denoiser import (
-    SOURCES,
-    ConditionPolicy,
-    Denoiser,
-    Schedule,
-    Source,
-    UNetOptions,
-    build_unet,
-)
+from palpate.diffusion.denoiser import Denoiser, build_unet
+from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_named
 from palpate.encoders.contrastive import load_manifest, train_part
@@ -57,11 +50,30 @@ from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, pick_device
 from palpate.training.engine import Batch, Losses, Task, fit
-from palpate.training.options import Compute, LoopOptions, Step
+from palpate.training.estimate import estimate
+from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import connect, first_alone, keep_logs, place, work_folder
+from palpate.training.steps import Step
+
+if TYPE_CHECKING:
+    from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 
 CACHE_FORMAT = "palpate-latents/1"
 Sources = Literal["text", "vision", "mixed"]
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A part of the data as the denoiser's training reads it.
+
+    Attributes:
+        conditions: embeddings (n, d) by source.
+        latents, background: (n, c, h, w), not normalized, in memory or mapped.
+    """
+
+    conditions: Mapping[Source, NDArray[Any]]
+    latents: NDArray[np.float32]
+    background: NDArray[np.float32] | None = None
 
 
 def train_generator(  # noqa: PLR0913 - a public verb
@@ -161,6 +173,43 @@ def train_generator(  # noqa: PLR0913 - a public verb
     return pipeline
 
 
+def plan_generator(
+    data: Manifest | str | Path,
+    split: Split | str | Path,
+    *,
+    preset: str | DiffusionPreset = "mini",
+    steps: int | None = None,
+    background: bool = False,
+    device: str = "auto",
+) -> dict[str, Any]:
+    """What training the denoiser would take; only the manifest is read.
+
+    Latents are taken as those of the preset's autoencoder, or of an f4 of three channels.
+
+    Returns:
+        see :func:`palpate.training.estimate.estimate`.
+    """
+    chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
+    train = train_part(load_manifest(data), Split.load(split))
+    loop = chosen.loop_for(len(train))
+    loop = loop if steps is None else replace(loop, steps=steps)
+    own, width = chosen.autoencoder, chosen.condition.width
+    factor = own.patch * 2 ** (len(own.widths) - 1) if own else 4
+    channels, side = own.channels if own else 3, chosen.size // factor
+
+    def build() -> nn.Module:
+        shape: dict[str, Any] = {"channels": channels, "size": side, "width": width}
+        return build_unet(chosen.unet, **shape, background=background)
+
+    def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
+        denoiser = Denoiser(cast("UNet2DConditionModel", model), chosen.condition).to(where)
+        z = torch.zeros(rows, channels * (2 if background else 1), side, side, device=where)
+        tokens = torch.zeros(rows, chosen.condition.tokens, width, device=where)
+        return denoiser(z, torch.zeros(rows, dtype=torch.long, device=where), tokens)
+
+    return estimate(build, forward, loop, len(train), pick_device(device))
+
+
 def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the training
     manifest: Manifest,
     split: Split,
@@ -212,38 +261,42 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     encoders.to(where)
     autoencoder.to(where)
     texts, text_source = texts_of(train)
-    keys = [digest_lines(texts), image_stamp(train, "vision"), autoencoder.digest]
-    keys += [encoders.digest(source) for source in SOURCES]
+    columns = ("tactile", "background") if background else ("tactile",)
 
-    def latents_of(column: str) -> NDArray[np.float32]:
-        images = cached_images(train, column, preset.size, cache, progress)
-        keys.append(digest_json([train.digest, image_stamp(train, column), preset.size]))
-        work = folder / f"latents-{column}"
-        return encode_latents(autoencoder, images, train.ids, work, key=keys[-1], progress=progress)
+    def encoded(part: Manifest, name: str) -> Encoded:
+        def latents(column: str) -> NDArray[np.float32]:
+            images = cached_images(part, column, preset.size, cache, progress)
+            key = digest_json([part.digest, image_stamp(part, column), preset.size])
+            work = folder / f"latents-{name}{column}"
+            return encode_latents(autoencoder, images, part.ids, work, key=key, progress=progress)
+
+        features = {s: embed(part, encoders, s, cache=cache, progress=progress) for s in SOURCES}
+        return Encoded({s: f.features for s, f in features.items()}, *map(latents, columns))
 
     with first_alone():
-        conditions: dict[Source, NDArray[Any]] = {
-            s: embed(train, encoders, s, cache=cache, progress=progress).features for s in SOURCES
-        }
-        latents = latents_of("tactile")
-        ground = latents_of("background") if background else None
-    stats = LatentStats.of(latents, preset.latent_scale) if start is None else start.stats
+        rows, held = encoded(train, ""), manifest.part(split, "val")
+        others = encoded(held, "val-") if len(held) else None
+    key = [digest_lines(texts), *(image_stamp(train, c) for c in ("vision", *columns))]
+    key += [train.digest, held.digest if len(held) else "", autoencoder.digest]
+    key += [encoders.digest(source) for source in SOURCES]
+    stats = LatentStats.of(rows.latents, preset.latent_scale) if start is None else start.stats
     policy = preset.condition_for(encoders.dim)
     policy = policy if source is None else replace(policy, source=source)
     loop = preset.loop_for(len(train), seed=seed)
     loop = loop if steps is None else replace(loop, steps=steps)
     denoiser = train_denoiser(
-        latents,
-        conditions,
+        rows.latents,
+        rows.conditions,
         stats=stats,
         unet=preset.unet,
         policy=policy,
         schedule=preset.schedule,
         loop=loop,
         folder=folder / "denoiser",
-        background=ground,
+        background=rows.background,
+        held_out=others,
         start=start.denoiser if start else None,
-        key=digest_json(keys),
+        key=digest_json(key),
         names=train.ids,
         device=where,
         compute=compute,
@@ -352,6 +405,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     loop: LoopOptions,
     folder: Path,
     background: Tensor | NDArray[Any] | None = None,
+    held_out: Encoded | None = None,
     start: Denoiser | None = None,
     key: str = "",
     names: Sequence[str] | None = None,
@@ -372,6 +426,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
         loop: length, rate, averaging; its seed also seeds the weights.
         folder: for checkpoints and the log.
         background: latents (n, c, h, w) of the no-contact images, for the variant w/ BG.
+        held_out: rows whose loss is measured in training.
         start: go on from these weights instead of random ones, in the same geometry. The modality
             means are those of ``conditions`` all the same.
         key: digest of latents, conditions and background, which are not read for it.
@@ -401,14 +456,21 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     if start is not None:
         _copy_weights(start, model)
     with torch.no_grad():
-        tokens: dict[Source, Tensor] = {
-            s: model.tokens(tables[s], s).to("cpu") for s in policy.sources
-        }
+
+        def loss_of(conditions: Mapping[Source, Tensor], *tables: Any) -> DiffusionLoss:
+            tokens = {s: model.tokens(conditions[s], s).to("cpu") for s in policy.sources}
+            how: dict[str, Any] = {"stats": stats, "schedule": schedule, "policy": policy}
+            return DiffusionLoss(tables[0], tokens, tables[1], **how)
+
+        loss, others = loss_of(tables, latents, background), None
+        if held_out is not None:
+            texts = {s: torch.as_tensor(held_out.conditions[s]) for s in policy.sources}
+            held = loss_of(texts, held_out.latents, held_out.background)
+            others = (len(held_out.latents), held.load)
     facts = [asdict(settings) for settings in (stats, unet, policy, schedule)]
     begin = [] if start is None else [digest_tensors(start.unet.state_dict())]
-    loss = DiffusionLoss(latents, tokens, background, stats=stats, schedule=schedule, policy=policy)
     key = digest_json([key, background is not None, *facts, *begin])
-    task = Task("generator", len(latents), loss.load, loss, key, names)
+    task = Task("generator", len(latents), loss.load, loss, key, names, others)
     fit(model, task, loop, folder, compute=compute, progress=progress)
     return model.eval().requires_grad_(False)
 

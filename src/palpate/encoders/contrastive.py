@@ -45,20 +45,20 @@ from palpate.encoders.losses import (
     ALL_PAIRS,
     LOG_SCALE_START,
     Labels,
-    Targets,
     clamped_scale,
     in_chunks,
     require_weights,
     three_way,
 )
 from palpate.encoders.models import move, pick_device
-from palpate.encoders.presets import EncoderPreset, augmented, preset
-from palpate.encoders.rows import Rows, numbers, unit
+from palpate.encoders.presets import EncoderPreset, Targets, preset
+from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
 from palpate.encoders.seen import digest_images, union
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task, fit
-from palpate.training.options import Compute, LoopOptions, Step
+from palpate.training.estimate import estimate
+from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import (
     connect,
     first_alone,
@@ -67,6 +67,7 @@ from palpate.training.processes import (
     place,
     work_folder,
 )
+from palpate.training.steps import Step
 
 Partners = Literal["frozen", "trainable"]
 
@@ -102,7 +103,7 @@ def train_encoder(  # noqa: PLR0913 - a public verb
             small one that is trained first on the same train part.
         output: folder for the encoders, new or empty; None keeps them in memory.
         epochs: of the tactile encoder; default: the preset's.
-        targets: see :data:`~palpate.encoders.losses.Targets`; default: the preset's.
+        targets: see :data:`~palpate.encoders.presets.Targets`; default: the preset's.
         weights: of the pairs tactile-text, vision-text, tactile-vision; 0 switches one off.
         partners: ``trainable``: vision and text learn along with the tactile encoder.
         held_out: share of the train part, by video, on which loss and probe are measured while it
@@ -150,6 +151,33 @@ def train_encoder(  # noqa: PLR0913 - a public verb
             encoders.save(output)
             keep_logs(work, output)
     return encoders
+
+
+def plan_encoder(
+    data: Manifest | str | Path,
+    split: Split | str | Path,
+    *,
+    preset: str | EncoderPreset = "mini",
+    epochs: float | None = None,
+    held_out: float = 0.0,
+    device: str = "auto",
+) -> dict[str, Any]:
+    """What :func:`train_encoder` would take; only the manifest is read.
+
+    Returns:
+        see :func:`palpate.training.estimate.estimate`.
+    """
+    chosen, split = preset_of(preset), Split.load(split)
+    train, _ = _parts(load_manifest(data), split, held_out, 0)
+
+    def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
+        return encode_tactile(model, torch.zeros(rows, 3, chosen.image, chosen.image, device=where))
+
+    def build() -> nn.Module:
+        return CLIPVisionModelWithProjection(chosen.tactile_config(chosen.dim))
+
+    options = chosen.tactile_course.options(len(train), 0, epochs)
+    return estimate(build, forward, options, len(train), pick_device(device))
 
 
 def load_manifest(data: Manifest | str | Path) -> Manifest:
@@ -446,7 +474,7 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     def load(step: Step) -> Batch:
         pixels = torch.from_numpy(np.array(images[step.rows]))
         every = words[torch.from_numpy(step.all_rows)]
-        own = {"images": pixels, "phrase": every[step.mine], **course.augment.draw(step)}
+        own = {"images": pixels, "phrase": every[step.mine], **draw(course.augment, step)}
         return {**own, "texts": every}
 
     def loss(module: nn.Module, batch: Batch) -> Losses:

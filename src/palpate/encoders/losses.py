@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -22,12 +21,8 @@ from torch.nn.functional import cross_entropy
 from torch.utils.checkpoint import checkpoint
 
 from palpate.core import PalpateError
+from palpate.encoders.presets import Targets
 
-#: ``diagonal``: the paper's, every other row is a negative. ``identical-text``: rows with equal
-#: captions share the target mass of the two text pairs. ``soft-text``: TVL's target of the text
-#: pairs, softmax(t_i.t_j / 0.05). ``exclude``: rows of one contact or with equal captions are no
-#: negatives of each other, in any pair.
-Targets = Literal["diagonal", "identical-text", "soft-text", "exclude"]
 #: The learned parameter is the logarithm of 1 / tau.
 LOG_SCALE_START, LOG_SCALE_MAX = math.log(1 / 0.07), math.log(100.0)
 TEXT_TAU = 0.05  # of TVL's soft text targets (recipes, section 3)
@@ -128,7 +123,7 @@ def three_way(
         vision: the same, or None for data without photos: the first pair alone.
         scale: 1 / tau.
         labels: of the rows.
-        targets: see :data:`Targets`.
+        targets: see :data:`~palpate.encoders.presets.Targets`.
         weights: of tactile-text, vision-text, tactile-vision; the total is their weighted mean; a
             pair of weight 0 is not computed.
 

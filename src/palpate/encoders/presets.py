@@ -8,17 +8,20 @@ to zero, learning rate 1.5e-4 x batch / 256 = 1.5e-4.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
 
-import torch
-from torch import Tensor
-from torch.nn.functional import affine_grid, grid_sample
-from transformers import CLIPConfig, CLIPVisionConfig
+from palpate.core import PalpateError, require_choice
+from palpate.training.options import LoopOptions
 
-from palpate.core import require_choice
-from palpate.encoders.losses import Targets
-from palpate.training.options import LoopOptions, Step
+if TYPE_CHECKING:
+    from transformers import CLIPConfig, CLIPVisionConfig
+
+#: ``diagonal``: the paper's, every other row is a negative. ``identical-text``: rows with equal
+#: captions share the target mass of the two text pairs. ``soft-text``: TVL's target of the text
+#: pairs, softmax(t_i.t_j / 0.05). ``exclude``: rows of one contact or with equal captions are no
+#: negatives of each other, in any pair.
+Targets = Literal["diagonal", "identical-text", "soft-text", "exclude"]
 
 
 @dataclass(frozen=True)
@@ -42,33 +45,6 @@ class Augment:
     flips: bool = False
     quarter_turns: bool = False
 
-    def draw(self, step: Step) -> dict[str, Tensor]:
-        """The random numbers of a batch: a window (b, 2, 3), a gain and an offset (b,) each."""
-        scale = 1 - self.crop * step.rand()
-        shift = (2 * step.rand(2) - 1) * (1 - scale)[:, None]
-        turns = step.randint(4) * self.quarter_turns
-        mirror = 1.0 - 2.0 * step.randint(2, 2) * self.flips
-        gain = torch.exp(self.gain * step.randn())
-        offset = self.offset * step.randn()
-        angle = turns * (torch.pi / 2)
-        cos, sin = scale * torch.cos(angle), scale * torch.sin(angle)
-        rows = [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)]
-        window = torch.stack(rows, 1)
-        window[:, :, :2] *= mirror[:, None]
-        return {"window": window, "gain": gain, "offset": offset}
-
-
-def augmented(images: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
-    """Change images (b, 3, h, w) in [0, 1] as :meth:`Augment.draw` says; not at all without draws.
-
-    Values may leave [0, 1], as over-exposure would.
-    """
-    if "window" not in drawn:
-        return images
-    grid = affine_grid(drawn["window"], list(images.shape), align_corners=False)
-    images = grid_sample(images, grid, align_corners=False, padding_mode="reflection")
-    return images * drawn["gain"].view(-1, 1, 1, 1) + drawn["offset"].view(-1, 1, 1, 1)
-
 
 @dataclass(frozen=True)
 class Size:
@@ -77,6 +53,12 @@ class Size:
     width: int
     layers: int
     heads: int
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.layers, self.heads) < 1 or self.width % self.heads:
+            got = f"width {self.width}, layers {self.layers}, heads {self.heads}"
+            must = "The width of a transformer must be a multiple of its heads, all at least 1"
+            raise PalpateError(must, got, "Choose other numbers")
 
 
 @dataclass(frozen=True)
@@ -89,7 +71,7 @@ class Course:
     warmup: float = 0.05
     weight_decay: float = 0.05
     betas: tuple[float, float] = (0.9, 0.95)
-    clip: float | None = 1.0
+    clip_norm: float | None = 1.0
     augment: Augment = field(default_factory=Augment)
     evaluations: int = 10
     patience: int | None = None
@@ -105,7 +87,7 @@ class Course:
             self.lr,
             warmup=round(self.warmup * steps),
             weight_decay=self.weight_decay,
-            clip=self.clip,
+            clip_norm=self.clip_norm,
             seed=seed,
             betas=self.betas,
             evaluations=self.evaluations,
@@ -128,7 +110,7 @@ class EncoderPreset:
             space, ``context`` in tokens.
         tactile_course, clip_course: how each is trained; None without a fresh CLIP.
         targets: what rows with equal captions are to each other
-            (:data:`palpate.encoders.losses.Targets`); ``diagonal`` is the paper's loss.
+            (:data:`Targets`); ``diagonal`` is the paper's loss.
         text_subsets: in training, show a random non-empty part of a text that is a list of
             adjectives (TVL).
         data_statistics: normalize pixels by the training part's mean and deviation instead of
@@ -153,12 +135,19 @@ class EncoderPreset:
     text_subsets: bool = False
     data_statistics: bool = True
 
+    def __post_init__(self) -> None:
+        if self.patch < 1 or self.image < 1 or self.image % self.patch:
+            must, got = f"must be a multiple of the patches, {self.patch}", f"{self.image}"
+            raise PalpateError(must, got, "Choose other sides", argument="image")
+
     def tactile_config(self, dim: int) -> CLIPVisionConfig:
         """The tactile encoder's configuration for a shared space of width ``dim``."""
         return _vision(self.tactile, self.image, self.patch, dim)
 
     def clip_config(self, vocabulary: int) -> CLIPConfig:
         """Return the fresh CLIP's configuration; ids of special tokens as in ``tokenizer``."""
+        from transformers import CLIPConfig
+
         assert self.vision is not None
         assert self.text is not None
         vision = _vision(self.vision, self.image, self.patch, self.dim)
@@ -178,6 +167,8 @@ class EncoderPreset:
 
 
 def _vision(size: Size, image: int, patch: int, dim: int) -> CLIPVisionConfig:
+    from transformers import CLIPVisionConfig
+
     return CLIPVisionConfig(
         hidden_size=size.width,
         intermediate_size=4 * size.width,
@@ -195,7 +186,7 @@ _MINI_VIEW = Augment(crop=0.2, gain=0.2, offset=0.1, flips=True, quarter_turns=T
 _MINI_CLIP = Course(epochs=6, batch=32, lr=1e-3, weight_decay=0.1, augment=_MINI_VIEW)
 _MINI_TACTILE = Course(epochs=16, batch=128, lr=2e-3, weight_decay=0.1)
 _TINY = Course(epochs=2, batch=8, lr=1e-3)
-_TVL = Course(epochs=200, batch=256, lr=1.5e-4, clip=None)
+_TVL = Course(epochs=200, batch=256, lr=1.5e-4, clip_norm=None)
 
 TINY = EncoderPreset(
     name="tiny",
@@ -236,7 +227,23 @@ PAPER = EncoderPreset(
     targets="diagonal",
     data_statistics=False,
 )
-PRESETS = {preset.name: preset for preset in (TINY, MINI, PAPER)}
+
+
+def _tvl(name: str, size: Size, lr: float, cost: str) -> EncoderPreset:
+    """TVL's training (recipes, section 3): its soft text targets, subsets of adjectives, views."""
+    view = Augment(crop=0, gain=0.06, offset=0.05, flips=True, quarter_turns=True)
+    course = replace(_TVL, lr=lr, augment=view)
+    more = {"patch": 16, "targets": "soft-text", "text_subsets": True}
+    return replace(PAPER, name=name, tactile=size, tactile_course=course, cost=cost, **more)
+
+
+_FLOP = "200 epochs of 13,900 pairs, arithmetic of --dry-run"
+TVL = (
+    _tvl("tvl-tiny", Size(192, 12, 3), 3e-4, f"{_FLOP}: 5.7 M parameters, 0.02 EFLOP"),
+    _tvl("tvl-small", Size(384, 12, 6), 1.5e-4, f"{_FLOP}: 22 M parameters, 0.08 EFLOP"),
+    _tvl("tvl-base", Size(768, 12, 12), 1.5e-4, f"{_FLOP}: 86 M parameters, 0.29 EFLOP"),
+)
+PRESETS = {preset.name: preset for preset in (TINY, MINI, *TVL, PAPER)}
 
 
 def preset(name: str) -> EncoderPreset:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import affine_grid, grid_sample
 
 from palpate.core import FeatureSet, Progress, atomic_path, digest_json, quiet, short
 from palpate.data.images import cached_images
@@ -17,7 +18,7 @@ from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import ClipEncoders, EncoderSet
 from palpate.encoders.presets import Augment
 from palpate.training.engine import Batch
-from palpate.training.options import Step
+from palpate.training.steps import Step
 
 PROBED = 2000  # rows that the probe in training sees, at most
 MOST_WORDS = 6  # of a text whose subsets are taken: 63 phrases
@@ -86,7 +87,7 @@ class Rows:
         every = torch.from_numpy(step.all_rows)
         phrase = self.first[every]
         if augment is not None:
-            batch |= augment.draw(step)
+            batch |= draw(augment, step)
             if int(self.count.max()) > 1:
                 phrase += (step.rand_all() * self.count[every]).long()
         batch |= {"texts": self.texts[every], "contacts": self.contacts[every]}
@@ -115,6 +116,34 @@ class Rows:
         labels, groups = ([str(c[k] or "") for k in some] for c in columns)
         ids = [self.manifest.ids[k] for k in some]
         return FeatureSet(ids, torch.cat(parts).numpy(), labels, groups)
+
+
+def draw(augment: Augment, step: Step) -> dict[str, Tensor]:
+    """The random numbers of a batch: a window (b, 2, 3), a gain and an offset (b,) each."""
+    scale = 1 - augment.crop * step.rand()
+    shift = (2 * step.rand(2) - 1) * (1 - scale)[:, None]
+    turns = step.randint(4) * augment.quarter_turns
+    mirror = 1.0 - 2.0 * step.randint(2, 2) * augment.flips
+    gain = torch.exp(augment.gain * step.randn())
+    offset = augment.offset * step.randn()
+    angle = turns * (torch.pi / 2)
+    cos, sin = scale * torch.cos(angle), scale * torch.sin(angle)
+    rows = [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)]
+    window = torch.stack(rows, 1)
+    window[:, :, :2] *= mirror[:, None]
+    return {"window": window, "gain": gain, "offset": offset}
+
+
+def augmented(images: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
+    """Change images (b, 3, h, w) in [0, 1] as :func:`draw` says; not at all without draws.
+
+    Values may leave [0, 1], as over-exposure would.
+    """
+    if "window" not in drawn:
+        return images
+    grid = affine_grid(drawn["window"], list(images.shape), align_corners=False)
+    images = grid_sample(images, grid, align_corners=False, padding_mode="reflection")
+    return images * drawn["gain"].view(-1, 1, 1, 1) + drawn["offset"].view(-1, 1, 1, 1)
 
 
 def unit(images: Tensor) -> Tensor:

@@ -28,8 +28,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet
-from palpate.training.options import Compute, LoopOptions, RowOrder, Step, Tracker, learning_rate
+from palpate.training.options import Compute, LoopOptions, RowOrder, Tracker, learning_rate
 from palpate.training.processes import average, barrier, place
+from palpate.training.steps import Step
 
 Batch = dict[str, Tensor]
 #: The data of a step, on the CPU; called in a thread, ahead of the step.
@@ -243,7 +244,7 @@ class _Run:
         gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
         average([*gradients, values])
         self.scaler.unscale_(self.optimizer)
-        limit = math.inf if self.options.clip is None else self.options.clip
+        limit = math.inf if self.options.clip_norm is None else self.options.clip_norm
         norm = nn.utils.clip_grad_norm_(list(self.parameters.values()), limit)
         self.busy = True
         self.scaler.step(self.optimizer)

@@ -1,24 +1,21 @@
-"""What a training does (:class:`LoopOptions`), how it is run (:class:`Compute`), and the random
-numbers of its steps.
+"""What a training does (:class:`LoopOptions`), how it is run (:class:`Compute`), the order of rows.
 
-Everything random in step k depends on (seed, k) and on the position in the *global* batch: each of
-several processes draws the numbers of the whole batch and keeps those of its own rows, so N
-processes take the steps of one.
+This file needs no torch: presets and the command line are made of it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from palpate.core import PalpateError, rng_for, seed_for
+from palpate.core import PalpateError, rng_for
 
+T = TypeVar("T")
 Precision = Literal["float32", "bf16", "fp16"]
 Tracker = Literal["tensorboard", "wandb"]
 
@@ -34,7 +31,7 @@ class LoopOptions:
         warmup: steps of linear warm-up.
         decay: ``cosine`` to zero after the warm-up, or ``constant``.
         weight_decay: of AdamW; applied to parameters of two or more dimensions.
-        clip: largest gradient norm, or None.
+        clip_norm: largest gradient norm, or None.
         ema: decay of the moving average that becomes the result, or None for the last weights.
         seed: of the order of rows and of the noise.
         betas: decay rates of AdamW's two moments.
@@ -52,7 +49,7 @@ class LoopOptions:
     warmup: int = 20
     decay: str = "cosine"
     weight_decay: float = 0.01
-    clip: float | None = 1.0
+    clip_norm: float | None = 1.0
     ema: float | None = None
     seed: int = 0
     betas: tuple[float, float] = (0.9, 0.999)
@@ -68,7 +65,7 @@ class LoopOptions:
             "warmup": (self.warmup >= 0, "must be at least 0"),
             "decay": (self.decay in ("cosine", "constant"), "must be cosine or constant"),
             "weight_decay": (0 <= self.weight_decay < math.inf, "must be at least 0"),
-            "clip": (self.clip is None or self.clip > 0, "must be positive or None"),
+            "clip_norm": (self.clip_norm is None or self.clip_norm > 0, "must be positive or None"),
             "ema": (self.ema is None or 0 <= self.ema < 1, "must lie in [0, 1) or be None"),
             "betas": (all(0 <= b < 1 for b in self.betas), "must lie in [0, 1)"),
             "evaluations": (self.evaluations >= 0, "must be at least 0"),
@@ -178,38 +175,17 @@ class RowOrder:
         return np.concatenate([order[first], np.delete(order, first)])
 
 
-class Step:
-    """One step of one process: its rows, and its random numbers.
+def changed(preset: T, fields: Mapping[str, Any]) -> T:
+    """A preset with other fields, by their names: ``{"tactile_course.lr": 1e-3}``.
 
-    Attributes:
-        number: from 0.
-        all_rows: of the global batch, (batch,).
-        rows: those of this process.
+    Raises:
+        PalpateError: for a field of a part that the preset does not have.
     """
-
-    def __init__(
-        self, number: int, rows: NDArray[np.int64], seed: int, part: tuple[int, int] = (0, 1)
-    ) -> None:
-        """Take the global batch, and as ``part`` this process's place among how many."""
-        size = len(rows) // part[1]
-        self.number, self.all_rows = number, rows
-        self.mine = slice(part[0] * size, (part[0] + 1) * size)
-        self.rows = rows[self.mine]
-        self.generator = torch.Generator().manual_seed(seed_for(seed, "step", number))
-
-    def rand(self, *shape: int) -> Tensor:
-        """Uniform numbers in [0, 1), (rows, *shape)."""
-        return torch.rand(len(self.all_rows), *shape, generator=self.generator)[self.mine]
-
-    def rand_all(self) -> Tensor:
-        """Uniform numbers in [0, 1) of the whole batch, (batch,)."""
-        return torch.rand(len(self.all_rows), generator=self.generator)
-
-    def randn(self, *shape: int) -> Tensor:
-        """Standard normal numbers, (rows, *shape)."""
-        return torch.randn(len(self.all_rows), *shape, generator=self.generator)[self.mine]
-
-    def randint(self, high: int, *shape: int) -> Tensor:
-        """Integers from 0 to ``high - 1``, (rows, *shape)."""
-        size = (len(self.all_rows), *shape)
-        return torch.randint(0, high, size, generator=self.generator)[self.mine]
+    for name, value in fields.items():
+        part, _, inner = name.partition(".")
+        if inner and getattr(preset, part) is None:
+            must, got = "must belong to a part that the preset has", f"a preset without {part}"
+            raise PalpateError(must, got, "Leave it out", argument=name.replace(".", "_"))
+        new = changed(getattr(preset, part), {inner: value}) if inner else value
+        preset = replace(preset, **{part: new})  # type: ignore[type-var]
+    return preset

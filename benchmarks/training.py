@@ -1,0 +1,319 @@
+"""What the training engine costs, as ratios within one run.
+
+::
+
+    python benchmarks/training.py [--only encoded-once overhead processes embedding memory gpu]
+
+- ``encoded-once``: steps a second with frozen partners embedded once, over embedding them in each
+  step (preset mini; wanted: 1.4).
+- ``overhead``: seconds of a step of the engine, over a bare PyTorch loop of the same model, batch
+  and optimizer (wanted: below 1.03).
+- ``processes``: images a second of two gloo processes, one thread each, over one process with one
+  thread, at equal global batch (wanted: 1.5; it needs two free cores).
+- ``embedding``: seconds to embed 10,000 images, over the bare forward pass (wanted: below 1.1).
+- ``memory``: peak memory of a step of batch 256 of a ViT-Small in chunks of 16 (wanted: below 6
+  GB), and how far loss and gradient are from the plain batch's at batch 32 (wanted: 1e-4).
+- ``gpu``: where there is one: the models of the preset paper in float32, with TF32, and in bf16
+  with ``torch.compile``: images a second, share of the peak, memory.
+
+Pairs are measured in turns, and the median ratio is printed: other work on the machine then
+disturbs both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import torch
+
+from palpate.core import rng_for
+from palpate.encoders.contrastive import TactileLoss, TactileModel, new_clip
+from palpate.encoders.embed import embed_images
+from palpate.encoders.encoder_set import EncoderSet, Preprocess, new_tactile
+from palpate.encoders.losses import ALL_PAIRS, Labels, in_chunks, three_way
+from palpate.encoders.preprocess import to_unit
+from palpate.encoders.presets import preset
+from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
+from palpate.training.engine import Task, fit
+from palpate.training.options import Compute, RowOrder
+from palpate.training.steps import Step
+
+MINI = preset("mini")
+WORDS = ["rough", "smooth", "soft", "hard", "grained", "ribbed", "woven", "sharp", "flat", "warm"]
+
+
+class Images(Rows):
+    """Rows of random images, texts and photos in memory."""
+
+    def __init__(self, n: int, trainable: bool = False) -> None:
+        rng = rng_for(0, "benchmark")
+        side = MINI.image
+        self.images, self.photos = (
+            rng.integers(0, 256, (n, side, side, 3), dtype=np.uint8) for _ in range(2)
+        )
+        self.captions = [", ".join(rng.choice(WORDS, 3, replace=False)) for _ in range(n)]
+        self.phrases = sorted(set(self.captions))
+        self.texts = self.first = numbers(self.captions)
+        self.count, self.contacts = torch.ones(n, dtype=torch.long), torch.arange(n)
+        self.photo, self.without_photo, self.trainable = torch.arange(n), 0, trainable
+        self.clip = new_clip(MINI, self.phrases, 0)
+        self.text, self.vision = torch.randn(len(self.phrases), 128), torch.randn(n, 128)
+        self.text, self.vision = (t / t.norm(dim=1, keepdim=True) for t in (self.text, self.vision))
+        if trainable:
+            self.text = self.vision = None
+        else:
+            self.photos = None
+
+
+def tactile_model(trainable=False, clip=None):
+    tactile = new_tactile(MINI.tactile_config(128), 0)
+    return TactileModel(tactile, clip.model if trainable else None)
+
+
+def in_turns(first, second, repeats=5):
+    """The median over turns of the ratio of two durations."""
+    first(), second()
+    ratios, times = [], []
+    for _ in range(repeats):
+        pair = []
+        for call in (first, second):
+            began = time.perf_counter()
+            call()
+            pair.append(time.perf_counter() - began)
+        ratios.append(pair[0] / pair[1])
+        times.append(pair)
+    return float(np.median(ratios)), np.median(np.array(times), axis=0)
+
+
+def engine_steps(rows, model, steps, loss, folder):
+    options = MINI.tactile_course.options(len(rows.images), 0)
+    options = replace(options, steps=steps)
+    task = Task(
+        "benchmark", len(rows.images), lambda s: rows.load(s, MINI.tactile_course.augment), loss
+    )
+    fit(model, task, options, Path(folder), compute=Compute(checkpoint_minutes=1e9))
+
+
+def encoded_once():
+    """Frozen partners from a table, or embedded in every step."""
+    rows, live = Images(1024), Images(1024, trainable=True)
+    preprocess = Preprocess(MINI.image, MINI.image)
+
+    def steps(part, live):
+        def run():
+            model = tactile_model(live, part.clip)
+            loss = TactileLoss(part, part.clip, preprocess, "identical-text", ALL_PAIRS)
+            with tempfile.TemporaryDirectory() as folder:
+                engine_steps(part, model, 6, loss, folder)
+
+        return run
+
+    for p in live.clip.model.parameters():
+        p.requires_grad_(False)
+    ratio, seconds = in_turns(steps(live, True), steps(rows, False), 3)
+    return {"ratio": ratio, "wanted": "at least 1.4", "seconds_a_step": (seconds / 6).tolist()}
+
+
+def overhead():
+    """The engine and the shortest loop that does the same to the same model."""
+    rows, steps = Images(1024), 8
+    preprocess, course = Preprocess(MINI.image, MINI.image), MINI.tactile_course
+    options = replace(course.options(1024, 0), steps=steps)
+    loss = TactileLoss(rows, rows.clip, preprocess, "identical-text", ALL_PAIRS)
+
+    def engine():
+        with tempfile.TemporaryDirectory() as folder:
+            engine_steps(rows, tactile_model(), steps, loss, folder)
+
+    def bare():
+        model = tactile_model()
+        optimizer = torch.optim.AdamW(model.parameters(), lr=options.lr, foreach=True)
+        order = RowOrder(1024, options.batch, 0)
+        for k in range(steps):
+            step = Step(k, order(k), 0)
+            index = torch.from_numpy(step.rows)
+            pixels = unit(torch.from_numpy(rows.images[step.rows]))
+            pixels = preprocess.normalize(augmented(pixels, draw(course.augment, step)))
+            embedded = model.tactile(pixel_values=pixels).image_embeds
+            embedded = embedded / embedded.norm(dim=1, keepdim=True)
+            labels = Labels(rows.texts[index])
+            text = rows.text[rows.first[index]]
+            total, _ = three_way(
+                embedded,
+                text,
+                rows.vision[index],
+                model.log_scale.exp(),
+                labels,
+                targets="identical-text",
+            )
+            optimizer.zero_grad(set_to_none=True)
+            total.backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            optimizer.step()
+
+    ratio, seconds = in_turns(engine, bare)
+    return {"ratio": ratio, "wanted": "below 1.03", "seconds_a_step": (seconds / steps).tolist()}
+
+
+WORKER = """
+import sys, time, tempfile, torch
+sys.path.insert(0, sys.argv[1])
+from training import Images, MINI, Preprocess, TactileLoss, ALL_PAIRS, engine_steps, tactile_model
+from palpate.training.processes import connect, place
+connect("cpu")
+torch.set_num_threads(1)
+rows = Images(1024)
+loss = TactileLoss(rows, rows.clip, Preprocess(64, 64), "identical-text", ALL_PAIRS)
+with tempfile.TemporaryDirectory() as folder:
+    engine_steps(rows, tactile_model(), 1, loss, folder)
+began = time.perf_counter()
+with tempfile.TemporaryDirectory() as folder:
+    engine_steps(rows, tactile_model(), 10, loss, folder)
+if place()[0] == 0:
+    print("RESULT", place()[1], 10 * 128 / (time.perf_counter() - began))
+"""
+
+
+def processes():
+    """Images a second of one and of two processes, in turns."""
+    rates = {1: [], 2: []}
+    with tempfile.TemporaryDirectory() as folder:
+        script = Path(folder) / "worker.py"
+        script.write_text(WORKER)
+        here = str(Path(__file__).parent)
+        for _ in range(3):
+            for n in (1, 2):
+                launch = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={n}"]
+                command = [sys.executable, *launch, str(script), here]
+                out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+                line = next(line for line in out.splitlines() if line.startswith("RESULT"))
+                assert line.split()[1] == str(n)
+                rates[n].append(float(line.split()[2]))
+    ratio = float(np.median([b / a for a, b in zip(rates[1], rates[2], strict=True)]))
+    return {"ratio": ratio, "wanted": "at least 1.5", "images_a_second": rates}
+
+
+def embedding(n=10_000):
+    """``embed_images`` and the bare forward pass."""
+    rng = rng_for(0, "embedding")
+    images = rng.integers(0, 256, (n, MINI.image, MINI.image, 3), dtype=np.uint8)
+    clip = new_clip(MINI, WORDS, 0)
+    preprocess = Preprocess(MINI.image, MINI.image)
+    tactile = new_tactile(MINI.tactile_config(128), 0).eval().requires_grad_(False)
+    encoders = EncoderSet(clip, tactile, preprocess, {})
+
+    @torch.inference_mode()
+    def bare():
+        for k in range(0, n, 128):
+            tactile(pixel_values=preprocess.normalize(to_unit(images[k : k + 128])))
+
+    ratio, seconds = in_turns(lambda: embed_images(images, encoders), bare, 3)
+    return {"ratio": ratio, "wanted": "below 1.1", "seconds": seconds.tolist()}
+
+
+def contrastive_step(model, config, batch, chunk, device="cpu"):
+    generator = torch.Generator().manual_seed(0)
+    side = config.image_size
+    pixels = torch.randn(batch, 3, side, side, generator=generator).to(device)
+    text, vision = (torch.randn(batch, 768, generator=generator).to(device) for _ in range(2))
+
+    def encode(x):
+        return torch.nn.functional.normalize(model(pixel_values=x).image_embeds, dim=1)
+
+    labels = Labels(torch.arange(batch, device=device))
+    total, _ = three_way(in_chunks(encode, pixels, chunk), text, vision, 10.0, labels)
+    model.zero_grad()
+    total.backward()
+    return float(total.detach()), torch.cat(
+        [p.grad.flatten() for p in model.parameters() if p.grad is not None]
+    )
+
+
+def memory(batch=256, chunk=16):
+    """Cached gradients of a ViT-Small: equal to the plain batch, and small."""
+    config = preset("tvl-small").tactile_config(768)
+    model = new_tactile(config, 0)
+    plain, cached = (contrastive_step(model, config, 8, c) for c in (None, 2))
+    apart = float((plain[1] - cached[1]).norm() / plain[1].norm())
+    began = time.perf_counter()
+    contrastive_step(model, config, batch, chunk)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    return {
+        "loss_apart": abs(plain[0] - cached[0]),
+        "gradient_apart": apart,
+        "peak_GB": peak,
+        "wanted": "below 6 GB, 1e-4",
+        "batch": batch,
+        "chunk": chunk,
+        "seconds": time.perf_counter() - began,
+    }
+
+
+def gpu(batch=256):
+    """The tactile encoder of the preset paper, plain and as fast as it goes."""
+    if not torch.cuda.is_available():
+        return {"skipped": "no CUDA device here"}
+    config, rows = preset("paper").tactile_config(768), {}
+    for name, tf32, dtype, compiled, chunk in (
+        ("float32", False, None, False, 32),
+        ("tf32", True, None, False, 32),
+        ("bf16", True, torch.bfloat16, False, 64),
+        ("bf16 + compile", True, torch.bfloat16, True, 64),
+    ):
+        torch.backends.cuda.matmul.allow_tf32 = tf32
+        model = new_tactile(config, 0).cuda()
+        if compiled:
+            model.compile()
+        torch.cuda.reset_peak_memory_stats()
+        for _ in range(3):
+            torch.cuda.synchronize()
+            began = time.perf_counter()
+            with torch.autocast("cuda", dtype, enabled=dtype is not None):
+                contrastive_step(model, config, batch, chunk, "cuda")
+            torch.cuda.synchronize()
+            seconds = time.perf_counter() - began
+        # Forward, its repetition and backward: four forward passes of 155.5 GFLOP an image.
+        rows[name] = {
+            "images_a_second": batch / seconds,
+            "TFLOP_a_second": 4 * 0.1555 * batch / seconds,
+            "peak_GB": torch.cuda.max_memory_allocated() / 1e9,
+        }
+    return {"device": torch.cuda.get_device_name(), "batch": batch, **rows}
+
+
+PARTS = {
+    "encoded-once": encoded_once,
+    "overhead": overhead,
+    "processes": processes,
+    "embedding": embedding,
+    "memory": memory,
+    "gpu": gpu,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))
+    names = parser.parse_args().only
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+    machine = {"machine": platform.machine(), "cores": os.cpu_count(), "torch": torch.__version__}
+    print(json.dumps(machine | {"load": os.getloadavg()[0]}))
+    for name in names:
+        print(json.dumps({"part": name, **PARTS[name]()}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""Every field of a preset as an option: ``--lr``, ``--batch-size``, ``--tactile-width`` ...
+
+What is not given is the preset's. The names are the fields', flat; those of a preset's main
+training have no prefix.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, make_dataclass
+from functools import cache
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+import tyro
+
+from palpate.cli.terminal import Switch, Terminal
+from palpate.training.options import Compute, LoopOptions, changed
+
+#: Fields that have another name on the command line.
+WORDS = {"batch": "batch_size"}
+
+
+@dataclass(frozen=True)
+class _Field:
+    flag: str
+    path: str
+    kind: Any
+    help: str
+
+
+@cache
+def _fields(preset: type[Any], main: str, skip: tuple[str, ...]) -> tuple[_Field, ...]:
+    return tuple(f for f in _walk(preset, main, ()) if f.path not in skip)
+
+
+def _walk(record: type[Any], main: str, path: tuple[str, ...]) -> Iterator[_Field]:
+    hints, texts = get_type_hints(record), attributes(record)
+    for each in dataclasses.fields(record):
+        kind = hints[each.name]
+        inner = next((t for t in (kind, *get_args(kind)) if dataclasses.is_dataclass(t)), None)
+        where = (*path, each.name)
+        if isinstance(inner, type):
+            yield from _walk(inner, main, where)
+            continue
+        parts = [p.removesuffix("_course") for p in where if p != main]
+        flag = "_".join([*parts[:-1], WORDS.get(parts[-1], parts[-1])])
+        text = texts.get(each.name) or attributes(LoopOptions).get(each.name, "")
+        yield _Field(flag, ".".join(where), kind, text)
+
+
+@cache
+def attributes(record: type[Any]) -> Mapping[str, str]:
+    """The texts of a record's docstring about its attributes."""
+    block = (record.__doc__ or "").partition("Attributes:")[2].partition("\n\n")[0]
+    found: dict[str, str] = {}
+    for names, text in re.findall(r"^ {8}([\w, ]+): ((?:.|\n {9,})+)", block, re.MULTILINE):
+        plain = re.sub(r":\w+:`([^`]*)`|``([^`]*)``", r"\1\2", " ".join(text.split()))
+        found |= dict.fromkeys(names.split(", "), plain[:1].upper() + plain[1:].rstrip(".") + ".")
+    return found
+
+
+def preset_flags(title: str, preset: type[Any], main: str, skip: tuple[str, ...]) -> Any:
+    """A group of options, each None unless given: the fields of a preset class.
+
+    Args:
+        title: of the class.
+        preset: the class.
+        main: the field that holds the main training, whose options have no prefix.
+        skip: paths of fields that have an option of their own.
+    """
+    rows: list[tuple[str, Any, Any]] = []
+    for each in _fields(preset, main, skip):
+        about = tyro.conf.arg(help=each.help, help_behavior_hint="(default: the preset's)")
+        rows.append((each.flag, Annotated[each.kind | None, about], field(default=None)))
+    return make_dataclass(title, rows, frozen=True, kw_only=True)
+
+
+def with_flags(preset: Any, given: Any, main: str, skip: tuple[str, ...]) -> Any:
+    """The preset with the fields that were given on the command line."""
+    values = {f.path: getattr(given, f.flag) for f in _fields(type(preset), main, skip)}
+    return changed(preset, {path: v for path, v in values.items() if v is not None})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """How to run it on the machine at hand; nothing here changes what is computed."""
+
+    device: str = "auto"
+    """auto, cpu, cuda, mps."""
+    precision: Literal["float32", "bf16", "fp16"] = "float32"
+    """Of matrix products; the weights stay float32."""
+    tf32: bool = True
+    """Let float32 products on CUDA round their factors to 10 bits."""
+    compile: Switch = False
+    """Compile the loss with torch.compile: minutes at the start, faster steps."""
+    channels_last: Switch = False
+    """Memory layout of convolutions."""
+    gradient_checkpointing: Switch = False
+    """Compute activations twice instead of keeping them."""
+    chunk: int | None = None
+    """Rows that a contrastive encoder sees at a time; the loss is that of the whole batch."""
+    checkpoint_minutes: float = 5.0
+    """Time between checkpoints."""
+    trackers: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    """Where the log goes, too."""
+
+    @property
+    def compute(self) -> Compute:
+        """The settings as the rooms take them."""
+        return Compute(**{k: v for k, v in vars(self).items() if k != "device"})
+
+
+def print_plan(terminal: Terminal, title: str, plan: dict[str, Any]) -> dict[str, Any]:
+    """Print what a training would take, and return it."""
+    gigabytes = {k: f"{v / 1e9:.3g} GB" for k, v in plan.items() if k.endswith("_bytes")}
+    numbers = {k: f"{v:.3g}" for k, v in plan.items() if isinstance(v, float) or "flop" in k}
+    shown = plan | numbers | gigabytes | {"seconds": f"{plan['seconds']:,.0f}"}
+    terminal.facts(title, {k.removesuffix("_bytes"): v for k, v in shown.items()})
+    return plan
