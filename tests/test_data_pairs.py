@@ -287,6 +287,11 @@ def test_groups_in_doubt_are_reported_with_their_number(images, tmp_path):
     table = write_table(images / "t.csv", "\n".join(["vision,video,object", *lines]))
     (problem, _) = import_pairs(table, tmp_path / "out2").suspicious
     assert (problem.kind, problem.text[:26]) == ("word-for-null", "4 of 6 rows have the video")
+    lines = [f"v/{k}.jpg,{thing},1" for k, thing in enumerate(("cup", "mug"))]
+    table = write_table(images / "t.csv", "\n".join(["vision,object,contact", *lines]))
+    (problem, _) = import_pairs(table, tmp_path / "out3").suspicious
+    assert problem.kind == "shared-contact"
+    assert "'1' in cup, mug" in problem.text
 
 
 def test_an_id_of_two_parts_is_in_neither_and_the_first_usable_row_keeps_it(images, tmp_path):

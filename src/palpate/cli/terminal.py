@@ -91,6 +91,7 @@ RENAMED: dict[tuple[str, str], str] = {
 #: argument's own name ("--sigma"). '' is every verb.
 OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "train_or_data"): "TRAIN",
+    ("split", "train_or_data"): "PATH",
     ("audit", "test"): "TEST",
     ("background", "how"): "--reference",
     ("caption check", "captions"): "CAPTIONS",

@@ -111,4 +111,20 @@ def odd_groups(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
             text = f"{len(worded)} of {count} rows have the {name} NA, NaN, None or null, taken"
             text += f" as a name; the first is {worded[0]}. For none, leave the cell empty"
             problems.append(Problem(str(source), "word-for-null", text))
-    return problems
+    return problems + _shared_contacts(source, rows)
+
+
+def _shared_contacts(source: Path, rows: Sequence[tuple[str, Row]]) -> list[Problem]:
+    """Report contacts of one name in several videos (or objects ...), which a contact cannot be."""
+    for name in GROUPS:
+        groups: dict[str, set[str]] = {}
+        for _, row in rows:
+            if "contact" in row and name in row:
+                groups.setdefault(row["contact"], set()).add(row[name])
+        if shared := [contact for contact, values in groups.items() if len(values) > 1]:
+            few = ", ".join(sorted(groups[shared[0]])[:3])
+            text = f"{len(shared)} contacts have one name in several {name}s and are taken as one: "
+            text += f"{shared[0]!r} in {few}. Map the contact to a name with its {name}, e.g. "
+            text += f"{name} || '/' || contact, in your column names"
+            return [Problem(str(source), "shared-contact", text)]
+    return []
