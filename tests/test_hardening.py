@@ -68,6 +68,7 @@ def typed_manifest(path: Path) -> None:
             )
         ),
         ("p.jpg", os.mkfifo, "generate p.jpg -o t.png", "an image that can be read"),
+        ("v/a.npy", os.mkfifo, "import v --tactile {video}.npy -o m", "1 bad-video"),
         *(
             ("g/index.json", INDEX + f'"skipped": [], "images": {images}}}', command, words)
             for command in ("score --generated g --reference g", "generate a.jpg -o g")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from palpate.core import PalpateError, atomic_path, inside
+from palpate.core import PalpateError, atomic_path, inside, require_regular
 from palpate.data.contacts import SIZE, thumbnail
 from palpate.data.images import SUFFIXES, read_image
 from palpate.data.stacks import SUFFIX, StackReader
@@ -38,6 +38,7 @@ Stream = tuple[NDArray[np.uint8], NDArray[np.float64] | None]
 
 def reader_of(source: Path) -> VideoReader | StackReader:
     """A reader of a video, or of a stack in a ``.npy`` file."""
+    require_regular(source)
     return (StackReader if source.suffix.lower() == SUFFIX else VideoReader)(source)
 
 
