@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -14,8 +15,10 @@ from torch.nn.functional import conv2d, gelu, layer_norm, linear, normalize
 from palpate import probe, score
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
-from palpate.encoders import Encoder, EncoderSet
+from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.embed import embed
+from palpate.encoders.preprocess import prepared_images
+from palpate.encoders.presets import preset
 from palpate.encoders.tactile import load_tactile
 from test_evaluation_guard import by_video
 
@@ -344,3 +347,29 @@ def test_they_score_probe_and_are_guarded_by_what_their_authors_name(tmp_path, d
     results = score(tmp_path / "g", digits, encoder=path, companions=[], permutations=0)
     notes = [n for s in results["TMMD"] for n in s.notes if n.code == "encoder-license"]
     assert {n.params["name"] for n in notes} == {"Sparsh"}
+
+
+def test_an_encoder_trains_on_whole_turned_images_minus_their_background(tmp_path, digits):
+    kind = replace(preset("tiny"), fitting="pad", turn="left", subtract=True)
+    split = by_video(digits, "v0", "v1", "v2")
+    encoders = train_encoder(digits, split, preset=kind, device="cpu", output=tmp_path / "e")
+    made = encoders.preprocess("tactile")
+    assert (made.fitting, made.turn, made.subtract) == ("pad", "left", ("",))
+    train = digits.part(split, "train")
+    pixels = prepared_images(train, "tactile", made)
+    for k, (path, gel) in enumerate(
+        zip(train.paths("tactile"), train.paths("background"), strict=True)
+    ):
+        assert np.array_equal(pixels[k], made.prepare(Image.open(path), Image.open(gel)))
+    assert np.allclose(made.mean, pixels.mean(axis=(0, 1, 2)) / 255, atol=1e-5)
+    cached = prepared_images(train, "tactile", made, tmp_path / "cache")
+    assert np.array_equal(cached, pixels)
+    again = EncoderSet.load(tmp_path / "e")
+    assert again.preprocess("tactile") == made
+    assert again.digest("tactile") == encoders.digest("tactile")
+    tactile = Encoder(again, "tactile")
+    assert tactile.saw(train).all()
+    assert not tactile.saw(digits.part(split, "test")).any()
+    bare = Manifest(digits.table.with_columns(background=pl.lit(None, pl.String)), digits.root)
+    with pytest.raises(PalpateError, match="subtracts the no-contact image"):
+        train_encoder(bare, split, preset=kind, device="cpu")

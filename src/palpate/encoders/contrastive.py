@@ -15,7 +15,7 @@ import json
 import math
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -51,6 +51,7 @@ from palpate.encoders.losses import (
     three_way,
 )
 from palpate.encoders.models import move, pick_device
+from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD
 from palpate.encoders.presets import EncoderPreset, Targets, preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
 from palpate.encoders.seen import digest_images, union
@@ -305,7 +306,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
 
     def read(part: Manifest) -> Rows:
         options: dict[str, Any] = {"cache": cache, "progress": progress, "trainable": trainable}
-        return Rows(part, clip, preset.image, subsets=preset.text_subsets, **options)
+        return Rows(part, clip, preset.preprocess, subsets=preset.text_subsets, **options)
 
     with first_alone():
         rows, others = read(train), None if held is None else read(held)
@@ -385,25 +386,29 @@ def _first_weights(
     """Return the encoder to train and its preprocessing: random, or a copy of ``start``'s."""
     tactile = new_tactile(preset.tactile_config(dim), seed)
     if start is None:
-        return tactile, _preprocess(preset, images)
+        return tactile, _preprocess(preset, images, preset.preprocess)
     before = start.preprocess("tactile")
     state = start.tactile.state_dict() if start.tactile is not None else {}
     shapes = [{k: v.shape for k, v in s.items()} for s in (state, tactile.state_dict())]
-    if shapes[0] != shapes[1] or before.size != preset.image or before.resize != preset.image:
-        must, fix = f"must have the size of the preset {preset.name}", "Leave it out"
-        raise PalpateError(must, "another size", fix, argument="start")
+    alike = replace(before, mean=CLIP_MEAN, std=CLIP_STD) == preset.preprocess
+    if shapes[0] != shapes[1] or not alike:
+        must = f"must have the preprocessing and size of the preset {preset.name}"
+        raise PalpateError(must, "another", "Leave it out", argument="start")
     tactile.load_state_dict(state)
     return tactile, before
 
 
-def _preprocess(preset: EncoderPreset, images: NDArray[np.uint8]) -> Preprocess:
+def _preprocess(
+    preset: EncoderPreset, images: NDArray[np.uint8], geometry: Preprocess
+) -> Preprocess:
     """CLIP's constants, or mean and deviation per channel of at most 2,000 evenly spaced images."""
     if not preset.data_statistics:
-        return Preprocess(preset.image, preset.image)
+        return geometry
     some = np.asarray(images[:: max(1, len(images) // 2000)], dtype=np.float64).reshape(-1, 3) / 255
     mean, std = some.mean(axis=0), np.maximum(some.std(axis=0), 1 / 255)
     statistics = (tuple(float(v) for v in values.round(6)) for values in (mean, std))
-    return Preprocess(preset.image, preset.image, *statistics)
+    mean, std = statistics
+    return replace(geometry, mean=mean, std=std)
 
 
 def new_clip(
@@ -465,7 +470,8 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     texts, source = texts_of(train)
     with first_alone():
         images = cached_images(train, side, preset.image, cache, progress)
-    clip = new_clip(preset, texts, seed, _preprocess(preset, images))
+    plain = Preprocess(preset.image, preset.image)
+    clip = new_clip(preset, texts, seed, _preprocess(preset, images, plain))
     move(clip.model, where)
     clip.model.requires_grad_(True)
     options = course.options(len(train), seed, epochs)
@@ -517,7 +523,7 @@ def _sides(train: Manifest) -> list[str]:
 def _stamps(train: Manifest) -> list[str]:
     """What must not have changed on disk for a checkpoint to be continued."""
     stamps: list[str] = []
-    for side in _sides(train):
+    for side in [*_sides(train), "background"]:
         cells = zip(train.ids, train.column(side), strict=True)
         stamps.append(image_stamp(train.take([i for i, image in cells if image]), side))
     return stamps

@@ -7,7 +7,6 @@ row is therefore another key; the root and the batch size are not part of it.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -101,7 +100,7 @@ def embed(  # noqa: PLR0913
     plain = modality == "text" or encoders.preprocess(modality).plain
     inputs = texts or _stamps(manifest, column)
     frames = None if plain else encoders.preprocess(modality).frames(manifest, column, still=still)
-    inputs = [inputs, _frame_stamps(frames, manifest.root)] if frames else inputs
+    inputs = [inputs, frames.stamps(manifest.root)] if frames else inputs
     label, group = _column(manifest, labels), _column(manifest, groups)
     key = digest_json(["palpate-embedding/1", digest, manifest.ids, column, inputs, label, group])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
@@ -238,14 +237,6 @@ def _stamps(manifest: Manifest, column: str) -> list[list[object]]:
     stamps = {path: file_stamp(path) for path in dict.fromkeys(paths)}
     names = manifest.column(column)
     return [[name, *stamps[path]] for name, path in zip(names, paths, strict=True)]
-
-
-def _frame_stamps(frames: Frames, root: Path) -> list[object]:
-    """What :func:`_stamps` does not name: no-contact images, earlier frames and sensors."""
-    more = {path for _, *further in frames.files for path in further if path is not None}
-    stamps = {path: [os.path.relpath(path, root), *file_stamp(path)] for path in more}
-    further = [[stamps.get(path) for path in paths] for _, *paths in frames.files]  # type: ignore[arg-type]
-    return [further, frames.sensors]
 
 
 def _column(manifest: Manifest, name: str) -> list[str] | None:

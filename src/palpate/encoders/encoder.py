@@ -106,17 +106,15 @@ class Encoder:
         Returns:
             (n,) booleans; all false where the encoder's images are not known (public ones).
         """
-        seen = self.encoders.seen_by(self.modality)
-        if isinstance(inputs, Manifest):
-            inputs = inputs.paths(self.modality)
+        seen, preprocess = self.encoders.seen_by(self.modality), self.preprocess
+        manifest = isinstance(inputs, Manifest)
         if seen is None:
-            return np.zeros(
-                len(inputs if hasattr(inputs, "__len__") else list_images(inputs)), bool
-            )
-        images, size = list_images(inputs), self.encoders.preprocess(self.modality).resize
-        found = np.empty(len(images), bool)
+            return np.zeros(len(inputs if manifest else list_images(inputs)), bool)
+        frames = preprocess.frames(inputs, self.modality).files if manifest else None
+        images = list_images(inputs) if frames is None else frames
+        found = np.zeros(len(images), bool)
         for start in range(0, len(images), batch):
-            pixels = squares(images[start : start + batch], size)
+            pixels = prepared(images[start : start + batch], preprocess)
             found[start : start + batch] = np.isin(digest_images(pixels), seen)
             progress("looking for known images", start + len(pixels), len(images))
         return found

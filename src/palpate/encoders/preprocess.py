@@ -8,6 +8,7 @@ channels. What results is 8-bit and may be cached. Then ``(x / 255 - mean) / std
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import lru_cache
@@ -20,8 +21,25 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from palpate.core import PalpateError, Problem, ProblemsError, read_record
-from palpate.data.images import REFETCH, in_threads, read_image
+from palpate.core import (
+    PalpateError,
+    Problem,
+    ProblemsError,
+    Progress,
+    atomic_path,
+    digest_json,
+    quiet,
+    read_record,
+    short,
+)
+from palpate.data.images import (
+    REFETCH,
+    cached_images,
+    file_stamp,
+    image_stamp,
+    in_threads,
+    read_image,
+)
 from palpate.data.manifest import Manifest
 
 SAVE_AGAIN = "Save the encoders again"
@@ -36,6 +54,12 @@ class Frames(NamedTuple):
 
     files: list[Frame]
     sensors: list[str]
+
+    def stamps(self, root: Path) -> list[object]:
+        """What changes with the no-contact images, the earlier frames and the sensors."""
+        more = {path for _, *further in self.files for path in further if path is not None}
+        stamp = {path: [os.path.relpath(path, root), *file_stamp(path)] for path in more}
+        return [[[path and stamp[path] for path in more] for _, *more in self.files], self.sensors]
 
 
 @dataclass(frozen=True)
@@ -252,6 +276,54 @@ def load_frames(files: Sequence[Frame], preprocess: Preprocess) -> NDArray[np.ui
     if problems:
         raise ProblemsError(sorted(problems, key=lambda p: p.where), REFETCH)
     return images
+
+
+def prepared_images(
+    manifest: Manifest,
+    column: str,
+    preprocess: Preprocess,
+    cache: Path | None = None,
+    progress: Progress = quiet,
+) -> NDArray[np.uint8]:
+    """The prepared images of a manifest; with a cache they are made once and mapped afterwards.
+
+    Args:
+        manifest: the samples.
+        column: of the images.
+        preprocess: how they are prepared.
+        cache: folder for a file of the array; None keeps it in memory.
+        progress: called with the number of images done.
+
+    Returns:
+        (n, height, width, channels), 0 to 255, in row order.
+
+    Raises:
+        PalpateError: if a row lacks an image, or the no-contact image of its sensor.
+        ProblemsError: naming unreadable files.
+    """
+    if preprocess.plain:
+        return cached_images(manifest, column, preprocess.resize, cache, progress)
+    frames, shape = preprocess.frames(manifest, column), (len(manifest), *preprocess.shape)
+
+    def fill(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        for start in range(0, len(images), 256):
+            rows = slice(start, start + 256)
+            images[rows] = load_frames(frames.files[rows], preprocess)
+            progress("preparing images", min(start + 256, len(images)), len(images))
+        return images
+
+    if cache is None:
+        return fill(np.empty(shape, np.uint8))
+    geometry = {k: v for k, v in preprocess.facts.items() if k not in ("mean", "std")}
+    key = digest_json([geometry, image_stamp(manifest, column), frames.stamps(manifest.root)])
+    file = Path(cache) / f"{column}-prepared-{short(key)}.npy"
+    if not file.is_file():
+        with atomic_path(file) as part:
+            options: Any = {"mode": "w+", "dtype": np.uint8, "shape": shape}
+            images = np.lib.format.open_memmap(part, **options)
+            fill(images)
+            images.flush()
+    return np.load(file, mmap_mode="r", allow_pickle=False)
 
 
 def to_unit(

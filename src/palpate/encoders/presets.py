@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from palpate.core import PalpateError, require_choice
 from palpate.training.options import LoopOptions
 
 if TYPE_CHECKING:
     from transformers import CLIPConfig, CLIPVisionConfig
+
+    from palpate.encoders.preprocess import Preprocess
 
 #: ``diagonal``: the paper's, every other row is a negative. ``identical-text``: rows with equal
 #: captions share the target mass of the two text pairs. ``soft-text``: TVL's target of the text
@@ -113,6 +115,10 @@ class EncoderPreset:
             (:data:`Targets`); ``diagonal`` is the paper's loss.
         text_subsets: in training, show a random non-empty part of a text that is a list of
             adjectives (TVL).
+        fitting: how tactile images become squares: ``crop`` takes the center, ``pad`` the whole
+            between black borders, ``squash`` the whole.
+        turn: ``left`` turns tactile images counterclockwise, ``portrait`` those that are wide.
+        subtract: take each tactile image minus its no-contact image.
         data_statistics: normalize pixels by the training part's mean and deviation instead of
             CLIP's constants.
         cost: what it takes, and where that was measured.
@@ -133,12 +139,24 @@ class EncoderPreset:
     context: int = 32
     targets: Targets = "identical-text"
     text_subsets: bool = False
+    fitting: Literal["crop", "pad", "squash"] = "crop"
+    turn: Literal["none", "left", "portrait"] = "none"
+    subtract: bool = False
     data_statistics: bool = True
 
     def __post_init__(self) -> None:
         if self.patch < 1 or self.image < 1 or self.image % self.patch:
             must, got = f"must be a multiple of the patches, {self.patch}", f"{self.image}"
             raise PalpateError(must, got, "Choose other sides", argument="image")
+
+    @property
+    def preprocess(self) -> Preprocess:
+        """How tactile images are prepared; their statistics are the training part's."""
+        from palpate.encoders.preprocess import Preprocess
+
+        subtract = ("",) if self.subtract else ()
+        options: dict[str, Any] = {"fitting": self.fitting, "turn": self.turn}
+        return Preprocess(self.image, self.image, subtract=subtract, **options)
 
     def tactile_config(self, dim: int) -> CLIPVisionConfig:
         """The tactile encoder's configuration for a shared space of width ``dim``."""

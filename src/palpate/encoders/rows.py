@@ -16,6 +16,7 @@ from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import embed, embed_texts, texts_of
 from palpate.encoders.encoder_set import ClipEncoders, EncoderSet
+from palpate.encoders.preprocess import Preprocess, prepared_images
 from palpate.encoders.presets import Augment
 from palpate.training.engine import Batch
 from palpate.training.steps import Step
@@ -41,7 +42,7 @@ class Rows:
         self,
         part: Manifest,
         clip: ClipEncoders,
-        size: int,
+        preprocess: Preprocess,
         *,
         subsets: bool = False,
         trainable: bool = False,
@@ -50,7 +51,7 @@ class Rows:
     ) -> None:
         """Decode the images, and embed photos and texts unless ``clip`` is ``trainable``."""
         self.manifest, self.trainable = part, trainable
-        self.images = cached_images(part, "tactile", size, cache, progress)
+        self.images = prepared_images(part, "tactile", preprocess, cache, progress)
         self.captions, self.text_source = texts_of(part)
         self.texts = numbers(self.captions)
         lists = [subsets_of(t) if subsets else [t] for t in sorted(set(self.captions))]
