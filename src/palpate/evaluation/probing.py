@@ -264,9 +264,13 @@ def _classify(
     if without := values[1].count(""):
         result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))
     train, test = (replace(f, labels=v) for f, v in zip(features, values, strict=True))
-    result.means += class_accuracies(
+    means = class_accuracies(
         train, test, label=label, neighbors=plan.neighbors, seed=plan.seed, **common
     )
+    if unseen := means[0].score.details["unseen_classes"]:
+        note = {"subject": common["subject"], "label": label, "classes": unseen}
+        result.notes.append(Note("probe-unseen-classes", note))
+    result.means += means
 
 
 def _retrieve(

@@ -462,6 +462,10 @@ EVALUATION: dict[str, Sentence] = {
     "materials-excluded": _materials_excluded,
     "probe-no-label": "The samples have no {label} in {part}: nothing was predicted from it",
     "probe-unlabeled": "{count} test samples without a {label} are excluded from its accuracy",
+    "probe-unseen-classes": lambda p, _: (
+        f"{p['subject']}: test samples of a {p['label']} that train lacks count as wrong "
+        f"({few(p['classes'])})"
+    ),
     "probe-no-encoder": "These encoders include none of {modality}: no retrieval with it",
     "probe-no-partner": "The test samples have no {modality}: no retrieval with it",
     "probe-some-partners": (
