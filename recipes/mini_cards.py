@@ -23,7 +23,8 @@ SUMMARIES = {
     "encoders": (
         "Vision, text and tactile encoders of palpate's world",
         "Three small encoders with one space of 128 dimensions: a CLIP (vision and text, with"
-        " its tokenizer) trained on photos and captions of the procedural world, and a "
+        " its tokenizer) trained on photos and captions of the procedural world, which say "
+        "what is felt and name no material, and a "
         "tactile encoder trained against it with the three-way InfoNCE. They replace the "
         "frozen CLIP of the paper where no hub is in reach.",
     ),
@@ -44,7 +45,8 @@ SUMMARIES = {
 }
 PAIR = (
     "Vision and text encoders of palpate's world",
-    "A small CLIP with its tokenizer, trained on photos and captions of the procedural world;"
+    "A small CLIP with its tokenizer, trained on photos and captions of the procedural world,"
+    " which say what is felt and name no material;"
     " its space has 128 dimensions. The tactile encoder next to it was trained against it.",
 )
 READ = {
