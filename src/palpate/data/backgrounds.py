@@ -229,13 +229,13 @@ class _Video:
         reference = self.numbers.index(how) if named else 0
         if how == "found":
             reference = int(free[find_reference(self.thumbnails[free])])
-        how = f"frame {how}" if named else how
+        way = f"frame {how}" if named else how
         if known:
             energy = contact_energy(self.thumbnails, self.thumbnails[reference])
-            runs, method = known, f"contacts of the manifest, reference {how}"
+            runs, method = known, f"contacts of the manifest, reference {way}"
         else:
             found = find_contacts(self.thumbnails, reference)
-            energy, runs, method = found.energy, found.runs, f"contacts found, reference {how}"
+            energy, runs, method = found.energy, found.runs, f"contacts found, reference {way}"
         chosen, before = np.full(len(self.paths), reference), np.zeros(len(self.paths), bool)
         after = -1
         for first, last in runs:
@@ -276,7 +276,8 @@ def _references(how: How | Mapping[str, How], videos: Collection[str]) -> dict[s
             raise PalpateError(must, repr(name), fix, argument="how")
         if not isinstance(value, int):
             require_choice("how", value, ("found", "first", "a frame"))
-    return {**dict.fromkeys(videos, "found"), **given}
+    references: dict[str, How] = dict.fromkeys(videos, "found")
+    return references | dict(given)
 
 
 def _videos(table: pl.DataFrame, given: Sequence[str | None]) -> dict[str, list[dict[str, Any]]]:

@@ -143,7 +143,9 @@ def _of_import(source: Path, options: Mapping[str, Any]) -> tuple[Facts, Scan]:
     given = {name: value for name, value in options.items() if value is not None} | {"root": None}
     if wrong := [name for name, value in given.items() if value is not None]:
         raise PalpateError("must be left out for a manifest", str(source), "", argument=wrong[0])
-    known = {k: manifest.facts[k] for k in ("license", "citation", "url") if k in manifest.facts}
+    known: dict[str, Any] = {
+        k: manifest.facts[k] for k in ("license", "citation", "url") if k in manifest.facts
+    }
     group = manifest.facts.get("group", "video")
     name, count = manifest.facts.get("dataset", "an import"), f"{len(manifest)} in the manifest"
     facts = Facts(
