@@ -207,7 +207,8 @@ def copies(train, modality, folder, seed):
             for column in (modality, "background"):
                 if train.table[column][k] is None:
                     continue
-                file = folder / f"edits-{seed}" / name.replace(" ", "_") / f"{column}{k}.png"
+                source = train.table["id"][k].replace("/", "-")
+                file = folder / "edits" / name.replace(" ", "_") / f"{column}-{source}.png"
                 if not file.is_file():
                     file.parent.mkdir(parents=True, exist_ok=True)
                     edit(Image.open(train.path(train.table[column][k])).convert("RGB")).save(file)

@@ -1,23 +1,28 @@
 """Thresholds from matches that are known to be unrelated, and what the flags then say.
 
 For a train image its best match in *other videos* is known to be no leak. Their similarities are
-the null: above its 90 % quantile u an exponential tail of mean excess b is fitted, and a share
-``rate`` of unrelated images lies over
+the null. A cosine c ends at 1, so tails are those of Fisher's z = artanh c: above its 90 % quantile
+u an exponential of mean excess b. What is over u comes from k videos only; with a prior that weighs
+as much as four videos of mean excess .07, n = k + 4 and B = (k b + .28) / n, the share of unrelated
+images that is expected above z is that of a Pareto distribution,
 
-    t(rate) = u + b log(.1 / rate).
+    .1 (1 + (z - u) / (n B))^-n,
+
+so thresholds rise where few videos are known, and the promised rate holds from three videos on
+(docs/studies/near_duplicates.md).
 
 Where no video is known, images far apart in recording order take that place, if
 the order says anything: an image's best match must lie near it more often than chance
 has it. A threshold is never replaced by a looser one; without a null nothing is promised.
 
-Several questions (as it is, moved, edited) share the rate. The answer that is rarest by chance
+Several questions (as it is, its cells, edited) share the rate. The answer that is rarest by chance
 counts, and the score is the similarity of the first question that would be as rare.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,13 +31,11 @@ from scipy.stats import poisson
 
 from palpate.leakage.neighbors import Floats, Ints
 
-#: Unrelated matches that a null needs; from how many videos a rate is more than a guess.
-FEWEST, VIDEOS = 30, 80
-#: Videos below which best matches in other videos say nothing of the tail.
-GROUPS = 20
+#: Unrelated matches that a null needs.
+FEWEST = 20
 TAIL, BINS = 0.9, 50
-#: Least scale of a tail.
-NARROWEST = 0.02
+#: The prior of a tail, its weight in videos and mean excess; the cosine at which z ends.
+PRIOR, EXCESS, END = 4, 0.07, 0.99999
 #: Flags that chance explains no more often than this are leaks, and a null that is over its
 #: threshold so rarely by chance contradicts a rate of MISSED times the promised one.
 CHANCE, MISSED = 0.01, 3.0
@@ -40,67 +43,100 @@ CHANCE, MISSED = 0.01, 3.0
 
 @dataclass(frozen=True)
 class Tail:
-    """The exponential tail of a null: location at the 90 % quantile, and mean excess."""
+    """The tail of a null: u, B and n of the formula above, and its share of the rate."""
 
     location: float
     scale: float
+    weight: int
+    share: float
 
     @classmethod
-    def of(cls, null: Floats) -> Tail | None:
+    def of(cls, null: Floats, groups: Ints, share: float) -> Tail | None:
         """Fit one to (n,) similarities of unrelated images; None if too few are known."""
-        known = null[np.isfinite(null)].astype(np.float64)
-        if len(known) < FEWEST:
+        known = np.isfinite(null)
+        if known.sum() < FEWEST:
             return None
-        location = float(np.quantile(known, TAIL))
-        over = known[known > location]
-        return cls(location, max(float((over - location).mean()) if len(over) else 0, NARROWEST))
+        z = _fisher(null[known])
+        location = float(np.quantile(z, TAIL))
+        over = z > location
+        videos = len(np.unique(groups[known][over]))
+        excess = videos * float((z[over] - location).mean()) if videos else 0.0
+        weight = videos + PRIOR
+        return cls(location, (excess + PRIOR * EXCESS) / weight, weight, share)
 
-    def threshold(self, rate: float) -> float:
-        """The similarity that a share ``rate`` of unrelated images exceeds."""
-        return self.location + self.scale * float(np.log(max((1 - TAIL) / rate, 1.0)))
+    def surprise(self, similarity: Any) -> Any:
+        """-log of the share of the tail that is expected above a similarity."""
+        excess = (_fisher(similarity) - self.location) / self.scale
+        return np.where(
+            excess > 0, self.weight * np.log1p(np.maximum(excess, 0) / self.weight), excess
+        )
+
+    def surprise_at(self, rate: float) -> float:
+        """The surprise that this question's share of a rate of unrelated images exceeds."""
+        return float(np.log((1 - TAIL) / (rate * self.share)))
+
+    def similarity(self, surprise: Any) -> Any:
+        """The inverse of :meth:`surprise`."""
+        excess = np.where(
+            surprise > 0, self.weight * np.expm1(np.maximum(surprise, 0) / self.weight), surprise
+        )
+        return np.tanh(self.location + self.scale * excess)
 
 
-def tails(nulls: Sequence[Floats]) -> list[Tail]:
+def tails(nulls: Sequence[Floats], groups: Ints, shares: Sequence[float]) -> list[Tail]:
     """One for each question, that of the question before where its null is too small.
 
     Args:
         nulls: (n,) similarities of unrelated images for each question; NaN where it has no answer.
+        groups: (n,) videos of these images.
+        shares: of the rate of false positives, for each question; together 1.
 
     Returns:
         As many; none if the first is too small.
     """
     fitted: list[Tail] = []
-    for null in nulls:
-        tail = Tail.of(null)
+    for null, share in zip(nulls, shares, strict=True):
+        tail = Tail.of(null, groups, share)
         if tail is None and not fitted:
             return []
-        fitted.append(tail or fitted[-1])
+        fitted.append(tail or replace(fitted[-1], share=share))
     return fitted
 
 
-def excess(similarities: Any, fitted: Sequence[Tail]) -> Floats:
-    """(questions, n): similarities over the location, in units of the scale."""
-    return np.stack([(s - t.location) / t.scale for s, t in zip(similarities, fitted, strict=True)])
+def surprises(similarities: Any, fitted: Sequence[Tail]) -> Floats:
+    """(questions, n): how rare answers are by chance, as surprises of the first question."""
+    return np.stack(
+        [
+            t.surprise(s) + np.log(t.share / fitted[0].share)
+            for s, t in zip(similarities, fitted, strict=True)
+        ]
+    )
 
 
 def score(similarities: Any, fitted: Sequence[Tail]) -> Floats:
     """(n,) of the rarest of (questions, n) answers, the first question's similarity as rare."""
-    rarest = np.fmax.reduce(excess(similarities, fitted))
-    return (fitted[0].location + fitted[0].scale * rarest).astype(np.float32)
+    rarest = np.fmax.reduce(surprises(similarities, fitted))
+    return fitted[0].similarity(rarest).astype(np.float32)
 
 
 def threshold(fitted: Sequence[Tail], rate: float) -> float:
     """The score that a share ``rate`` of unrelated images exceeds, by any question."""
-    return fitted[0].threshold(rate / len(fitted))
+    return float(fitted[0].similarity(fitted[0].surprise_at(rate)))
 
 
 def rate_of(score: float, fitted: Sequence[Tail]) -> float:
     """The share of unrelated images that exceeds a score: the inverse of :func:`threshold`."""
-    over = np.exp((fitted[0].location - score) / fitted[0].scale)
-    return float(len(fitted) * (1 - TAIL) * min(over, 1.0))
+    over = np.exp(-max(float(fitted[0].surprise(score)), 0.0))
+    return float((1 - TAIL) * over / fitted[0].share)
 
 
-def measured(nulls: Sequence[Floats], groups: Ints, rate: float) -> float:
+def _fisher(similarity: Any) -> Any:
+    return np.arctanh(np.clip(similarity, -END, END))
+
+
+def measured(
+    nulls: Sequence[Floats], groups: Ints, shares: Sequence[float], rate: float
+) -> float:
     """The share of unrelated images over a threshold from the other half of the groups.
 
     Where a half is too small, over the threshold from all.
@@ -108,7 +144,8 @@ def measured(nulls: Sequence[Floats], groups: Ints, rate: float) -> float:
     half = np.unique(groups, return_inverse=True)[1] % 2 == 0
     over = 0
     for fold in (half, ~half):
-        fitted = tails([null[~fold] for null in nulls]) or tails(nulls)
+        rest = [null[~fold] for null in nulls]
+        fitted = tails(rest, groups[~fold], shares) or tails(nulls, groups, shares)
         values = score([null[fold] for null in nulls], fitted)
         over += int((values >= threshold(fitted, rate)).sum())
     return over / len(groups)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import Progress, quiet, rng_for
-from palpate.leakage.descriptors import Descriptors, Edits, Whitened
-from palpate.leakage.neighbors import Apart, Base, Floats, Ints
+from palpate.leakage.descriptors import Descriptors, Whitened
+from palpate.leakage.neighbors import Apart, Floats, Ints
 from palpate.leakage.pool import Pool
 
 #: Rows in recording order within which two images may show one contact.
 WINDOW = 16
 #: Train images whose unrelated matches make the null.
-NULL_IMAGES = 4000
+NULL_IMAGES = 2000
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def unrelated(unit: Ints, order: Ints) -> Unrelated | None:
 def ordered(view: View, base: Ints, null: Unrelated) -> bool:
     """Whether recording order says anything: whether best matches lie within the window."""
     itself = Apart(null.apart.queries, null.apart.base, 0)
-    _, places = answers(view, base, [(base[null.rows], itself)])[0]
+    _, places = answers(view, base, [(base[null.rows], itself)], ways=1)[0]
     known = places[0] >= 0
     near = np.abs(null.apart.queries - null.apart.base[places[0]])[known] <= WINDOW
     chance = 2 * WINDOW / len(base)
@@ -102,9 +102,20 @@ def ordered(view: View, base: Ints, null: Unrelated) -> bool:
 
 
 def answers(
-    view: View, base: Ints, tasks: Sequence[tuple[Ints, Apart | None]], progress: Progress = quiet
+    view: View,
+    base: Ints,
+    tasks: Sequence[tuple[Ints, Apart | None]],
+    progress: Progress = quiet,
+    ways: int | None = None,
 ) -> list[tuple[Floats, Ints]]:
     """Best matches of several sets of images among the base.
+
+    Args:
+        view: how they are compared.
+        base: (m,) train images.
+        tasks: images, and which of the base are no neighbors of them.
+        progress: callback.
+        ways: how many ways of the view are tried; None tries all.
 
     Returns:
         for each task the similarities and places in ``base``, (questions, n); NaN and -1 where
@@ -112,24 +123,22 @@ def answers(
     """
     b = np.flatnonzero(view.known[base])
     found: list[tuple[Floats, Ints]] = []
-    steps: list[tuple[Ints, Apart | None, Callable[[int], Edits]]] = []
-    for items, apart in tasks:
-        q = np.flatnonzero(view.known[items])
-        shape = (view.descriptors.questions, len(items))
+    asked = [np.flatnonzero(view.known[items]) for items, _ in tasks]
+    for items, _ in tasks:
+        shape = (len(view.descriptors.shares), len(items))
         found.append((np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int64)))
-        if apart is not None:
-            apart = Apart(apart.queries[q], apart.base[b], apart.window)
-        steps.append((q, apart, view.descriptors.test(items[q])))
-    for k in range(view.descriptors.bases):
-        progress("comparing images", k, view.descriptors.bases)
-        among = Base(view.descriptors.train(base[b], k))
-        for (q, apart, edits), (similarity, place) in zip(steps, found, strict=True):
-            for question, at, vectors in edits(k):
-                best, where = similarity[question], place[question]
-                rows, values = among.closest(vectors, 1, None if apart is None else apart.only(at))
-                better = (rows[:, 0] >= 0) & ~(values[:, 0] <= best[q[at]])
-                best[q[at[better]]] = values[better, 0]
-                where[q[at[better]]] = b[rows[better, 0]]
+    for k, (question, index) in enumerate(view.descriptors.ways[:ways]):
+        progress("comparing images", k, len(view.descriptors.ways))
+        among = index(base[b])
+        for (items, apart), q, (similarity, place) in zip(tasks, asked, found, strict=True):
+            if not len(q) or not len(b):
+                continue
+            if apart is not None:
+                apart = Apart(apart.queries[q], apart.base[b], apart.window)
+            rows, values = (x[:, 0] for x in among.closest(items[q], 1, apart))
+            better = (rows >= 0) & ~(values <= similarity[question, q])
+            similarity[question, q[better]] = values[better]
+            place[question, q[better]] = b[rows[better]]
     return found
 
 
@@ -138,11 +147,11 @@ def links(
 ) -> Iterator[tuple[int, Ints, Ints, Floats]]:
     """Pairs of images that may be linked: (question, i, j, cosines)."""
     b = np.flatnonzero(view.known[base])
-    edits = view.descriptors.test(base[b])
-    for k in range(view.descriptors.bases):
-        progress("comparing images", k, view.descriptors.bases)
-        among = Base(view.descriptors.train(base[b], k))
-        for question, at, vectors in edits(k):
-            rows, cosines = among.closest(vectors, count, Apart(at, np.arange(len(b)), 0))
-            known = rows >= 0
-            yield question, b[at[np.nonzero(known)[0]]], b[rows[known]], cosines[known]
+    itself = Apart(np.arange(len(b)), np.arange(len(b)), 0)
+    for k, (question, index) in enumerate(view.descriptors.ways):
+        progress("comparing images", k, len(view.descriptors.ways))
+        if not len(b):
+            return
+        rows, cosines = index(base[b]).closest(base[b], count, itself)
+        known = rows >= 0
+        yield question, b[np.nonzero(known)[0]], b[rows[known]], cosines[known]

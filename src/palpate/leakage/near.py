@@ -10,8 +10,8 @@ verdict          when
 ``leaks``        more samples are over the threshold than chance explains
 ``none``         no more than chance explains
 ``cannot tell``  nothing was touched, or there is no null: unrelated images are not known to be so,
-                 or are all similar. Samples are ranked; only equal images are flagged, or with a
-                 cosine of 0.9 or more where no null contradicts: then they are leaks
+                 or are all similar. Samples are ranked; only equal images are flagged: then they
+                 are leaks
 ===============  =================================================================================
 
 Images are compared as they are and as if edited, tactile ones with their backgrounds, where these
@@ -33,7 +33,7 @@ from scipy.sparse.csgraph import connected_components
 from palpate.core import Note, PalpateError, Progress, quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage import calibration
-from palpate.leakage.calibration import GROUPS, VIDEOS, Tail
+from palpate.leakage.calibration import Tail
 from palpate.leakage.descriptors import Embeddings
 from palpate.leakage.matching import (
     Unrelated,
@@ -52,8 +52,10 @@ from palpate.leakage.signals import Flags
 LINKS = 16
 #: Cosine from which images are linked in any case.
 LINKED = 0.75
-#: Cosine of images that are equal but for encoding, where nothing is known to be unrelated.
-COPY = 0.9
+#: A threshold above this finds no copies: nothing is told.
+TIGHT = 0.97
+#: Videos from which a rate is more than a guess.
+VIDEOS = 80
 #: Cosine of equal images.
 SAME = 0.9995
 
@@ -133,9 +135,11 @@ def near_groups(
     i, j = [base[:0]], [base[:0]]
     for view in views:
         nulls = [row for values, _ in answers(view, base, tasks, progress) for row in values]
-        fitted = calibration.tails(nulls)
+        shares = view.descriptors.shares
+        fitted = calibration.tails(nulls, null.groups, shares) if null is not None else []
         for question, first, second, cosine in links(view, base, LINKS, progress):
-            limit = min([t.threshold(false_positives) for t in fitted[question:][:1]] + [LINKED])
+            own = [t.similarity(t.surprise_at(false_positives)) for t in fitted[question:][:1]]
+            limit = min([*own, LINKED])
             i.append(first[cosine >= limit])
             j.append(second[cosine >= limit])
     return _clusters(images, base[np.concatenate(i)], base[np.concatenate(j)])
@@ -182,16 +186,16 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         # Equal images of two videos are copies for certain, and say nothing of unrelated ones.
         nulls += [np.where(row < SAME, row, np.nan) for values, _ in more for row in values]
     similarities, places = (np.stack(x) for x in zip(*matches, strict=True))
-    fitted = calibration.tails(nulls) or [Tail(0, 1)] * len(matches)
-    rarest = np.nan_to_num(calibration.excess(similarities, fitted), nan=-np.inf).argmax(axis=0)
+    shares = [share / len(views) for view in views for share in view.descriptors.shares]
+    known = [] if null is None else calibration.tails(nulls, null.groups, shares)
+    fitted = known or [Tail(0, 1, 1, share) for share in shares]
+    rarest = np.nan_to_num(calibration.surprises(similarities, fitted), nan=-np.inf).argmax(axis=0)
     score = calibration.score(similarities, fitted)
     place = np.take_along_axis(places, rarest[None], axis=0)[0]
     limit = calibration.threshold(fitted, rate)
-    few = null is None or (null.source == "videos" and len(np.unique(null.groups)) < GROUPS)
-    if few or null is None or not calibration.tails(nulls) or limit >= 1:
-        params = {"images": len(base), "threshold": None if few else round(limit, 3)}
-        limit = COPY if few else 1.0
-        return Matches(score, place, limit, Note("cannot-tell-no-null", params))
+    if null is None or not known or limit > TIGHT:
+        params = {"images": len(base), "threshold": round(limit, 3) if known else None}
+        return Matches(score, place, 1.0, Note("cannot-tell-no-null", params))
     groups = len(np.unique(null.groups))
     params = {"threshold": round(limit, 3), "samples": len(null.rows), "groups": groups}
     return Matches(
@@ -201,7 +205,7 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         Note(f"threshold-{null.source}", params | {"rate": rate, "few": groups < VIDEOS}),
         fitted,
         calibration.score(nulls, fitted),
-        calibration.measured(nulls, null.groups, rate),
+        calibration.measured(nulls, null.groups, shares, rate),
     )
 
 
@@ -268,8 +272,6 @@ def _verdict(
     """Whether the flags are more than chance explains: all of them, or the strongest alone."""
     if same.any() or not flag.any():
         return "leaks" if same.any() else "none" if matches.tails else "cannot tell"
-    if not matches.tails:
-        return "leaks"
     known = np.isfinite(matches.unrelated).sum()
     if matches.measured and calibration.missed(matches.measured, int(known), rate):
         return "cannot tell"

@@ -1,4 +1,4 @@
-"""Nearest neighbors of unit vectors: all pairs of small sets, faiss' flat index for large ones."""
+"""Nearest neighbors, by faiss, without those that may be related to a query."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ Ints = NDArray[np.int64]
 
 #: Queries between two calls of the progress callback.
 BLOCK = 2048
-#: Up to so many pairs all are compared; above, so many candidates by the leading columns.
-EXHAUSTIVE, COARSE, CANDIDATES = 4_000_000, 192, 8
+#: Neighbors up to which a search is quick; more related rows than that are left out before.
+MOST = 100
 
 
 @dataclass(frozen=True)
@@ -35,77 +35,9 @@ class Apart:
     base: Ints
     window: int | None = None
 
-    def only(self, rows: Ints) -> Apart:
-        """For some of the queries."""
-        return Apart(self.queries[rows], self.base, self.window)
-
     def related(self, rows: Any, base: Any) -> NDArray[np.bool_]:
         """Whether queries and base rows, broadcast, are related."""
         return np.abs(self.queries[rows] - self.base[base]) <= (self.window or 0)
-
-
-class Base:
-    """Vectors to search among.
-
-    Args:
-        vectors: (m, d) unit vectors, of any float type; candidates are chosen by the leading
-            ``COARSE`` columns.
-    """
-
-    def __init__(self, vectors: NDArray[Any]) -> None:
-        self._vectors = vectors
-
-    def closest(
-        self,
-        queries: Floats,
-        count: int = 1,
-        apart: Apart | None = None,
-        progress: Progress = quiet,
-    ) -> tuple[Ints, Floats]:
-        """The most similar rows of each query.
-
-        Returns:
-            (rows, cosines): (q, count), best first; -1 and NaN where there is none.
-        """
-        rows = np.full((len(queries), count), -1, np.int64)
-        cosines = np.full((len(queries), count), np.nan, np.float32)
-        every = len(queries) * len(self._vectors) <= EXHAUSTIVE
-        candidates = np.arange(len(self._vectors))[None].repeat(len(queries) if every else 0, 0)
-        if not every:
-            coarse, among = (
-                np.ascontiguousarray(x[:, :COARSE], np.float32) for x in (queries, self._vectors)
-            )
-            candidates = nearest(coarse, among, count + CANDIDATES, apart=apart, progress=progress)
-        vectors = self._vectors.astype(np.float32) if every else None
-        for start in range(0, len(queries), BLOCK):
-            part = slice(start, start + BLOCK)
-            near = candidates[part]
-            if vectors is not None:
-                values = queries[part] @ vectors.T
-                if apart is not None:
-                    at = np.arange(start, start + len(near))[:, None]
-                    values[apart.related(at, near)] = -np.inf
-            else:
-                values = _cosines(queries[part], self._vectors, near)
-            best = min(count, near.shape[1])
-            order = values.argmax(axis=1)[:, None]
-            if count > 1:
-                order = np.argsort(-values, axis=1, kind="stable")[:, :best]
-            value = np.take_along_axis(values, order, axis=1)
-            place = np.take_along_axis(near, order, axis=1)
-            known = np.isfinite(value)
-            rows[part, :best] = np.where(known, place, -1)
-            cosines[part, :best] = np.where(known, value, np.nan)
-        return rows, cosines
-
-
-def _cosines(queries: Floats, base: NDArray[Any], candidates: Ints) -> Floats:
-    """(q, k) of each query with its candidates; -inf where there is none."""
-    values = np.full(candidates.shape, -np.inf, np.float32)
-    for k, rows in enumerate(candidates.T):
-        value = np.einsum("qd,qd->q", queries, base[rows].astype(np.float32))
-        values[:, k] = np.where(rows >= 0, value, -np.inf)
-    return values
 
 
 def nearest(
@@ -130,8 +62,9 @@ def nearest(
     """
     if apart is None:
         return _search(queries, base, k, progress)[0]
-    if apart.window is not None:
-        index = _search(queries, base, k + 2 * apart.window + 1, progress)[0]
+    widest = 2 * apart.window + 1 if apart.window is not None else _largest(apart)
+    if apart.window is not None or k + widest <= MOST:
+        index = _search(queries, base, k + widest, progress)[0]
         index[apart.related(np.arange(len(index))[:, None], index) & (index >= 0)] = -1
         order = np.argsort(index < 0, axis=1, kind="stable")[:, :k]
         return np.take_along_axis(index, order, axis=1)
@@ -152,6 +85,12 @@ def nearest(
         done += len(at)
         progress("searching", done, len(queries))
     return index
+
+
+def _largest(apart: Apart) -> int:
+    """The most base rows that are related to one query."""
+    known = apart.base[np.isin(apart.base, apart.queries)]
+    return int(np.unique(known, return_counts=True)[1].max(initial=0))
 
 
 def _search(queries: Floats, base: Floats, k: int, progress: Progress = quiet) -> tuple[Ints, Any]:

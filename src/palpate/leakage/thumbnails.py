@@ -2,10 +2,10 @@
 
 They are squashed to a square on purpose: quarter turns and mirrors then permute pixels.
 
-Each distinct file is decoded once, a JPEG at the smallest scale that libjpeg offers above 48 pixels
-(Pillow's ``draft``). Equal thumbnails are kept once. Files that are cut, empty or no images are
-listed, not raised: an audit goes on without them. With a cache, thumbnails are written in pieces of
-1,024 files, so that a run that was stopped goes on where it was.
+Each distinct file is decoded once, a JPEG at the smallest scale that libjpeg offers above 128
+pixels (Pillow's ``draft``). Equal thumbnails are kept once. Files that are cut, empty or no images
+are listed, not raised: an audit goes on without them. With a cache, thumbnails are written in
+pieces of 1,024 files, so that a run that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from PIL import Image, ImageOps
 from palpate.core import PalpateError, Progress, atomic_path, digest_json, quiet, short
 from palpate.data.images import BROKEN, check_image, file_stamp, in_threads, opened, read_image
 
-VERSION = 4
+VERSION = 5
 SIDE = 32
 #: Files of one cached piece.
 PIECE = 1024
-#: A JPEG is decoded at no less than this: libjpeg's reduction aliases, and differently after a
-#: shift.
-DRAFT = 48
+#: A JPEG is decoded at no less than this: libjpeg's reduction aliases, and faint contacts drown in
+#: that where a copy is edited.
+DRAFT = 128
 #: Modes that need no rule of :func:`palpate.data.images.read_image`.
 PLAIN = ("RGB", "L")
 
