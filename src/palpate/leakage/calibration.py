@@ -134,9 +134,7 @@ def _fisher(similarity: Any) -> Any:
     return np.arctanh(np.clip(similarity, -END, END))
 
 
-def measured(
-    nulls: Sequence[Floats], groups: Ints, shares: Sequence[float], rate: float
-) -> float:
+def measured(nulls: Sequence[Floats], groups: Ints, shares: Sequence[float], rate: float) -> float:
     """The share of unrelated images over a threshold from the other half of the groups.
 
     Where a half is too small, over the threshold from all.

@@ -15,11 +15,11 @@ would be taken for background where they are few.
    Where exactly a print lies within a cell does not matter: presses that slip stay similar.
 1. *Cells*. x averaged to 8 x 8 and to 16 x 16 cells of the middle 94 %, whitened. Of 16
    candidates the best is chosen with the query moved by 3 % over its background, in 9 ways.
-2. *Edited cells*. Queries in 8 turns and mirrors, each with red and blue swapped; train also as if
-   cropped and slightly turned, each with a mean of its own. Candidates are found by keys that no
-   turn, mirror or swap changes, the mean over all of them of max(0, u A) with random A. An edit
-   is tried only where the whitened length of the query, over the least of all edits, is
-   plausible: the light shows which edit was made.
+2. *Edited cells*, where no background is used. Queries in 8 turns and mirrors, each with red and
+   blue swapped; train also as if cropped and slightly turned, each with a mean of its own.
+   Candidates are found by keys that no turn, mirror or swap changes, the mean over all of them
+   of max(0, u A) with random A. An edit is tried only where the whitened length of the query,
+   over the least of all edits, is plausible: the light shows which edit was made.
 
 Measured in docs/studies/near_duplicates.md.
 """
@@ -31,7 +31,6 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from palpate.core import rng_for
 from palpate.leakage.neighbors import Apart, Floats, Ints, nearest
@@ -128,22 +127,29 @@ class Embeddings:
 
 
 class Whitener:
-    """PCA whitening of (n, d) signals that come in blocks."""
+    """PCA whitening of (n, d) signals that are added in blocks."""
 
-    def __init__(self, blocks: Iterator[Floats], ridge: float) -> None:
-        total, squares, count = 0.0, 0.0, 0
-        for x in blocks:
-            total, squares, count = (
-                total + x.sum(0, dtype=np.float64),
-                squares + x.T @ x,
-                count + len(x),
-            )
-        self.mean = np.asarray(total / count, np.float32)
-        values, directions = np.linalg.eigh(squares / count - np.outer(self.mean, self.mean))
+    def __init__(self) -> None:
+        self._total: Any = 0.0
+        self._squares: Any = 0.0
+        self._count = 0
+
+    def add(self, x: Floats) -> None:
+        """Fit on some more."""
+        self._total += x.sum(0, dtype=np.float64)
+        self._squares += x.T @ x
+        self._count += len(x)
+
+    def fit(self, ridge: float) -> Whitener:
+        """Finish, with the ridge of many images."""
+        self.mean = np.asarray(self._total / self._count, np.float32)
+        covariance = self._squares / self._count - np.outer(self.mean, self.mean)
+        values, directions = np.linalg.eigh(covariance)
         values = np.maximum(values, 0)
-        damped = values + ridge * min(max(1, MANY / count), MOST) * values.mean()
+        damped = values + ridge * min(max(1, MANY / self._count), MOST) * values.mean()
         self.directions = directions.astype(np.float32)
         self.matrix = self.directions * np.maximum(damped, 1e-12).astype(np.float32) ** -0.5
+        return self
 
     def __call__(self, x: Floats) -> Floats:
         """(n, d) whitened."""
@@ -160,8 +166,6 @@ class Whitened:
         gray: compare luma alone, as copies without color need.
         fit: (f,) the images to fit on, those that show something.
     """
-
-    shares = SHARES
 
     def __init__(
         self,
@@ -180,86 +184,94 @@ class Whitened:
         )
         fit = fit[np.linspace(0, len(fit) - 1, min(len(fit), FITTED)).astype(np.int64)]
         self._samplers = [[_sampler(s, *g) for s in GRIDS] for g in GEOMETRIES]
-        blocks = lambda: map(self._logs, _blocks(fit))  # noqa: E731
-        self._images_whitened: list[Whitener] = []
-        for c in range(1 if gray else 3):
-            whiten = Whitener((x[:, c] for x in blocks()), IMAGE_RIDGE)
+        self._white = [Whitener() for _ in range(1 if gray else 3)]
+        cells, keys = [Whitener() for _ in GRIDS], Whitener()
+        sums = [[0.0 for _ in GRIDS] for _ in GEOMETRIES]
+        for logs in map(self.logs, _blocks(fit)):
+            for c, whiten in enumerate(self._white):
+                whiten.add(logs[:, c])
+            for g, total in enumerate(sums):
+                signals = self.cells(logs, g)
+                for k, x in enumerate(signals):
+                    total[k] = total[k] + x.sum(axis=0, dtype=np.float64)
+                if g == 0:
+                    keys.add(self._swapped(signals[0]))
+                    for whiten, x in zip(cells, signals, strict=True):
+                        whiten.add(x)
+        for whiten in self._white:
+            whiten.fit(IMAGE_RIDGE)
             whiten.matrix = whiten.matrix @ whiten.directions.T
-            self._images_whitened.append(whiten)
-        self._slopes_whitened = Whitener(map(self._raw_slopes, blocks()), SLOPE_RIDGE)
-        self._cells = [
-            Whitener((_cells(x, self._samplers[0][g]) for x in blocks()), ridge)
-            for g, ridge in enumerate(GRIDS.values())
+        self._slopes = Whitener()
+        for logs in map(self.logs, _blocks(fit)):
+            self._slopes.add(self._raw_slopes(logs))
+        self._slopes.fit(SLOPE_RIDGE)
+        fitted = zip(cells, GRIDS.values(), strict=True)
+        self.matrices = [whiten.fit(ridge).matrix for whiten, ridge in fitted]
+        means = [[np.asarray(x / len(fit), np.float32) for x in total] for total in sums]
+        #: For each grid (geometries, d) whitened means.
+        self.means = [
+            np.stack([mean[k] @ matrix for mean in means]) for k, matrix in enumerate(self.matrices)
         ]
-        self._means = [
-            [
-                sum(_cells(x, s).sum(axis=0) for x in blocks()) / np.float32(len(fit)) @ w.matrix
-                for s, w in zip(samplers, self._cells, strict=True)
-            ]
-            for samplers in self._samplers
-        ]
-        self._moved = [[_sampler(s, *GEOMETRIES[0], move) for s in GRIDS] for move in MOVES]
-        self._edits = _edits(8 if gray else 16, 1 if gray else 3)
+        random = rng_for(0, "near-duplicates", "key")
+        self._key = keys.fit(GRIDS[min(GRIDS)]).matrix
+        self._key_means = [self._swapped(mean[0][None]) @ self._key for mean in means]
+        self._random = random.standard_normal((len(self._key), KEY), dtype=np.float32)
+        self._moved = [_sampler(min(GRIDS), *GEOMETRIES[0], move) for move in MOVES]
+        self._finely_moved = [_sampler(max(GRIDS), *GEOMETRIES[0], move) for move in MOVES]
+        self.edits = _edits(8 if gray else 16, 1 if gray else 3)
+        self._turns = _edits(8, 1 if gray else 2)[0]
         self.ways = [
             (0, lambda rows: VectorIndex(self.slopes, rows)),
-            (1, lambda rows: CellIndex(self, 0, rows, edited=False)),
-            *((2, lambda rows, g=g: CellIndex(self, g, rows)) for g in range(len(GEOMETRIES))),
+            (1, lambda rows: MoveIndex(self, rows)),
         ]
+        if backgrounds is None:  # over a background the light no longer tells which edit was made
+            self.ways.append((2, lambda rows: EditIndex(self, rows)))
+        self.shares = SHARES[: len(self.ways)]
 
     def slopes(self, rows: Ints) -> NDArray[np.float16]:
         """(n, d) unit vectors of slopes."""
         parts = [
-            unit(self._slopes_whitened(self._raw_slopes(self._logs(block)))).astype(np.float16)
+            unit(self._slopes(self._raw_slopes(self.logs(block)))).astype(np.float16)
             for block in _blocks(rows)
         ]
         return np.concatenate(parts)
 
-    def cells(self, rows: Ints, geometry: int) -> list[Floats]:
+    def cells(self, logs: Floats, geometry: int = 0) -> list[Floats]:
         """Cells of each grid, (n, cells^2 x channels), before whitening."""
-        parts = [
-            [_cells(logs, s) for s in self._samplers[geometry]]
-            for logs in map(self._logs, _blocks(rows))
-        ]
-        return [np.concatenate(x) for x in zip(*parts, strict=True)]
+        return [_cells(logs, s) for s in self._samplers[geometry]]
 
-    def moved(self, rows: Ints) -> list[list[Floats]]:
+    def moved(self, rows: Ints) -> Iterator[list[Floats]]:
         """Cells of images that are moved over their backgrounds, as they are first."""
         logs = self._log(self._images[rows])
-        moved = [[_cells(logs, s) for s in samplers] for samplers in self._moved]
+        behind = [np.float32(0)] * len(GRIDS)
         if self._backgrounds is not None:
-            logs = self._log(self._backgrounds[rows])
-            behind = [_cells(logs, s) for s in self._samplers[0]]
-            moved = [[x - y for x, y in zip(c, behind, strict=True)] for c in moved]
-        return moved
+            behind = self.cells(self._log(self._backgrounds[rows]))
+        for samplers in zip(self._moved, self._finely_moved, strict=True):
+            yield [_cells(logs, s) - x for s, x in zip(samplers, behind, strict=True)]
 
-    def edited(self, cells: Sequence[Floats]) -> list[list[Floats]]:
-        """Cells as if edited in every way, as they are first."""
-        ways = zip(*self._edits, strict=True)
-        return [[x[:, at] for x, at in zip(cells, columns, strict=False)] for columns in ways]
-
-    def vectors(self, cells: Sequence[Floats], geometry: int) -> Floats:
+    def vectors(self, cells: Sequence[Floats], geometry: int | Ints) -> Floats:
         """(n, d) unit vectors of cells, in which both grids weigh the same; coarse ones first."""
-        parts = [self.white(x, geometry, grid) for grid, x in enumerate(cells)]
+        fitted = zip(cells, self.matrices, self.means, strict=True)
+        parts = [unit(x @ matrix - means[geometry]) for x, matrix, means in fitted]
         return np.hstack(parts) / np.float32(np.sqrt(len(parts)))
 
-    def white(self, cells: Floats, geometry: int, grid: int = 0) -> Floats:
-        """(n, d) unit vectors of one grid."""
-        return unit(cells @ self._cells[grid].matrix - self._means[geometry][grid])
+    def keys(self, coarse: Floats, geometries: Sequence[int]) -> list[Floats]:
+        """For each geometry (n, KEY) what is the same for every edit of an image."""
+        cells = self._swapped(coarse)
+        turned = [cells[:, columns] @ self._key for columns in self._turns]
+        return [
+            sum(np.maximum(unit(x - self._key_means[g]) @ self._random, 0) for x in turned)
+            for g in geometries
+        ]
 
-    def plausible(self, variants: Sequence[Sequence[Floats]], geometry: int) -> NDArray[np.bool_]:
-        """(n, variants) whether an image may have been edited so, by its whitened length."""
-        lengths = np.stack(
-            [
-                [
-                    np.linalg.norm(x - means[0], axis=1)
-                    for x in (cells[0] @ self._cells[0].matrix for cells in variants)
-                ]
-                for means in self._means
-            ]
-        )  # (geometries, variants, n)
-        return (lengths[geometry] <= PLAUSIBLE * lengths.min(axis=(0, 1))).T
+    def _swapped(self, coarse: Floats) -> Floats:
+        """Coarse cells of what stays where red and blue are swapped: green, and red with blue."""
+        if self._gray:
+            return coarse
+        x = coarse.reshape(len(coarse), -1, 3)
+        return np.stack([x[..., 1], (x[..., 0] + x[..., 2]) / 2], axis=-1).reshape(len(x), -1)
 
-    def _logs(self, rows: Ints) -> Floats:
+    def logs(self, rows: Ints) -> Floats:
         """(n, channels, side^2): log thumbnails, over the background where it is used."""
         logs = self._log(self._images[rows])
         if self._backgrounds is not None:
@@ -274,7 +286,7 @@ class Whitened:
 
     def _raw_slopes(self, logs: Floats) -> Floats:
         """(n, channels x directions x cells^2)."""
-        white = [w(logs[:, c]) for c, w in enumerate(self._images_whitened)]
+        white = [w(logs[:, c]) for c, w in enumerate(self._white)]
         image = np.stack(white, axis=1).reshape(len(logs), -1, SIDE, SIDE)
         down, right = np.gradient(image, axis=(2, 3))
         pooled: list[Floats] = []
@@ -284,73 +296,99 @@ class Whitened:
         return np.sqrt(unit(np.stack(pooled, axis=1).reshape(len(logs), -1)))
 
 
-class CellIndex:
-    """Cells of train images; queries are edited, or moved, in the way that fits best.
+class MoveIndex:
+    """Cells of train images; queries are moved in the way that fits best."""
 
-    Args:
-        pool: all images.
-        geometry: crop and turn of the train images.
-        rows: the train images.
-        edited: turn, mirror and swap queries; else move them.
-    """
-
-    def __init__(self, pool: Whitened, geometry: int, rows: Ints, *, edited: bool = True) -> None:
-        self._pool, self._geometry, self._edited = pool, geometry, edited
-        self._vectors = np.concatenate(
-            [
-                pool.vectors(pool.cells(block, geometry), geometry).astype(np.float16)
-                for block in _blocks(rows)
-            ]
-        )
-        self._coarse = pool.cells(rows[:1], geometry)[0].shape[1]
-        self._random = rng_for(0, "near-duplicates", "key").standard_normal(
-            (self._coarse, KEY), dtype=np.float32
-        )
-        keys = self._keys(rows, geometry)
-        self._center = keys.mean(axis=0)
-        self._base = unit(keys - self._center)
+    def __init__(self, pool: Whitened, rows: Ints) -> None:
+        self._pool = pool
+        parts = [
+            pool.vectors(pool.cells(pool.logs(block)), 0).astype(np.float16)
+            for block in _blocks(rows)
+        ]
+        self._vectors, self._coarse = np.concatenate(parts), len(pool.matrices[0])
+        self._keys = np.ascontiguousarray(self._vectors[:, : self._coarse], np.float32)
 
     def closest(
         self, rows: Ints, count: int = 1, apart: Apart | None = None
     ) -> tuple[Ints, Floats]:
         """See :class:`Index`."""
-        keys = unit(self._keys(rows, 0) - self._center)
-        near = nearest(keys, self._base, count + CANDIDATES, apart=apart)
+        moved = [
+            [self._pool.vectors(cells, 0).astype(np.float16) for cells in self._pool.moved(block)]
+            for block in _blocks(rows)
+        ]
+        still = np.concatenate([variants[0][:, : self._coarse] for variants in moved])
+        near = nearest(still.astype(np.float32), self._keys, count + CANDIDATES, apart=apart)
         values = np.empty(near.shape, np.float32)
-        for start in range(0, len(rows), BLOCK):
-            part = slice(start, start + BLOCK)
-            variants = self._variants(rows[part])
-            among = self._vectors[near[part]].astype(np.float32)
-            coarse = np.stack([self._pool.white(c[0], self._geometry) for c in variants], axis=1)
-            alike = coarse @ among[:, :, : self._coarse].transpose(0, 2, 1)
-            if self._edited:
-                alike[~self._pool.plausible(variants, self._geometry)] = -np.inf
-                if self._geometry == 0:
-                    alike[:, 0] = -np.inf  # as it is: another question
-            best, every = alike.max(axis=2).argmax(axis=1), np.arange(len(alike))
-            chosen = [np.stack(grid)[best, every] for grid in zip(*variants, strict=True)]
-            vectors = self._pool.vectors(chosen, self._geometry)
-            values[part] = np.einsum("qd,qkd->qk", vectors, among)
-            near[part][alike[every, best].max(axis=1) == -np.inf] = -1
+        for block, variants in zip(_blocks(np.arange(len(rows))), moved, strict=True):
+            queries = np.stack(variants, axis=1).astype(np.float32)
+            among = self._vectors[near[block]].astype(np.float32)
+            values[block] = (queries @ among.transpose(0, 2, 1)).max(axis=1)
         return _best(near, values, count)
 
-    def _variants(self, rows: Ints) -> list[list[Floats]]:
-        if self._edited:
-            return self._pool.edited(self._pool.cells(rows, 0))
-        return self._pool.moved(rows)
 
-    def _keys(self, rows: Ints, geometry: int) -> Floats:
-        """(n, d) to search by: coarse vectors, or what is the same for every edit of an image."""
-        parts: list[Floats] = []
-        for block in _blocks(rows):
-            cells = self._pool.cells(block, geometry)[:1]
-            if self._edited:
-                edits = [self._pool.white(c[0], self._geometry) for c in self._pool.edited(cells)]
-                total = sum(np.maximum(x @ self._random, 0) for x in edits)
-                parts.append(total / np.float32(len(edits)))
-            else:
-                parts.append(self._pool.white(cells[0], geometry))
-        return np.concatenate(parts)
+class EditIndex:
+    """Cells of train images, as if cropped or turned; queries are edited in the best way."""
+
+    def __init__(self, pool: Whitened, rows: Ints) -> None:
+        self._pool, self._coarse = pool, len(pool.matrices[0])
+        every = range(len(GEOMETRIES))
+        vectors: list[list[Any]] = [[] for _ in every]
+        keys: list[list[Floats]] = [[] for _ in every]
+        for logs in map(pool.logs, _blocks(rows)):
+            for g in every:
+                cells = pool.cells(logs, g)
+                vectors[g].append(pool.vectors(cells, g).astype(np.float16))
+                keys[g] += pool.keys(cells[0], [g])
+        self._vectors = np.stack([np.concatenate(x) for x in vectors])
+        self._centers = [np.concatenate(x).mean(axis=0) for x in keys]
+        self._keys = [unit(np.concatenate(x) - c) for x, c in zip(keys, self._centers, strict=True)]
+
+    def closest(
+        self, rows: Ints, count: int = 1, apart: Apart | None = None
+    ) -> tuple[Ints, Floats]:
+        """See :class:`Index`."""
+        pool, every = self._pool, range(len(GEOMETRIES))
+        cells = [pool.cells(pool.logs(block)) for block in _blocks(rows)]
+        keys = zip(*(pool.keys(c[0], every) for c in cells), strict=True)
+        near = np.stack(
+            [
+                nearest(unit(np.concatenate(key) - center), base, count + CANDIDATES, apart=apart)
+                for key, center, base in zip(keys, self._centers, self._keys, strict=True)
+            ],
+            axis=1,
+        )  # (n, geometries, candidates)
+        found: list[tuple[Ints, Floats]] = []
+        for block, signals in zip(_blocks(np.arange(len(rows))), cells, strict=True):
+            found.append(self._compared(signals, near[block], count))
+        return tuple(np.concatenate(x) for x in zip(*found, strict=True))
+
+    def _compared(self, cells: Sequence[Floats], near: Ints, count: int) -> tuple[Ints, Floats]:
+        """Choose edits by the coarse grid, and compare the best candidates in full."""
+        pool, every = self._pool, np.arange(len(near))
+        edited = np.stack([cells[0][:, at] for at in pool.edits[0]], axis=1) @ pool.matrices[0]
+        centered = edited[:, None] - pool.means[0][:, None]  # (n, geometries, edits, d)
+        lengths = np.linalg.norm(centered, axis=3)
+        plausible = lengths <= PLAUSIBLE * lengths.min(axis=(1, 2), keepdims=True)
+        plausible[:, 0, 0] = False  # as it is: another question
+        geometry = np.arange(len(GEOMETRIES))[:, None]
+        among = self._vectors[geometry, near][..., : self._coarse].astype(np.float32)
+        alike = centered @ among.transpose(0, 1, 3, 2) / np.maximum(lengths, 1e-9)[..., None]
+        alike[~plausible] = -np.inf
+        alike.transpose(0, 1, 3, 2)[near < 0] = -np.inf
+        edit, alike = alike.argmax(axis=2), alike.max(axis=2)  # (n, geometries, candidates)
+        best = np.argsort(-alike.reshape(len(near), -1), axis=1, kind="stable")[:, : count + 2]
+        row, values = np.full(best.shape, -1), np.full(best.shape, np.nan, np.float32)
+        for t, at in enumerate(best.T):
+            g, k = np.divmod(at, near.shape[2])
+            known = np.isfinite(alike[every, g, k])
+            row[:, t] = np.where(known, near[every, g, k], -1)
+            chosen = [
+                np.take_along_axis(x, np.stack(columns)[edit[every, g, k]], axis=1)
+                for x, columns in zip(cells, pool.edits, strict=True)
+            ]
+            vectors = self._vectors[g, near[every, g, k]].astype(np.float32)
+            values[:, t] = np.einsum("nd,nd->n", pool.vectors(chosen, g), vectors)
+        return _best(row, values, count)
 
 
 def unit(x: Floats) -> Floats:
@@ -371,11 +409,11 @@ def _blocks(rows: Ints) -> Iterator[Ints]:
         yield rows[start : start + BLOCK]
 
 
-def _cells(logs: Floats, sampler: Any) -> Floats:
+def _cells(logs: Floats, sampler: Floats) -> Floats:
     """(n, cells x channels), each channel's mean removed."""
     count, channels, pixels = logs.shape
-    x = (sampler @ logs.reshape(-1, pixels).T).reshape(-1, count, channels)
-    return (x - x.mean(axis=0)).transpose(1, 0, 2).reshape(count, -1)
+    x = (logs.reshape(-1, pixels) @ sampler).reshape(count, channels, -1)
+    return (x - x.mean(axis=2, keepdims=True)).transpose(0, 2, 1).reshape(count, -1)
 
 
 def _edits(count: int, channels: int) -> list[list[Ints]]:
@@ -391,8 +429,8 @@ def _edits(count: int, channels: int) -> list[list[Ints]]:
 
 def _sampler(
     cells: int, share: float, degrees: float, move: tuple[float, float] = (0.0, 0.0)
-) -> Any:
-    """(cells^2, side^2) sparse: the middle of a thumbnail, cropped to a share, turned and moved."""
+) -> Floats:
+    """(side^2, cells^2): the middle of a thumbnail, cropped to a share, turned and moved."""
     finer = SIDE // cells
     at = ((np.arange(cells * finer) + 0.5) / (cells * finer) - 0.5) * (1 - 2 * MARGIN) * share
     y, x = np.meshgrid(at, at, indexing="ij")
@@ -410,8 +448,9 @@ def _sampler(
     ]
     columns = np.concatenate([((i + dy) * SIDE + j + dx).ravel() for dy, dx, _ in corners])
     weights = np.concatenate([w.ravel() for _, _, w in corners]) / finer**2
-    shape = (cells * cells, SIDE * SIDE)
-    return sparse.csr_matrix((weights.astype(np.float32), (np.tile(cell, 4), columns)), shape=shape)
+    out = np.zeros((SIDE * SIDE, cells * cells), np.float32)
+    np.add.at(out, (columns, np.tile(cell, 4)), weights.astype(np.float32))
+    return out
 
 
 def _pool() -> Floats:

@@ -186,7 +186,8 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         # Equal images of two videos are copies for certain, and say nothing of unrelated ones.
         nulls += [np.where(row < SAME, row, np.nan) for values, _ in more for row in values]
     similarities, places = (np.stack(x) for x in zip(*matches, strict=True))
-    shares = [share / len(views) for view in views for share in view.descriptors.shares]
+    shares = np.array([share for view in views for share in view.descriptors.shares])
+    shares = (shares / shares.sum()).tolist()
     known = [] if null is None else calibration.tails(nulls, null.groups, shares)
     fitted = known or [Tail(0, 1, 1, share) for share in shares]
     rarest = np.nan_to_num(calibration.surprises(similarities, fitted), nan=-np.inf).argmax(axis=0)
