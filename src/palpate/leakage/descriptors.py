@@ -42,7 +42,7 @@ GRIDS = {8: 0.01, 16: 0.03}
 #: Ridges of the whitened image and of its slopes, cells a side and directions of the slopes.
 IMAGE_RIDGE, SLOPE_RIDGE, SLOPE_CELLS, DIRECTIONS = 0.4, 0.05, 4, 8
 #: Images from which ridges stay as they are, and the most that they grow below.
-MANY, MOST = 8000, 10
+MANY, MOST = 8000, 40
 #: Share of the side that a copy may show, and degrees that it may be turned.
 GEOMETRIES = ((1.0, 0.0), (0.9, 0.0), (1.0, 3.0), (1.0, -3.0))
 #: Shares of the side by which a copy may be moved.
@@ -71,7 +71,7 @@ class Index(Protocol):
         ...
 
 
-class Descriptors(Protocol):
+class Descriptors:
     """Ways in which a pool of images is compared, by row.
 
     Attributes:
@@ -116,7 +116,7 @@ class VectorIndex:
         return _best(near, values, count)
 
 
-class Embeddings:
+class Embeddings(Descriptors):
     """Given vectors, compared as they are."""
 
     shares = (1.0,)
@@ -156,7 +156,7 @@ class Whitener:
         return (x - self.mean) @ self.matrix
 
 
-class Whitened:
+class Whitened(Descriptors):
     """Thumbnails of a pool.
 
     Args:
@@ -223,9 +223,10 @@ class Whitened:
         self.ways = [
             (0, lambda rows: VectorIndex(self.slopes, rows)),
             (1, lambda rows: MoveIndex(self, rows)),
+            (2, lambda rows: EditIndex(self, rows)),
         ]
-        if backgrounds is None:  # over a background the light no longer tells which edit was made
-            self.ways.append((2, lambda rows: EditIndex(self, rows)))
+        if backgrounds is not None:  # over them the light no longer tells which edit was made
+            self.ways = self.ways[:2]
         self.shares = SHARES[: len(self.ways)]
 
     def slopes(self, rows: Ints) -> NDArray[np.float16]:
@@ -260,7 +261,7 @@ class Whitened:
         cells = self._swapped(coarse)
         turned = [cells[:, columns] @ self._key for columns in self._turns]
         return [
-            sum(np.maximum(unit(x - self._key_means[g]) @ self._random, 0) for x in turned)
+            np.sum([np.maximum(unit(x - self._key_means[g]) @ self._random, 0) for x in turned], 0)
             for g in geometries
         ]
 
@@ -269,7 +270,9 @@ class Whitened:
         if self._gray:
             return coarse
         x = coarse.reshape(len(coarse), -1, 3)
-        return np.stack([x[..., 1], (x[..., 0] + x[..., 2]) / 2], axis=-1).reshape(len(x), -1)
+        return np.stack([x[..., 1], (x[..., 0] + x[..., 2]) * np.float32(0.5)], axis=-1).reshape(
+            len(x), -1
+        )
 
     def logs(self, rows: Ints) -> Floats:
         """(n, channels, side^2): log thumbnails, over the background where it is used."""
@@ -360,7 +363,7 @@ class EditIndex:
         found: list[tuple[Ints, Floats]] = []
         for block, signals in zip(_blocks(np.arange(len(rows))), cells, strict=True):
             found.append(self._compared(signals, near[block], count))
-        return tuple(np.concatenate(x) for x in zip(*found, strict=True))
+        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
 
     def _compared(self, cells: Sequence[Floats], near: Ints, count: int) -> tuple[Ints, Floats]:
         """Choose edits by the coarse grid, and compare the best candidates in full."""
@@ -400,7 +403,10 @@ def _best(near: Ints, values: Floats, count: int) -> tuple[Ints, Floats]:
     """The best of some candidates."""
     values = np.where(near >= 0, values, -np.inf)
     order = np.argsort(-values, axis=1, kind="stable")[:, :count]
-    near, values = (np.take_along_axis(x, order, axis=1) for x in (near, values))
+    near, values = (
+        np.take_along_axis(near, order, axis=1),
+        np.take_along_axis(values, order, axis=1),
+    )
     return near, np.where(near >= 0, values, np.nan)
 
 

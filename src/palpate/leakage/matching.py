@@ -135,7 +135,8 @@ def answers(
                 continue
             if apart is not None:
                 apart = Apart(apart.queries[q], apart.base[b], apart.window)
-            rows, values = (x[:, 0] for x in among.closest(items[q], 1, apart))
+            rows, values = among.closest(items[q], 1, apart)
+            rows, values = rows[:, 0], values[:, 0]
             better = (rows >= 0) & ~(values <= similarity[question, q])
             similarity[question, q[better]] = values[better]
             place[question, q[better]] = b[rows[better]]
