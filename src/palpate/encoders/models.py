@@ -159,7 +159,7 @@ def find_encoder(source: str | Path) -> tuple[Path, str | None]:
     what = "encoder"
     name, _, sensor = str(source).partition("#")
     owner, colon, file = name.partition(":")
-    if Path(source).exists() and not is_shipped(source):
+    if str(source) and Path(source).exists() and not is_shipped(source):
         path, sensor = Path(source), ""
     elif colon and is_hub_id(owner):
         path = _fetch(owner, [file], what, FIX_ENCODERS) / file
