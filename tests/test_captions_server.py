@@ -277,7 +277,7 @@ WRONG = {
     "refused": ("--server http://127.0.0.1:9/v1 --model m", "Connection refused"),
     "refused, no model": ("--server http://127.0.0.1:9/v1", "Connection refused"),
     "path": ("--server {url}/x --model m", "http://HOST:PORT/v1"),
-    "path, no model": ("--server {url}/x", "Name it"),
+    "path, no model": ("--server {url}/x", "Name it, or give the base"),
     "model": ("--server {url} --model gpt", "It has fake/vlm-7b"),
     "variable": ("--server {url} --key-variable NONE_7", "NONE_7, which is not set"),
     "body": ("--server {url} --body [1]", "a JSON object"),

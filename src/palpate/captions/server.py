@@ -208,7 +208,8 @@ class Server:
         models = self._models()
         if len(models) != 1:
             got = f"{len(models)} models" if models else "no list of models"
-            fix = f"Choose one of {_few(models)}" if models else "Name it"
+            unlisted = "Name it, or give the base of the API: http://HOST:PORT/v1"
+            fix = f"Choose one of {_few(models)}" if models else unlisted
             raise PalpateError(f"must be named for {self.url}", got, fix, argument="model")
         return models[0]
 
