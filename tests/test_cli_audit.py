@@ -320,7 +320,7 @@ def test_mistakes_are_one_line_each(tmp_path, small_manifest, capsys):
         ([lines, lines, "--group", "video"], "--by"),
         ([one, "--split", split, "--false-positives", "0.7"], "--false-positives"),
         ([one, "--split", split, "--near-frames", "-1"], "--near-frames"),
-        ([one, "--split", split, "--encoder", tmp_path / "none"], "encoders"),
+        ([one, "--split", split, "--encoder", tmp_path / "none"], "no folder"),
         ([lines, tmp_path / "bad.txt"], "1 problem"),
         ([one, "--split", split, "--by", "object", "--no-images"], "object"),
     ]:

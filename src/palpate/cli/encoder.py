@@ -62,7 +62,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
-        how = {"held_out": options.held_out, "device": machine.device}
+        how: dict[str, Any] = {"held_out": options.held_out, "device": machine.device}
         plan = plan_encoder(*data, preset=preset, epochs=options.epochs, **how)
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:

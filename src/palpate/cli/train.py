@@ -60,7 +60,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     preset = with_flags(PRESETS[options.preset], options.fields, *_FLAGS)
     data, machine = (options.data, options.split), options.machine
     if options.dry_run:
-        how = {"background": options.background, "device": machine.device}
+        how: dict[str, Any] = {"background": options.background, "device": machine.device}
         plan = plan_generator(*data, preset=preset, steps=options.steps, **how)
         return print_plan(terminal, f"Plan of {options.output}", plan)
     with terminal.progress() as progress:

@@ -269,6 +269,7 @@ def _references(how: How | Mapping[str, How], videos: Collection[str]) -> dict[s
     Raises:
         PalpateError: on a video that is not there, or a word that is no reference.
     """
+    given: Mapping[str, How]
     given = how if isinstance(how, Mapping) else dict.fromkeys(videos, how)
     for name, value in given.items():
         if name not in videos:
@@ -277,7 +278,8 @@ def _references(how: How | Mapping[str, How], videos: Collection[str]) -> dict[s
         if not isinstance(value, int):
             require_choice("how", value, ("found", "first", "a frame"))
     references: dict[str, How] = dict.fromkeys(videos, "found")
-    return references | dict(given)
+    references.update(given)
+    return references
 
 
 def _videos(table: pl.DataFrame, given: Sequence[str | None]) -> dict[str, list[dict[str, Any]]]:

@@ -270,8 +270,10 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
             work = folder / f"latents-{name}{column}"
             return encode_latents(autoencoder, images, part.ids, work, key=key, progress=progress)
 
-        features = {s: embed(part, encoders, s, cache=cache, progress=progress) for s in SOURCES}
-        return Encoded({s: f.features for s, f in features.items()}, *map(latents, columns))
+        conditions: dict[Source, NDArray[Any]] = {
+            s: embed(part, encoders, s, cache=cache, progress=progress).features for s in SOURCES
+        }
+        return Encoded(conditions, *map(latents, columns))
 
     with first_alone():
         rows, held = encoded(train, ""), manifest.part(split, "val")
@@ -441,7 +443,9 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     Raises:
         PalpateError: if a source is missing, or ``start`` has another geometry.
     """
-    tables = {s: torch.as_tensor(np.asarray(t), dtype=torch.float32) for s, t in conditions.items()}
+    tables: dict[Source, Tensor] = {
+        s: torch.as_tensor(np.asarray(t), dtype=torch.float32) for s, t in conditions.items()
+    }
     if missing := [s for s in policy.sources if s not in tables]:
         must, fix = f"source={policy.source!r} needs embeddings of {', '.join(policy.sources)}", ""
         raise PalpateError(must, f"none of {missing[0]}", fix)
@@ -458,13 +462,17 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     with torch.no_grad():
 
         def loss_of(conditions: Mapping[Source, Tensor], *tables: Any) -> DiffusionLoss:
-            tokens = {s: model.tokens(conditions[s], s).to("cpu") for s in policy.sources}
+            tokens: dict[Source, Tensor] = {
+                s: model.tokens(conditions[s], s).to("cpu") for s in policy.sources
+            }
             how: dict[str, Any] = {"stats": stats, "schedule": schedule, "policy": policy}
             return DiffusionLoss(tables[0], tokens, tables[1], **how)
 
         loss, others = loss_of(tables, latents, background), None
         if held_out is not None:
-            texts = {s: torch.as_tensor(held_out.conditions[s]) for s in policy.sources}
+            texts: dict[Source, Tensor] = {
+                s: torch.as_tensor(held_out.conditions[s]) for s in policy.sources
+            }
             held = loss_of(texts, held_out.latents, held_out.background)
             others = (len(held_out.latents), held.load)
     facts = [asdict(settings) for settings in (stats, unet, policy, schedule)]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -138,8 +139,10 @@ def three_way(
         tactile, text = tactile.float(), text.float()
         pair = {"tactile_text": (tactile, text, labels)}
         if vision is not None:
-            some = slice(None) if labels.photos is None else labels.photos.nonzero()[:, 0]
-            seen = labels if labels.photos is None else labels.take(some)
+            some, seen = slice(None), labels
+            if labels.photos is not None:
+                some = labels.photos.nonzero()[:, 0]
+                seen = labels.take(some)
             vision = vision.float()[some]
             pair["vision_text"] = (vision, text[some], seen)
             pair["tactile_vision"] = (tactile[some], vision, seen)
@@ -177,5 +180,5 @@ def in_chunks(
     """
     if chunk is None or chunk >= len(inputs):
         return encode(inputs)
-    options = {"use_reentrant": False, "preserve_rng_state": False}
+    options: dict[str, Any] = {"use_reentrant": False, "preserve_rng_state": False}
     return torch.cat([checkpoint(encode, part, **options) for part in inputs.split(chunk)])

@@ -27,11 +27,13 @@ class View:
         descriptors: of all images.
         known: (items,) those that can be compared so.
         queries: (items,) those whose matches are of interest.
+        shares: of the rate of false positives of these, for each question.
     """
 
     descriptors: Descriptors
     known: NDArray[np.bool_]
     queries: NDArray[np.bool_]
+    shares: Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -57,16 +59,21 @@ def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     gray = images.colorless()
     kinds = [(False, ~images.blank)]
     if gray[queries].any() and not gray[base].all():
-        kinds.append((True, gray))
+        kinds = [(False, ~images.blank & ~gray), (True, gray)]
     views: list[View] = []
     for luma, wanted in kinds:
+        found: list[tuple[Whitened, NDArray[np.bool_]]] = []
         for backgrounds in (None, images.backgrounds):
             known = ~images.blank if backgrounds is None else ~images.blank & (backgrounds >= 0)
             if backgrounds is None or (known[base].any() and known[queries].any()):
                 described = Whitened(
                     images.pixels, images.images, backgrounds, gray=luma, fit=both[known[both]]
                 )
-                views.append(View(described, known, wanted))
+                found.append((described, known))
+        whole = sum(sum(described.shares) for described, _ in found)
+        views += [
+            View(d, known, wanted, tuple(share / whole for share in d.shares)) for d, known in found
+        ]
     return views
 
 

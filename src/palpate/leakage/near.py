@@ -135,8 +135,7 @@ def near_groups(
     i, j = [base[:0]], [base[:0]]
     for view in views:
         nulls = [row for values, _ in answers(view, base, tasks, progress) for row in values]
-        shares = view.descriptors.shares
-        fitted = calibration.tails(nulls, null.groups, shares) if null is not None else []
+        fitted = calibration.tails(nulls, null.groups, view.shares) if null is not None else []
         for question, first, second, cosine in links(view, base, LINKS, progress):
             own = [t.similarity(t.surprise_at(false_positives)) for t in fitted[question:][:1]]
             limit = min([*own, LINKED])
@@ -186,8 +185,7 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         # Equal images of two videos are copies for certain, and say nothing of unrelated ones.
         nulls += [np.where(row < SAME, row, np.nan) for values, _ in more for row in values]
     similarities, places = (np.stack(x) for x in zip(*matches, strict=True))
-    shares = np.array([share for view in views for share in view.descriptors.shares])
-    shares = (shares / shares.sum()).tolist()
+    shares = [share for view in views for share in view.shares]
     known = [] if null is None else calibration.tails(nulls, null.groups, shares)
     fitted = known or [Tail(0, 1, 1, share) for share in shares]
     rarest = np.nan_to_num(calibration.surprises(similarities, fitted), nan=-np.inf).argmax(axis=0)
@@ -198,6 +196,7 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         params = {"images": len(base), "threshold": round(limit, 3) if known else None}
         return Matches(score, place, 1.0, Note("cannot-tell-no-null", params))
     groups = len(np.unique(null.groups))
+    first = np.count_nonzero(np.cumsum(shares) < 1 + 1e-6)  # of images in color, or of all
     params = {"threshold": round(limit, 3), "samples": len(null.rows), "groups": groups}
     return Matches(
         score,
@@ -205,8 +204,8 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
         limit,
         Note(f"threshold-{null.source}", params | {"rate": rate, "few": groups < VIDEOS}),
         fitted,
-        calibration.score(nulls, fitted),
-        calibration.measured(nulls, null.groups, shares, rate),
+        calibration.score(nulls[:first], fitted[:first]),
+        calibration.measured(nulls[:first], null.groups, shares[:first], rate),
     )
 
 
@@ -303,7 +302,7 @@ def _first(item: Ints, count: int) -> Ints:
 def _views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     if images.vectors is None:
         return image_views(images, base, queries)
-    return [View(Embeddings(images.vectors), ~images.blank, ~images.blank)]
+    return [View(Embeddings(images.vectors), ~images.blank, ~images.blank, Embeddings.shares)]
 
 
 def _null(images: Pool, base: Ints, views: list[View]) -> Unrelated | None:

@@ -252,7 +252,7 @@ class _Run:
         if self.options.ema is not None:
             d = min(self.options.ema, (1 + self.step) / (10 + self.step))
             with torch.no_grad():
-                torch._foreach_lerp_(
+                torch._foreach_lerp_(  # pyright: ignore
                     list(self.average.values()), list(self.parameters.values()), 1 - d
                 )
         rows = None if losses.rows is None else losses.rows.detach()

@@ -86,7 +86,7 @@ def average(tensors: Sequence[Tensor]) -> None:
             work.wait()  # type: ignore[union-attr]
     except RuntimeError as error:
         raise _ended(error) from None
-    torch._foreach_div_(list(tensors), size)
+    torch._foreach_div_(list(tensors), size)  # pyright: ignore
 
 
 def gather_rows(own: Tensor) -> Tensor:
