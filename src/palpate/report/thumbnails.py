@@ -112,6 +112,8 @@ def thumbnail(
     """Return one image with at most ``side`` pixels a side; ``less`` as in :class:`Wanted`."""
     if name is None:
         return Thumbnail(problem="not recorded")
+    if (base / name).is_fifo():  # it would be waited for
+        return Thumbnail(problem="file unreadable")
     try:
         with Image.open(base / name) as file:
             if file.width * file.height > LARGEST:
