@@ -91,8 +91,9 @@ COMMANDS: dict[str, int] = {
     "--epochs 0.1 --preset tiny -o OUT/e": 1,
     "train generator IN/manifest --split IN/split/split.json --clip IN/models/encoders "
     "--autoencoder IN/models/autoencoder --steps 1 --preset tiny -o OUT/g": 1,
-    "caption IN/manifest --template {material} -o OUT/c": 2,
-    "caption IN/manifest --server http://127.0.0.1:9/v1 --model x --dry-run -o OUT/c": 1,
+    "caption IN/manifest --template {material} --per frame -o OUT/c": 2,
+    "caption IN/manifest --server http://127.0.0.1:9/v1 --model x "
+    "--per frame --dry-run -o OUT/c": 1,
     "demo --data IN/vectors --preset tiny -o OUT/d": 1,
     "completion bash": 1,
 }
