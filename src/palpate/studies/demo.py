@@ -464,6 +464,7 @@ class _Demo:
                 seed=self.options.seed,
                 cache=self.cache,
                 progress=self.progress,
+                allow_seen=True,  # data may be a copy of the pretraining world; the scores say so
             )
             write_json(folder / "scores.json", [s.to_json() for s in results])
             return {"scores": len(results)}
