@@ -49,6 +49,14 @@ def test_a_template_has_no_dry_run(data, tmp_path):
     assert not (tmp_path / "c").exists()
 
 
+def test_captions_of_a_model_are_not_replaced(data, tmp_path):
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "replies.jsonl").write_text("{}\n")
+    with pytest.raises(PalpateError, match="no replies of a model"):
+        caption(data, tmp_path / "c", template="")
+    assert [p.name for p in (tmp_path / "c").iterdir()] == ["replies.jsonl"]
+
+
 def test_an_import_joins_captions_and_models_will_name_their_digest(data, tmp_path):
     made = caption(data, tmp_path / "c", template="{material} of {video}")
     args = ["import", data, "--text", tmp_path / "c", "-o", tmp_path / "tag-c", "-q"]

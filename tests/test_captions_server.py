@@ -371,7 +371,7 @@ def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
             describe(data, tmp_path / "c", server, concurrency=1)
         estimate = describe(data, tmp_path / "c", server, dry_run=True)
     assert (estimate.requests, estimate.measured, estimate.tokens) == (8, 4, (5600, 240))
-    assert re.search("8 .4 are answered", str(estimate))
+    assert re.search(" 8, none for photos", str(estimate))
 
 
 def test_the_client_is_loaded_when_a_server_is_asked_and_missed_in_one_line(

@@ -128,7 +128,7 @@ class Estimate:
         minutes = self.seconds / 60
         rows = {
             "photos": f"{self.photos:,}",
-            "requests": f"{self.requests:,} ({self.photos - self.requests:,} are answered)",
+            "requests": f"{self.requests:,}, none for photos that are answered or equal",
             "tokens": f"{self.tokens[0]:,} in, {self.tokens[1]:,} out",
             "time": f"{minutes / 60:.1f} h" if minutes > 90 else f"{minutes:.1f} min",
             "price": None if self.price is None else f"{self.price:.2f}",
@@ -201,13 +201,7 @@ def caption(  # noqa: PLR0913 (a public verb)
     manifest, output = load(data, progress=progress), Path(output)
     units = units_of(manifest, per)
     if template is not None:
-        if dry_run:
-            got, fix = "a template, which needs no model", "Leave one of the two out"
-            raise PalpateError("must be of a model", got, fix, argument="dry_run")
-        texts = template_texts(template, manifest, units, seed)
-        descriptions = [Description(text, flags=() if text else ("no-column",)) for text in texts]
-        made = {"model": None, "template": template or "adjectives of the material", "prompt": None}
-        return _write(manifest, units, descriptions, output, {"per": per, "seed": seed, **made})
+        return _of_columns(template, manifest, units, output, per=per, seed=seed, dry_run=dry_run)
     if not manifest.table["vision"].count():
         must, fix = "must have vision images", "Map the column vision to the photos"
         raise PalpateError(must, "samples without any", fix, argument="data")
@@ -221,7 +215,7 @@ def caption(  # noqa: PLR0913 (a public verb)
             replies, _ = read_replies(output / REPLIES)
             photos = Photos.of(manifest, units, question, progress)
             threads = describer.threads or concurrency
-            return _estimate(photos, question, replies, threads, prices)
+            return _estimate(photos, question, replies, threads, prices, again=again)
         with locked(output), closing(ReplyLog(output / REPLIES)) as log:
             photos = Photos.of(manifest, units, question, progress)
             pending = photos.pending(log.replies, question.prompt, again=again)
@@ -283,6 +277,30 @@ def _made(
     }
 
 
+def _of_columns(
+    template: str,
+    manifest: Manifest,
+    units: Units,
+    output: Path,
+    *,
+    per: str,
+    seed: int,
+    dry_run: bool,
+) -> Captions:
+    """Captions from a template; never over those of a model, which cost something."""
+    if dry_run:
+        got, fix = "a template, which needs no model", "Leave one of the two out"
+        raise PalpateError("must be of a model", got, fix, argument="dry_run")
+    if (output / REPLIES).exists():
+        must, fix = "must hold no replies of a model", "Choose another folder"
+        raise PalpateError(must, str(output), fix, argument="output")
+    texts = template_texts(template, manifest, units, seed)
+    descriptions = [Description(text, flags=() if text else ("no-column",)) for text in texts]
+    made = {"model": None, "template": template or "adjectives of the material", "prompt": None}
+    with locked(output):
+        return _write(manifest, units, descriptions, output, {"per": per, "seed": seed, **made})
+
+
 def _answers(photos: Photos, replies: Mapping[str, Reply]) -> list[Reply]:
     """The replies about these photos, each once."""
     keys = sorted({key for key in photos.keys if key is not None and key in replies})
@@ -295,9 +313,11 @@ def _estimate(
     replies: Mapping[str, Reply],
     threads: int,
     prices: Sequence[float] | None,
+    *,
+    again: bool,
 ) -> Estimate:
     """What the remaining requests take, by the replies so far or by assumptions."""
-    count = len(photos.pending(replies, question.prompt))
+    count = len(photos.pending(replies, question.prompt, again=again))
     known = _answers(photos, replies)
     if known:
         inward, outward = (sum(r.tokens[k] for r in known) / len(known) for k in (0, 1))

@@ -187,7 +187,7 @@ def _match(images: Pool, base: Ints, queries: Ints, rate: float, progress: Progr
     similarities, places = (np.stack(x) for x in zip(*matches, strict=True))
     shares = [share for view in views for share in view.shares]
     known = [] if null is None else calibration.tails(nulls, null.groups, shares)
-    fitted = known or [Tail(0, 1, 1, share) for share in shares]
+    fitted = known or [Tail(0, 1, 1, 1)] * len(shares)  # the highest cosine
     rarest = np.nan_to_num(calibration.surprises(similarities, fitted), nan=-np.inf).argmax(axis=0)
     score = calibration.score(similarities, fitted)
     place = np.take_along_axis(places, rarest[None], axis=0)[0]

@@ -9,12 +9,10 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import Progress, quiet
-
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-#: Queries between two calls of the progress callback.
+#: Queries at a time, which bounds memory.
 BLOCK = 2048
 #: Neighbors up to which a search is quick; more related rows than that are left out before.
 MOST = 100
@@ -40,14 +38,7 @@ class Apart:
         return np.abs(self.queries[rows] - self.base[base]) <= (self.window or 0)
 
 
-def nearest(
-    queries: Floats,
-    base: Floats,
-    k: int = 1,
-    *,
-    apart: Apart | None = None,
-    progress: Progress = quiet,
-) -> Ints:
+def nearest(queries: Floats, base: Floats, k: int = 1, *, apart: Apart | None = None) -> Ints:
     """The k nearest base rows of each query, by Euclidean distance.
 
     Args:
@@ -55,16 +46,15 @@ def nearest(
         base: (m, d).
         k: how many, at least 1.
         apart: which base rows are no neighbors.
-        progress: called with the number of queries done.
 
     Returns:
         (n, k) rows of the base, nearest first; -1 where there is none.
     """
     if apart is None:
-        return _search(queries, base, k, progress)[0]
+        return _search(queries, base, k)[0]
     widest = 2 * apart.window + 1 if apart.window is not None else _largest(apart)
     if apart.window is not None or k + widest <= MOST:
-        index = _search(queries, base, k + widest, progress)[0]
+        index = _search(queries, base, k + widest)[0]
         index[apart.related(np.arange(len(index))[:, None], index) & (index >= 0)] = -1
         order = np.argsort(index < 0, axis=1, kind="stable")[:, :k]
         return np.take_along_axis(index, order, axis=1)
@@ -72,7 +62,6 @@ def nearest(
     order = np.argsort(apart.base, kind="stable")
     rows, labels = base[order], apart.base[order]
     index = np.full((len(queries), k), -1, np.int64)
-    done = 0
     for group in np.unique(apart.queries).tolist():
         at = np.flatnonzero(apart.queries == group)
         low, high = np.searchsorted(labels, [group, group + 1])
@@ -82,8 +71,6 @@ def nearest(
         best = np.argsort(np.concatenate([near, far], axis=1), axis=1, kind="stable")[:, :k]
         picked = np.take_along_axis(both, best, axis=1)
         index[at] = np.where(picked < 0, -1, order[picked])
-        done += len(at)
-        progress("searching", done, len(queries))
     return index
 
 
@@ -93,15 +80,13 @@ def _largest(apart: Apart) -> int:
     return int(np.unique(known, return_counts=True)[1].max(initial=0))
 
 
-def _search(queries: Floats, base: Floats, k: int, progress: Progress = quiet) -> tuple[Ints, Any]:
+def _search(queries: Floats, base: Floats, k: int) -> tuple[Ints, Any]:
     """Rows and squared distances; -1 and infinity where there are fewer than k."""
     index = np.full((len(queries), k), -1, np.int64)
     distance = np.full((len(queries), k), np.inf, np.float32)
     if len(base):
         for start in range(0, len(queries), BLOCK):
-            progress("searching", start, len(queries))
             part = slice(start, start + BLOCK)
             least, rows = faiss.knn(queries[part], base, k)
             index[part], distance[part] = rows, np.where(rows < 0, np.inf, least)
-    progress("searching", len(queries), len(queries))
     return index, distance
