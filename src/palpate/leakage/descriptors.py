@@ -56,7 +56,7 @@ KEY, CANDIDATES = 128, 16
 #: Train images up to which all columns of vectors are searched; above, so many columns.
 FEW, COLUMNS = 4000, 96
 #: Images that are fitted on, and images at a time.
-FITTED, BLOCK = 10_000, 512
+FITTED, BLOCK = 6_000, 512
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 _LOG = np.log(np.arange(256, dtype=np.float32) + OFFSET)
 
@@ -315,17 +315,15 @@ class MoveIndex:
         self, rows: Ints, count: int = 1, apart: Apart | None = None
     ) -> tuple[Ints, Floats]:
         """See :class:`Index`."""
-        moved = [
-            [self._pool.vectors(cells, 0).astype(np.float16) for cells in self._pool.moved(block)]
-            for block in _blocks(rows)
-        ]
-        still = np.concatenate([variants[0][:, : self._coarse] for variants in moved])
-        near = nearest(still.astype(np.float32), self._keys, count + CANDIDATES, apart=apart)
+        pool = self._pool
+        parts = [pool.vectors(pool.cells(pool.logs(block)), 0) for block in _blocks(rows)]
+        still = np.concatenate([x[:, : self._coarse] for x in parts])
+        near = nearest(still, self._keys, count + CANDIDATES, apart=apart)
         values = np.empty(near.shape, np.float32)
-        for block, variants in zip(_blocks(np.arange(len(rows))), moved, strict=True):
-            queries = np.stack(variants, axis=1).astype(np.float32)
+        for block in _blocks(np.arange(len(rows))):
+            moved = [pool.vectors(cells, 0) for cells in pool.moved(rows[block])]
             among = self._vectors[near[block]].astype(np.float32)
-            values[block] = (queries @ among.transpose(0, 2, 1)).max(axis=1)
+            values[block] = (np.stack(moved, axis=1) @ among.transpose(0, 2, 1)).max(axis=1)
         return _best(near, values, count)
 
 
@@ -335,14 +333,15 @@ class EditIndex:
     def __init__(self, pool: Whitened, rows: Ints) -> None:
         self._pool, self._coarse = pool, len(pool.matrices[0])
         every = range(len(GEOMETRIES))
-        vectors: list[list[Any]] = [[] for _ in every]
+        width = sum(map(len, pool.matrices))
+        self._vectors = np.empty((len(GEOMETRIES), len(rows), width), np.float16)
         keys: list[list[Floats]] = [[] for _ in every]
-        for logs in map(pool.logs, _blocks(rows)):
+        for block in _blocks(np.arange(len(rows))):
+            logs = pool.logs(rows[block])
             for g in every:
                 cells = pool.cells(logs, g)
-                vectors[g].append(pool.vectors(cells, g).astype(np.float16))
+                self._vectors[g, block] = pool.vectors(cells, g)
                 keys[g] += pool.keys(cells[0], [g])
-        self._vectors = np.stack([np.concatenate(x) for x in vectors])
         self._centers = [np.concatenate(x).mean(axis=0) for x in keys]
         self._keys = [unit(np.concatenate(x) - c) for x, c in zip(keys, self._centers, strict=True)]
 

@@ -26,6 +26,8 @@ VERSION = 5
 SIDE = 32
 #: Files of one cached piece.
 PIECE = 1024
+#: Files that a thread decodes at a time: handing over each costs as much as decoding it.
+AT_ONCE = 32
 #: A JPEG is decoded at no less than this: libjpeg's reduction aliases, and faint contacts drown in
 #: that where a copy is edited.
 DRAFT = 128
@@ -84,25 +86,26 @@ def thumbnails(
         threads: that decode; default: the number of cores, 16 at most.
         progress: called with the number of files done.
     """
-    files = sorted({path for path in paths if path is not None})
+    names = [None if path is None else str(path) for path in paths]  # hashed quicker than paths
+    files = [Path(name) for name in sorted({name for name in names if name is not None})]
     rows: dict[bytes, int] = {}
     different: list[NDArray[np.uint8]] = []
-    row_of: dict[Path | None, int] = {None: -1}
+    row_of: dict[str | None, int] = {None: -1}
     unreadable: dict[str, str] = {}
     for start in range(0, len(files), PIECE):
         progress("decoding images", start, len(files))
         piece = files[start : start + PIECE]
         pixels, reasons = _piece(piece, cache, threads)
         unreadable.update({str(piece[k]): reason for k, reason in sorted(reasons.items())})
-        for k, path in enumerate(piece):
+        for k, name in enumerate(map(str, piece)):
             if k in reasons:
-                row_of[path] = -1
+                row_of[name] = -1
                 continue
-            row_of[path] = rows.setdefault(pixels[k].tobytes(), len(rows))
-            if row_of[path] == len(different):
+            row_of[name] = rows.setdefault(pixels[k].tobytes(), len(rows))
+            if row_of[name] == len(different):
                 different.append(pixels[k].copy())
     progress("decoding images", len(files), len(files))
-    row = np.array([row_of[path] for path in paths], np.int64)
+    row = np.array([row_of[name] for name in names], np.int64)
     empty = np.zeros((0, SIDE, SIDE, 3), np.uint8)
     return Thumbnails(row, np.stack(different) if different else empty, unreadable)
 
@@ -128,10 +131,12 @@ def _piece(files: Sequence[Path], cache: Path | None, threads: int | None) -> De
 
 def _decode(files: Sequence[Path], threads: int | None) -> Decoded:
     pixels, reasons = np.zeros((len(files), SIDE, SIDE, 3), np.uint8), dict[int, str]()
-    decoded = in_threads(lambda k: thumbnail(files[k]), range(len(files)), threads=threads)
-    for k, result in decoded:
-        if isinstance(result, str):
-            reasons[k] = result
-        else:
-            pixels[k] = result
+    starts = range(0, len(files), AT_ONCE)
+    some = lambda k: [thumbnail(file) for file in files[k : k + AT_ONCE]]  # noqa: E731
+    for start, results in in_threads(some, starts, threads=threads):
+        for k, result in enumerate(results, start):
+            if isinstance(result, str):
+                reasons[k] = result
+            else:
+                pixels[k] = result
     return pixels, reasons
