@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.encoders.seen import FILE, digest_images, load_seen, save_seen, union
+from palpate.encoders.encoder_set import SEEN, load_seen, save_seen
+from palpate.encoders.preprocess import digest_images, union
 
 
 def run() -> None:
@@ -38,7 +39,7 @@ def run() -> None:
         seen = union(digest_images(images))
         print(f"digests of {n:,} images of {side} px: {time.process_time() - begin:.2f} CPU-s")
         save_seen(seen, folder)
-        print(f"file: {(folder / FILE).stat().st_size:,} bytes")
+        print(f"file: {(folder / SEEN).stat().st_size:,} bytes")
         begin = time.process_time()
         again = load_seen(folder, len(seen))
         assert again is not None

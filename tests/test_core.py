@@ -43,14 +43,17 @@ PROBLEMS = [Problem("a:1", "bad-line", "x"), Problem("a:2", "bad-line", "y")]
             PalpateError("must lie in (0, 1)", "2", "", argument="val", example={"val": 0.1}),
             "`val` must lie in (0, 1). Got 2. E.g. val=0.1.",
         ),
-        (ProblemsError(PROBLEMS, "Fix them"), "Got 2 problems: 2 bad-line. Fix them."),
+        (
+            ProblemsError(PROBLEMS, "Fix them"),
+            "Got 2 problems: 2 bad-line. Fix them.\n  a:1: x\n  a:2: y",
+        ),
         (
             MissingExtraError("av", "video", "Video"),
             "In palpate's checkout run: pip install -e '.[video]'.",
         ),
     ],
 )
-def test_an_error_is_one_line_and_survives_pickling(error, text):
+def test_an_error_says_must_got_fix_and_survives_pickling(error, text):
     assert str(error).endswith(text)
     again = pickle.loads(pickle.dumps(error))
     assert (str(again), again.to_json()) == (str(error), error.to_json())

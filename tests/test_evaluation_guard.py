@@ -14,8 +14,8 @@ from palpate import probe, score
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
-from palpate.encoders.seen import digest_images, union
-from palpate.evaluation.guard import guard
+from palpate.encoders.preprocess import digest_images, union
+from palpate.evaluation.inputs import guard
 
 
 def by_video(manifest, *train):
@@ -51,7 +51,7 @@ def test_training_keeps_which_images_it_saw_by_pixels_not_by_names(
         shutil.copy(path, renamed / f"{k}.png")
     for modality in ("vision", "tactile"):  # the fresh vision encoder has seen the photos
         encoder = Encoder(again, modality)
-        assert encoder.knows_seen
+        assert again.knows_seen(modality)
         assert encoder.saw(train).all()
         assert not encoder.saw(test).any()
     assert encoder.saw(renamed).tolist() == [True, True, False]
@@ -135,7 +135,7 @@ def test_going_on_from_an_encoder_keeps_what_it_saw(trained, small_manifest, tmp
             small_manifest, later, start.clip, TINY, folder, start=begin, **options
         )
         encoder = Encoder(result, "tactile")
-        assert encoder.knows_seen == known
+        assert result.knows_seen("tactile") == known
         videos = {v for v, s in zip(small_manifest.column("video"), encoder.saw(small_manifest),
                                     strict=True) if s}  # fmt: skip
         assert videos == ({"v0", "v1", "v2", "v3"} if known else {"v3"})

@@ -1,5 +1,6 @@
 """The house: imports go one way without effects, help is quick, sources hold nothing personal."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -7,7 +8,9 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from palpate.cli import VERBS
 
@@ -140,7 +143,6 @@ assert state() == before
 def test_no_module_imports_itself_in_a_circle():
     """Strongly connected components of the import graph have one module each."""
     import grimp
-    import numpy as np
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -154,3 +156,21 @@ def test_no_module_imports_itself_in_a_circle():
     count, label = connected_components(matrix, directed=True, connection="strong")
     circles = [[m for m in modules if label[index[m]] == k] for k in range(count)]
     assert not [circle for circle in circles if len(circle) > 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "files"),
+    [("score a --reference b --encoder palpate/mini", 30), ("generate b/0.png -o t.png", 14)],
+)
+def test_the_main_paths_stay_short(tmp_path, words, files):
+    """Files of palpate in which a function runs; before the house was made simple, 51 and 24."""
+    images = np.random.default_rng(0).integers(0, 256, (2, 12, 64, 64, 3), dtype=np.uint8)
+    for name, folder in zip("ab", images, strict=True):
+        (tmp_path / name).mkdir()
+        for k, image in enumerate(folder):
+            Image.fromarray(image).save(tmp_path / name / f"{k}.png")
+    script = [sys.executable, TOP / "benchmarks" / "walk.py", "--json", "walk.json", "--"]
+    subprocess.run([*script, "palpate", *words.split()], cwd=tmp_path, check=True, timeout=300)
+    walked = json.loads((tmp_path / "walk.json").read_text(encoding="utf-8"))
+    assert len(walked) <= files, "\n".join(walked)

@@ -5,6 +5,7 @@ from palpate.core.digest import (
     digest_folder,
     digest_json,
     digest_lines,
+    fact_lines,
     plain,
     rng_for,
     seed_for,
@@ -40,7 +41,6 @@ from palpate.core.progress import Progress, quiet, track
 from palpate.core.samples import SampleRef
 from palpate.core.score import Score, columns, require_comparable
 from palpate.core.split import PARTS, Split
-from palpate.core.text import fact_lines
 
 __all__ = [
     "PARTS",

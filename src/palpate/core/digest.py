@@ -1,4 +1,4 @@
-"""JSON values, digests and seeds: SHA-256 over canonical forms.
+"""Values as JSON and as text, digests and seeds: SHA-256 over canonical forms.
 
 Equal content has one name, and a random draw depends on (seed, purpose, sample), never on order.
 """
@@ -41,6 +41,21 @@ def plain(value: Any) -> Any:
     if isinstance(value, PurePath):
         return value.as_posix()
     raise TypeError(f"cannot put a {type(value).__name__} into JSON")
+
+
+def fact_lines(rows: Mapping[str, Any]) -> list[str]:
+    """Return one line per name, the values below each other; ``-`` for none."""
+    width = max(map(len, rows), default=0)
+    return [f"{name:<{width}}  {_as_text(value) or '-'}" for name, value in rows.items()]
+
+
+def _as_text(value: Any) -> str:
+    """Return a value as a person writes it: ``train 16, test 4`` for a mapping."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_as_text(cell)}" for name, cell in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_as_text, value))
+    return "" if value is None else str(value)
 
 
 def to_numpy(values: Any) -> np.ndarray:

@@ -156,6 +156,9 @@ class ProblemsError(PalpateError):
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.problems, self.fix, self.must), self.__dict__
 
+    def __str__(self) -> str:
+        return "\n".join([self.message(), *problem_lines(self.problems)])
+
     def to_json(self) -> dict[str, Any]:
         """Return the error as a JSON object, with the list ``problems``."""
         return super().to_json() | {"problems": plain(self.problems)}

@@ -177,15 +177,26 @@ def cached_images(
     if cache is None:
         return load_images(paths, size, progress=progress)
     key = short(digest_json([2, size, image_stamp(manifest, column)]))
-    file = Path(cache) / f"{column}-{size}-{key}.npy"
-    shape = (len(paths), size, size, 3)
+
+    def fill(images: NDArray[np.uint8]) -> None:
+        load_images(paths, size, progress=progress, into=images)
+
+    return mapped_images(
+        Path(cache) / f"{column}-{size}-{key}.npy", (len(paths), size, size, 3), fill
+    )
+
+
+def mapped_images(
+    file: Path, shape: tuple[int, ...], fill: Callable[[NDArray[np.uint8]], object]
+) -> NDArray[np.uint8]:
+    """Map an array of bytes read-only from its file; ``fill`` computes one that is not there."""
     with suppress(Exception):  # a damaged header is parsed as Python, and fails in many ways
         mapped = np.load(file, mmap_mode="r", allow_pickle=False)
         if mapped.shape == shape and mapped.dtype == np.uint8:
             return mapped
     with atomic_path(file) as part:
         images = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
-        load_images(paths, size, progress=progress, into=images)
+        fill(images)
         images.flush()
         del images
     return np.load(file, mmap_mode="r", allow_pickle=False)
@@ -228,7 +239,7 @@ def in_threads(
     Args:
         function: the work.
         items: what to work on.
-        what: name of the work for ``progress``.
+        what: name of the work for ``progress``; work without a name is not reported.
         progress: progress callback.
         threads: how many; default: the number of cores, 16 at most.
         stop: set when the caller leaves early, for functions that run long and look at it.
@@ -237,7 +248,9 @@ def in_threads(
         raise PalpateError("must be at least 1", str(threads), "", argument="threads")
     threads = threads or min(16, os.cpu_count() or 1)
     remaining = iter(items)
-    progress(what, 0, len(items))
+    report = progress if what else None
+    if report:
+        report(what, 0, len(items))
     with ThreadPoolExecutor(threads) as pool:
         running = {pool.submit(function, item): item for item in islice(remaining, 4 * threads)}
         done = 0
@@ -247,7 +260,8 @@ def in_threads(
                     item = running.pop(future)
                     yield item, future.result()
                     done += 1
-                    progress(what, done, len(items))
+                    if report:
+                        report(what, done, len(items))
                     for following in islice(remaining, 1):
                         running[pool.submit(function, following)] = following
         finally:

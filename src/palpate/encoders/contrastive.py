@@ -51,10 +51,9 @@ from palpate.encoders.losses import (
     three_way,
 )
 from palpate.encoders.models import move, pick_device
-from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD
+from palpate.encoders.preprocess import CLIP_MEAN, CLIP_STD, digest_images, union
 from palpate.encoders.presets import EncoderPreset, Targets, preset
 from palpate.encoders.rows import Rows, augmented, draw, numbers, unit
-from palpate.encoders.seen import digest_images, union
 from palpate.encoders.tokenizer import train_tokenizer
 from palpate.metrics.probe import material_accuracy
 from palpate.training.engine import Batch, Losses, Task, fit

@@ -28,7 +28,7 @@ from palpate.core import (
     short,
 )
 from palpate.data.captions import NAMED, caption
-from palpate.data.images import REFETCH, cached_images, file_stamp
+from palpate.data.images import REFETCH, cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
 from palpate.encoders.preprocess import Frames, load_frames, to_unit
@@ -98,9 +98,9 @@ def embed(  # noqa: PLR0913
     digest = encoders.digest(modality)
     texts = texts_of(manifest)[0] if modality == "text" else []
     plain = modality == "text" or encoders.preprocess(modality).plain
-    inputs = texts or _stamps(manifest, column)
+    inputs: list[Any] = texts or [image_stamp(manifest, column)]
     frames = None if plain else encoders.preprocess(modality).frames(manifest, column, still=still)
-    inputs = [inputs, frames.stamps(manifest.root)] if frames else inputs
+    inputs += frames.stamps(manifest.root) if frames else []
     label, group = _column(manifest, labels), _column(manifest, groups)
     key = digest_json(["palpate-embedding/1", digest, manifest.ids, column, inputs, label, group])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
@@ -110,14 +110,14 @@ def embed(  # noqa: PLR0913
     if modality == "text":
         features = embed_texts(texts, encoders, batch=batch, progress=progress)
     elif frames is not None:
-        features = _embed_frames(frames, encoders, modality, batch, progress)
+        features = embed_frames(frames, encoders, modality, batch, progress)
     elif cache is not None and keep_pixels:
         size = encoders.preprocess(modality).resize
         pixels = cached_images(manifest, column, size, cache, progress)
         features = embed_images(pixels, encoders, modality, batch=batch, progress=progress)
     else:
         frames = encoders.preprocess(modality).frames(manifest, column)
-        features = _embed_frames(frames, encoders, modality, batch, progress)
+        features = embed_frames(frames, encoders, modality, batch, progress)
     result = FeatureSet(manifest.ids, features, label, group, digest)
     if file is not None:
         result.save(file)
@@ -190,7 +190,7 @@ def exact() -> Generator[None]:
         yield
 
 
-def _embed_frames(
+def embed_frames(
     frames: Frames, encoders: EncoderSet, modality: Modality, batch: int, progress: Progress
 ) -> NDArray[np.float32]:
     """Embed files, a batch in memory at a time; report all unreadable files together."""
@@ -229,14 +229,6 @@ def _require(modality: str, batch: int) -> None:
         raise PalpateError(
             "must be at least 1", str(batch), "", argument="batch", example={"batch": 128}
         )
-
-
-def _stamps(manifest: Manifest, column: str) -> list[list[object]]:
-    """Return relative path, size and modification time of every image."""
-    paths = manifest.paths(column)
-    stamps = {path: file_stamp(path) for path in dict.fromkeys(paths)}
-    names = manifest.column(column)
-    return [[name, *stamps[path]] for name, path in zip(names, paths, strict=True)]
 
 
 def _column(manifest: Manifest, name: str) -> list[str] | None:

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from palpate.core import PalpateError, Progress, quiet, require_choice
-from palpate.data.images import SUFFIXES, in_threads, read_image
+from palpate.data.images import SUFFIXES
 from palpate.data.manifest import Manifest
-from palpate.encoders.embed import embed, embed_images, embed_texts
+from palpate.encoders.embed import embed, embed_frames, embed_texts
 from palpate.encoders.encoder_set import EncoderSet, Modality
 from palpate.encoders.models import pick_device
-from palpate.encoders.preprocess import Frame, Preprocess
-from palpate.encoders.seen import digest_images
+from palpate.encoders.preprocess import Frames, Preprocess, load_frames
 
 
 @dataclass(frozen=True)
@@ -83,15 +82,9 @@ class Encoder:
 
     @property
     def trained_on(self) -> tuple[str, ...]:
-        """Data sets that the encoder's authors trained it on, beyond what :meth:`saw` knows."""
+        """Data sets that the encoder's authors trained it on."""
         public = self.encoders.public(self.modality)
         return public.trained_on if public else ()
-
-    @property
-    def knows_seen(self) -> bool:
-        """Whether all images of the training are known; else :meth:`saw` knows some or none."""
-        card = self.encoders.clip.card if self.modality == "vision" else self.encoders.card
-        return self.encoders.seen_by(self.modality) is not None and not card.get("seen_in_part")
 
     def saw(
         self, inputs: Any, *, batch: int = 128, progress: Progress = quiet
@@ -106,18 +99,8 @@ class Encoder:
         Returns:
             (n,) booleans; all false where the encoder's images are not known (public ones).
         """
-        seen, preprocess = self.encoders.seen_by(self.modality), self.preprocess
-        manifest = isinstance(inputs, Manifest)
-        if seen is None:
-            return np.zeros(len(inputs if manifest else list_images(inputs)), bool)
-        frames = preprocess.frames(inputs, self.modality).files if manifest else None
-        images = list_images(inputs) if frames is None else frames
-        found = np.zeros(len(images), bool)
-        for start in range(0, len(images), batch):
-            pixels = prepared(images[start : start + batch], preprocess)
-            found[start : start + batch] = np.isin(digest_images(pixels), seen)
-            progress("looking for known images", start + len(pixels), len(images))
-        return found
+        images = inputs if isinstance(inputs, Manifest) else list_images(inputs)
+        return self.encoders.saw(self.modality, images, batch=batch, progress=progress)
 
     def encode(
         self, inputs: Any, *, batch: int = 128, progress: Progress = quiet
@@ -143,13 +126,9 @@ class Encoder:
         if self.modality == "text":
             texts = [inputs] if isinstance(inputs, str) else list(inputs)
             return embed_texts(texts, self.encoders, batch=batch, progress=progress)
-        images, preprocess = list_images(inputs), self.preprocess
-        features = np.empty((len(images), self.dim), np.float32)
-        for start in range(0, len(images), batch):
-            pixels = prepared(images[start : start + batch], preprocess)
-            features[start : start + batch] = embed_images(pixels, self.encoders, self.modality)
-            progress(f"embedding {self.modality}", start + len(pixels), len(images))
-        return features
+        files = [(image, None, None) for image in list_images(inputs)]
+        frames = Frames([*files], [""] * len(files))
+        return embed_frames(frames, self.encoders, self.modality, batch, progress)
 
 
 def list_images(inputs: Any) -> list[Path | Image.Image]:
@@ -180,24 +159,7 @@ def list_images(inputs: Any) -> list[Path | Image.Image]:
 
 def squares(images: Sequence[Path | Image.Image], size: int) -> NDArray[np.uint8]:
     """Decode images to center squares (n, size, size, 3)."""
-    return prepared(images, Preprocess(size, size))
-
-
-def prepared(
-    images: Sequence[Path | Image.Image | Frame], preprocess: Preprocess
-) -> NDArray[np.uint8]:
-    """Decode and prepare images, (n, height, width, channels)."""
-    pixels = np.empty((len(images), *preprocess.shape), np.uint8)
-
-    def decode(k: int) -> None:
-        image = images[k]
-        parts = image if isinstance(image, tuple) else (image,)
-        read: list[Any] = [read_image(p) if isinstance(p, Path) else p for p in parts]
-        pixels[k] = preprocess.prepare(*read)
-
-    for _ in in_threads(decode, range(len(images))):
-        pass
-    return pixels
+    return load_frames([(image, None, None) for image in images], Preprocess(size, size))
 
 
 def _bytes(images: Any) -> NDArray[np.uint8]:

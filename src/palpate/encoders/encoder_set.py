@@ -29,7 +29,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 from transformers import (
@@ -42,13 +47,15 @@ from transformers import (
 
 from palpate.core import (
     PalpateError,
+    Progress,
     atomic_folder,
     digest_json,
+    quiet,
     read_record,
-    require_choice,
     seed_for,
     write_json,
 )
+from palpate.data.manifest import Manifest
 from palpate.encoders.models import (
     architecture,
     digest_modules,
@@ -63,8 +70,14 @@ from palpate.encoders.models import (
     save_model,
     silent,
 )
-from palpate.encoders.preprocess import SAVE_AGAIN, Preprocess
-from palpate.encoders.seen import Digests, load_seen, save_seen
+from palpate.encoders.preprocess import (
+    SAVE_AGAIN,
+    Digests,
+    Frame,
+    Preprocess,
+    digest_images,
+    load_frames,
+)
 from palpate.encoders.tactile import Format, TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
@@ -95,6 +108,8 @@ CLIP_FILES = {
     "tokenizer.json (or vocab.json and merges.txt)": ("tokenizer.json", "vocab.json"),
     "preprocessor_config.json": ("preprocessor_config.json",),
 }
+#: Digests of the images that an encoder was trained on, in its folder.
+SEEN = "seen.safetensors"
 CLIP_FIX = f"Pass a folder that holds {', '.join(CLIP_FILES)}"
 
 
@@ -303,7 +318,8 @@ class EncoderSet:
         return getattr(self, "clip", None) is not None
 
     def _clip(self, modality: str) -> ClipEncoders:
-        require_choice("modality", modality, self.modalities)
+        if modality not in self.modalities:
+            raise _lacks(modality, self.modalities)
         return self.clip
 
     def to(self, device: str | torch.device) -> EncoderSet:
@@ -355,6 +371,39 @@ class EncoderSet:
         """Digests of the images that one encoder was trained on; None: unknown, or of texts."""
         clip = self.clip.seen if self._has_clip else None
         return {"vision": clip, "tactile": self.seen}.get(modality)
+
+    def knows_seen(self, modality: str) -> bool:
+        """Whether all images are known that one encoder was trained on; else some, or none."""
+        card = self.clip.card if modality == "vision" else self.card
+        return self.seen_by(modality) is not None and not card.get("seen_in_part")
+
+    def saw(
+        self,
+        modality: str,
+        images: Manifest | Sequence[Path | Image.Image],
+        *,
+        batch: int = 128,
+        progress: Progress = quiet,
+    ) -> NDArray[np.bool_]:
+        """Whether one encoder was trained on images, by their pixels, whatever their names.
+
+        Returns:
+            (n,) booleans; all false where the encoder's images are not known (public ones).
+        """
+        known, preprocess = self.seen_by(modality), self.preprocess(modality)
+        if known is None:
+            return np.zeros(len(images), bool)
+        files: Sequence[Frame] = (
+            preprocess.frames(images, modality).files
+            if isinstance(images, Manifest)
+            else [(image, None, None) for image in images]
+        )
+        seen = np.zeros(len(files), bool)
+        for start in range(0, len(files), batch):
+            pixels = load_frames(files[start : start + batch], preprocess)
+            seen[start : start + batch] = np.isin(digest_images(pixels), known)
+            progress("looking for known images", start + len(pixels), len(files))
+        return seen
 
     def public(self, modality: str) -> Format | None:
         """What is known of a public tactile encoder."""
@@ -458,8 +507,7 @@ class EncoderSet:
             must, fix = "must be vision or tactile for images", "Pass texts to the text encoder"
             raise PalpateError(must, repr(modality), fix, argument="modality")
         if self.tactile is None or self.tactile_preprocess is None:
-            must, fix = "These encoders must include a tactile encoder", "Train one: train_encoder"
-            raise PalpateError(must, "vision and text only", fix)
+            raise _lacks(modality, self.modalities)
         return self.tactile, self.tactile_preprocess
 
 
@@ -501,6 +549,39 @@ def seeded(seed: int, purpose: str) -> Generator[None]:
 def _config(model: nn.Module) -> Any:
     """The model's configuration, whose fields transformers types too loosely."""
     return model.config
+
+
+def _lacks(modality: str, modalities: Sequence[str]) -> PalpateError:
+    must, got = f"These encoders must include a {modality} encoder", f"{' and '.join(modalities)}"
+    return PalpateError(must, f"{got} only", "Use others, or train one: palpate.train_encoder")
+
+
+def save_seen(seen: Digests | None, folder: Path) -> None:
+    """Write the digests into the folder of an encoder; None writes nothing."""
+    if seen is not None:
+        save_file({"digests": seen}, folder / SEEN)
+
+
+def load_seen(folder: Path, count: int | None) -> Digests | None:
+    """Read what :func:`save_seen` wrote.
+
+    Args:
+        folder: of the encoder.
+        count: how many there must be, by the card; None for a card without a count.
+
+    Raises:
+        PalpateError: if the file is missing, damaged, or holds another number.
+    """
+    if count is None:
+        return None
+    must = f"{folder / SEEN} must hold the digests of the {count:,} images of the training"
+    try:
+        seen = load_file(folder / SEEN)["digests"]
+    except (OSError, KeyError, SafetensorError) as error:
+        raise PalpateError(must, str(error), "Fetch the encoder again") from None
+    if len(seen) != count or seen.dtype != np.uint64:
+        raise PalpateError(must, f"{len(seen):,}", "Fetch the encoder again")
+    return seen
 
 
 def _counts(seen: Mapping[str, Digests | None]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a call of :func:`palpate.evaluation.score` reads, as aligned samples.
+"""What a call of :func:`palpate.evaluation.score` reads: aligned samples, and the encoders.
 
 A source is a folder of images, a manifest, a folder of ``palpate generate``, a file of embeddings
 (:mod:`palpate.evaluation.embedding_files`), an array or tensor of images or features, a list of
@@ -33,6 +33,7 @@ from palpate.core import (
     Split,
     digest_file,
     digest_json,
+    quiet,
     read_json,
     require_regular,
     short,
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from palpate.data.manifest import Manifest
+    from palpate.encoders.encoder_set import EncoderSet, Modality
 
 
 Source = Any
@@ -712,3 +714,87 @@ def _common_group(sets: Sequence[Samples], requested: str) -> str | None:
         got = " and ".join(f"{kind} in {source}" for kind, source in known.items())
         raise PalpateError("All groups must be of one kind", got, "Pass groups for every id")
     return next(iter(known), None)
+
+
+def load_encoders(encoder: Any, progress: Progress) -> Any:
+    """An ``EncoderSet``, loaded where it is a name or a folder."""
+    if encoder is None or not isinstance(encoder, str | Path):
+        return encoder
+    progress(f"loading {encoder}", 0, 1)
+    from palpate.encoders.models import find_encoder, parts_of
+
+    for part in parts_of(encoder):
+        find_encoder(part)  # a wrong name answers at once; torch takes seconds to import
+    from palpate.encoders.encoder_set import EncoderSet
+
+    return EncoderSet.load(encoder)
+
+
+def guard(
+    encoders: EncoderSet,
+    modality: Modality,
+    images: Manifest | NDArray[Any],
+    *,
+    split: Split | None = None,
+    allow_seen: bool = False,
+    progress: Progress = quiet,
+) -> list[Note]:
+    """Raise if an encoder was trained on the images that it judges (paper, section 5).
+
+    What it was trained on is known by the decoded pixels or, of public encoders, by the data sets
+    that their authors name. Neither depends on the split: an encoder that was trained on another
+    split of the same data may judge this one if it has seen none of its images.
+
+    Args:
+        encoders: the set.
+        modality: whose encoder judges them, ``vision`` or ``tactile``.
+        images: what is judged: a manifest, or (n, h, w, 3) uint8.
+        split: of which ``images`` are the test part.
+        allow_seen: add a note where the guard would raise.
+        progress: called with the number of images compared.
+
+    Returns:
+        What readers must know of every score that the encoder makes of these images.
+
+    Raises:
+        PalpateError: if the encoder has seen some of the images, or declares their data set.
+    """
+    from PIL import Image
+
+    judged: Any = [*map(Image.fromarray, images)] if isinstance(images, np.ndarray) else images
+    dataset = str(getattr(images, "facts", {}).get("dataset") or "")
+    notes: list[Note] = []
+    public = encoders.public(modality)
+    seen = encoders.saw(modality, judged, progress=progress)
+    trained_on = public.trained_on if public else ()
+    declared = [name for name in trained_on if name.lower() in dataset.lower()]
+    if seen.any():
+        params = {"modality": modality, "seen": int(seen.sum()), "n": len(seen)}
+        notes.append(Note("seen-images", params))
+    elif declared:
+        notes.append(
+            Note("seen-dataset", {"modality": modality, "dataset": " and ".join(declared)})
+        )
+    if notes and not allow_seen:
+        got = f"{int(seen.sum()):,} of {len(seen):,} that it was trained on"
+        if not seen.any():
+            got = f"images of {' and '.join(declared)}, with which its authors trained it"
+        raise PalpateError(
+            f"The {modality} encoder must judge images that it has not seen",
+            got,
+            "Judge other images or use another encoder, or allow it: every score then says so",
+            example={"allow_seen": True},
+        )
+    if public:
+        params = {"modality": modality, "name": public.name, "license": public.license}
+        notes.append(Note("encoder-license", params))
+    if modality != "tactile":
+        return notes
+    card, simulated = encoders.card, getattr(images, "synthetic", None)
+    if card.get("synthetic") and not simulated:
+        notes.append(Note("synthetic-encoder", {"real": simulated is False}))
+    unknown = not trained_on and not encoders.knows_seen(modality)
+    if split is not None and unknown and card.get("split") != split.digest:
+        known = card.get("split") is not None
+        notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))
+    return notes

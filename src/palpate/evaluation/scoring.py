@@ -40,13 +40,14 @@ from palpate.evaluation.controls import (
     control_samples,
     material_accuracies,
 )
-from palpate.evaluation.guard import guard
 from palpate.evaluation.inputs import (
     REFERENCE,
     Inputs,
     Samples,
     Source,
     from_reference,
+    guard,
+    load_encoders,
     read_inputs,
 )
 from palpate.metrics import PRESETS, Comparison, compare, compare_tmmd, distance, paired_by_id, tmmd
@@ -477,20 +478,6 @@ def _companions(
             example = {"companions": ["fid", "kid", "prdc"]}
             raise PalpateError(f"{name}: {error.must}", error.got, fix, example=example) from None
     return chosen, True
-
-
-def load_encoders(encoder: Any, progress: Progress) -> Any:
-    """An ``EncoderSet``, loaded where it is a name or a folder."""
-    if encoder is None or not isinstance(encoder, str | Path):
-        return encoder
-    progress(f"loading {encoder}", 0, 1)
-    from palpate.encoders.models import find_encoder, parts_of
-
-    for part in parts_of(encoder):
-        find_encoder(part)  # a wrong name answers at once; torch takes seconds to import
-    from palpate.encoders.encoder_set import EncoderSet
-
-    return EncoderSet.load(encoder)
 
 
 @dataclass(frozen=True)
