@@ -45,10 +45,8 @@ from palpate.metrics import (
     i_tmmd,
     kid,
     measure_contacts,
-    ms_ssim_per_image,
+    per_image,
     prdc,
-    psnr_per_image,
-    ssim_per_image,
     tmmd,
 )
 from palpate.sim import VERSION
@@ -59,7 +57,7 @@ PIXELS = 12  # every twelfth pair is compared image by image
 TESTS = {"TMMD": 10.0, "TMMD, median": "median", "TMMD, multi": "multi"}
 PRDC = ("precision", "recall", "density", "coverage")
 WITH_FLOOR = ("I: E", "CI: E", "D: E_ratio")
-WHOLE = {"PSNR": psnr_per_image, "SSIM": ssim_per_image, "MS-SSIM": ms_ssim_per_image}
+WHOLE = ("PSNR", "SSIM", "MS-SSIM")
 CONTACT = ("contact PSNR", "contact SSIM", "contact MS-SSIM", "contact residual", "contact IoU")
 UP = {*PRDC, *WHOLE, *CONTACT} - {"contact residual"}
 COLUMNS = {
@@ -138,7 +136,7 @@ def image_scores(scene, images):
         if key not in scene.compared:
             pair = images[k : k + 1], scene.real[k : k + 1]
             contacts = measure_contacts(*pair, scene.real_gel[k : k + 1]).values
-            values = {name: per_image(*pair) for name, per_image in WHOLE.items()} | contacts
+            values = {name: per_image(name, *pair).values for name in WHOLE} | contacts
             scene.compared[key] = {name: v[0] for name, v in values.items()}
         rows.append(scene.compared[key])
     # an image without contact has no contact score

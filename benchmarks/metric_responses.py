@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from palpate.core import FeatureSet, rng_for
-from palpate.metrics import ci_tmmd, d_tmmd, i_tmmd, mmd2, tmmd
+from palpate.metrics import ci_tmmd, d_tmmd, distance, i_tmmd, tmmd
 
 WIDTH, CLASSES, VIDEOS, FRAMES = 64, 10, 8, 10
 FIDELITY = 0.7
@@ -148,7 +148,7 @@ def all_halves(n=8, seed=0):
             (("unbiased", 0.0), ("biased", 1000 * 2 / (n // 2) * (1 - off)))
         ):
             pairs = [(x[h], x[np.setdiff1d(np.arange(n), h)]) for h in halves]
-            mean = np.mean([mmd2(*pair, estimator=estimator) for pair in pairs])
+            mean = np.mean([distance(*pair, estimator=estimator).value for pair in pairs])
             worst[j] = max(worst[j], abs(float(mean) - expected))
     return worst
 

@@ -14,16 +14,10 @@ from palpate.metrics import (
     background_digest,
     contact,
     contact_images,
-    contact_iou,
     contact_mask,
-    contact_ms_ssim,
-    contact_psnr,
-    contact_residual,
     contact_scores,
-    contact_ssim,
     measure_contacts,
 )
-from palpate.metrics.contact import LEAST
 from palpate.sim import Video, World, WorldOptions
 from palpate.sim.plan import first_contact, plan_world
 
@@ -34,6 +28,10 @@ from world_statistics import change, contact_area
 RESIDUAL, SSIM, PSNR, IOU, MS_SSIM = (
     f"contact {name}" for name in ("residual", "SSIM", "PSNR", "IoU", "MS-SSIM")
 )
+
+
+def contact_residual(*images, **options):
+    return contact_scores(*images, **options)[0]
 
 
 def gel(n=3, size=48, level=0.5):
@@ -82,7 +80,6 @@ def test_noise_alone_is_an_empty_mask():
     speck = background.copy()
     speck[:, 30:32, 30:32] += 0.3
     assert not contact_mask(speck, background).any()  # 16 pixels exceed the threshold: under 1 %
-    assert contact_mask(speck, background, least=LEAST / 4).any()
 
 
 def test_moved_markers_are_no_contact():
@@ -100,12 +97,8 @@ def test_moved_markers_are_no_contact():
     assert mask.mean() < 0.4
     # the same print with its markers elsewhere: identical away from the markers
     moved = np.where(background == 0.1, background, 0.6) + np.where(dent - image > 0.05, 0.1, 0)
-    skip, keep = (
-        measure_contacts(moved, dent, background, markers=m).values[RESIDUAL][0]
-        for m in ("skip", "keep")
-    )
-    assert skip == pytest.approx(0, abs=1e-12)
-    assert keep > 0.3
+    residual = measure_contacts(moved, dent, background).values[RESIDUAL][0]
+    assert residual == pytest.approx(0, abs=1e-12)
 
 
 def test_noise_is_estimated_away_from_the_markers():
@@ -227,12 +220,12 @@ def slow_ms_ssim(made, real, kept, scales):
 
 def test_values_equal_loops_over_the_mask():
     background, real = pressed(2, 2)
-    made, made_gel = pressed(3, 2)[1] + 0.05, background + 0.05
-    contacts = measure_contacts(made, real, background, generated_background=made_gel)
-    real_masks, made_masks = contact_mask(real, background), contact_mask(made, made_gel)
+    made = pressed(3, 2)[1]
+    contacts = measure_contacts(made, real, background)
+    real_masks, made_masks = contact_mask(real, background), contact_mask(made, background)
     for n in range(2):
         mask, union = real_masks[n], real_masks[n] | made_masks[n]
-        d, e = (real - background)[n], (made - made_gel)[n]
+        d, e = (real - background)[n], (made - background)[n]
         error = sum((e[i, j, k] - d[i, j, k]) ** 2 for i, j in np.argwhere(mask) for k in range(3))
         energy, both = (d[mask] ** 2).sum(), (d[mask] ** 2 + e[mask] ** 2).sum()
         expected = {
@@ -257,11 +250,9 @@ def test_contact_ms_ssim_is_the_definition_by_windows(size):
     real[0, -30:, -40:] += 0.8 * shape
     moved = 0.8 * ndimage.shift(shape, (1, 1, 0)) + 0.01 * rng.normal(size=shape.shape)
     made[0, -30:, -40:] += moved
-    score = contact_ms_ssim(made, real, background, markers="keep")
-    kept, differences = (
-        contact_mask(real, background)[0],
-        [(v - background)[0] for v in (made, real)],
-    )
+    score = contact_scores(made, real, background)[4]
+    mask, near_marker = contact.mask_of(real[0], background[0])
+    kept, differences = mask & ~near_marker, [(v - background)[0] for v in (made, real)]
     assert score.settings["scales"] == 3
     assert score.value == pytest.approx(slow_ms_ssim(*differences, kept, 3), rel=1e-9)
     assert 0.05 < score.value < 0.95
@@ -293,8 +284,6 @@ def test_empty_gel_and_the_real_image_are_the_two_ends():
         expected = empty[metric].details["empty"]
         assert empty[metric].value == pytest.approx(expected, abs=1e-12)
         assert expected < most
-    lighter = background + 0.1  # empty gel of another sensor, with its own background
-    assert contact_residual(lighter, real, background, generated_background=lighter).value == 1
     same = {s.metric: s for s in contact_scores(real, real, background)}
     assert [same[m].value for m in (RESIDUAL, IOU, PSNR)] == [0, 1, None]
     assert [same[m].value for m in (SSIM, MS_SSIM)] == pytest.approx([1, 1])
@@ -319,8 +308,9 @@ def test_another_image_of_the_same_material_does_not_lose_to_empty_gel():
     residual = {}
     for name, keep in (("video", same_video), ("material", same_material)):
         i, j = partners(keep)
-        gels = {"background": background[i], "generated_background": background[j]}
-        scores = contact_scores(image[j], image[i], **gels, groups=video[i].tolist())
+        moved = background[i].astype(float) + image[j] - background[j]  # the contact on gel i
+        moved = np.clip(moved, 0, 255).astype(np.uint8)
+        scores = contact_scores(moved, image[i], background[i], groups=video[i].tolist())
         values = {s.metric: s.value for s in scores}
         empty = {s.metric: s.details["empty"] for s in scores}
         residual[name] = values[RESIDUAL]
@@ -359,14 +349,12 @@ def test_images_without_contact_are_excluded_and_named():
     assert contact_residual(made[:1], real[:1], background[:1]).interval is None
 
 
-def test_single_scores_directions_and_intervals():
+def test_directions_and_intervals():
     background, real = pressed(10, 6)
     made = pressed(11, 6)[1]
     scores = contact_scores(made, real, background)
     assert [s.metric for s in scores] == [RESIDUAL, SSIM, PSNR, IOU, MS_SSIM]
     assert [s.higher_is_better for s in scores] == [False, True, True, True, True]
-    single = (contact_residual, contact_ssim, contact_psnr, contact_iou, contact_ms_ssim)
-    assert [metric(made, real, background) for metric in single] == scores
     values = measure_contacts(made, real, background).values[RESIDUAL]
     reach = stats.t.ppf(0.975, 5) * values.std(ddof=1) / math.sqrt(6)
     assert scores[0].interval == pytest.approx((values.mean() - reach, values.mean() + reach))
@@ -375,13 +363,12 @@ def test_single_scores_directions_and_intervals():
     assert 0 < contact_residual(*gray).value < 2
 
 
-def test_scores_of_other_settings_or_backgrounds_are_not_comparable():
+def test_scores_of_other_backgrounds_are_not_comparable():
     background, real = pressed(10, 6)
     made = pressed(11, 6)[1]
     score = contact_residual(made, real, background)
-    for options in ({"markers": "keep"}, {"least": 0.03}, {"generated_background": background}):
-        with pytest.raises(PalpateError, match="settings"):
-            require_comparable([score, contact_residual(made, real, background, **options)])
+    with pytest.raises(PalpateError, match="settings"):
+        require_comparable([score, contact_residual(made, real, 0.99 * background)])
     require_comparable([score, contact_residual(real, real, background, subject="real")])
     backwards = [v[::-1] for v in (made, real, background)]
     require_comparable([score, contact_residual(*backwards)])
@@ -418,30 +405,23 @@ def with_pixel(x, value):
 
 @pytest.mark.parametrize("call", [contact_scores, contact_images])
 @pytest.mark.parametrize(
-    ("made", "real", "background", "options", "words"),
+    ("made", "real", "background", "words"),
     [
-        (with_pixel(MADE, np.nan), REAL, GEL, {}, ["`generated`", "image 2"]),
-        (MADE, with_pixel(REAL, np.nan), GEL, {}, ["`reference`", "image 2"]),
-        (MADE, REAL, with_pixel(GEL, 1.5), {}, ["`background`", "1.5", "image 2"]),
-        (
-            *(MADE, REAL, GEL, {"generated_background": with_pixel(GEL, -1)}),
-            ["`generated_background`", "image 2"],
-        ),
-        (MADE, REAL, GEL[:2], {}, ["`reference` and `background`", "one to one"]),
-        (MADE[:2], REAL, GEL, {}, ["one to one"]),
-        (MADE[:, :40], REAL[:, :40], GEL, {}, ["one to one"]),
-        (MADE[:0], REAL[:0], GEL[:0], {}, ["n >= 1"]),
-        (MADE[0], REAL[0], GEL[0], {}, ["shape (n, h, w, 3 or 1)"]),
-        (MADE[:, :10], REAL[:, :10], GEL[:, :10], {}, ["11 x 11", "10 x 48"]),
-        (MADE, REAL, GEL, {"markers": "drop"}, ["`markers`", "skip, keep"]),
-        (MADE, REAL, GEL, {"least": 0}, ["`least`", "(0, 1)"]),
-        (MADE, REAL, GEL, {"least": math.nan}, ["`least`", "(0, 1)"]),
-        ([[1], [1, 2]], REAL, GEL, {}, ["`generated`", "array"]),
+        (with_pixel(MADE, np.nan), REAL, GEL, ["`generated`", "image 2"]),
+        (MADE, with_pixel(REAL, np.nan), GEL, ["`reference`", "image 2"]),
+        (MADE, REAL, with_pixel(GEL, 1.5), ["`background`", "1.5", "image 2"]),
+        (MADE, REAL, GEL[:2], ["`reference` and `background`", "one to one"]),
+        (MADE[:2], REAL, GEL, ["one to one"]),
+        (MADE[:, :40], REAL[:, :40], GEL, ["one to one"]),
+        (MADE[:0], REAL[:0], GEL[:0], ["n >= 1"]),
+        (MADE[0], REAL[0], GEL[0], ["shape (n, h, w, 3 or 1)"]),
+        (MADE[:, :10], REAL[:, :10], GEL[:, :10], ["11 x 11", "10 x 48"]),
+        ([[1], [1, 2]], REAL, GEL, ["`generated`", "array"]),
     ],
 )
-def test_bad_images_are_rejected_by_name(call, made, real, background, options, words):
+def test_bad_images_are_rejected_by_name(call, made, real, background, words):
     with pytest.raises(PalpateError) as caught:
-        call(made, real, background, **options)
+        call(made, real, background)
     assert [word for word in words if word not in str(caught.value)] == []
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from palpate.core import FeatureSet, PalpateError, PalpateWarning
-from palpate.metrics import Gaussian, Linear, Polynomial, distance, i_tmmd, kernels, mmd2, tmmd
+from palpate.metrics import Gaussian, Polynomial, distance, i_tmmd, kernels, tmmd
 from palpate.metrics.kernels import (
     Kernel,
     blocked_sums,
@@ -21,6 +21,12 @@ from palpate.metrics.kernels import (
 )
 from palpate.metrics.mmd import random_halves_sd
 from palpate.metrics.moments import WIDEST, Moments, center_of, remainder_factor
+
+LINEAR = Polynomial(degree=1, gamma=1.0, coef0=0.0)
+
+
+def mmd2(x, y, **options):
+    return distance(x, y, **options).value
 
 
 def unit_rows(seed, n, d, spread=1.0):
@@ -84,7 +90,8 @@ def test_mmd_equals_the_double_loop(seed, m, n, d, sigma, estimator, duplicates,
     gx[:2], gy[:2] = ["v0", "v1"], ["v2", "v0"]
     groups = {"groups_x": gx, "groups_y": gy} if estimator == "grouped" else {}
     got = mmd2(x, y, sigma=sigma, estimator=estimator, block=block, **groups)
-    assert got == pytest.approx(loop_mmd(x, y, estimator, gx, gy, sigma), abs=1e-9)
+    close = 1e-9 if dtype == np.float64 else 1e-4
+    assert got == pytest.approx(loop_mmd(x, y, estimator, gx, gy, sigma), abs=close)
 
 
 class Shifted(Kernel):
@@ -105,7 +112,7 @@ KERNELS = {
     "several": (Gaussian((1.0, 3.0)), lambda a, b: np.mean([rbf(a, b, s) for s in (1, 3)])),
     "polynomial": (Polynomial(), lambda a, b: (a @ b / len(a) + 1) ** 3),
     "quadratic": (Polynomial(2, 0.5, 0.25), lambda a, b: (0.5 * a @ b + 0.25) ** 2),
-    "linear": (Linear(), lambda a, b: a @ b),
+    "linear": (LINEAR, lambda a, b: a @ b),
     "custom": (Shifted(), lambda a, b: np.exp(-((a - b) ** 2).sum() / 2)),
 }
 
@@ -119,22 +126,21 @@ def test_sums_by_segment_and_unit_equal_the_double_loop(name, library, most_item
     kernel, k = KERNELS[name]
     for seed, n, units, block in [(0, 1, 3, 7), (1, 24, 3, 7), (2, 24, 30, 1024), (3, 50, 5, 16)]:
         x, (segment, unit) = unit_rows(seed, n, 4), layout(seed, n, units=units)
-        swept = blocked_sums(
-            xp.asarray(x), segment, unit, segments=3, kernel=kernel, block=block, spread=[[0, 1]]
-        )
+        options = {"segments": 3, "kernel": kernel, "block": block}
+        swept = blocked_sums(xp.asarray(x), segment, unit, **options)
         sums, same = loop_sums(x, segment, unit, k)
-        np.testing.assert_allclose(swept.sums.totals.sums, sums, atol=1e-10)
-        np.testing.assert_allclose(swept.sums.totals.same, same, atol=1e-10)
+        np.testing.assert_allclose(swept.totals.sums, sums, atol=1e-10)
+        np.testing.assert_allclose(swept.totals.same, same, atol=1e-10)
         diagonal = [sum(k(x[i], x[i]) for i in np.flatnonzero(segment == s)) for s in range(3)]
-        np.testing.assert_allclose(swept.sums.totals.diagonal, diagonal, atol=1e-10)
-        for u, without in zip(swept.sums.units, swept.sums.leave_one_out(), strict=True):
+        np.testing.assert_allclose(swept.totals.diagonal, diagonal, atol=1e-10)
+        for u, without in zip(swept.units, swept.leave_one_out(), strict=True):
             left = unit != u
             sums, same = loop_sums(x[left], segment[left], unit[left], k)
             np.testing.assert_allclose(without.sums, sums, atol=1e-10)
             np.testing.assert_allclose(without.same, same, atol=1e-10)
-        assert (swept.sums.block is None) == (most_items == 0)
-        merged = swept.sums.merge(np.array([1, -1, 0]), 2).totals
-        np.testing.assert_allclose(merged.sums, swept.sums.totals.sums[np.ix_([2, 0], [2, 0])])
+        assert (swept.block is None) == (most_items == 0)
+        merged = swept.merge(np.array([1, -1, 0]), 2).totals
+        np.testing.assert_allclose(merged.sums, swept.totals.sums[np.ix_([2, 0], [2, 0])])
         inside = np.flatnonzero(segment < 2)
         if len(inside) > 1:
             values = [[k(x[i], x[j]) * (i != j) for j in inside] for i in inside]
@@ -142,7 +148,15 @@ def test_sums_by_segment_and_unit_equal_the_double_loop(name, library, most_item
             centered = h @ np.array(values) @ h
             own = np.diagonal(centered)
             expected = ((centered**2).sum() - (own**2).sum(), own.sum(), (own**2).sum())
-            assert swept.spread[0] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+            got = centered_squares(xp.asarray(x), inside, kernel)
+            assert got == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_the_spread_of_many_rows_is_that_of_some(monkeypatch):
+    x, every = unit_rows(0, 900, 8), np.arange(900)
+    whole = centered_squares(x, every, Gaussian())
+    monkeypatch.setattr(kernels, "SPREAD_ROWS", 300)
+    assert centered_squares(x, every, Gaussian()) == pytest.approx(whole, rel=0.1)
 
 
 def test_the_result_does_not_depend_on_threads(monkeypatch):
@@ -151,22 +165,21 @@ def test_the_result_does_not_depend_on_threads(monkeypatch):
     for threads in (1, 5):
         monkeypatch.setattr("palpate.metrics.inputs.blas_threads", lambda n=threads: n)
         swept = blocked_sums(x, segment, unit, segments=3, kernel=Gaussian(), block=64)
-        blocks.append(swept.sums.block)
+        blocks.append(swept.block)
     np.testing.assert_array_equal(*blocks)
 
 
 @pytest.mark.parametrize("estimator", ["unbiased", "biased"])
-@pytest.mark.parametrize("sizes", [(2, 2), (3, 2), (4, 4), (5, 4), (5, 3)])
+@pytest.mark.parametrize("sizes", [(2, 2), (4, 4), (5, 4)])
 def test_the_sd_of_random_halves_is_that_of_all_halvings(estimator, sizes):
     n = sum(sizes)
     x = unit_rows(6, n, 8)
     x[0] = x[1]
     parts = [np.isin(np.arange(n), half) for half in itertools.combinations(range(n), sizes[0])]
     values = [mmd2(x[h], x[~h], estimator=estimator, tolerance=0) for h in parts]
-    k = np.array([[rbf(a, b, 10.0) for a in x] for b in x])
-    spread = np.array([centered_squares((k**2).sum(), k.sum(axis=1))])
-    sd = random_halves_sd(spread, np.array([sizes]), estimator, 1000.0)[0]
-    assert sd == pytest.approx(np.std(values), rel=1e-9)
+    spread = np.array([centered_squares(x, np.arange(n), Gaussian())])
+    sd = random_halves_sd(spread, np.array([n]), estimator, 1000.0)[0]
+    assert sd == pytest.approx(np.std(values), rel=1e-6 if n % 2 == 0 else 0.03)
     if estimator == "unbiased":  # random halves carry no signal
         if sizes[0] == sizes[1]:
             assert np.mean(values) == pytest.approx(0, abs=1e-10)
@@ -297,9 +310,6 @@ def test_moments_add_up_over_batches_and_devices():
     for a, b in zip(batched.products(), whole.products(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
     assert batched.rho == pytest.approx(whole.rho)
-    one = np.zeros(500, int)
-    exact = blocked_sums(x, one, item, segments=1, kernel=Gaussian(), spread=[[0]]).spread[0]
-    assert whole.spread(np.arange(4))[:2] == pytest.approx(tuple(exact[:2]), rel=0.03)
 
 
 @pytest.fixture
@@ -388,7 +398,7 @@ def test_bandwidths_by_name():
     apart = np.sqrt(((y[:10, None] - y[None, 10:]) ** 2).sum(-1))
     groups = ["a"] * 10 + ["b"] * 10
     assert gaussian("median", y, groups).bandwidth == pytest.approx(np.median(apart))
-    linear = mmd2(x, y, kernel=Linear(), estimator="biased", scale=1.0)
+    linear = mmd2(x, y, kernel=LINEAR, estimator="biased", scale=1.0)
     assert linear == pytest.approx(((x.mean(0) - y.mean(0)) ** 2).sum())
 
 
@@ -474,7 +484,7 @@ GROUPS = {"estimator": "grouped", "groups_x": ["a"] * 8, "groups_y": ["b"] * 8}
         (lambda: Polynomial(degree=True), ["`degree`", "True"]),
         (lambda: Polynomial(gamma=-1), ["`gamma`", "-1"]),
         (lambda: Polynomial(coef0=math.nan), ["`coef0`"]),
-        (lambda: mmd2(X, Y, backend="moments", kernel=Linear()), ["one Gaussian", "linear"]),
+        (lambda: mmd2(X, Y, backend="moments", kernel=LINEAR), ["one Gaussian", "polynomial"]),
         (lambda: mmd2(X, Y, backend="moments", sigma=(1.0, 2.0)), ["one Gaussian"]),
         (lambda: tmmd(X, Y[:, :2]), ["`generated` and `reference`", "3 and 2"]),
         (lambda: tmmd(2 * X, Y), ["`generated` must be L2-normalized"]),

@@ -8,11 +8,11 @@ import pytest
 from scipy import stats
 
 from palpate.core import Note, PalpateError, Score
-from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, mmd2, tmmd
+from palpate.metrics import ci_tmmd, compare, four_scores, i_tmmd, tmmd
 from palpate.metrics.intervals import Scored, permutation_test
 from palpate.metrics.kernels import Gaussian, blocked_sums
 from palpate.metrics.paired import difference, excess_of, holm
-from test_metrics_mmd import loop_mmd, unit_rows
+from test_metrics_mmd import loop_mmd, mmd2, unit_rows
 from test_metrics_tactile import change, codes, keep, share, world
 
 ESTIMATORS = ["unbiased", "biased", "grouped"]
@@ -39,7 +39,7 @@ def test_relabeling_items_is_relabeling_samples(estimator, shared):
     unit = np.r_[frames, frames] if shared else np.r_[frames, frames + 4][:18]
     label = np.r_[np.zeros(11, bool), np.ones(11, bool)][: len(unit)]
     x = unit_rows(3, len(unit), 4)
-    sums = blocked_sums(x, label.astype(int), unit, segments=2, kernel=Gaussian()).sums
+    sums = blocked_sums(x, label.astype(int), unit, segments=2, kernel=Gaussian())
     found = permutation_test(sums, estimator, 1000.0, count=400, seed=1)
     allowed = set()
     units = np.unique(unit)
@@ -111,7 +111,7 @@ def test_unequal_numbers_of_frames_do_no_harm(mine, theirs, paired, shift, low, 
             unit,
             segments=2,
             kernel=Gaussian((2.0,)),
-        ).sums
+        )
         hits.append(permutation_test(sums, "grouped", 1000.0, count=99, seed=seed).p <= 0.05)
     assert low <= np.mean(hits) <= high
 
@@ -120,7 +120,7 @@ def test_nothing_to_exchange_is_no_test():
     s = world(0, classes=1, videos=3, frames=2)
     one = blocked_sums(
         s.features, np.zeros(6, int), np.arange(6) // 2, segments=2, kernel=Gaussian()
-    ).sums
+    )
     assert permutation_test(one, "unbiased", 1.0) is None
 
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from palpate.core import FeatureSet, PalpateError, Score, require_comparable
-from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, mmd2, tmmd
+from palpate.metrics import PRESETS, ci_tmmd, d_tmmd, four_scores, i_tmmd, tmmd
 from palpate.metrics.mmd import half_of, sample_units
 from palpate.metrics.tactile import i_tmmd_of, reference_free
 from palpate.report.notes import sentence
-from test_metrics_mmd import loop_mmd, unit_rows
+from test_metrics_mmd import loop_mmd, mmd2, unit_rows
 
 
 def world(seed, classes=3, videos=4, frames=3, d=6, draw=None, prefix="", encoder="e" * 64):

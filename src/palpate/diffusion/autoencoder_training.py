@@ -32,7 +32,7 @@ from palpate.diffusion.autoencoder import Autoencoder, to_bytes
 from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.encoders.preprocess import to_unit
-from palpate.metrics.images import psnr_per_image, ssim_per_image
+from palpate.metrics.images import per_image
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import gather_rows
@@ -237,8 +237,8 @@ def measure_reconstruction(
         z = autoencoder.latents(to_unit(pixels, device, signed=True))
         # Rounded to bytes first: what is scored is the image that a user gets.
         made, free = (to_bytes(autoencoder.image(z, quantize=q)[0]) for q in (True, False))
-        psnr = [psnr_per_image(image, pixels) for image in (made, free)]
-        rows.append(np.stack([*psnr, ssim_per_image(made, pixels)]))
+        pairs = (("PSNR", made), ("PSNR", free), ("SSIM", made))
+        rows.append(np.stack([per_image(name, image, pixels).values for name, image in pairs]))
         counts += np.bincount(autoencoder.codes(z).flatten().cpu().numpy(), minlength=codes)
     share = counts[counts > 0] / counts.sum()
     psnr, psnr_free, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))

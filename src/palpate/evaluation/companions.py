@@ -36,14 +36,9 @@ from palpate.metrics import (
     contact_images,
     mean_score,
     measure_contacts,
-    ms_ssim,
-    ms_ssim_per_image,
-    psnr,
-    psnr_per_image,
-    ssim,
-    ssim_per_image,
+    per_image,
 )
-from palpate.metrics.contact import LEAST
+from palpate.metrics.contact import SETTINGS
 from palpate.metrics.distributions import prdc_rows
 from palpate.metrics.paired import mean_differences
 
@@ -347,27 +342,21 @@ def _renamed(
 
 
 def _ssim(pairs: Pairs) -> Outcome:
-    return _mean_of_pairs(pairs, ssim, ssim_per_image)
+    return _mean_of_pairs(pairs, "SSIM")
 
 
 def _psnr(pairs: Pairs) -> Outcome:
-    return _mean_of_pairs(pairs, psnr, psnr_per_image)
+    return _mean_of_pairs(pairs, "PSNR")
 
 
 def _ms_ssim(pairs: Pairs) -> Outcome:
-    return _mean_of_pairs(pairs, ms_ssim, ms_ssim_per_image)
+    return _mean_of_pairs(pairs, "MS-SSIM")
 
 
-def _mean_of_pairs(
-    pairs: Pairs, metric: Callable[..., Score], per_image: Callable[..., NDArray[np.float64]]
-) -> Outcome:
-    scores = {
-        name: metric(images, pairs.reference, subject=name, **pairs.common)
-        for name, images in pairs.images.items()
-    }
-    return _with_differences(
-        pairs, scores, lambda name: per_image(pairs.images[name], pairs.reference)
-    )
+def _mean_of_pairs(pairs: Pairs, metric: Literal["SSIM", "PSNR", "MS-SSIM"]) -> Outcome:
+    each = {n: per_image(metric, images, pairs.reference) for n, images in pairs.images.items()}
+    scores = {name: e.score(subject=name, **pairs.common) for name, e in each.items()}
+    return _with_differences(pairs, scores, lambda name: each[name].values)
 
 
 def _with_differences(
@@ -424,12 +413,7 @@ def _lpips(pairs: Pairs) -> Outcome:
         return outcome
     empty = _contact_lpips(pairs.background, pairs, network)
     contact = {name: _contact_lpips(x, pairs, network) for name, x in pairs.images.items()}
-    settings |= {
-        "markers": "skip",
-        "least": round(LEAST, 6),
-        "generated_background": "real",
-        "background": background_digest(pairs.background),
-    }
+    settings |= SETTINGS | {"background": background_digest(pairs.background)}
     bare = int(np.isnan(empty).sum())
     gel = float(np.nanmean(empty)) if bare < len(real) else None
     on_contact = outcome_of("contact LPIPS", contact, settings=settings, details={"empty": gel})

@@ -50,7 +50,15 @@ from palpate.evaluation.inputs import (
     load_encoders,
     read_inputs,
 )
-from palpate.metrics import PRESETS, Comparison, compare, compare_tmmd, distance, paired_by_id, tmmd
+from palpate.metrics import (
+    PRESETS,
+    Comparison,
+    compare,
+    compare_tmmd,
+    distance,
+    require_same_ids,
+    tmmd,
+)
 from palpate.metrics.kernels import MOMENT_BYTES
 from palpate.metrics.mmd import BLOCKS_OF_MANY, sample_units
 from palpate.report.results import GalleryItem, Results
@@ -472,7 +480,7 @@ def _companions(
         return chosen, False
     for name, samples in made.items():
         try:
-            paired_by_id(samples.ids, real.ids)
+            require_same_ids(samples.ids, real.ids)
         except PalpateError as error:
             fix = "Score the same samples on both sides, or request companions without pairs"
             example = {"companions": ["fid", "kid", "prdc"]}

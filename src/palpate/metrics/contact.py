@@ -10,8 +10,7 @@ and compared where the real image shows contact, so that the no-contact image ea
   An image whose mask covers under 1 % of the pixels shows no contact: it is excluded and counted.
 * *Markers*: pixels darker than 0.82 of the median luma around, of the image or the background, and
   (from 48 px on) a pixel around them. They move with the membrane and would outweigh the print (on
-  the real clips of Touch and Go they hold three quarters of the squared d), so they are skipped
-  unless ``markers="keep"``.
+  the real clips of Touch and Go they hold three quarters of the squared d), so they are skipped.
 * *Residual*: ``sum (d' - d)^2 / sum (d'^2 + d^2)`` over the mask, d' generated. 0: identical; 1:
   the no-contact image, and on average any contact unrelated to the real one; 2: its negative. The
   sum below is over both, because sum d^2 alone would reward the no-contact image
@@ -34,19 +33,18 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from palpate.core import Note, PalpateError, Score, require_choice
+from palpate.core import Note, Score
 from palpate.metrics.images import (
-    WINDOW,
     WINDOW_SETTINGS,
     Array,
-    Pairs,
     ScoreOptions,
+    as_unit,
     fitting_scales,
     image_pairs,
     image_stack,
@@ -58,7 +56,6 @@ from palpate.metrics.images import (
 from palpate.metrics.inputs import checked_names, to_host
 
 Mask = NDArray[np.bool_]
-Markers = Literal["skip", "keep"]
 
 #: Data range of the SSIM of differences.
 SSIM_RANGE = 0.25
@@ -71,38 +68,36 @@ METRICS: dict[str, tuple[tuple[float, float], bool, dict[str, Any]]] = {
     "contact IoU": ((0, 1), True, {}),
     "contact MS-SSIM": ((0, 1), True, _SSIM_SETTINGS),
 }
-
-
 #: Least change that is a contact, on the scale of [0, 1].
 LEAST = 4 / 255
 #: How many times the noise after the blur a contact must exceed.
 TIMES_NOISE = 3.0
 #: Share of the pixels under which a mask is empty.
 SMALLEST = 0.01
+#: What every score keeps of the comparison.
+SETTINGS = {"markers": "skip", "least": round(LEAST, 6), "generated_background": "real"}
 #: A marker is darker than this share of the median luma in a window of a sixth of the side.
 MARKER = 0.82
 LUMA = np.array([0.299, 0.587, 0.114])
 
 
-def contact_mask(tactile: Any, background: Any, *, least: float = LEAST) -> Mask:
+def contact_mask(tactile: Any, background: Any) -> Mask:
     """Where each tactile image shows contact.
 
     Args:
         tactile: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1].
         background: the same shape, or one image (h, w, c) for all: the gel without contact, of the
             same sensor at the same time.
-        least: least change that is a contact, on the scale of [0, 1]; noise can only raise it.
 
     Returns:
         (n, h, w), markers included; all False where there is no contact.
 
     Raises:
-        PalpateError: on other shapes, dtypes or ranges, or a ``least`` outside (0, 1).
+        PalpateError: on other shapes, dtypes or ranges.
     """
-    check_least(least)
     background = _for_all(background, tactile)
-    pairs = image_pairs(tactile, background, arguments=("tactile", "background"))
-    return np.stack([mask_of(image, empty, least)[0] for image, empty in pairs])
+    x, gel = image_pairs(tactile, background, arguments=("tactile", "background"))
+    return np.stack([mask_of(as_unit(a), as_unit(b))[0] for a, b in zip(x, gel, strict=True)])
 
 
 def _for_all(background: Any, images: Any) -> Any:
@@ -113,14 +108,7 @@ def _for_all(background: Any, images: Any) -> Any:
     return np.broadcast_to(gel, (len(images), *gel.shape))
 
 
-def check_least(least: Any) -> None:
-    """Reject a least change that is not inside (0, 1)."""
-    if not isinstance(least, int | float | np.number) or not 0 < least < 1:
-        must, fix = "must lie in (0, 1), the scale of the images", "Use the default, 4 / 255"
-        raise PalpateError(must, repr(least), fix, argument="least")
-
-
-def mask_of(image: Array, background: Array, least: float) -> tuple[Mask, Mask]:
+def mask_of(image: Array, background: Array) -> tuple[Mask, Mask]:
     """Contact mask (h, w) of one image, and the pixels on or next to a marker."""
     side = min(image.shape[:2])
     near = _markers(image) | _markers(background)
@@ -131,7 +119,7 @@ def mask_of(image: Array, background: Array, least: float) -> tuple[Mask, Mask]:
     change = ndimage.gaussian_filter(change, (sigma, sigma, 0))
     # white noise of two images after the blur
     noise = np.sqrt(2) * _noise(background, ~near) / (2 * np.sqrt(np.pi) * max(sigma, 0.5))
-    mask = np.sqrt((change**2).mean(axis=2)) > max(least, TIMES_NOISE * noise)
+    mask = np.sqrt((change**2).mean(axis=2)) > max(LEAST, TIMES_NOISE * noise)
     if mask.mean() < SMALLEST:
         return np.zeros_like(mask), near
     return _dilated(mask, side // 64), near
@@ -142,10 +130,9 @@ def background_digest(images: Any) -> str:
 
     Contact scores against other backgrounds are not comparable.
     """
-    stack = image_stack("background", _for_all(images, range(1)))
     rows = {
-        hashlib.sha256(np.rint(stack[i] * 65535).astype("<u2").tobytes()).digest()
-        for i in range(len(stack))
+        hashlib.sha256(np.rint(as_unit(image) * 65535).astype("<u2").tobytes()).digest()
+        for image in image_stack("background", _for_all(images, range(1)))
     }
     return hashlib.sha256(b"".join(sorted(rows))).hexdigest()[:16]
 
@@ -187,27 +174,8 @@ def _noise(background: Array, keep: Mask) -> float:
     return 1.4826 * float(np.median(change[away])) / 6
 
 
-class ContactOptions(TypedDict, total=False):
-    """How contacts are compared.
-
-    Attributes:
-        generated_background: (n, h, w, c) or (h, w, c), the generator's gel without contact;
-            default: the real.
-        markers: skip the pixels of the real markers (``"skip"``, the default), or compare them.
-        least: as in :func:`palpate.metrics.contact_mask`.
-    """
-
-    generated_background: Any
-    markers: Markers
-    least: float
-
-
-class ContactScoreOptions(ContactOptions, ScoreOptions, total=False):
-    """Options of :func:`contact_scores`."""
-
-
 def contact_scores(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
+    generated: Any, reference: Any, background: Any, **options: Unpack[ScoreOptions]
 ) -> list[Score]:
     """Mean contact residual, SSIM, PSNR, IoU and MS-SSIM, over the images that show contact.
 
@@ -215,53 +183,17 @@ def contact_scores(
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape: the real tactile image of each generated one.
         background: the same shape, or one image (h, w, c) for all: the real gel without contact.
-        **options: :class:`ContactOptions` and :class:`palpate.metrics.images.ScoreOptions`.
+        **options: :class:`palpate.metrics.images.ScoreOptions`.
 
     Returns:
-        Five scores. Images without contact are excluded; ``details["no_contact"]`` counts them and
+        Five scores: residual (0: identical, 1: no contact), SSIM, PSNR in dB, IoU of the masks,
+        MS-SSIM. Images without contact are excluded; ``details["no_contact"]`` counts them and
         names the first ten.
 
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
     """
-    fields: dict[str, Any] = {"subject": "generated", **options}
-    how: Any = {k: fields.pop(k) for k in ContactOptions.__annotations__ if k in fields}
-    return measure_contacts(generated, reference, background, **how).scores(**fields)
-
-
-def contact_residual(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
-) -> Score:
-    """Contact residual: 0 is identical, 1 no contact. Arguments as :func:`contact_scores`."""
-    return contact_scores(generated, reference, background, **options)[0]
-
-
-def contact_ssim(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
-) -> Score:
-    """SSIM of the contact: 1 is identical. Arguments as :func:`contact_scores`."""
-    return contact_scores(generated, reference, background, **options)[1]
-
-
-def contact_psnr(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
-) -> Score:
-    """PSNR of the contact in dB. Arguments as :func:`contact_scores`."""
-    return contact_scores(generated, reference, background, **options)[2]
-
-
-def contact_iou(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
-) -> Score:
-    """Overlap of the masks: 1 is equal, 0 no contact. Arguments as :func:`contact_scores`."""
-    return contact_scores(generated, reference, background, **options)[3]
-
-
-def contact_ms_ssim(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactScoreOptions]
-) -> Score:
-    """MS-SSIM of the contact: 1 is identical. Arguments as :func:`contact_scores`."""
-    return contact_scores(generated, reference, background, **options)[4]
+    return measure_contacts(generated, reference, background).scores(**options)
 
 
 @dataclass(frozen=True)
@@ -284,7 +216,7 @@ class Contacts:
 
     def scores(self, *, ids: Sequence[str] | None = None, **fields: Any) -> list[Score]:
         """One score a metric; ``fields`` as :func:`palpate.metrics.mean_score`."""
-        n, none = len(self.area), self.area == 0
+        fields, n, none = {"subject": "generated", **fields}, len(self.area), self.area == 0
         names = checked_names("ids", ids, n) or [str(i) for i in range(n)]
         count, first = int(none.sum()), [names[i] for i in np.flatnonzero(none)[:10]]
         notes = [Note("no-contact", {"count": count, "n": n})] if count else []
@@ -311,35 +243,25 @@ class Contacts:
         ]
 
 
-def measure_contacts(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
-) -> Contacts:
+def measure_contacts(generated: Any, reference: Any, background: Any) -> Contacts:
     """Every contact metric of each pair; arguments and errors as :func:`contact_scores`."""
-    pairs, real, markers, least = checked = _checked(generated, reference, background, **options)
-    n = len(real)
+    x, y, gel = _checked(generated, reference, background)
+    n = len(y)
     values, empty = ({name: np.full(n, np.nan) for name in METRICS} for _ in range(2))
     energy, area = np.full(n, np.nan), np.zeros(n)
-    for i, x, y, kept, mask in _in_contact(*checked):
-        generated_mask = mask_of(*pairs[i], least)[0]
-        row = {"contact IoU": (mask & generated_mask).sum() / (mask | generated_mask).sum()}
-        row |= _compare(x, y, kept)
-        gel = {"contact IoU": 0.0} | _compare(np.zeros_like(y), y, kept)
+    for i, made, real, kept, mask in _in_contact(x, y, gel):
+        made_mask = mask_of(as_unit(x[i]), as_unit(gel[i]))[0]
+        row = {"contact IoU": (mask & made_mask).sum() / (mask | made_mask).sum()}
+        row |= _compare(made, real, kept)
+        nothing = {"contact IoU": 0.0} | _compare(np.zeros_like(real), real, kept)
         for metric in METRICS:
-            values[metric][i], empty[metric][i] = row[metric], gel[metric]
+            values[metric][i], empty[metric][i] = row[metric], nothing[metric]
         energy[i], area[i] = row["per_real_energy"], mask.mean()
-    given = options.get("generated_background") is not None
-    settings = {
-        "markers": markers,
-        "least": round(float(least), 6),
-        "size": real.size,
-        "generated_background": "own" if given else "real",
-        "background": background_digest(background),
-    }
-    return Contacts(values, empty, energy, area, settings)
+    size = {"size": list(y.shape[1:3]), "background": background_digest(background)}
+    return Contacts(values, empty, energy, area, SETTINGS | size)
 
 
-@dataclass(frozen=True)
-class ContactImages:
+class ContactImages(NamedTuple):
     """Differences to the background as images, for a network that compares images.
 
     Attributes:
@@ -353,55 +275,37 @@ class ContactImages:
     mask: Mask
 
 
-def contact_images(
-    generated: Any, reference: Any, background: Any, **options: Unpack[ContactOptions]
-) -> ContactImages:
+def contact_images(generated: Any, reference: Any, background: Any) -> ContactImages:
     """The contact of each pair as images; arguments and errors as :func:`contact_scores`."""
-    checked = _checked(generated, reference, background, **options)
-    shape = checked[1].reference.pixels.shape
-    images = [np.full(shape, 0.5, np.float32) for _ in range(2)]
-    masks = np.zeros(shape[:3], bool)
-    for i, x, y, kept, _ in _in_contact(*checked):
+    x, y, gel = _checked(generated, reference, background)
+    images = [np.full(y.shape, 0.5, np.float32) for _ in range(2)]
+    masks = np.zeros(y.shape[:3], bool)
+    for i, made, real, kept, _ in _in_contact(x, y, gel):
         masks[i] = kept
-        for image, difference in zip(images, (x, y), strict=True):
+        for image, difference in zip(images, (made, real), strict=True):
             image[i][kept] = np.clip(0.5 + difference[kept], 0, 1)
-    return ContactImages(images[0], images[1], masks)
+    return ContactImages(*images, masks)
 
 
-def _checked(
-    generated: Any,
-    reference: Any,
-    background: Any,
-    *,
-    generated_background: Any = None,
-    markers: Markers = "skip",
-    least: float = LEAST,
-) -> tuple[Pairs, Pairs, Markers, float]:
-    """Generated and real images, each with its background; errors as :func:`contact_scores`."""
-    require_choice("markers", markers, ("skip", "keep"))
-    check_least(least)
+def _checked(generated: Any, reference: Any, background: Any) -> tuple[NDArray[Any], ...]:
+    """Generated images, real ones, and their backgrounds; errors as :func:`contact_scores`."""
     background = _for_all(background, reference)
-    real = image_pairs(reference, background, arguments=("reference", "background"))
-    require_side(real.size, WINDOW, "contact metrics")
-    image_pairs(generated, reference)
-    if generated_background is None:
-        return image_pairs(generated, background), real, markers, least
-    names = ("generated", "generated_background")
-    generated_background = _for_all(generated_background, generated)
-    return image_pairs(generated, generated_background, arguments=names), real, markers, least
+    y, gel = image_pairs(reference, background, arguments=("reference", "background"))
+    require_side(y.shape[1:3], "contact metrics")
+    return image_pairs(generated, y)[0], y, gel
 
 
 def _in_contact(
-    generated: Pairs, reference: Pairs, markers: Markers, least: float
+    x: NDArray[Any], y: NDArray[Any], gel: NDArray[Any]
 ) -> Iterator[tuple[int, Array, Array, Mask, Mask]]:
     """Of every pair that shows contact: its number, the two differences (h, w, c) to the
     background, the pixels to compare and the whole real mask (h, w).
     """
-    for i, ((x, x_gel), (y, y_gel)) in enumerate(zip(generated, reference, strict=True)):
-        mask, near_marker = mask_of(y, y_gel, least)
-        kept = mask & ~near_marker if markers == "skip" else mask
-        if kept.any():
-            yield i, x - x_gel, y - y_gel, kept, mask
+    for i, images in enumerate(zip(x, y, gel, strict=True)):
+        made, real, empty = map(as_unit, images)
+        mask, near_marker = mask_of(real, empty)
+        if (kept := mask & ~near_marker).any():
+            yield i, made - empty, real - empty, kept, mask
 
 
 def _compare(x: Array, y: Array, kept: Mask) -> dict[str, float]:

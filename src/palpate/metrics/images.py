@@ -18,7 +18,7 @@ sensor itself; :mod:`palpate.metrics.contact` compares the contact alone.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict, Unpack
 
@@ -32,8 +32,6 @@ from palpate.metrics.inputs import as_array, checked_level, checked_names, to_ho
 from palpate.metrics.intervals import mean_interval
 
 Array = NDArray[np.float64]
-Range = float | tuple[float, float]
-Scales = int | Literal["auto"]
 Border = Literal["valid", "mirror"]
 
 WINDOW, SIGMA, K1, K2 = 11, 1.5, 0.01, 0.03
@@ -61,98 +59,90 @@ class ScoreOptions(TypedDict, total=False):
     level: float
 
 
-def ssim(
-    generated: Any,
-    reference: Any,
-    *,
-    data_range: Range | None = None,
-    **options: Unpack[ScoreOptions],
-) -> Score:
+def ssim(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Score:
     """Mean SSIM over pairs of images; 1 is identical.
 
     Args:
         generated: (n, h, w, 3 or 1) array or tensor, uint8 or float in [0, 1]; h, w >= 11.
         reference: the same shape; image i is the partner of generated image i.
-        data_range: ``(low, high)``, or ``high`` with low = 0, of other numbers; they are mapped to
-            [0, 1], so the score does not depend on the coding (``details["coding"]`` keeps it).
         **options: see :class:`ScoreOptions`.
 
     Raises:
         PalpateError: on other shapes, dtypes or ranges, or images smaller than the window.
     """
-    pairs = image_pairs(generated, reference, data_range)
-    settings = WINDOW_SETTINGS | {"data_range": 1, "border": "valid"}
-    return _pair_score("SSIM", pairs, _ssim(pairs), settings, (-1.0, 1.0), **options)
+    return per_image("SSIM", generated, reference).score(**options)
 
 
-def ssim_per_image(generated: Any, reference: Any, *, data_range: Range | None = None) -> Array:
-    """SSIM (n,) in [-1, 1] of each pair of images; arguments and errors as :func:`ssim`."""
-    return _ssim(image_pairs(generated, reference, data_range))
-
-
-def psnr(
-    generated: Any,
-    reference: Any,
-    *,
-    data_range: Range | None = None,
-    **options: Unpack[ScoreOptions],
-) -> Score:
+def psnr(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Score:
     """Mean PSNR in dB over the pairs of images that are not identical.
 
     Arguments and errors as :func:`ssim`; images may be smaller than its window.
     """
-    pairs = image_pairs(generated, reference, data_range)
-    return _pair_score("PSNR", pairs, _psnr(pairs), {"data_range": 1}, **options)
+    return per_image("PSNR", generated, reference).score(**options)
 
 
-def psnr_per_image(generated: Any, reference: Any, *, data_range: Range | None = None) -> Array:
-    """PSNR (n,) in dB of each pair, infinity where identical; arguments as :func:`psnr`."""
-    return _psnr(image_pairs(generated, reference, data_range))
+def ms_ssim(generated: Any, reference: Any, **options: Unpack[ScoreOptions]) -> Score:
+    """Mean MS-SSIM over pairs of images, of as many scales as these hold; 1 is identical.
 
-
-def ms_ssim(
-    generated: Any,
-    reference: Any,
-    *,
-    data_range: Range | None = None,
-    scales: Scales = "auto",
-    **options: Unpack[ScoreOptions],
-) -> Score:
-    """Mean MS-SSIM over pairs of images; 1 is identical.
-
-    Arguments and errors as :func:`ssim`, and ``scales``: 1 to 5, or ``"auto"`` for as many as the
-    images hold. Weights of fewer than five are divided by their sum. Values of different numbers
-    of scales are different metrics: the settings keep the number, a note names fewer than five.
+    Arguments and errors as :func:`ssim`. Weights of fewer than five scales are divided by their
+    sum. Values of different numbers of scales are different metrics: the settings keep the number,
+    a note names fewer than five.
     """
-    pairs = image_pairs(generated, reference, data_range)
-    count = _scale_count(scales, pairs.size)
-    weights = [round(float(v), 6) for v in scale_weights(count)]
-    settings = WINDOW_SETTINGS | {"data_range": 1, "border": "valid", "scales": count}
-    settings |= {"downsampling": "2 x 2 mean", "weights": weights}
-    few = Note("fewer-scales", {"scales": count, "least": least_side(5), "auto": scales == "auto"})
-    notes = [few] if count < len(WEIGHTS) else []
-    values = _ms_ssim(pairs, count)
-    return _pair_score("MS-SSIM", pairs, values, settings, (0.0, 1.0), notes=notes, **options)
+    return per_image("MS-SSIM", generated, reference).score(**options)
 
 
-def ms_ssim_per_image(
-    generated: Any, reference: Any, *, data_range: Range | None = None, scales: Scales = "auto"
-) -> Array:
-    """MS-SSIM (n,) in [0, 1] of each pair of images; arguments and errors as :func:`ms_ssim`."""
-    pairs = image_pairs(generated, reference, data_range)
-    return _ms_ssim(pairs, _scale_count(scales, pairs.size))
+@dataclass(frozen=True)
+class PerImage:
+    """A metric of each pair of images.
+
+    Attributes:
+        metric: its name.
+        values: (n,); a PSNR is infinite where the two are identical.
+        bounds: of the metric.
+        settings: what a score keeps.
+        notes: of the score.
+    """
+
+    metric: str
+    values: Array
+    bounds: tuple[float, float]
+    settings: dict[str, Any]
+    notes: Sequence[Note] = ()
+
+    def score(self, **fields: Any) -> Score:
+        """Their mean; ``fields`` as :func:`mean_score`."""
+        fields = {"subject": "generated", "bounds": self.bounds, **fields}
+        return mean_score(
+            self.metric, self.values, settings=self.settings, notes=self.notes, **fields
+        )
 
 
-def _pair_score(
-    metric: str,
-    pairs: Pairs,
-    values: Array,
-    settings: dict[str, Any],
-    bounds: tuple[float, float] = (-np.inf, np.inf),
-    **fields: Any,
-) -> Score:
-    fields = {"subject": "generated", "bounds": bounds, "details": pairs.coding} | fields
-    return mean_score(metric, values, settings=settings | {"size": pairs.size}, **fields)
+def per_image(
+    metric: Literal["SSIM", "PSNR", "MS-SSIM"], generated: Any, reference: Any
+) -> PerImage:
+    """SSIM in [-1, 1], PSNR in dB or MS-SSIM in [0, 1] of each pair of images.
+
+    Arguments and errors as :func:`ssim`.
+    """
+    x, y = image_pairs(generated, reference)
+    pairs = ((as_unit(a), as_unit(b)) for a, b in zip(x, y, strict=True))
+    size = list(x.shape[1:3])
+    settings: dict[str, Any] = {"data_range": 1, "size": size}
+    if metric == "PSNR":
+        with np.errstate(divide="ignore"):
+            values = -10 * np.log10([((a - b) ** 2).mean() for a, b in pairs])
+        return PerImage(metric, values, (-np.inf, np.inf), settings)
+    require_side(size, metric)
+    settings |= WINDOW_SETTINGS | {"border": "valid"}
+    if metric == "SSIM":
+        values = np.array([local_maps(a, b)[0].mean() for a, b in pairs])
+        return PerImage(metric, values, (-1.0, 1.0), settings)
+    scales = fitting_scales(size)
+    values = np.array([multiscale_similarity(a, b, scales) for a, b in pairs])
+    weights = [round(float(v), 6) for v in scale_weights(scales)]
+    settings |= {"scales": scales, "downsampling": "2 x 2 mean", "weights": weights}
+    few = Note("fewer-scales", {"scales": scales, "least": least_side(len(WEIGHTS))})
+    return PerImage(metric, values, (0.0, 1.0), settings, [few] if scales < len(WEIGHTS) else [])
 
 
 def mean_score(
@@ -225,158 +215,68 @@ def _mean_notes(n: int, kept: int, identical: int, no_interval: bool) -> list[No
     return notes + ([Note("no-interval-over-images")] if no_interval else [])
 
 
-def paired_by_id(
-    generated_ids: Sequence[str], reference_ids: Sequence[str]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of the two images of each id; the order of the lists may differ, their ids may not.
-
-    Returns:
-        Two (n,) such that ``generated[first]`` and ``reference[second]`` are partners, in the
-        order of ``reference_ids``.
+def require_same_ids(generated_ids: Sequence[str], reference_ids: Sequence[str]) -> None:
+    """Check that both lists have the same ids, each once, in any order.
 
     Raises:
         PalpateError: if an id is repeated, or is in one list only; the first few are named.
     """
     generated, reference = ([str(v) for v in ids] for ids in (generated_ids, reference_ids))
     for name, ids in (("generated", generated), ("reference", reference)):
-        if not ids:
-            raise PalpateError(f"There must be {name} ids", "none", f"Pass the {name} ids")
         if repeated := [i for i, count in Counter(ids).items() if count > 1]:
             got = f"{len(repeated)} repeated: {_first(repeated)}"
             raise PalpateError(f"Every {name} id must be unique", got, "Keep one image an id")
-    row, known = {name: k for k, name in enumerate(generated)}, set(reference)
-    missing = [i for i in reference if i not in row]
-    surplus = [i for i in generated if i not in known]
-    if missing or surplus:
+    missing, surplus = set(reference) - set(generated), set(generated) - set(reference)
+    if missing or surplus or not reference:
         lists = (("not generated", missing), ("without reference", surplus))
-        got = "; ".join(f"{len(ids)} {what}: {_first(ids)}" for what, ids in lists if ids)
+        got = "; ".join(f"{len(ids)} {what}: {_first(sorted(ids))}" for what, ids in lists if ids)
         fix = "Score the same samples in both: take() the common ids if that is what you mean"
-        raise PalpateError("Generated and reference ids must be the same set", got, fix)
-    return np.array([row[i] for i in reference], np.intp), np.arange(len(reference))
+        must = "Generated and reference ids must be the same set"
+        raise PalpateError(must, got or "none", fix)
 
 
 def _first(ids: Sequence[str]) -> str:
     return ", ".join(map(repr, ids[:3])) + f" and {len(ids) - 3} more" * (len(ids) > 3)
 
 
-@dataclass(frozen=True)
-class Stack:
-    """Checked images (n, h, w, c) whose numbers run from ``low`` (black) to ``high``."""
-
-    pixels: NDArray[Any]
-    low: float
-    high: float
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def __getitem__(self, i: int) -> Array:
-        """Image i (h, w, c) as float64 in [0, 1]."""
-        return (self.pixels[i].astype(np.float64) - self.low) / (self.high - self.low)
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Two stacks of one shape; iterates over pairs of images (h, w, c) in [0, 1]."""
-
-    generated: Stack
-    reference: Stack
-    data_range: Range | None = None
-
-    def __len__(self) -> int:
-        return len(self.reference)
-
-    def __getitem__(self, i: int) -> tuple[Array, Array]:
-        return self.generated[i], self.reference[i]
-
-    def __iter__(self) -> Iterator[tuple[Array, Array]]:
-        return (self[i] for i in range(len(self)))
-
-    @property
-    def size(self) -> list[int]:
-        """Height and width."""
-        return [int(v) for v in self.reference.pixels.shape[1:3]]
-
-    @property
-    def coding(self) -> dict[str, list[float]]:
-        """``{"coding": [low, high]}`` where the range was given."""
-        given = self.data_range is not None
-        return {"coding": [self.reference.low, self.reference.high]} if given else {}
-
-
 def image_pairs(
-    generated: Any,
-    reference: Any,
-    data_range: Range | None = None,
-    arguments: tuple[str, str] = ("generated", "reference"),
-) -> Pairs:
+    generated: Any, reference: Any, arguments: tuple[str, str] = ("generated", "reference")
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Two stacks of images, checked; ``arguments`` names them in errors.
 
     Raises:
         PalpateError: on other shapes, dtypes or ranges (image numbers are named).
     """
-    pair = zip(arguments, (generated, reference), strict=True)
-    x, y = (image_stack(name, images, data_range) for name, images in pair)
-    if x.pixels.shape != y.pixels.shape:
+    x, y = image_stack(arguments[0], generated), image_stack(arguments[1], reference)
+    if x.shape != y.shape:
         must = f"`{arguments[0]}` and `{arguments[1]}` must pair one to one in one size"
-        got = f"shapes {x.pixels.shape} and {y.pixels.shape}"
+        got = f"shapes {x.shape} and {y.shape}"
         raise PalpateError(must, got, "Pass the same samples in the same order and size")
-    return Pairs(x, y, data_range)
+    return x, y
 
 
-def image_stack(argument: str, images: Any, data_range: Range | None = None) -> Stack:
+def image_stack(argument: str, images: Any) -> NDArray[Any]:
     """A stack of images, checked; errors as :func:`image_pairs`."""
     pixels = np.asarray(as_array(argument, to_host(images)))
     if pixels.ndim != 4 or pixels.shape[3] not in (1, 3) or 0 in pixels.shape:
         must, got = "must have shape (n, h, w, 3 or 1), n >= 1", f"shape {pixels.shape}"
         raise PalpateError(must, got, "Stack images with channels last", argument=argument)
-    kind = pixels.dtype.kind
-    if data_range is None:
-        if pixels.dtype == np.uint8:
-            return Stack(pixels, 0, 255)
-        must, kinds, low, high = "must be uint8, or floats in [0, 1]", "f", 0.0, 1.0
-    else:
-        low, high = _span(data_range)
-        must, kinds = f"must be numbers in [{low:g}, {high:g}]", "uif"
-    fix, example = "Pass the range of the numbers", {"data_range": (-1, 1)}
-    if kind not in kinds:
-        raise PalpateError(must, f"dtype {pixels.dtype}", "Convert them", argument=argument)
+    if pixels.dtype == np.uint8:
+        return pixels
+    must, fix = "must be uint8, or floats in [0, 1]", "Convert them to this range"
+    if pixels.dtype.kind != "f":
+        raise PalpateError(must, f"dtype {pixels.dtype}", fix, argument=argument)
     least, most = pixels.min(axis=(1, 2, 3)), pixels.max(axis=(1, 2, 3))
-    slack = 1e-6 * (high - low)
-    if (bad := ~((least >= low - slack) & (most <= high + slack))).any():  # also for NaN
+    if (bad := ~((least >= -1e-6) & (most <= 1 + 1e-6))).any():  # also for NaN
         k = int(bad.argmax())
         got = f"[{least[k]:.4g}, {most[k]:.4g}] in image {k}"
-        raise PalpateError(must, got, fix, argument=argument, example=example)
-    if kind == "f" and high - low >= 100 and least.min() >= 0 and 0 < most.max() <= 1:
-        must = f"must fill the data range [{low:g}, {high:g}]"
-        raise PalpateError(must, "floats in [0, 1]", "Scale the images", argument=argument)
-    return Stack(pixels, low, high)
+        raise PalpateError(must, got, fix, argument=argument)
+    return pixels
 
 
-def _span(data_range: Any) -> tuple[float, float]:
-    try:
-        low, high = map(float, (0, data_range) if np.ndim(data_range) == 0 else data_range)
-    except (TypeError, ValueError):
-        low, high = np.nan, np.nan
-    if not -np.inf < low < high < np.inf:
-        must = "must be a positive number, or (low, high) with low < high"
-        fix, example = "Pass the range of the numbers", {"data_range": (-1, 1)}
-        raise PalpateError(must, repr(data_range), fix, argument="data_range", example=example)
-    return low, high
-
-
-def _ssim(pairs: Pairs) -> Array:
-    require_side(pairs.size, WINDOW, "SSIM")
-    return np.array([local_maps(x, y)[0].mean() for x, y in pairs])
-
-
-def _psnr(pairs: Pairs) -> Array:
-    with np.errstate(divide="ignore"):
-        return -10 * np.log10([((x - y) ** 2).mean() for x, y in pairs])
-
-
-def _ms_ssim(pairs: Pairs, scales: int) -> Array:
-    return np.array([multiscale_similarity(x, y, scales) for x, y in pairs])
+def as_unit(image: NDArray[Any]) -> Array:
+    """A checked image as float64 in [0, 1]."""
+    return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
 
 
 def local_maps(
@@ -463,19 +363,11 @@ def scale_weights(scales: int) -> Array:
     return weights if scales == len(WEIGHTS) else weights / weights.sum()
 
 
-def require_side(size: Sequence[int], side: int, what: str) -> None:
-    """Reject images (height, width) whose shorter side is below ``side`` pixels."""
-    if min(size) < side:
-        must, got = f"Images must be at least {side} x {side} for {what}", f"{size[0]} x {size[1]}"
+def require_side(size: Sequence[int], what: str) -> None:
+    """Reject images (height, width) that are smaller than a window."""
+    if min(size) < WINDOW:
+        must, got = (
+            f"Images must be at least {WINDOW} x {WINDOW} for {what}",
+            f"{size[0]} x {size[1]}",
+        )
         raise PalpateError(must, got, "Score larger images")
-
-
-def _scale_count(scales: Any, size: Sequence[int]) -> int:
-    if scales == "auto":
-        require_side(size, WINDOW, "MS-SSIM")
-        return fitting_scales(size)
-    if type(scales) is not int or not 1 <= scales <= len(WEIGHTS):
-        must = f'must be "auto" or a whole number from 1 to {len(WEIGHTS)}'
-        raise PalpateError(must, repr(scales), "Use the default", argument="scales")
-    require_side(size, least_side(scales), f"MS-SSIM of {scales} scales")
-    return scales

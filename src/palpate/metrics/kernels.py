@@ -9,7 +9,6 @@ sigma = 10, k lies in [0.98, 1], and sums of k itself in float32 lose what matte
   between samples of different groups, ``"multi"`` the mean of five Gaussians at 1/4 to 4 times
   that.
 * :class:`Polynomial`: ``(gamma x.y + coef0)^degree``; degree 3, gamma 1/d, coef0 1 is KID's.
-* :class:`Linear`: ``x.y``; its MMD^2 is ``||mean x - mean y||^2``.
 
 The back ends give the same sums:
 
@@ -167,19 +166,10 @@ class Polynomial(Kernel):
         return super().settings() | {"degree": self.degree, "gamma": gamma, "coef0": self.coef0}
 
 
-@dataclass(frozen=True)
-class Linear(Kernel):
-    """``x.y``."""
-
-    def values(self, t: Any, xp: Any) -> Any:
-        """The product."""
-        return t
-
-
 def checked_kernel(kernel: Any) -> None:
     """Reject what is no kernel; None is the Gaussian of ``sigma``."""
     if kernel is not None and not isinstance(kernel, Kernel):
-        must = "must be a kernel: Gaussian(), Polynomial(), Linear() or another Kernel"
+        must = "must be a kernel: Gaussian(), Polynomial() or another Kernel"
         raise invalid("kernel", must, repr(kernel), "Import one from palpate.metrics")
 
 
@@ -246,8 +236,6 @@ MOMENT_BYTES, STATE_BYTES = 512 << 20, 64 << 20
 LONG = 300_000
 #: Rows of an array on disk that are added to moments together.
 STREAM = 1 << 15
-#: Up to this many rows float64 costs nothing.
-FLOAT64_BELOW = 1024
 #: Largest ``||z||^2`` in float32: an exponent is then rounded by less than 1e-7, so that MMD^2 at
 #: scale 1000 keeps 1e-4 even where all errors have one direction.
 FLOAT32_RADIUS = 0.25
@@ -255,17 +243,11 @@ FLOAT32_RADIUS = 0.25
 SMALL_BLOCK = 256
 #: Up to this many items their sums with one another are kept (34 MB).
 MOST_ITEMS = 2048
+#: Rows that the spread of random halves is taken over; their deviation is then known to 3 %.
+SPREAD_ROWS = 1000
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """Sums by item and segment, and (K, 3) :func:`centered_squares` of the requested segments."""
-
-    sums: PairSums
-    spread: Array
-
-
-def kernel_sums(  # noqa: PLR0913
+def kernel_sums(
     parts: Sequence[Any],
     segment: Index,
     unit: Index,
@@ -276,9 +258,8 @@ def kernel_sums(  # noqa: PLR0913
     backend: Backend = "auto",
     tolerance: float = 1e-4,
     block: int = 1024,
-    spread: Sequence[Index] = (),
     weights: Sequence[Array] = (),
-) -> Sweep:
+) -> PairSums:
     """Sums of k by item and segment.
 
     Args:
@@ -292,7 +273,6 @@ def kernel_sums(  # noqa: PLR0913
         backend: see the module.
         tolerance: largest ``bound`` that ``auto`` takes moments with.
         block: most rows of a block.
-        spread: sets of segments whose :func:`centered_squares` are computed.
         weights: (N,) each, the same for samples of one (segment, unit): of
             ``PairSums.weighings``.
 
@@ -317,42 +297,31 @@ def kernel_sums(  # noqa: PLR0913
     if backend == "moments" or (backend == "auto" and not reason and cheap and many):
         sigma = float(kernel.bandwidth or 0)
         number = number.reshape(-1)
-        sweep = _moments(parts, items, number, segments=segments, sigma=sigma, spread=spread)
+        sums = _moments(parts, number, items.shape[1], sigma).sums(*items, segments)
         one_of = np.unique(number, return_index=True)[1]
-        weighings = [sweep.sums.weighed(w[one_of]) for w in weights]
-        sweep = replace(sweep, sums=replace(sweep.sums, weighings=weighings))
-        remainder = bound(sweep.sums)
+        sums = replace(sums, weighings=[sums.weighed(w[one_of]) for w in weights])
+        remainder = bound(sums)
         if backend == "moments" or remainder <= tolerance:
-            return sweep
+            return sums
         reason = f"their bound {remainder:.2g} exceeds the tolerance {tolerance:.2g}"
     if rows > LONG:
         why = f" Moments were not taken: {reason}." if backend == "auto" and reason else ""
         text = f"All {rows**2 / 2:.2g} pairs are formed, which takes long.{why}"
         warnings.warn(text, PalpateWarning, stacklevel=4)
     x = parts[0] if len(parts) == 1 else array_namespace(parts[0]).concat(list(parts), axis=0)
-    options: dict[str, Any] = {"segments": segments, "kernel": kernel, "spread": spread}
-    options |= {"weights": weights}
+    options: dict[str, Any] = {"segments": segments, "kernel": kernel, "weights": weights}
     return blocked_sums(x, segment, unit, block=block, **options)
 
 
-def _moments(
-    parts: Sequence[Any],
-    items: Index,
-    number: Index,
-    *,
-    segments: int,
-    sigma: float,
-    spread: Sequence[Index],
-) -> Sweep:
-    moments, first = Moments.empty(center_of(parts), sigma, items.shape[1]), 0
+def _moments(parts: Sequence[Any], number: Index, items: int, sigma: float) -> Moments:
+    moments, first = Moments.empty(center_of(parts), sigma, items), 0
     for part in parts:
         for k in range(0, len(part), STREAM):
             slab = part[k : k + STREAM]
             moments.add(slab, number[first : first + len(slab)])
             release(part)
             first += len(slab)
-    squares = [moments.spread(np.flatnonzero(np.isin(items[0], s))) for s in spread]
-    return Sweep(moments.sums(items[0], items[1], segments), np.array(squares).reshape(-1, 3))
+    return moments
 
 
 def blocked_sums(
@@ -363,71 +332,50 @@ def blocked_sums(
     segments: int,
     kernel: Kernel,
     block: int = 1024,
-    spread: Sequence[Index] = (),
     weights: Sequence[Array] = (),
-) -> Sweep:
+) -> PairSums:
     """As :func:`kernel_sums` by blocks, of the rows ``x`` (N, d)."""
     order = np.lexsort((unit, segment))
     segment, unit = segment[order].astype(np.intp), unit[order].astype(np.intp)
+    weights = [w[order] for w in weights]
     new = (np.diff(segment, prepend=-1) != 0) | (np.diff(unit, prepend=unit[:1]) != 0)
     item, first, n = np.cumsum(new) - 1, np.flatnonzero(new), len(order)
-    pairs, joined = _Pairs(x, order, kernel), len(first) <= MOST_ITEMS
+    pairs = _Pairs(x, order, kernel)
     blocks = _slices(n, max(1, min(block, max(SMALL_BLOCK, -(-n // 8)))))
-    by_item = _Cells(item, len(first), blocks, pairs.z) if joined else None
-    by_segment = _Cells(segment, segments, blocks, pairs.z) if spread or not joined else None
-    weights = [w[order] for w in weights]
-    of_rows = [np.ones(n), *([] if joined else weights)]
-    columns = [by_segment.weighed(w, blocks) for w in of_rows] if by_segment else []
-    rows = np.zeros((len(columns), n, segments))
+    rows = columns = [_indicators(item[b], pairs.z) for b in blocks]
+    width = len(first)
+    if not (joined := width <= MOST_ITEMS):  # sums with weighted segments instead of items
+        weighed = [one_hot(segment, segments) * w[:, None] for w in (np.ones(n), *weights)]
+        dense, width = np.hstack(weighed), segments * len(weighed)
+        columns = [(np.arange(width), _wide(dense[b], pairs.z)) for b in blocks]
+    total = np.zeros((len(first), width))
 
-    def sums_of(pair: tuple[int, int]) -> tuple[Any, ...]:
+    def sums_of(pair: tuple[int, int]) -> list[Array]:
         i, j = pair
         k = pairs.block(blocks[i], blocks[j], diagonal=0 if i == j else None)
-        items = by_item.sums(k, i, j) if by_item else None
-        if by_segment is None:
-            return items, None, None, None
-        across, down = ([host(v @ c[at]) for c in columns] for v, at in ((k, j), (k.T, i)))
-        return items, across, down, by_segment.sums(k * k, i, j)
+        mirrored = [(k.T, j, i)] if i != j else []
+        return [host(rows[a][1].T @ (v @ columns[b][1])) for v, a, b in [(k, i, j), *mirrored]]
 
     todo = [(i, j) for i in range(len(blocks)) for j in range(i, len(blocks))]
     for (i, j), sums in zip(todo, in_threads(sums_of, todo, x), strict=True):
-        if by_item:
-            by_item.add(sums[0], i, j)
-        if by_segment:
-            for k, (across, down) in enumerate(zip(sums[1], sums[2], strict=True)):
-                rows[k][blocks[i], by_segment.present[j]] += across
-                if i != j:
-                    rows[k][blocks[j], by_segment.present[i]] += down
-            by_segment.add(sums[3], i, j)
-    squares = by_segment.total if by_segment else np.zeros((0, 0))
-    centered = [
-        centered_squares(
-            float(squares[np.ix_(s, s)].sum()), rows[0][np.isin(segment, s)][:, s].sum(axis=1)
-        )
-        for s in spread
-    ]
-    if by_item:
-        each = (np.ones(n), pairs.diagonal())
-        size, diagonal = (np.bincount(item, v, len(first)).astype(np.float64) for v in each)
-        of_items = PairSums.from_block(
-            by_item.total, size, diagonal, segment[first], unit[first], segments=segments
-        )
-        weighings = [of_items.weighed(w[first]) for w in weights]
-    else:
-        same = _same_unit(pairs, segment, unit, np.zeros((n, segments)), block)
-        of_items = PairSums(np.ones(n), rows[0], same, pairs.diagonal(), segment, unit)
-        weighings = [of_items.weighed(w, r) for w, r in zip(weights, rows[1:], strict=True)]
-    of_items = replace(of_items, weighings=weighings)
-    return Sweep(of_items, np.array(centered).reshape(-1, 3))
-
-
-def _same_unit(pairs: _Pairs, segment: Index, unit: Index, same: Array, block: int) -> Array:
-    """(N, S) sums of each sample with those of its unit, into ``same``."""
+        for values, a, b in zip(sums, (i, j), (j, i), strict=False):
+            total[np.ix_(rows[a][0], columns[b][0])] += values
+    each = (np.ones(n), pairs.diagonal())
+    size, diagonal = (np.bincount(item, v, len(first)).astype(np.float64) for v in each)
+    of_item = (size, diagonal, segment[first], unit[first])
+    if joined:
+        sums = PairSums.from_block(total, *of_item, segments=segments)
+        return replace(sums, weighings=[sums.weighed(w[first]) for w in weights])
+    with_segments, *weighed = np.hsplit(total, len(weights) + 1)
+    same = np.zeros((len(first), segments))
     for at in split_by(unit):
-        for part in _slices(len(at), block if len(at) > 1 else 0):
+        for part in _slices(len(at), block):
             k = pairs.block(at[part], at, diagonal=part.start)
-            same[at[part]] = host(k @ like(one_hot(segment[at], same.shape[1]), k))
-    return same
+            inside = host(k @ _wide(one_hot(segment[at], segments), pairs.z))
+            np.add.at(same, item[at[part]], inside)
+    sums = PairSums(size, with_segments, same, *of_item[1:])
+    each = zip(weights, weighed, strict=True)
+    return replace(sums, weighings=[sums.weighed(w[first], v) for w, v in each])
 
 
 class _Pairs:
@@ -439,19 +387,16 @@ class _Pairs:
 
     def __init__(self, x: Any, order: Index, kernel: Kernel) -> None:
         self.kernel, self.xp = kernel, array_namespace(x)
-        xp, z, single = self.xp, rows_at(x, order), False
+        xp, single = self.xp, False
+        z = xp.astype(rows_at(x, order), xp.float64)
         if kernel.stationary and len(order):
-            z = z - xp.mean(z, axis=0)  # any center is right: float32 is near enough
-        z = z / kernel.unit(x.shape[1])
-        if z.dtype != xp.float64 and kernel.stationary and len(order) > FLOAT64_BELOW:
-            single = float(row_norms(z).max()) ** 2 <= FLOAT32_RADIUS
-        if z.dtype != xp.float64 and not single:
-            wide = xp.astype(rows_at(x, order), xp.float64)
-            wide = wide - like(host(xp.mean(wide, axis=0)), wide) if kernel.stationary else wide
-            z = wide / kernel.unit(x.shape[1])
-        self.z = z
-        self.half = row_norms(z) ** 2 / 2
-        self.shift = like(self.half, z)
+            z -= xp.mean(z, axis=0)  # any center is right: float32 is near enough
+        z /= kernel.unit(x.shape[1])
+        if x.dtype != xp.float64 and kernel.stationary:
+            single = float(row_norms(z).max(initial=0)) ** 2 <= FLOAT32_RADIUS
+        self.z = xp.astype(z, x.dtype) if single else z
+        self.half = row_norms(self.z) ** 2 / 2
+        self.shift = like(self.half, self.z)
 
     def block(self, rows: Any, columns: Any, diagonal: int | None = None) -> Any:
         """(n, m) float64 values, 0 at i = j; ``diagonal``: the column of the first row, if any."""
@@ -477,51 +422,38 @@ def _slices(n: int, step: int) -> list[slice]:
     return [slice(i, min(i + step, n)) for i in range(0, n, step)] if step else []
 
 
-class _Cells:
-    """Sums over blocks by pair of cells (items, or segments).
-
-    Attributes:
-        present: of each block the cells that occur, ascending.
-        indicators: of each block (n, R) indicators of these, in float64 on the device of the rows.
-        total: (C, C) sums so far.
-    """
-
-    def __init__(self, cell: Index, cells: int, blocks: Sequence[slice], z: Any) -> None:
-        self.present = [np.unique(cell[b]) for b in blocks]
-        wide = array_namespace(z).astype(z[:0], array_namespace(z).float64)
-        indicators = (cell[b][:, None] == p for b, p in zip(blocks, self.present, strict=True))
-        self.indicators = [like(m.astype(np.float64), wide) for m in indicators]
-        self.total = np.zeros((cells, cells))
-
-    def weighed(self, weight: Array, blocks: Sequence[slice]) -> list[Any]:
-        """The indicators times (n,) weights of the rows."""
-        return [
-            m * like(weight[b][:, None], m) for m, b in zip(self.indicators, blocks, strict=True)
-        ]
-
-    def sums(self, k: Any, i: int, j: int) -> Array:
-        """The sums of a block of values."""
-        return host(self.indicators[i].T @ k @ self.indicators[j])
-
-    def add(self, sums: Array, i: int, j: int) -> None:
-        """Add the sums of block (i, j), and of its mirror image."""
-        self.total[np.ix_(self.present[i], self.present[j])] += sums
-        if i != j:
-            self.total[np.ix_(self.present[j], self.present[i])] += sums.T
+def _wide(values: Array, z: Any) -> Any:
+    """``values`` in float64 in the library and on the device of ``z``."""
+    xp = array_namespace(z)
+    return like(values, xp.astype(z[:0], xp.float64))
 
 
-def centered_squares(squares: float, row_sums: Array) -> tuple[float, float, float]:
+def _indicators(cell: Index, z: Any) -> tuple[Index, Any]:
+    """The cells that occur in a block, ascending, and (n, R) indicators of these."""
+    present = np.unique(cell)
+    return present, _wide((cell[:, None] == present).astype(np.float64), z)
+
+
+def centered_squares(x: Any, rows: Index, kernel: Kernel) -> tuple[float, float, float]:
     """Sum of squares over i != j, trace and squared diagonal of the doubly centered kernel.
 
-    From sum_ij k^2 and row sums of a matrix whose diagonal is 0:
-    ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means, and ``Kc_ii = r - 2 r_i``.
+    With the diagonal 0, ``Kc_ij = k_ij - r_i - r_j + r`` with r the row means, ``Kc_ii = r -
+    2 r_i``. Of more than :data:`SPREAD_ROWS` rows it is estimated from so many random ones.
+
+    Args:
+        x: (N, d) features.
+        rows: (n,) of which.
+        kernel: the kernel.
     """
-    n = len(row_sums)
+    n = len(rows)
     if n < 2:
         return np.nan, np.nan, np.nan
-    r = row_sums / n
-    mean = r.mean()
-    diagonal = mean - 2 * r
-    inner = float((diagonal**2).sum())
-    every = float(squares - 2 * n * (r**2).sum() + n**2 * mean**2)
-    return max(every - inner, 0.0), float(diagonal.sum()), inner
+    some = np.sort(rng_for(0, "centered squares").permutation(rows)[:SPREAD_ROWS])
+    m, every = len(some), slice(None)
+    k = host(_Pairs(x, some, kernel).block(every, every, diagonal=0))
+    r = k.mean(axis=0)
+    centered = k - r - r[:, None] + r.mean()
+    own = np.diagonal(centered)
+    inner = float((own**2).sum())
+    off = (float((centered**2).sum()) - inner) * n * (n - 1) / (m * (m - 1))
+    return off, float(own.sum()) * (n - 1) / (m - 1), inner * n / m

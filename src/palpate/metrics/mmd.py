@@ -251,7 +251,7 @@ def distance(  # noqa: PLR0913
         tolerance=tolerance * scale / 1000,
         block=block,
         bound=lambda sums: largest_bound(sums, estimator, scale),
-    ).sums
+    )
     value = float(mmd_matrix(sums.totals, estimator, scale)[0, 1])
     bound = largest_bound(sums, estimator, scale)
     if not np.isfinite(sums.totals.sums).all():
@@ -267,11 +267,6 @@ def distance(  # noqa: PLR0913
         raise invalid("sigma", must, got, "Sum blocks", backend="blocked")
     how = (sums.backend, estimator, kernel.settings(), kernel.bandwidth, scale)
     return Distance(value, bound, *how, m=len(x), n=len(y))
-
-
-def mmd2(x: Any, y: Any, **options: Any) -> float:
-    """The value of :func:`distance`, with the same options."""
-    return distance(x, y, **options).value
 
 
 class Options(TypedDict, total=False):
@@ -530,42 +525,28 @@ def dispersion_of(t: Totals, plan: Plan) -> Array:
         return (1 / halves_of(t.n)).sum(axis=1) * plan.scale * spread
 
 
-def random_halves_sd(spread: Array, sizes: Array, estimator: str, scale: float) -> Array:
+def random_halves_sd(spread: Array, n: Array, estimator: str, scale: float) -> Array:
     """Standard deviation (K,) of dist^2 between two random halves of each of K sets.
 
-    Let s = +-1 mark halves of m and m' samples, n = m + m', D = m - m', and Kc be the doubly
-    centered kernel matrix, whose rows add up to 0. With ``W = sum_{i != j} Kc_ij s_i s_j`` and
-    ``L = sum_i Kc_ii s_i``
+    Let s = +-1 mark the halves, m = n/2 samples each (of odd n nearly), and Kc be the doubly
+    centered kernel matrix. ``W = sum_{i != j} Kc_ij s_i s_j`` times c, up to a constant, is
 
-    biased = const + W (1/m + 1/m')^2 / 4,   unbiased = const + c W - 2 b L,
+    biased: ``c = 4 / n^2``, unbiased: ``c = 1/(2m(m-1)) + 1/(2m^2)``.
 
-    c = [1/(m(m-1)) + 1/(m'(m'-1))] / 4 + 1/(2 m m'), b = [1/(m(m-1)) - 1/(m'(m'-1))] / 4. Variances
-    follow from the mean products of one to four distinct signs over all halvings: p1 = D/n,
-    p2 = (D^2 - n) / (n(n-1)), p3 = (D^3 - (3n-2) D) / (n(n-1)(n-2)),
-    p4 = (D^4 - (6n-8) D^2 + 3n^2 - 6n) / (n(n-1)(n-2)(n-3)). The mean is exactly 0 for unbiased
-    (for any data), and :func:`dispersion_of` for biased.
+    Its variance follows from the mean products of two and four signs over all halvings, p2 = -1 /
+    (n-1) and p4 = 3 / ((n-1)(n-3)). The mean is 0 for unbiased (for any data), and
+    :func:`dispersion_of` for biased.
 
     Args:
         spread: (K, 3): S, sum over i != j of Kc_ij^2; T and Q, sums of Kc_ii and of their squares.
-        sizes: (K, 2) m and m'.
+        n: (K,) samples.
         estimator: ``"biased"``, or any other for unbiased.
         scale: factor on the result.
     """
-    (off, trace, squares), (x, y) = spread.T, sizes.T
-    n, d = x + y, x - y
+    (off, trace, squares), m = spread.T, n / 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        p1, p2 = d / n, (d**2 - n) / (n * (n - 1))
-        p3 = (d**3 - (3 * n - 2) * d) / (n * (n - 1) * (n - 2))
-        p4 = (d**4 - (6 * n - 8) * d**2 + 3 * n**2 - 6 * n) / (n * (n - 1) * (n - 2) * (n - 3))
+        p2, p4 = -1 / (n - 1), 3 / ((n - 1) * (n - 3))
         four = trace**2 - 2 * off - 4 * (squares - off)
-        var_w = 2 * off + 4 * p2 * (squares - off) + p4 * four - (p2 * trace) ** 2
-        var_l = squares * (1 - p1**2) + (trace**2 - squares) * (p2 - p1**2)
-        both = -2 * p1 * squares + p3 * (2 * squares - trace**2) + p1 * p2 * trace**2
-        if estimator == "biased":
-            c, b = (1 / x + 1 / y) ** 2 / 4, 0.0
-        else:
-            of_x, of_y = 1 / (x * (x - 1)), 1 / (y * (y - 1))
-            c, b = (of_x + of_y) / 4 + 1 / (2 * x * y), (of_x - of_y) / 4
-        variance = c**2 * var_w + 4 * b**2 * var_l - 4 * b * c * both
-        few = (n < 4) | (sizes.min(axis=1) < (1 if estimator == "biased" else 2))
-        return np.where(few, np.nan, scale * np.sqrt(np.maximum(variance, 0)))
+        variance = 2 * off + 4 * p2 * (squares - off) + p4 * four - (p2 * trace) ** 2
+        c = 1 / m**2 if estimator == "biased" else (1 / (m * (m - 1)) + 1 / m**2) / 2
+        return np.where(n < 4, np.nan, scale * c * np.sqrt(np.maximum(variance, 0)))

@@ -133,22 +133,6 @@ class Moments:
         bound = PairSums.from_block(remainder, n, none, segment, unit, **fixed)
         return PairSums.from_block(block, n, none, segment, unit, **fixed, bound=bound)
 
-    def spread(self, items: Index) -> tuple[float, float, float]:
-        """As :func:`palpate.metrics.kernels.centered_squares`, to leading order in 1 / sigma^2.
-
-        ``Kc_ij = z_i . z_j`` with z centered on the mean of the samples of these items.
-        """
-        n, first = self.n[items].sum(), self.first[items].sum(axis=0)
-        if n < 2:
-            return np.nan, np.nan, np.nan
-        about_center = self.second[items].sum(axis=0, dtype=np.float64)
-        second = about_center - np.outer(first, first) / n
-        # sum of ||z - mean||^4; the cross terms, of order 1/n, by the mean distance
-        trace = float(np.trace(about_center))
-        shrunk = 1 - float(first @ first) / n / trace if trace > 0 else 0.0
-        inner = float(self.fourth[items].sum()) * shrunk**2
-        return max(float((second**2).sum() - inner), 0.0), float(np.trace(second)), inner
-
 
 def remainder_factor(rho: float) -> float:
     """``h(rho) = (exp(rho) - 1 - rho - rho^2 / 2) / rho^2``, accurate for small rho too."""

@@ -54,7 +54,7 @@ from palpate.metrics.intervals import (
     over_classes,
     permutation_test,
 )
-from palpate.metrics.kernels import Kernel, Polynomial, gaussian, kernel_sums
+from palpate.metrics.kernels import Kernel, Polynomial, centered_squares, gaussian, kernel_sums
 from palpate.metrics.mmd import (
     AGGREGATES,
     DENOMINATORS,
@@ -89,8 +89,8 @@ class Table:
         unit: what the jackknife leaves out: ``"group"``, ``"sample"`` or ``"random-block"``.
         names: the name of each unit number.
         kernel: what was summed.
-        spread: (1 + C, 3) :func:`palpate.metrics.kernels.centered_squares` of the generated set
-            and of each class.
+        x: (n, d) generated features.
+        label: (n,) class number of each.
         copies: generated rows that are bit for bit rows of the reference.
     """
 
@@ -99,7 +99,8 @@ class Table:
     unit: str
     names: Sequence[str]
     kernel: Kernel
-    spread: Array
+    x: Any
+    label: Index
     copies: int | None = 0
 
     @property
@@ -121,6 +122,12 @@ class Table:
         for k, c in enumerate(kept):
             to[4 * c : 4 * c + 4] = [2 * k, 2 * k, 2 * k + 1, 2 * k + 1]
         return self.sums.merge(to, 2 * len(kept), 1)
+
+    def spread(self, kept: Index | None = None) -> Array:
+        """(K, 3) centered squares of these classes, or (1, 3) of the whole generated set."""
+        every = [np.arange(len(self.label))]
+        rows = every if kept is None else [np.flatnonzero(self.label == c) for c in kept]
+        return np.array([centered_squares(self.x, at, self.kernel) for at in rows])
 
     def whole_classes(self) -> PairSums:
         """Segment c: class number c, whole."""
@@ -166,7 +173,7 @@ def build_table(
         ids = [str(i) for s in sets for i in s.ids]
         units, unit, unit_names = sample_units(ids, plan.seed)
     classes, segment = _segments(generated, plan)
-    reference_segment = 4 * len(classes)
+    label, reference_segment = segment // 4, 4 * len(classes)
     segment = np.append(segment, np.full(len(units) - len(segment), reference_segment))
     kernel = plan.kernel
     if kernel is None and isinstance(plan.sigma, str) and median_of is not None:
@@ -175,13 +182,15 @@ def build_table(
         kernel = gaussian(plan.sigma, rows, median_of.groups)
     kernel = kernel or gaussian(plan.sigma, parts[-1], sets[-1].groups)
 
+    def table_of(sums: PairSums) -> Table:
+        return Table(sums, classes, unit, unit_names, kernel, parts[0], label)
+
     def bound(sums: PairSums) -> float:
-        table = Table(sums, classes, unit, unit_names, kernel, np.zeros((0, 3)))
+        table = table_of(sums)
         ratio = further(table, plan) * plan.scale / 1000 if further else 0.0
         return max(_bound(table, plan), ratio)
 
-    of_class = [np.arange(4 * c, 4 * c + 4) for c in range(len(classes))]
-    sweep = kernel_sums(
+    sums = kernel_sums(
         parts,
         segment,
         units,
@@ -191,11 +200,10 @@ def build_table(
         tolerance=plan.tolerance * plan.scale / 1000,
         bound=bound,
         block=plan.block,
-        spread=[np.arange(reference_segment), *of_class],
         weights=_even_weights(units, segment, len(generated.ids)) if grouped else (),
     )
     copies = copies_across(*parts) if reference is not None else 0
-    return Table(sweep.sums, classes, unit, unit_names, kernel, sweep.spread, copies)
+    return replace(table_of(sums), copies=copies)
 
 
 def _even_weights(unit: Index, segment: Index, generated: int) -> list[Array]:
@@ -581,7 +589,7 @@ def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     if reason:
         least, n = plan.min_samples, len(generated.ids)
         notes = [Note("undefined", {"reason": reason, "least": least, "n": n})]
-    given: dict[str, Any] = {"spread": table.spread[:1], "details": details, "notes": notes}
+    given: dict[str, Any] = {"spread": table.spread(), "details": details, "notes": notes}
     return _mean_of_halves("I-TMMD", table, generated, plan, sums=sums, **given)
 
 
@@ -593,7 +601,7 @@ def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
         notes = [Note("undefined", {"reason": "no-class", "labeled": labeled})]
         common: dict[str, Any] = {"details": details, "notes": notes, **_halves_fields(plan)}
         return scored("CI-TMMD", table, generated, plan, ("halves",), **common)
-    sums, spread = table.class_halves(kept), table.spread[1 + kept]
+    sums, spread = table.class_halves(kept), table.spread(kept)
     each, excess = self_distances(sums.totals, plan)
     sizes = whole_sets(sums.totals).n
     details["per_class"] = {}
@@ -623,7 +631,7 @@ def _mean_of_halves(
     )
     whole = whole_sets(sums.totals)
     sizes = halves_of(whole.n)
-    sds = random_halves_sd(spread, sizes, plan.estimator, plan.scale)
+    sds = random_halves_sd(spread, whole.n, plan.estimator, plan.scale)
     sd = float(np.sqrt((sds**2).sum())) / len(sds)
     dispersion = float(dispersion_of(whole, plan).mean())
     center = dispersion if plan.estimator == "biased" else 0.0

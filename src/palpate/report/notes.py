@@ -127,23 +127,6 @@ PYTHON, COMMAND_LINE = Style(), Style(command_line=True)
 Sentence = str | Callable[[Mapping[str, Any], Style], str]
 
 
-def _fewer_scales(p: Mapping[str, Any], _: Style) -> str:
-    why = f"five need {p['least']} pixels a side" if p["auto"] else "as requested"
-    return (
-        f"{p['scales']} of the 5 scales ({why}), weights divided by their sum: not comparable with "
-        "MS-SSIM of 5"
-    )
-
-
-def _fid_biased(p: Mapping[str, Any], _: Style) -> str:
-    if p["extrapolated"]:
-        return (
-            "Biased upwards at this size; its details have the extrapolation to infinitely many "
-            "samples (infinity)"
-        )
-    return "Biased upwards, the more the fewer samples: compare at equal sizes only"
-
-
 #: Why a class, or a set, cannot be cut into halves (``details["excluded"]`` of scores).
 EXCLUDED = {
     "few-samples": "too few samples",
@@ -238,13 +221,16 @@ METRICS: dict[str, Sentence] = {
     ),
     "no-interval-over-groups": "No interval: one group, or no variation between them",
     "no-interval-few-units": "No interval: too few groups or samples to leave some out",
-    "fewer-scales": _fewer_scales,
+    "fewer-scales": (
+        "{scales} of the 5 scales (five need {least} pixels a side), weights divided by their sum: "
+        "not comparable with MS-SSIM of 5"
+    ),
     "no-contact": "{count} of {n} real images show no contact, excluded from the mean",
     "empty-balls": "{count} of {n} {of} rows occur more than k times: their balls hold nothing",
     "fid-mostly-bias": (
         "Not meaningful: {n} samples do not span the {d} dimensions, so the value is mostly bias"
     ),
-    "fid-biased": _fid_biased,
+    "fid-biased": "Biased upwards, the more the fewer samples: compare at equal sizes only",
     "fid-difference-biased": "Of FID at this size, whose biases need not be equal",
 }
 
