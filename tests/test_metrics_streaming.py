@@ -113,11 +113,13 @@ def test_merged_and_pickled_in_the_middle(cls):
     first, second = np.arange(0, 41), np.arange(41, len(g.ids))
     a = pickle.loads(pickle.dumps(both(make(), g, r, order=first)))
     b = pickle.loads(pickle.dumps(both(make(), g, r, order=second)))
-    assert same(a.merge(b).compute(), whole)
     assert same(both(pickle.loads(pickle.dumps(a)), g, r, order=second).compute(), whole)
     a.merge_state(b)
     assert same(a.compute(), whole)
-    assert same(make().merge(b, both(make(), g, r, order=first)).compute(), whole)
+    c = make()
+    c.merge_state(b)
+    c.merge_state(both(make(), g, r, order=first))
+    assert same(c.compute(), whole)
 
 
 def work(job):
@@ -134,7 +136,8 @@ def test_two_processes_give_what_one_gives():
         metrics = [pickle.loads(p) for p in pool.map(work, jobs)]
     for k, cls in enumerate(ALL):
         one = both(cls(encoder=g.encoder), g, r).compute()
-        assert same(metrics[2 * k].merge(metrics[2 * k + 1]).compute(), one)
+        metrics[2 * k].merge_state(metrics[2 * k + 1])
+        assert same(metrics[2 * k].compute(), one)
 
 
 @pytest.mark.parametrize(
@@ -151,15 +154,15 @@ def test_metrics_of_other_settings_are_not_merged(mine, other):
     g, r = sets()
     a, b, equal = (both(TMMD(**options), g, r) for options in (mine, other, mine))
     before = a.compute()
-    for call in (a.merge_state, a.merge):
-        with pytest.raises(PalpateError, match="same settings"):
-            call(b)
+    with pytest.raises(PalpateError, match="same settings"):
+        a.merge_state(b)
     with pytest.raises(PalpateError, match="itself"):
         a.merge_state(a)
     with pytest.raises(PalpateError, match="one class"):
         a.merge_state(ITMMD())
     assert a.compute() == before
-    assert a.merge(equal).compute().n == 2 * len(g.ids)
+    a.merge_state(equal)
+    assert a.compute().n == 2 * len(g.ids)
 
 
 def test_features_of_another_width_are_not_merged():

@@ -155,7 +155,7 @@ def check_excess(backend, seed, frames):
     # Every leave-one-out value has the same weights.
     one = s.groups[0]
     rest = i_tmmd(s.take([i for i, g in zip(s.ids, s.groups, strict=True) if g != one]))
-    first = reference_free(i_tmmd_of, s, {"backend": backend}).excess[0]
+    first = reference_free(i_tmmd_of, s, None, {"backend": backend}).excess[0]
     assert first == pytest.approx(rest.details["E"], abs=1e-9 + bound)
 
 

@@ -13,9 +13,9 @@ Rows are kept: memory grows with them. For TMMD of sets that do not fit, see
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import blake2b
 from typing import Any, ClassVar, Self, Unpack
 
@@ -66,17 +66,6 @@ class Batch:
         """Which of ids, labels and groups there are."""
         return [name for name in COLUMNS if getattr(self, name) is not None]
 
-    def require_like(self, other: Batch) -> None:
-        """Raise where two batches cannot be rows of one array, or columns differ within one set."""
-        widths = [b.features.shape[1] for b in (other, self)]
-        if widths[0] != widths[1]:
-            must, got = "must have the same width in all updates", f"{widths[0]} and {widths[1]}"
-            raise invalid("features", must, got, "Embed all with the same encoder")
-        if len(self.features) and self.real == other.real and self.given != other.given:
-            got = " and ".join(", ".join(b.given) or "none" for b in (other, self))
-            must = "All updates of one set must give the same of ids, labels and groups"
-            raise PalpateError(must, got, "Give each always, or never")
-
     def to_bytes(self) -> NDArray[np.uint8]:
         """The batch as bytes: size and ``real`` as int64, then an npz; several may be joined."""
         names = {name: np.array(getattr(self, name), dtype=str) for name in self.given}
@@ -97,45 +86,30 @@ class Batch:
             joined = joined[stop:]
 
 
-@dataclass
-class Batches:
-    """All batches so far."""
+def require_like(batch: Batch, before: Sequence[Batch]) -> None:
+    """Raise where a batch does not fit those before: their last one, and the last of its set."""
+    for other in [*before[-1:], *[b for b in before if b.real == batch.real][-1:]]:
+        widths = [b.features.shape[1] for b in (other, batch)]
+        if widths[0] != widths[1]:
+            must, got = "must have the same width in all updates", f"{widths[0]} and {widths[1]}"
+            raise invalid("features", must, got, "Embed all with the same encoder")
+        if len(batch.features) and batch.real == other.real and batch.given != other.given:
+            got = " and ".join(", ".join(b.given) or "none" for b in (other, batch))
+            must = "All updates of one set must give the same of ids, labels and groups"
+            raise PalpateError(must, got, "Give each always, or never")
 
-    batches: list[Batch] = field(default_factory=list)
 
-    def add(self, batch: Batch) -> None:
-        """Add a batch that fits those before."""
-        for other in self.batches[-1:] + [b for b in self.batches if b.real == batch.real][-1:]:
-            batch.require_like(other)
-        if len(batch.features):
-            self.batches.append(batch)
-
-    def reset(self, *, keep_real: bool) -> None:
-        """Forget the batches; those of real samples may stay."""
-        self.batches = [b for b in self.batches if b.real and keep_real]
-
-    def merge(self, other: Batches) -> Batches:
-        """The batches of both."""
-        merged = Batches(list(self.batches))
-        for batch in other.batches:
-            merged.add(batch)
-        return merged
-
-    def rows(self, real: bool) -> int:
-        """Rows of a set."""
-        return sum(len(b.features) for b in self.batches if b.real == real)
-
-    def feature_set(self, real: bool, encoder: str | None) -> FeatureSet | None:
-        """The rows of a set in the order of arrival, None if there are none."""
-        batches = [b for b in self.batches if b.real == real]
-        if not batches:
-            return None
-        features = np.concatenate([b.features for b in batches])
-        columns: dict[str, Any] = {
-            name: [v for b in batches for v in getattr(b, name)] for name in batches[0].given
-        }
-        columns.setdefault("ids", row_ids(features, "real" if real else "generated"))
-        return FeatureSet(features=features, encoder=encoder, **columns)
+def joined(batches: Sequence[Batch], real: bool, encoder: str | None) -> FeatureSet | None:
+    """The rows of a set in the order of arrival, None if there are none."""
+    batches = [b for b in batches if b.real == real]
+    if not batches:
+        return None
+    features = np.concatenate([b.features for b in batches])
+    columns: dict[str, Any] = {
+        name: [v for b in batches for v in getattr(b, name)] for name in batches[0].given
+    }
+    columns.setdefault("ids", row_ids(features, "real" if real else "generated"))
+    return FeatureSet(features=features, encoder=encoder, **columns)
 
 
 def row_ids(features: NDArray[Any], kind: str) -> list[str]:
@@ -166,7 +140,7 @@ class StreamingMetric:
     """
 
     name: ClassVar[str]
-    function: ClassVar[Any]
+    function: ClassVar[Any]  # (generated, real, options) -> Scored
     higher_is_better: ClassVar[bool | None] = None
     is_differentiable: ClassVar[bool] = False
     full_state_update: ClassVar[bool] = False
@@ -181,12 +155,14 @@ class StreamingMetric:
     ) -> None:
         self.encoder, self.reset_real_features, self.options = encoder, reset_real_features, options
         self.plan = plan_for(options, grouped=True)  # checks; groups are known with the rows
-        self.state = Batches()
+        self.batches: list[Batch] = []
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the settings that states depend on."""
-        return digest_json([self.encoder, self.reset_real_features, self.plan.normalize])
+        """SHA-256 of the settings, which must agree where states are merged."""
+        return digest_json(
+            [self.encoder, self.reset_real_features, repr(sorted(self.options.items()))]
+        )
 
     def update(
         self,
@@ -214,7 +190,10 @@ class StreamingMetric:
                 rejects, another width than before, or columns of another length.
         """
         columns: dict[str, Any] = {"real": real, "ids": ids, "labels": labels, "groups": groups}
-        self.state.add(Batch.of(features, self.plan.normalize, **columns))
+        batch = Batch.of(features, self.plan.normalize, **columns)
+        require_like(batch, self.batches)
+        if len(batch.features):
+            self.batches.append(batch)
 
     def compute(self) -> Score:
         """The score of all batches since the last reset.
@@ -222,90 +201,74 @@ class StreamingMetric:
         Raises:
             PalpateError: if a set is missing, or as the function does.
         """
-        return self.score_of(self.state)
+        return self.score_of(self.batches)
 
-    def missing(self, state: Batches) -> bool:
-        """Whether a state lacks a set that the metric needs."""
-        return not state.rows(False) or (self.needs_real and not state.rows(True))
+    def missing(self, batches: Sequence[Batch]) -> bool:
+        """Whether batches lack a set that the metric needs."""
+        sets = {b.real for b in batches}
+        return False not in sets or (self.needs_real and True not in sets)
 
-    def score_of(self, state: Batches) -> Score:
-        """The score of a state."""
-        if self.missing(state):
+    def score_of(self, batches: Sequence[Batch]) -> Score:
+        """The score of batches."""
+        if self.missing(batches):
             sets = "generated and real samples" if self.needs_real else "generated samples"
-            got = f"{state.rows(False)} generated and {state.rows(True)} real"
+            rows = [
+                sum(len(b.features) for b in batches if b.real == real) for real in (False, True)
+            ]
+            got = f"{rows[0]} generated and {rows[1]} real"
             fix = "Call update(features)" + " and update(features, real=True)" * self.needs_real
             raise PalpateError(f"{self.name} must have {sets} before compute()", got, fix)
-        generated, real = (state.feature_set(real, self.encoder) for real in (False, True))
+        generated, real = (joined(batches, real, self.encoder) for real in (False, True))
         assert generated is not None  # missing() looked
-        score = self._scored(generated, real)
+        score = type(self).function(generated, real, self.options).score
         repeated = len(generated.ids) - len(set(generated.ids))
-        if not repeated:
-            return score
-        return replace(score, notes=(*score.notes, Note("repeated-ids", {"count": repeated})))
-
-    def _scored(self, generated: FeatureSet, real: FeatureSet | None) -> Score:
-        return reference_free(type(self).function, generated, self.options, real).score
+        notes = [Note("repeated-ids", {"count": repeated})] if repeated else []
+        return replace(score, notes=(*score.notes, *notes))
 
     def reset(self) -> None:
         """Forget all batches; with ``reset_real_features=False`` not those of real samples."""
-        self.state.reset(keep_real=not self.reset_real_features)
+        self.batches = [b for b in self.batches if b.real and not self.reset_real_features]
 
     def merge_state(self, other: Self) -> None:
         """Add what another metric of the same settings has seen, e.g. one unpickled from a process.
 
         Raises:
-            PalpateError: if class, settings or width differ.
+            PalpateError: if class, settings or width differ, or on the metric itself.
         """
-        require_same_settings(self, other)
-        self.state = self.state.merge(other.state)
-
-    def merge(self, *others: Self) -> Self:
-        """A new metric that has seen what this one and others have."""
-        merged = deepcopy(self)
-        for other in others:
-            merged.merge_state(other)
-        return merged
+        if other is self:
+            got, fix = "itself", "Merge what other processes have seen"
+            raise PalpateError("A metric must be merged with another one", got, fix)
+        if type(self) is not type(other) or self.digest != other.digest:
+            must = "Metrics that are merged must be of one class with the same settings"
+            got = f"{type(self).__name__} and {type(other).__name__}"
+            raise PalpateError(must, got, "Construct all with the same arguments")
+        merged = [*self.batches]
+        for batch in other.batches:
+            require_like(batch, merged)
+            merged.append(batch)
+        self.batches = merged
 
 
 class TMMD(StreamingMetric):
     """TMMD (paper, Eq. 2), the streaming form of :func:`palpate.metrics.tmmd`."""
 
     name, higher_is_better, needs_real = "TMMD", False, True
-
-    def _scored(self, generated: FeatureSet, real: Any) -> Score:
-        return tmmd_scored(generated, real, self.options).score
+    function = staticmethod(tmmd_scored)
 
 
 class ITMMD(StreamingMetric):
     """I-TMMD (paper, Eq. 3), the streaming form of :func:`palpate.metrics.i_tmmd`."""
 
-    name, function = "I-TMMD", i_tmmd_of
+    name, function = "I-TMMD", partial(reference_free, i_tmmd_of)
 
 
 class CITMMD(StreamingMetric):
     """CI-TMMD (paper, Eq. 4), the streaming form of :func:`palpate.metrics.ci_tmmd`."""
 
-    name, function = "CI-TMMD", ci_tmmd_of
+    name, function = "CI-TMMD", partial(reference_free, ci_tmmd_of)
 
 
 class DTMMD(StreamingMetric):
     """D-TMMD (paper, Eq. 5-7), the streaming form of :func:`palpate.metrics.d_tmmd`."""
 
-    name, function = "D-TMMD", d_tmmd_of
-
-
-def require_same_settings(metric: Any, other: Any) -> None:
-    """Raise where two metrics cannot be merged.
-
-    Raises:
-        PalpateError: on a metric with itself, another class, or other options.
-    """
-    a, b = metric.options, other.options
-    same = type(metric) is type(other) and metric.digest == other.digest and a.keys() == b.keys()
-    if other is metric:
-        got, fix = "itself", "Merge what other processes have seen"
-        raise PalpateError("A metric must be merged with another one", got, fix)
-    if not same or not all(np.array_equal(a[k], b[k]) for k in a):
-        must = "Metrics that are merged must be of one class with the same settings"
-        got = f"{type(metric).__name__} and {type(other).__name__}"
-        raise PalpateError(must, got, "Construct all with the same arguments")
+    name, function = "D-TMMD", partial(reference_free, d_tmmd_of)

@@ -507,7 +507,7 @@ def i_tmmd(
         PalpateError: on features that are rejected, or ``halves="group"`` without groups.
     """
     columns: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups, "encoder": encoder}
-    return reference_free(i_tmmd_of, feature_set(generated, **columns), options).score
+    return reference_free(i_tmmd_of, feature_set(generated, **columns), None, options).score
 
 
 def ci_tmmd(
@@ -529,7 +529,7 @@ def ci_tmmd(
         ``details``: ``E``, ``per_class``, ``excluded``.
     """
     columns: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups, "encoder": encoder}
-    return reference_free(ci_tmmd_of, feature_set(generated, **columns), options).score
+    return reference_free(ci_tmmd_of, feature_set(generated, **columns), None, options).score
 
 
 def d_tmmd(
@@ -556,11 +556,11 @@ def d_tmmd(
         is not two standard errors above 0), ``excluded``.
     """
     columns: dict[str, Any] = {"ids": ids, "labels": labels, "groups": groups, "encoder": encoder}
-    return reference_free(d_tmmd_of, feature_set(generated, **columns), options).score
+    return reference_free(d_tmmd_of, feature_set(generated, **columns), None, options).score
 
 
 def reference_free(
-    metric: Any, generated: FeatureSet, options: Options, real: FeatureSet | None = None
+    metric: Any, generated: FeatureSet, real: FeatureSet | None, options: Options
 ) -> Scored:
     """One of the reference-free metrics, with real samples for its floor."""
     [result] = _from_one_table([metric], generated, options, real)

@@ -11,8 +11,8 @@ States, with their ``dist_reduce_fx``:
   (:class:`palpate.metrics.streaming.Batch`). Features, names and counts travel in one gather;
   processes may have seen unequal numbers of rows, or none. Metrics of one collection whose settings
   agree share one list (compute groups).
-* ``settings`` ("max"): digest of the settings that states depend on, which must be the same in all
-  processes and within a compute group.
+* ``settings`` ("max"): digest of the settings, which must be the same in all processes and within a
+  compute group.
 
 torch and torchmetrics are loaded when this module is, and by no other module of this room.
 """
@@ -25,7 +25,7 @@ from typing import Any, Self
 
 from palpate.core import MissingExtraError, PalpateError, Score
 from palpate.metrics import streaming
-from palpate.metrics.streaming import Batch, Batches
+from palpate.metrics.streaming import Batch, require_like
 
 try:
     torch: Any = importlib.import_module("torch")
@@ -81,7 +81,7 @@ class TorchMetric(Metric):
         batch = Batch.of(features, self.plain.plan.normalize, **columns)
         # It must fit the last batch, and the last of its set; the ninth byte is ``real``.
         of_set = (r for r in reversed(self.records) if len(r) and bool(r[8]) == batch.real)
-        self._read([*self.records[-1:], *islice(of_set, 1)]).add(batch)
+        require_like(batch, self._read([*islice(of_set, 1), *self.records[-1:]]))
         self._append([batch])
 
     def compute(self) -> Any:
@@ -109,14 +109,14 @@ class TorchMetric(Metric):
         self.update(*args, **kwargs)
         alone = self._read(self.records[before:])
         if self.plain.needs_real:
-            alone = self._real().merge(alone)
+            alone = [*self._real(), *(b for b in alone if not b.real)]
         score = None if self.plain.missing(alone) else self.plain.score_of(alone)
         self._forward_cache = self._tensor(score)
         return self._forward_cache
 
     def reset(self) -> None:
         """Forget all batches; with ``reset_real_features=False`` not those of real samples."""
-        kept = [] if self.plain.reset_real_features else self._real().batches
+        kept = [] if self.plain.reset_real_features else self._real()
         super().reset()
         self._score = None
         self._append(kept)
@@ -125,25 +125,15 @@ class TorchMetric(Metric):
         """Add the state of another metric of the same settings.
 
         Raises:
-            PalpateError: if settings differ; of a bare state only those that states depend on are
-                known.
+            PalpateError: if settings differ.
         """
-        if isinstance(incoming_state, TorchMetric):
-            streaming.require_same_settings(self.plain, incoming_state.plain)
-        states = incoming_state
-        if isinstance(incoming_state, Metric):
-            states = incoming_state.metric_state
-        self._require_settings(states["settings"])
+        theirs = isinstance(incoming_state, Metric)
+        self._require_settings(
+            (incoming_state.metric_state if theirs else incoming_state)["settings"]
+        )
         self._computed = self._score = None
         super().merge_state(incoming_state)
         self._update_count += getattr(incoming_state, "_update_count", 1)
-
-    def merge(self, *others: Self) -> Self:
-        """A new metric that has seen what this one and others have."""
-        merged = self.clone()
-        for other in others:
-            merged.merge_state(other)
-        return merged
 
     def sync(self, *args: Any, **kwargs: Any) -> None:
         """As torchmetrics; a process without data gathers an empty record of the right type."""
@@ -154,10 +144,6 @@ class TorchMetric(Metric):
     def set_dtype(self, dst_type: Any) -> Self:
         """Do nothing: records are bytes."""
         return self
-
-    def _apply(self, fn: Any, *args: Any, **kwargs: Any) -> Any:
-        """Move states between devices; never to another type."""
-        return super()._apply(lambda t: t.to(fn(t.new_empty(0)).device), *args, **kwargs)
 
     def _require_settings(self, settings: Any) -> None:
         if bytes(settings.cpu().tolist()).hex() != self.plain.digest:
@@ -170,19 +156,17 @@ class TorchMetric(Metric):
         wide = torch.float32 if self.device.type == "mps" else torch.float64
         return torch.tensor(value, dtype=wide, device=self.device)
 
-    def _read(self, records: Any) -> Batches:
+    def _read(self, records: Any) -> list[Batch]:
         tensors = records if isinstance(records, list) else [records]
-        return Batches([batch for r in tensors for batch in Batch.read(r.detach().cpu().numpy())])
+        return [batch for r in tensors for batch in Batch.read(r.detach().cpu().numpy())]
 
     def _append(self, batches: list[Batch]) -> None:
         records = [b.to_bytes() for b in batches if len(b.features)]
         self.records.extend(torch.from_numpy(r).to(self.device) for r in records)
 
-    def _real(self) -> Batches:
+    def _real(self) -> list[Batch]:
         """What was seen of real samples."""
-        state = self._read(self.records)
-        state.reset(keep_real=True)
-        return state
+        return [batch for batch in self._read(self.records) if batch.real]
 
 
 class TMMD(TorchMetric):
