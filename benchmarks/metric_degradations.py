@@ -293,7 +293,7 @@ def page(results, command, worlds):
         "encoder that ships: the table shows mechanisms, and its numbers are never compared with "
         "those of real data. The script describes how it is made.",
         "",
-        'Unless said: `preset="grouped"`, sigma = 10, scale 1000. `TMMD, paper` is the unbiased '
+        'Unless stated: `preset="grouped"`, sigma = 10, scale 1000. `TMMD, paper` is the unbiased '
         "estimator (Eq. 2), `I, random` the paper's random halves; FID and the neighbor metrics "
         f"have {MATERIALS * VIDEOS * 6} samples a set and the encoder's 128 dimensions.",
         "",

@@ -344,7 +344,7 @@ def main():
     )
     options = f"--sizes {' '.join(map(str, asked.sizes))} --seeds {' '.join(map(str, asked.seeds))} --videos {asked.videos}"
     head = [
-        "# The simulated GelSight beside real touches",
+        "# The simulated GelSight next to real tactile images",
         "",
         f"Written by `{command} {options}`, world VERSION {VERSION}, {datetime.datetime.now(tz=datetime.UTC).date()}. What is measured, and how, "
         "stands in that script and in `benchmarks/world_statistics.py`.",

@@ -54,11 +54,11 @@ def _walk(record: type[Any], main: str, path: tuple[str, ...]) -> Iterator[_Fiel
 def attributes(record: type[Any]) -> Mapping[str, str]:
     """The texts of a record's docstring about its attributes."""
     block = (record.__doc__ or "").partition("Attributes:")[2].partition("\n\n")[0]
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for names, text in re.findall(r"^ {8}([\w, ]+): ((?:.|\n {9,})+)", block, re.MULTILINE):
         plain = re.sub(r":\w+:`([^`]*)`|``([^`]*)``", r"\1\2", " ".join(text.split()))
-        found |= dict.fromkeys(names.split(", "), plain[:1].upper() + plain[1:].rstrip(".") + ".")
-    return found
+        texts |= dict.fromkeys(names.split(", "), plain[:1].upper() + plain[1:].rstrip(".") + ".")
+    return texts
 
 
 def preset_flags(title: str, preset: type[Any], main: str, skip: tuple[str, ...]) -> Any:

@@ -234,15 +234,16 @@ class _Video:
             energy = contact_energy(self.thumbnails, self.thumbnails[reference])
             runs, method = known, f"contacts of the manifest, reference {way}"
         else:
-            found = find_contacts(self.thumbnails, reference)
-            energy, runs, method = found.energy, found.runs, f"contacts found, reference {way}"
+            contacts = find_contacts(self.thumbnails, reference)
+            energy, runs = contacts.energy, contacts.runs
+            method = f"contacts found, reference {way}"
         chosen, before = np.full(len(self.paths), reference), np.zeros(len(self.paths), bool)
         after = -1
         for first, last in runs:
             peak = float(energy[first : last + 1].max())
-            rest = rest_before(energy, first, after, peak)
-            if rest is not None:
-                chosen[first : last + 1], before[first : last + 1] = rest, True
+            quiet_frame = rest_before(energy, first, after, peak)
+            if quiet_frame is not None:
+                chosen[first : last + 1], before[first : last + 1] = quiet_frame, True
             after = max(after, last)
         strongest = max((float(energy[a : b + 1].max()) for a, b in runs), default=0.0)
         if strongest < LEAST:

@@ -173,9 +173,9 @@ def _contacts(
     for peak, (low, high) in zip(peaks, pairwise(troughs), strict=False):
         first = peak - _reach(smooth[low : peak + 1][::-1], height)
         last = peak + _reach(smooth[peak : high + 1], height)
-        rest = rest_before(smooth, first, after, float(smooth[peak]))
+        quiet_frame = rest_before(smooth, first, after, float(smooth[peak]))
         runs.append((first, last))
-        backgrounds.append(reference if rest is None else rest)
+        backgrounds.append(reference if quiet_frame is None else quiet_frame)
         after = last
     return runs, backgrounds
 

@@ -94,9 +94,9 @@ def _by_role(stems: dict[str, str]) -> dict[str, list[str]]:
     words = {path: _words(stem) for path, stem in stems.items()}
     shared = set.intersection(*map(set, words.values()))
     sides: dict[str, list[str]] = defaultdict(list)
-    for path, own in words.items():
-        strong = [_ROLE_OF[word] for word in own if word in _ROLE_OF and word not in shared]
-        weak = [_WEAK[word] for word in own if word in _WEAK and word not in shared]
+    for path, known in words.items():
+        strong = [_ROLE_OF[word] for word in known if word in _ROLE_OF and word not in shared]
+        weak = [_WEAK[word] for word in known if word in _WEAK and word not in shared]
         # The picture of an empty gel may lie in the folder of the tactile images.
         role = "background" if "background" in strong else (strong or weak or [""])[-1]
         sides[role].append(path)

@@ -111,9 +111,9 @@ def name_together(
     rows = [_fields(path, patterns, parsed) for path in paths]
     if parsed is not None:
         name_apart(rows, parsed.fields)
-    said = dict(zip(paths, rows, strict=True))
+    fields = dict(zip(paths, rows, strict=True))
     named = [
-        replace(m, table=_filled(m.table, said)) if any(m.table is t for t in unread) else m
+        replace(m, table=_filled(m.table, fields)) if any(m.table is t for t in unread) else m
         for m in manifests
     ]
     if "HCT" in known:
@@ -130,9 +130,9 @@ def _fields(path: str, patterns: Sequence[re.Pattern[str]], template: Template |
     return next((m.groupdict() for p in patterns if (m := p.fullmatch(path))), {})
 
 
-def _filled(table: pl.DataFrame, said: Mapping[str, Fields]) -> pl.DataFrame:
+def _filled(table: pl.DataFrame, fields: Mapping[str, Fields]) -> pl.DataFrame:
     """The table with what its paths say in the columns that are empty."""
-    rows = [said.get(path, {}) for path in table[PATH].to_list()]
+    rows = [fields.get(path, {}) for path in table[PATH].to_list()]
     columns: list[pl.Series] = []
     for name in dict.fromkeys(name for row in rows for name in row):
         if name in SCHEMA and not table[name].count():

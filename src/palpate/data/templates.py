@@ -213,7 +213,7 @@ def join(
             files = partners.get(key, [])
             if len(files) > 1 and len(alone[key]) > 1:
                 text = f"{len(alone[key])} {first} and {len(files)} {side} images"
-                text += f" {_named(keys, key)}; a further field must tell them apart"
+                text += f" {_named(keys, key)}; a further field must distinguish them"
                 problems.append(Problem(row[first], "ambiguous", text))
             elif not files and side not in optional:
                 problems.append(

@@ -193,9 +193,9 @@ def plan_generator(
     train = train_part(load_manifest(data), Split.load(split))
     loop = chosen.loop_for(len(train))
     loop = loop if steps is None else replace(loop, steps=steps)
-    own, width = chosen.autoencoder, chosen.condition.width
-    factor = own.patch * 2 ** (len(own.widths) - 1) if own else 4
-    channels, side = own.channels if own else 3, chosen.size // factor
+    vq, width = chosen.autoencoder, chosen.condition.width
+    factor = vq.patch * 2 ** (len(vq.widths) - 1) if vq else 4
+    channels, side = vq.channels if vq else 3, chosen.size // factor
 
     def build() -> nn.Module:
         shape: dict[str, Any] = {"channels": channels, "size": side, "width": width}

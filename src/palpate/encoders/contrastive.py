@@ -226,7 +226,7 @@ class TactileLoss:
         assert isinstance(module, TactileModel)
         scale, clip = clamped_scale(module.log_scale), self.clip
         images = augmented(unit(batch["images"]), batch)
-        own = in_chunks(partial(self.encode, module), images, self.chunk)
+        tactile = in_chunks(partial(self.encode, module), images, self.chunk)
         text, vision = batch.get("text"), batch.get("vision")
         if module.partners is not None:
             text = gather_rows(_encode_phrases(clip, self.rows.phrases, batch["phrase"]))
@@ -236,8 +236,8 @@ class TactileLoss:
         assert text is not None
         labels = Labels(batch["texts"], batch["contacts"], batch.get("seen"))
         how: dict[str, Any] = {"targets": self.targets, "weights": self.weights}
-        total, logs = three_way(gather_rows(own), text, vision, scale, labels, **how)
-        return Losses(total, {**logs, "scale": scale.detach()}, own.sum(dim=1))
+        total, logs = three_way(gather_rows(tactile), text, vision, scale, labels, **how)
+        return Losses(total, {**logs, "scale": scale.detach()}, tactile.sum(dim=1))
 
     def probe(self, others: Rows, module: nn.Module) -> dict[str, float]:
         """Accuracy on the held-out part of a linear material probe of the train part."""
@@ -389,8 +389,8 @@ def _first_weights(
     before = start.preprocess("tactile")
     state = start.tactile.state_dict() if start.tactile is not None else {}
     shapes = [{k: v.shape for k, v in s.items()} for s in (state, tactile.state_dict())]
-    alike = replace(before, mean=CLIP_MEAN, std=CLIP_STD) == preset.preprocess
-    if shapes[0] != shapes[1] or not alike:
+    same = replace(before, mean=CLIP_MEAN, std=CLIP_STD) == preset.preprocess
+    if shapes[0] != shapes[1] or not same:
         must = f"must have the preprocessing and size of the preset {preset.name}"
         raise PalpateError(must, "another", "Leave it out", argument="start")
     tactile.load_state_dict(state)
@@ -479,18 +479,18 @@ def train_clip(  # noqa: PLR0913 - as train_tactile
     def load(step: Step) -> Batch:
         pixels = torch.from_numpy(np.array(images[step.rows]))
         every = words[torch.from_numpy(step.all_rows)]
-        own = {"images": pixels, "phrase": every[step.mine], **draw(course.augment, step)}
-        return {**own, "texts": every}
+        batch = {"images": pixels, "phrase": every[step.mine], **draw(course.augment, step)}
+        return {**batch, "texts": every}
 
     def loss(module: nn.Module, batch: Batch) -> Losses:
         pixels = clip.preprocess.normalize(augmented(unit(batch["images"]), batch))
-        own = in_chunks(clip.encode_vision, pixels, compute.chunk)
+        encoded = in_chunks(clip.encode_vision, pixels, compute.chunk)
         text = gather_rows(_encode_phrases(clip, distinct, batch["phrase"]))
         scale = clamped_scale(clip.model.logit_scale)
-        labels, vision = Labels(batch["texts"]), gather_rows(own)
+        labels, vision = Labels(batch["texts"]), gather_rows(encoded)
         how: dict[str, Any] = {"targets": mode, "weights": (1, 0, 0)}  # one pair alone
         total, _ = three_way(vision, text, None, scale, labels, **how)
-        return Losses(total, {"scale": scale.detach()}, own.sum(dim=1))
+        return Losses(total, {"scale": scale.detach()}, encoded.sum(dim=1))
 
     facts = _facts(preset, train, split, (texts, source), options) | {"targets": mode}
     facts |= {} if side == "vision" else {"trained_on": "tactile images, not photos"}

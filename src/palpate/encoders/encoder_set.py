@@ -441,7 +441,7 @@ class EncoderSet:
 
     @classmethod
     def load(cls, source: str | Path, *, device: str = "cpu") -> EncoderSet:
-        """Load encoders of any kind: own ones, a CLIP, SigLIP or DINO, a public tactile encoder.
+        """Load encoders of any kind: palpate's, a CLIP, SigLIP or DINO, a public tactile encoder.
 
         What :meth:`save` wrote is compared with its digests.
 

@@ -161,9 +161,9 @@ class Preprocess:
     @property
     def facts(self) -> dict[str, Any]:
         """What belongs into the encoder's digest: all that is not the center square of a CLIP."""
-        usual = asdict(Preprocess(self.size, self.resize))
+        clip = asdict(Preprocess(self.size, self.resize))
         keep = ("size", "resize", "mean", "std")
-        return {k: v for k, v in asdict(self).items() if k in keep or v != usual[k]}
+        return {k: v for k, v in asdict(self).items() if k in keep or v != clip[k]}
 
     @property
     def plain(self) -> bool:

@@ -50,11 +50,11 @@ class Plan:
     """What is measured.
 
     Attributes: see :func:`probe`; ``axis`` is what several subjects differ in (``encoder``,
-    ``split``), '' for one; ``trained`` if each split has an encoder of its own.
+    ``split``), '' for one; ``trained`` if an encoder was trained for each split.
     """
 
     modality: Modality = "tactile"
-    labels: Sequence[str] = ("material",)
+    label: str | Sequence[str] = "material"
     group: str = "auto"
     neighbors: int = 20
     top: Sequence[int] = (1, 5, 10)
@@ -137,18 +137,7 @@ def probe(  # noqa: PLR0913 - one argument a choice
     plan = plan_of(
         manifest,
         loaded,
-        Plan(
-            modality,
-            [label] if isinstance(label, str) else list(label),
-            group,
-            neighbors,
-            tuple(top),
-            pool,
-            text_threshold,
-            seed,
-            allow_seen,
-            axis,
-        ),
+        Plan(modality, label, group, neighbors, top, pool, text_threshold, seed, allow_seen, axis),
     )
     runs: dict[str, list[Probed]] = {}
     for s, e in ((s, e) for s in loaded for e in sets):
@@ -173,8 +162,9 @@ def load_manifest(data: Manifest | str | Path) -> Manifest:
 
 
 def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan:
-    """The plan with its group chosen, and one pool size for all splits."""
-    for name in plan.labels:
+    """The plan with its labels listed, its group chosen, and one pool size for all splits."""
+    labels = [plan.label] if isinstance(plan.label, str) else list(plan.label)
+    for name in labels:
         manifest.column(name)  # raises for a column that is not there
     if plan.neighbors < 1:
         raise PalpateError("must be at least 1", f"{plan.neighbors}", "", argument="neighbors")
@@ -187,7 +177,7 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     if plan.pool is not None and not 2 <= plan.pool <= min(sizes):
         must = f"must lie in 2 to {min(sizes)}, the number of test samples"
         raise PalpateError(must, f"{plan.pool}", "Choose a smaller pool", argument="pool")
-    return replace(plan, group=group, pool=pool)
+    return replace(plan, label=labels, top=tuple(plan.top), group=group, pool=pool)
 
 
 def measure(
@@ -219,7 +209,7 @@ def measure(
     common: dict[str, Any] = {"subject": subject, "split": split.digest}
     common["settings"] = {"axis": plan.axis} if plan.axis else {}
     result = Probed()
-    for label in plan.labels:
+    for label in plan.label:
         _classify(result, parts, features, label, plan=plan, common=common)
     others = ("text", "vision" if plan.modality == "tactile" else "tactile")
     for other in others if plan.top else ():
@@ -360,7 +350,7 @@ def results_of(
     notes = list({canonical_json(note): note for run in all_runs for note in run.notes}.values())
     if any("similar text" in metric for metric in by_metric):
         notes.append(Note("probe-text-threshold", {"threshold": plan.text_threshold}))
-    names = ("modality", "labels", "group", "neighbors", "top", "pool", "text_threshold", "seed")
+    names = ("modality", "label", "group", "neighbors", "top", "pool", "text_threshold", "seed")
     digests = {"manifest": manifest.digest}
     digests |= {
         f"split {name}" if len(splits) > 1 else "split": s.digest for name, s in splits.items()

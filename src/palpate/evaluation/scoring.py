@@ -157,8 +157,8 @@ def score_family(
                 (outcome.scores, scores, more.scores),
                 (outcome.differences, result.differences, more.differences),
             )
-            for results, own, excess in both:
-                results += [family.named(s, sigma) for s in _interleaved(own, excess)]
+            for results, of_family, excess in both:
+                results += [family.named(s, sigma) for s in _interleaved(of_family, excess)]
             outcome.notes += [
                 Note("below-floor", {"metric": s.metric, "subject": s.subject})
                 for s in (family.named(s, sigma) for s in more.scores)
@@ -460,7 +460,7 @@ def _companions(
     *,
     streamed: bool,
 ) -> tuple[Chosen, bool]:
-    """What is compared beside the TMMD family, and whether every image has its reference.
+    """What is compared next to the TMMD family, and whether every image has its reference.
 
     Raises:
         PalpateError: on a companion whose inputs are not there; where some images have no
@@ -474,8 +474,8 @@ def _companions(
     if not chosen.pairs:
         return chosen, False
     if real.numbered:  # pairs by position are taken on request alone
-        alike = all(s.numbered and len(s) == len(real) for s in made.values())
-        return chosen, not chosen.default and alike
+        by_row = all(s.numbered and len(s) == len(real) for s in made.values())
+        return chosen, not chosen.default and by_row
     if chosen.default and not any({*s.ids} & {*real.ids} for s in made.values()):
         return chosen, False
     for name, samples in made.items():

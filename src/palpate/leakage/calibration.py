@@ -142,8 +142,8 @@ def measured(nulls: Sequence[Floats], groups: Ints, shares: Sequence[float], rat
     half = np.unique(groups, return_inverse=True)[1] % 2 == 0
     over = 0
     for fold in (half, ~half):
-        rest = [null[~fold] for null in nulls]
-        fitted = tails(rest, groups[~fold], shares) or tails(nulls, groups, shares)
+        others = [null[~fold] for null in nulls]
+        fitted = tails(others, groups[~fold], shares) or tails(nulls, groups, shares)
         values = score([null[fold] for null in nulls], fitted)
         over += int((values >= threshold(fitted, rate)).sum())
     return over / len(groups)

@@ -225,7 +225,7 @@ class Whitened(Descriptors):
             (1, lambda rows: MoveIndex(self, rows)),
             (2, lambda rows: EditIndex(self, rows)),
         ]
-        if backgrounds is not None:  # over them the light no longer tells which edit was made
+        if backgrounds is not None:  # over them the light no longer shows which edit was made
             self.ways = self.ways[:2]
         self.shares = SHARES[: len(self.ways)]
 
@@ -359,10 +359,10 @@ class EditIndex:
             ],
             axis=1,
         )  # (n, geometries, candidates)
-        found: list[tuple[Ints, Floats]] = []
+        parts: list[tuple[Ints, Floats]] = []
         for block, signals in zip(_blocks(np.arange(len(rows))), cells, strict=True):
-            found.append(self._compared(signals, near[block], count))
-        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
+            parts.append(self._compared(signals, near[block], count))
+        return np.concatenate([x for x, _ in parts]), np.concatenate([x for _, x in parts])
 
     def _compared(self, cells: Sequence[Floats], near: Ints, count: int) -> tuple[Ints, Floats]:
         """Choose edits by the coarse grid, and compare the best candidates in full."""
@@ -374,15 +374,16 @@ class EditIndex:
         plausible[:, 0, 0] = False  # as it is: another question
         geometry = np.arange(len(GEOMETRIES))[:, None]
         among = self._vectors[geometry, near][..., : self._coarse].astype(np.float32)
-        alike = centered @ among.transpose(0, 1, 3, 2) / np.maximum(lengths, 1e-9)[..., None]
-        alike[~plausible] = -np.inf
-        alike.transpose(0, 1, 3, 2)[near < 0] = -np.inf
-        edit, alike = alike.argmax(axis=2), alike.max(axis=2)  # (n, geometries, candidates)
-        best = np.argsort(-alike.reshape(len(near), -1), axis=1, kind="stable")[:, : count + 2]
+        similarity = centered @ among.transpose(0, 1, 3, 2) / np.maximum(lengths, 1e-9)[..., None]
+        similarity[~plausible] = -np.inf
+        similarity.transpose(0, 1, 3, 2)[near < 0] = -np.inf
+        # (n, geometries, candidates)
+        edit, similarity = similarity.argmax(axis=2), similarity.max(axis=2)
+        best = np.argsort(-similarity.reshape(len(near), -1), axis=1, kind="stable")[:, : count + 2]
         row, values = np.full(best.shape, -1), np.full(best.shape, np.nan, np.float32)
         for t, at in enumerate(best.T):
             g, k = np.divmod(at, near.shape[2])
-            known = np.isfinite(alike[every, g, k])
+            known = np.isfinite(similarity[every, g, k])
             row[:, t] = np.where(known, near[every, g, k], -1)
             chosen = [
                 np.take_along_axis(x, np.stack(columns)[edit[every, g, k]], axis=1)

@@ -185,7 +185,7 @@ def tell_apart(
 
     Args:
         train: samples.
-        test: the samples to tell from them.
+        test: the samples to distinguish from them.
         shared: columns whose names mean the same thing in both.
         parts: prefixes of the names, for ``train`` and ``test``.
 

@@ -62,17 +62,18 @@ def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
         kinds = [(False, ~images.blank & ~gray), (True, gray)]
     views: list[View] = []
     for luma, wanted in kinds:
-        found: list[tuple[Whitened, NDArray[np.bool_]]] = []
+        descriptors: list[tuple[Whitened, NDArray[np.bool_]]] = []
         for backgrounds in (None, images.backgrounds):
             known = ~images.blank if backgrounds is None else ~images.blank & (backgrounds >= 0)
             if backgrounds is None or (known[base].any() and known[queries].any()):
                 described = Whitened(
                     images.pixels, images.images, backgrounds, gray=luma, fit=both[known[both]]
                 )
-                found.append((described, known))
-        whole = sum(sum(described.shares) for described, _ in found)
+                descriptors.append((described, known))
+        whole = sum(sum(described.shares) for described, _ in descriptors)
         views += [
-            View(d, known, wanted, tuple(share / whole for share in d.shares)) for d, known in found
+            View(d, known, wanted, tuple(share / whole for share in d.shares))
+            for d, known in descriptors
         ]
     return views
 
@@ -129,15 +130,15 @@ def answers(
         there is none.
     """
     b = np.flatnonzero(view.known[base])
-    found: list[tuple[Floats, Ints]] = []
-    asked = [np.flatnonzero(view.known[items]) for items, _ in tasks]
+    closest: list[tuple[Floats, Ints]] = []
+    known = [np.flatnonzero(view.known[items]) for items, _ in tasks]
     for items, _ in tasks:
         shape = (len(view.descriptors.shares), len(items))
-        found.append((np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int64)))
+        closest.append((np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int64)))
     for k, (question, index) in enumerate(view.descriptors.ways[:ways]):
         progress("comparing images", k, len(view.descriptors.ways))
         among = index(base[b])
-        for (items, apart), q, (similarity, place) in zip(tasks, asked, found, strict=True):
+        for (items, apart), q, (similarity, place) in zip(tasks, known, closest, strict=True):
             if not len(q) or not len(b):
                 continue
             if apart is not None:
@@ -147,7 +148,7 @@ def answers(
             better = (rows >= 0) & ~(values <= similarity[question, q])
             similarity[question, q[better]] = values[better]
             place[question, q[better]] = b[rows[better]]
-    return found
+    return closest
 
 
 def links(

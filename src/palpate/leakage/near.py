@@ -52,7 +52,7 @@ from palpate.leakage.signals import Flags
 LINKS = 16
 #: Cosine from which images are linked in any case.
 LINKED = 0.75
-#: A threshold above this finds no copies: nothing is told.
+#: A threshold above this finds no copies: no verdict is given.
 TIGHT = 0.97
 #: Videos from which a rate is more than a guess.
 VIDEOS = 80
@@ -137,8 +137,8 @@ def near_groups(
         nulls = [row for values, _ in answers(view, base, tasks, progress) for row in values]
         fitted = calibration.tails(nulls, null.groups, view.shares) if null is not None else []
         for question, first, second, cosine in links(view, base, LINKS, progress):
-            own = [t.similarity(t.surprise_at(false_positives)) for t in fitted[question:][:1]]
-            limit = min([*own, LINKED])
+            limits = [t.similarity(t.surprise_at(false_positives)) for t in fitted[question:][:1]]
+            limit = min([*limits, LINKED])
             i.append(first[cosine >= limit])
             j.append(second[cosine >= limit])
     return _clusters(images, base[np.concatenate(i)], base[np.concatenate(j)])

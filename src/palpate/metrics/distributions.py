@@ -14,7 +14,7 @@ Forsyth, arXiv 1911.07023): compare values of equal n only. With n <= d the valu
 interval for the FID expected at this n, bias included. The difference of two generators on the same
 samples is jackknifed as a whole, with the same blocks (:func:`compare_fid`).
 
-Precision and its companions ask: do generated samples lie among the real ones, and back?
+Precision and its companions: do generated samples lie among the real ones, and vice versa?
 
 The ball of a sample reaches to its k-th nearest neighbor in its own set. With ``B_k(r)`` the balls
 of the m real samples and ``B_k(g)`` those of the n generated ones (Kynkäänniemi et al.,

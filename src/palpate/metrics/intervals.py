@@ -143,7 +143,7 @@ class PairSums:
         )
 
     def weighed(self, weight: Array, rows: Array | None = None) -> PairSums:
-        """The sums with a weight on every sample: ``n`` adds weights, the rest products of two.
+        """The sums with a weight on every sample: ``n`` adds weights, the others products of two.
 
         Args:
             weight: (P,) of the samples of each item; equal for the items of a unit that are in one
@@ -239,7 +239,7 @@ def mean_interval(
     """Interval of the mean of ``values``, robust to whole groups deviating together.
 
     ``SE^2 = G/(G-1) * sum_g (sum_{i in g} (v_i - mean))^2 / n^2``; groups of equal size make it the
-    t interval over group means, and groups of one the usual interval.
+    t interval over group means, and groups of one sample the standard interval.
 
     Returns:
         (interval or None, method).

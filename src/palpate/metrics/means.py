@@ -46,10 +46,10 @@ class Mean:
 
     def without(self, names: NDArray[np.str_]) -> Array:
         """(G,) the mean without each of the sorted ``names``; NaN where nothing is left."""
-        own = np.isin(self.groups, names)
-        at = np.searchsorted(names, self.groups[own])
+        listed = np.isin(self.groups, names)
+        at = np.searchsorted(names, self.groups[listed])
         above, below = (
-            part.sum() - np.bincount(at, part[own], len(names))
+            part.sum() - np.bincount(at, part[listed], len(names))
             for part in (self.weights * self.values, self.weights)
         )
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -463,8 +463,8 @@ def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple
         or fewer than 4 samples.
     """
     whole = whole_sets(t)
-    within, between, own = _even_means(whole.even or whole)
-    excess, spread = within - between, own - between  # E = w - b
+    within, between, same = _even_means(whole.even or whole)
+    excess, spread = within - between, same - between  # E = w - b
     pairs = np.diagonal(whole.pairs)  # whole numbers, unlike sums of weights
     bad = ~np.isfinite(excess) | (whole.n < 4) | (pairs == whole.n) | (pairs == whole.n**2)
     excess, spread = (np.where(bad, np.nan, plan.scale * a) for a in (excess, spread))

@@ -193,8 +193,8 @@ def blocks(rows: int, columns: int) -> Generator[slice]:
 
 def _own_ranks(a: Floats, b: Floats) -> tuple[Ranks, Ranks]:
     n = len(a)
-    own = np.einsum("ij,ij->i", a, b)
-    high, low = own + np.float32(TIE), own - np.float32(TIE)
+    pair = np.einsum("ij,ij->i", a, b)
+    high, low = pair + np.float32(TIE), pair - np.float32(TIE)
     counts = np.zeros((2, 2, n))  # direction, (above, not below)
     for rows in blocks(n, n):
         similar = a[rows] @ b.T
@@ -202,8 +202,8 @@ def _own_ranks(a: Floats, b: Floats) -> tuple[Ranks, Ranks]:
             counts[0, k, rows] = _by_row(similar > bound[rows, None])
             # Bytes are added without a wider copy.
             counts[1, k] += (similar > bound).view(np.uint8).sum(axis=0, dtype=np.uint8)
-    one = np.ones(n)
-    forth, back = (Ranks(c[0], c[1] - c[0], c[1] - c[0] - 1, one, n) for c in counts)
+    weights = np.ones(n)
+    forth, back = (Ranks(c[0], c[1] - c[0], c[1] - c[0] - 1, weights, n) for c in counts)
     return forth, back
 
 

@@ -197,7 +197,7 @@ class Table:
 
     Attributes:
         title: family, preset, features, split and reference, as far as they are needed.
-        question: what the family asks; '' in its further tables.
+        question: what the family answers; '' in its further tables.
         columns: the metrics.
         subjects: the rows.
         differences: paired differences of these scores.

@@ -266,7 +266,7 @@ class _Demo:
 
     def split(self, manifest: Manifest) -> tuple[Split, list[Audit]]:
         """The leak-free split, and the audits of it and of the data set's own splits."""
-        own = sorted((self.run.stages["data"].folder / "splits").glob("*.json"))
+        splits = sorted((self.run.stages["data"].folder / "splits").glob("*.json"))
         options, preset = self.options, self.preset
 
         def build(folder: Path) -> dict[str, Any]:
@@ -275,7 +275,7 @@ class _Demo:
             how: dict[str, Any] = {"cache": self.cache, "progress": self.progress}
             audits = [
                 audit(manifest, split=path, name=path.stem, by="video", **how)
-                for path in own
+                for path in splits
                 if Split.load(path).ids("test")
             ]
             group = str(clean.rule["group"])
@@ -288,7 +288,7 @@ class _Demo:
             return {"digest": clean.digest, "counts": clean.counts(), "rule": dict(clean.rule)}
 
         inputs = {"manifest": manifest.digest, "root": str(manifest.root), "train": preset.train}
-        inputs |= {"by": options.by, "own": [digest_file(p) for p in own]}
+        inputs |= {"by": options.by, "own": [digest_file(p) for p in splits]}
         folder = self.stage("split", inputs, (), build).folder
         audits = [Audit.from_json(a) for a in read_json(folder / "audits.json", "audits")]
         return Split.load(folder / "noleak.json"), audits
@@ -329,10 +329,10 @@ class _Demo:
         if options is None:
             must = f"must be given for the preset {self.diffusion.name}"
             raise PalpateError(must, "none", "Pass a hub id or a folder", argument="autoencoder")
-        own = manifest.part(split, "train")
+        train = manifest.part(split, "train")
 
         def build(folder: Path) -> dict[str, Any]:
-            images, mine = self.pixels(pretraining), self.pixels(own)
+            images, mine = self.pixels(pretraining), self.pixels(train)
             # The train part is repeated until it is `repeat` of the whole, at most 8 times.
             share, others = self.preset.repeat, max(0, len(images) - len(mine))
             times = np.ceil(share / (1 - share) * others / max(1, len(mine)) - 1)
@@ -343,7 +343,7 @@ class _Demo:
                 folder / "training",
                 held_out=self.pixels(manifest.part(split, "test")),
                 seed=self.options.seed,
-                key=digest_lines([pretraining.digest, own.digest]),
+                key=digest_lines([pretraining.digest, train.digest]),
                 device=pick_device(self.options.device),
                 progress=self.progress,
             )
@@ -352,7 +352,7 @@ class _Demo:
             return {"digest": model.digest, "images": len(images), "ceiling on test": ceiling}
 
         inputs = {"options": options, "size": self.diffusion.size, "repeat": self.preset.repeat}
-        inputs |= {"train": pretraining.digest, "own": own.digest}
+        inputs |= {"train": pretraining.digest, "own": train.digest}
         after = ("pretraining-data", "split", "data")
         return str(self.stage("autoencoder", inputs, after, build).folder / "autoencoder")
 

@@ -15,8 +15,6 @@ from typing import Any
 from palpate.core import PalpateError, Progress, Split, locked, quiet
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.evaluation.probing import (
-    TVL_THRESHOLD,
-    Modality,
     Plan,
     Probed,
     load_manifest,
@@ -29,7 +27,7 @@ from palpate.report.results import Results
 from palpate.studies.stages import Run
 
 
-def compare_splits(  # noqa: PLR0913 - those of training and of probing
+def compare_splits(
     data: Any,
     splits: Any,
     *,
@@ -38,17 +36,10 @@ def compare_splits(  # noqa: PLR0913 - those of training and of probing
     clip: str | None = None,
     epochs: float | None = None,
     seeds: Sequence[int] = (0, 1, 2),
-    modality: Modality = "tactile",
-    label: str | Sequence[str] = "material",
-    group: str = "auto",
-    neighbors: int = 20,
-    top: Sequence[int] = (1, 5, 10),
-    pool: int | None = None,
-    text_threshold: float = TVL_THRESHOLD,
-    seed: int = 0,
     device: str = "auto",
     print_line: Callable[[str], None] = lambda line: None,
     progress: Progress = quiet,
+    **options: Any,
 ) -> Results:
     """Train a tactile encoder on each split with each seed, and score it under that split.
 
@@ -60,17 +51,10 @@ def compare_splits(  # noqa: PLR0913 - those of training and of probing
         clip: see :func:`palpate.train_encoder`.
         epochs: see :func:`palpate.train_encoder`.
         seeds: one training each.
-        modality: see :func:`palpate.probe`.
-        label: see :func:`palpate.probe`.
-        group: see :func:`palpate.probe`.
-        neighbors: see :func:`palpate.probe`.
-        top: see :func:`palpate.probe`.
-        pool: see :func:`palpate.probe`.
-        text_threshold: see :func:`palpate.probe`.
-        seed: of probing; see :func:`palpate.probe`.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         print_line: called with one line a training.
         progress: called with what is done.
+        options: of probing; see :func:`palpate.probe`.
 
     Returns:
         Scores that are means over seeds, with intervals over videos and seeds, and the paired
@@ -84,21 +68,9 @@ def compare_splits(  # noqa: PLR0913 - those of training and of probing
         raise PalpateError(must, f"{list(seeds)}", "", argument="seeds", example=example)
     manifest, folder = load_manifest(data), Path(work)
     loaded = {name: Split.load(split) for name, split in named(splits, "split").items()}
-    labels = [label] if isinstance(label, str) else list(label)
+    axis = "split" if len(loaded) > 1 else ""
     # A leaking split may hold a test image in train as well: that is what is measured.
-    plan = Plan(
-        modality,
-        labels,
-        group,
-        neighbors,
-        tuple(top),
-        pool,
-        text_threshold,
-        seed,
-        allow_seen=True,
-        axis="split" if len(loaded) > 1 else "",
-        trained=True,
-    )
+    plan = Plan(**options, allow_seen=True, axis=axis, trained=True)
     plan = plan_of(manifest, loaded, plan)
     training: dict[str, Any] = {"preset": preset, "clip": clip, "epochs": epochs, "device": device}
     runs: dict[str, list[Probed]] = {}

@@ -227,7 +227,7 @@ class _Run:
         return batch
 
     def forward(self, batch: Batch) -> Losses:
-        """The loss of a batch, in the precision asked for."""
+        """The loss of a batch, in the requested precision."""
         batch = {k: v.to(self.device, non_blocking=True) for k, v in batch.items()}
         dtype = DTYPES.get(self.compute.precision)
         with torch.autocast(self.device.type, dtype, enabled=dtype is not None):
@@ -515,7 +515,7 @@ def _checkpoint_blocks(module: nn.Module) -> None:
 
 @contextmanager
 def _numerics(compute: Compute) -> Generator[None]:
-    """TF32 inside, where asked for; the setting is restored."""
+    """TF32 inside, where requested; the setting is restored."""
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = compute.tf32
     try:

@@ -89,22 +89,22 @@ def average(tensors: Sequence[Tensor]) -> None:
     torch._foreach_div_(list(tensors), size)  # pyright: ignore
 
 
-def gather_rows(own: Tensor) -> Tensor:
+def gather_rows(rows: Tensor) -> Tensor:
     """The rows of all processes, (processes * n, ...), differentiable.
 
     Every process computes the same loss of all rows, and gradients are averaged over the processes:
-    so the gradient of the own rows counts as often as there are processes. Other rows' gradients
+    so the gradient of these rows counts as often as there are processes. Other rows' gradients
     are computed where these rows are.
     """
     rank, size = place()
     if size == 1:
-        return own
-    parts = [torch.empty_like(own, requires_grad=False) for _ in range(size)]
+        return rows
+    parts = [torch.empty_like(rows, requires_grad=False) for _ in range(size)]
     try:
-        dist.all_gather(parts, own.detach().contiguous())
+        dist.all_gather(parts, rows.detach().contiguous())
     except RuntimeError as error:
         raise _ended(error) from None
-    parts[rank] = own.detach() + size * (own - own.detach())
+    parts[rank] = rows.detach() + size * (rows - rows.detach())
     return torch.cat(parts)
 
 

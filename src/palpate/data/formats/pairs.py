@@ -294,7 +294,7 @@ def name_apart(rows: Sequence[Cells], fields: Sequence[str]) -> None:
     for column, around in (("video", outer), ("contact", ("video", *outer))):
         before = fields[: fields.index(column)] if column in fields else ()
         named = [row for row in rows if column in row]
-        names: list[str] = []  # those that tell apart what the ones before them do not
+        names: list[str] = []  # those that distinguish what earlier ones do not
         count = len({row[column] for row in named})
         for name in (name for name in around if name in before):
             several = len({tuple(map(row.get, (column, *names, name))) for row in named})

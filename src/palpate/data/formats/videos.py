@@ -237,17 +237,17 @@ def _named(rows: list[Fields], fields: tuple[str, ...], result: Scan) -> dict[st
         paths = {column: row[column] for column in ORDER if column in row}
         moving = {c: path for c, path in paths.items() if path.lower().endswith(MOVING)}
         still = {c: path for c, path in paths.items() if c not in moving}
-        own = {field: row[field] for field in fields if field in row}
+        values = {field: row[field] for field in fields if field in row}
         name = name or Path(next(iter(moving.values()))).stem
-        video = _Video(name, moving, still, own)
+        video = _Video(name, moving, still, values)
         if len(set(paths.values())) < len(paths):
             text = f"its {' and its '.join(paths)} are one file"
             result.problem(video.where, "same-image", text)
         elif (before := videos.setdefault(name, video)) is not video:
             text = f"the video {name!r} is {before.where} already"
             result.problem(video.where, "duplicate-id", text)
-        elif own.get("split", "train").lower() not in PART_NAMES:
-            result.problem(video.where, "unknown-part", f"the split {own['split']!r} is unknown")
+        elif values.get("split", "train").lower() not in PART_NAMES:
+            result.problem(video.where, "unknown-part", f"the split {values['split']!r} is unknown")
     return videos
 
 
@@ -300,14 +300,14 @@ def _contacts(
         return contacts, findings(images, seconds)
 
     contacts: dict[str, Contacts | None] = {}
-    for video, found in in_threads(find, sorted(work.frames), "finding contacts", progress):
-        if isinstance(found, str):
-            work.problems.append(Problem(video, "bad-video", found))
+    for video, outcome in in_threads(find, sorted(work.frames), "finding contacts", progress):
+        if isinstance(outcome, str):
+            work.problems.append(Problem(video, "bad-video", outcome))
             continue
-        contacts[video] = found[0]
-        work.suspicious += [Problem(video, *problem) for problem in found[1]]
-        if found[0] is not None and not found[0].runs:
-            work.suspicious.append(Problem(video, "no-contact", found[0].why_none()))
+        contacts[video] = outcome[0]
+        work.suspicious += [Problem(video, *problem) for problem in outcome[1]]
+        if outcome[0] is not None and not outcome[0].runs:
+            work.suspicious.append(Problem(video, "no-contact", outcome[0].why_none()))
     return contacts
 
 
@@ -330,12 +330,12 @@ def _rows(
     for name, video in videos.items():
         if name not in work.frames or (contacts and name not in contacts):
             continue
-        found = contacts.get(name)
+        analysis = contacts.get(name)
         contact_of = dict.fromkeys(range(min(map(len, work.frames[name].values()))), name)
-        chosen = {} if found is None else {name: found.reference}
-        for k, (first, last) in enumerate(found.runs if found else (), 1):
+        chosen = {} if analysis is None else {name: analysis.reference}
+        for k, (first, last) in enumerate(analysis.runs if analysis else (), 1):
             contact = video.fields.get("contact", f"{name}#{k:04d}")
-            chosen.setdefault(contact, found.backgrounds[k - 1] if found else 0)
+            chosen.setdefault(contact, analysis.backgrounds[k - 1] if analysis else 0)
             inside = (frame for frame in range(first, last + 1) if frame in contact_of)
             contact_of |= dict.fromkeys(inside, contact)
         if "background" not in video.still:
