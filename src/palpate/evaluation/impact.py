@@ -44,23 +44,17 @@ from palpate.evaluation.impact_features import (
     fit_reduction,
     pixel_sources,
 )
-from palpate.evaluation.impact_scores import (
-    Codes,
-    Table,
-    accuracy,
-    code,
-    jackknife,
-    nearest_hits,
-    tabulate,
-    thin,
-)
+from palpate.evaluation.impact_scores import Codes, code, nearest_hits, thin
 from palpate.leakage.groups import GROUPS, choose_group, nested_groups
 from palpate.leakage.splitting import split as leak_free_split
+from palpate.metrics.means import Mean, mean_of, spread_of
 from palpate.metrics.probe import fit_probe
 from palpate.report.results import Impact, ImpactRow
 
 #: Train samples of the linear probe; its penalty is chosen by twelve fits.
 PROBE_ROWS = 10_000
+#: Columns kept by the PCA; features of no more columns are not reduced.
+COMPONENTS = 128
 CLASSIFIERS = ("1-NN", "linear probe")
 Features = Literal["pixels"] | Mapping[str, FeatureSet | NDArray[Any]]
 
@@ -99,7 +93,7 @@ class _Design:
     settings: dict[str, Any]
 
 
-def impact(  # noqa: PLR0913
+def impact(
     manifest: Manifest,
     split: Split,
     *,
@@ -107,8 +101,6 @@ def impact(  # noqa: PLR0913
     features: Features = "pixels",
     seeds: Sequence[int] = (0, 1, 2),
     size: int = 32,
-    components: int = 128,
-    balanced: bool = False,
     name: str = "",
     cache: Path | None = None,
     progress: Progress = quiet,
@@ -126,8 +118,6 @@ def impact(  # noqa: PLR0913
             ``manifest.ids``.
         seeds: one leak-free split each; the clean accuracy is that of their test samples together.
         size: side of the pixels.
-        components: columns kept by the PCA; features of no more columns are not reduced.
-        balanced: average accuracies over materials instead of over samples.
         name: of the split, for the headline; default: its rule's name.
         cache: folder for decoded pixels; None keeps nothing.
         progress: called with what is done.
@@ -142,7 +132,7 @@ def impact(  # noqa: PLR0913
             on features that are missing, of another length, or not finite.
         ProblemsError: naming every missing or unreadable image.
     """
-    _check(features, seeds, components)
+    _check(features, seeds)
     design = _design(manifest, split, group, seeds)
     coarser, more = _coarser(manifest, split, design, seeds)
     notes = [*design.notes, *more]
@@ -152,12 +142,11 @@ def impact(  # noqa: PLR0913
         notes += more
     else:
         sources = array_sources(features, manifest, design.ids, design.rows)
-    rows, facts = _measure(design, sources, components, balanced, progress)
+    rows, facts = _measure(design, sources, progress)
     settings = {
         **design.settings,
         "size": size if features == "pixels" else None,
-        "components": components,
-        "balanced": balanced,
+        "components": COMPONENTS,
         "features": facts,
         "interval": "leave-one-group-out jackknife over test groups, paired, t, 95 %",
     }
@@ -165,7 +154,7 @@ def impact(  # noqa: PLR0913
         rows[0], name or str(split.rule.get("name") or "the given split"), settings
     )
     if coarser is not None:
-        further, facts = _measure(coarser, sources, components, balanced, progress)
+        further, facts = _measure(coarser, sources, progress)
         column, rows = coarser.settings["group"], rows + further
         settings[f"by {column}"] = coarser.settings | {"features": facts}
         headline += f" Of new {column}s (splits by {column}): {100 * further[0].clean:.1f} %."
@@ -174,33 +163,32 @@ def impact(  # noqa: PLR0913
 
 
 def _measure(
-    design: _Design, sources: Sequence[Source], components: int, balanced: bool, progress: Progress
+    design: _Design, sources: Sequence[Source], progress: Progress
 ) -> tuple[list[ImpactRow], dict[str, Any]]:
     """Rows for each kind of features and classifier, and facts on the features."""
     rows: list[ImpactRow] = []
     facts: dict[str, Any] = {}
     column, total = design.settings["group"], len(sources) * len(design.splits)
     for number, source in enumerate(sources):
-        tables: dict[str, list[Table]] = {c: [] for c in CLASSIFIERS}
+        means: dict[str, list[Mean]] = {c: [] for c in CLASSIFIERS}
         fits: list[tuple[float, float]] = []
         for k, parts in enumerate(design.splits):
             done = number * len(design.splits) + k
             progress(f"classifying materials by {column}", done, total, source.name)
-            by_classifier, penalty, explained = _classify(source, parts, design, components)
+            by_classifier, penalty, explained = _classify(source, parts, design)
             fits.append((penalty, round(explained, 4)))
             for c in CLASSIFIERS:
-                tables[c].append(by_classifier[c])
+                means[c].append(by_classifier[c])
         facts[source.name] = {
             "digest": source.digest,
             "columns": source.width,
             "standardized": source.standardize,
             "penalty": [penalty for penalty, _ in fits],
             "explained": [explained for _, explained in fits],
-            **{c: [round(accuracy(t, balanced), 5) for t in tables[c]] for c in CLASSIFIERS},
+            **{c: [round(float(m.score), 5) for m in means[c]] for c in CLASSIFIERS},
         }
         chance = 1 / len(design.materials)
-        made = [_row(source.name, c, tables[c], chance, balanced) for c in CLASSIFIERS]
-        rows += [replace(row, group=column) for row in made]
+        rows += [_row(source.name, c, means[c], chance, column) for c in CLASSIFIERS]
     progress(f"classifying materials by {column}", total, total)
     return rows, facts
 
@@ -229,7 +217,7 @@ def _shares(table: pl.DataFrame, column: str) -> bool:
     return table.select(column, "part").n_unique() > table[column].n_unique()
 
 
-def _check(features: Features, seeds: Sequence[int], components: int) -> None:
+def _check(features: Features, seeds: Sequence[int]) -> None:
     if isinstance(features, str) and features != "pixels":
         fix = "Pass name -> embeddings"
         raise PalpateError(
@@ -238,9 +226,6 @@ def _check(features: Features, seeds: Sequence[int], components: int) -> None:
     if not seeds or len(set(seeds)) < len(seeds):
         must, example = "must hold at least one seed, each once", {"seeds": (0, 1, 2)}
         raise PalpateError(must, f"{list(seeds)}", "", argument="seeds", example=example)
-    if components < 1:
-        must, example = "must be at least one", {"components": 128}
-        raise PalpateError(must, f"{components}", "", argument="components", example=example)
 
 
 def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) -> _Design:
@@ -385,14 +370,13 @@ def _qualifications(
 
 
 def _classify(
-    source: Source, parts: _Parts, design: _Design, components: int
-) -> tuple[dict[str, Table], float, float]:
-    """Classify under one split: two tables, the probe's penalty, the share of variance kept."""
-    shape = (len(design.groups), len(design.materials))
+    source: Source, parts: _Parts, design: _Design
+) -> tuple[dict[str, Mean], float, float]:
+    """Classify under one split: two accuracies, the probe's penalty, the share of variance kept."""
     size, seed = int(design.settings["train_samples"]), int(design.settings["seeds"][0])
     at, group, material = design.at, design.group, design.material
     train = thin(parts.train, group[parts.train], material[parts.train], size, seed)
-    reduction = fit_reduction(source, at[train], components, seed)
+    reduction = fit_reduction(source, at[train], COMPONENTS, seed)
     x, z = reduction.apply(source, at[train]), reduction.apply(source, at[parts.test])
     y, truth, owner = material[train], material[parts.test], group[parts.test]
     few = thin(np.arange(len(train)), group[train], y, min(size, PROBE_ROWS), seed)
@@ -402,22 +386,26 @@ def _classify(
     known = FeatureSet(ids, x[few], labels, [design.groups[k] for k in group[rows]])
     probe = fit_probe(known, seed=seed)
     right = np.array(probe.predict(z)) == np.array(design.materials)[truth]
-    hits = {"1-NN": nearest_hits(z, x, truth, y), "linear probe": right.astype(np.float64)}
-    tables = {c: tabulate(hits[c], owner, truth, shape) for c in CLASSIFIERS}
-    return tables, probe.l2, reduction.explained
+    hits = {"1-NN": nearest_hits(z, x, truth, y), "linear probe": right}
+    groups = [design.groups[k] for k in owner]
+    means = {c: mean_of(c, hits[c], groups, subject=source.name) for c in CLASSIFIERS}
+    return means, probe.l2, reduction.explained
 
 
 def _row(
-    features: str, classifier: str, tables: Sequence[Table], chance: float, balanced: bool
+    features: str, classifier: str, means: Sequence[Mean], chance: float, group: str
 ) -> ImpactRow:
-    """One row from the tables of the given split and of the clean ones."""
-    given, clean = tables[0], tables[1]
-    for more in tables[2:]:
-        clean = clean + more
-    a, a_interval, _ = jackknife(given, balanced=balanced)
-    b, b_interval, _ = jackknife(clean, balanced=balanced)
-    cost, interval, _ = jackknife(given, clean, balanced=balanced)
-    return ImpactRow(features, classifier, a, b, cost, a_interval, b_interval, interval, chance)
+    """One row from the accuracies under the given split and under the leak-free ones."""
+    given, *others = means
+    names = np.concatenate([m.groups for m in others])
+    hits = np.concatenate([m.values for m in others])
+    clean = mean_of(classifier, hits, names, subject=features)
+    cost = spread_of([[given], [clean]], lambda m: m[..., 0] - m[..., 1])
+    a, b = given.score, clean.score
+    intervals = a.interval, b.interval, cost.interval(-1, 1)
+    return ImpactRow(
+        features, classifier, float(a), float(b), cost.value, *intervals, chance, group
+    )
 
 
 def _headline(row: ImpactRow, name: str, settings: Mapping[str, Any]) -> str:
@@ -429,9 +417,8 @@ def _headline(row: ImpactRow, name: str, settings: Mapping[str, Any]) -> str:
         low, high = row.cost_interval
         interval = f" [{100 * low:.1f}, {100 * high:.1f}]"
         doubt = ", which may be nothing" if low <= 0 <= high else ""
-    kind = " (balanced)" if settings["balanced"] else ""
     start = (
-        f"{row.classifier} on {row.features}{kind}: {100 * row.given:.1f} % under {name}, "
+        f"{row.classifier} on {row.features}: {100 * row.given:.1f} % under {name}, "
         f"{100 * row.clean:.1f} % under {clean} by {group} (chance {100 * row.chance:.1f} %)"
     )
     points = f"{100 * row.cost:.1f} points{interval}"
