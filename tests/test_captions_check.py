@@ -53,7 +53,15 @@ def shares(results):
         ("Others", "other surface of natural material", []),
         ("Rubber", "rubbery tires", ["rubbery", "tires"]),
         ("Carpet", "rugged", []),
-        ("Soil", "oily", []),
+        ("Carpet", "carpeted, carpeting, a rug", ["carpeted", "carpeting", "rug"]),
+        ("Tile", "tiled, tiling", ["tiled", "tiling"]),
+        ("Plastic", "plasticky, plasticized", ["plasticky", "plasticized"]),
+        ("Rubber", "rubberized, rubberlike; tired", ["rubberized", "rubberlike"]),
+        ("Natural Fabric", "woolly, velvety, silken", ["woolly", "velvety", "silken"]),
+        ("Metal", "metallised, tiny", ["metallised"]),
+        ("Fur", "furry, further", ["furry"]),
+        ("Soil", "oily, soiled, muddy", ["muddy"]),
+        ("Plants", "leaving", []),
     ],
 )
 def test_inflections_and_synonyms_of_a_label(label, text, names):
@@ -62,7 +70,7 @@ def test_inflections_and_synonyms_of_a_label(label, text, names):
 
 def test_names_of_other_materials_count_as_naming_a_material():
     assert Vocabulary(["Wood"]).naming("smooth granite", "Wood") == []
-    assert Vocabulary(["Wood"]).naming("smooth granite") == ["granite"]
+    assert Vocabulary(["Wood"]).naming("smooth granite, asphalt") == ["granite", "asphalt"]
 
 
 def test_words_that_no_finger_feels():

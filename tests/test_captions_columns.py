@@ -1,12 +1,15 @@
 """Captions from columns, and texts that an import joins."""
 
+import shutil
+from dataclasses import replace
+
 import polars as pl
 import pytest
 
-from palpate.captions import caption
+from palpate.captions import caption, mask_captions
 from palpate.cli import main
 from palpate.core import PalpateError, ProblemsError, Split
-from palpate.data import import_dataset
+from palpate.data import import_dataset, texts
 from palpate.data.manifest import Manifest
 from palpate.encoders.embed import texts_of
 
@@ -63,9 +66,9 @@ def test_an_import_joins_captions_and_models_will_name_their_digest(data, tmp_pa
     assert main([*map(str, args)]) == 0
     manifest = Manifest.load(tmp_path / "tag-c")
     assert manifest.column("text") == made.table["text"].to_list()
-    texts, source = texts_of(manifest)
+    words, source = texts_of(manifest)
     assert made.record["digest"][:12] in source
-    assert texts[0] == "Wood of v0"
+    assert words[0] == "Wood of v0"
     assert Split.load(tmp_path / "tag-c" / "splits" / "Orig.json").manifest == manifest.digest
     assert manifest.paths("vision")[0].is_file()
 
@@ -97,3 +100,48 @@ def test_texts_of_another_kind_leave_nothing_behind(data, tmp_path, rows, error,
     with pytest.raises(error, match=got):
         import_dataset(data, tmp_path / "o", text=tmp_path / "t.csv")
     assert not (tmp_path / "o").exists()
+
+
+def with_other_photos(manifest, root):
+    """The same samples in another folder, with another photo of the first contact."""
+    shutil.copytree(manifest.root, root)
+    other = replace(manifest, root=root)
+    other.paths("vision")[0].write_bytes(manifest.paths("vision")[20].read_bytes())
+    return other
+
+
+@pytest.mark.parametrize("make", ["caption", "mask"])
+def test_captions_of_other_photos_with_the_same_ids_are_an_error(data, tmp_path, make, capsys):
+    made = tmp_path / "c"
+    caption(data, made, template="{material} in {video}")
+    if make == "mask":
+        made = mask_captions(tmp_path / "c", tmp_path / "m").path.parent
+    with_other_photos(Manifest.load(data), tmp_path / "other").save(tmp_path / "o/manifest.parquet")
+    joins = ["import", tmp_path / "o", "--text", made, "-o", tmp_path / "x"]
+    for command in (joins, ["caption", "check", made, "--data", tmp_path / "o"]):
+        assert main([*map(str, command), "-q"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert all("made for another image of 'v0/0'" in line for line in lines)
+    assert not (tmp_path / "x").exists()
+    pl.read_parquet(made / "captions.parquet").select("id", "text").write_csv(tmp_path / "t.csv")
+    assert import_dataset(tmp_path / "o", tmp_path / "x", text=tmp_path / "t.csv").manifest
+
+
+@pytest.mark.parametrize("change", ["columns", "texts", "fewer", "elsewhere", "no files"])
+def test_captions_of_the_same_photos_join_whatever_else_changed(data, tmp_path, change):
+    manifest = Manifest.load(data)
+    caption(data, tmp_path / "c", template="{material} in {video}")
+    table, root = manifest.table, manifest.root
+    if change == "columns":
+        table = table.with_columns(object=pl.col("video"), material=None, session=pl.lit("s"))
+    if change == "texts":
+        table = table.with_columns(text=pl.lit("rough"))
+    if change == "fewer":
+        table = table.tail(7)
+    if change == "elsewhere":
+        root = shutil.copytree(root, tmp_path / "moved")
+    if change == "no files":
+        shutil.rmtree(root)
+    joined = texts.joined(Manifest(table, root), texts.read_texts(tmp_path / "c"), tmp_path / "c")
+    assert joined.column("text")[-1].startswith(manifest.column("material")[-1])

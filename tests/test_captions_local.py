@@ -5,6 +5,7 @@ import json
 import pytest
 
 from palpate.captions import caption
+from palpate.cli import main
 from palpate.core import PalpateError
 
 pytestmark = pytest.mark.slow
@@ -84,7 +85,8 @@ def test_what_a_random_model_says_is_flagged_and_kept(model, small_manifest, tmp
     assert counts["texts"] == 0
     assert set(counts["flags"]) <= {"truncated", "invalid"}
     replies = (tmp_path / "c" / "replies.jsonl").read_text().splitlines()
-    assert all(json.loads(reply)["tries"] == 3 for reply in replies)
+    unused = [json.loads(reply)["unused"] for reply in replies]
+    assert [why is None for why in unused] == [False, False, True] * 12, "three tries each"
     assert result.record["model"].startswith(f"{model}@")
     again = caption(small_manifest, tmp_path / "c", local=str(model), max_tokens=4)
     assert (tmp_path / "c" / "replies.jsonl").read_text().splitlines() == replies
@@ -98,6 +100,32 @@ def test_a_local_reply_becomes_a_caption(model, small_manifest, tmp_path, monkey
     result = caption(small_manifest, tmp_path / "c", local=str(model), max_tokens=3, crop=BOX)
     assert set(result.table["text"]) == {"rough, dry, hard"}
     assert result.record["tokens"]["out"] == 12 * 3
+
+
+@pytest.mark.parametrize(("failing", "status"), [(2, 1), (99, 2)])
+def test_what_breaks_in_generate_costs_a_photo_or_ends_the_run_in_one_line(
+    model, small_manifest, tmp_path, monkeypatch, capsys, failing, status
+):
+    calls, generate = iter(range(999)), transformers.Idefics3ForConditionalGeneration.generate
+
+    def breaks(self, **options):
+        if next(calls) < failing:
+            raise RuntimeError("CUDA out of memory.\nTried to allocate 20 MiB")
+        return generate(self, **options)
+
+    monkeypatch.setattr(transformers.Idefics3ForConditionalGeneration, "generate", breaks)
+    answer = '{"adjectives": ["rough", "dry", "hard"], "surface_visible": true}'
+    monkeypatch.setattr(transformers.Idefics3Processor, "decode", lambda *a, **k: answer)
+    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
+    args = ["caption", tmp_path / "tag", "-o", tmp_path / "c", "--local", model]
+    assert main([*map(str, args), "--max-tokens", "3", "-q"]) == status
+    output = capsys.readouterr()
+    if status == 1:
+        assert "Without a caption: 2" in output.out
+        assert main([*map(str, args), "--max-tokens", "3", "-q"]) == 0, "the same command goes on"
+    else:
+        assert "Traceback" not in output.err
+        assert "RuntimeError CUDA out of memory. Tried" in output.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("kind", ["nothing", "another model", "text"])

@@ -119,6 +119,39 @@ def test_one_fault_is_repaired_or_flagged(data, tmp_path, quick, name):
     assert tuple(counts["flags"]) == flags
 
 
+def logged(output):
+    return [json.loads(line) for line in (output / "replies.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize(("fault", "why"), [("truncated", "truncated"), ("prose", "invalid")])
+def test_replies_that_are_asked_for_again_are_kept_with_the_reason(data, tmp_path, fault, why):
+    with FakeServer(lambda number: fault if number in (5, 6) else None) as server:
+        result = describe(data, tmp_path / "c", server, concurrency=1)
+        rows = logged(tmp_path / "c")
+        assert [row["unused"] for row in rows] == [None] * 4 + [why] * 2 + [None] * 8
+        assert len({row["key"] for row in rows[4:7]}) == 1
+        assert rows[4]["raw"] != rows[6]["raw"]
+        assert result.record["unused"] == {why: 2}
+        assert result.record["tokens"] == {"in": 14 * 700, "out": 14 * 30}
+        again = describe(data, tmp_path / "c", server)
+    assert (server.count, again.record) == (14, result.record)
+
+
+def test_a_run_that_goes_on_repeats_no_try(data, tmp_path):
+    """Cut after the first of two tries, it sends the second request and the tables are equal."""
+    with FakeServer(lambda number: "truncated" if number in (5, 6) else None) as server:
+        describe(data, tmp_path / "c", server, concurrency=1)
+        whole, log = table_of(tmp_path / "c"), tmp_path / "c" / "replies.jsonl"
+        log.write_text("".join(log.read_text().splitlines(keepends=True)[:5]))
+        first = server.payloads[4]
+        server.count, server.payloads = 5, []
+        result = describe(data, tmp_path / "c", server, concurrency=1)
+    assert len(server.payloads) == 9
+    assert server.payloads[0]["max_tokens"] == 2 * first["max_tokens"]
+    assert server.payloads[0]["seed"] == first["seed"] + 1
+    assert (result.record["unused"], table_of(tmp_path / "c")) == ({"truncated": 2}, whole)
+
+
 def test_a_hanging_request_is_sent_again(data, tmp_path, quick):
     with FakeServer(lambda number: "hang" if number == 3 else None) as server:
         result = describe(data, tmp_path / "c", server, timeout=0.3)
@@ -139,6 +172,8 @@ def test_what_stays_unusable_is_flagged_kept_and_asked_again_on_request(data, tm
         result = describe(data, tmp_path / "c", server, again=True)
     assert (server.count, result.record["counts"]["texts"]) == (48, 12)
     assert result.record["counts"]["flags"] == {}
+    assert result.record["unused"] == {"asked again": 12, "truncated": 24}
+    assert result.record["tokens"]["out"] == 48 * 30
 
 
 def test_a_server_that_answers_as_another_model_is_noted(data, tmp_path):
@@ -267,6 +302,8 @@ def test_single_requests_that_the_server_does_not_take_are_listed(data, tmp_path
         assert table["text"].null_count() == 8
         assert main([*map(str, args)]) == 0, "the same command asks again"
     assert server.count == 14
+    rows = [row for row in logged(tmp_path / "c") if row["unused"] == "rejected"]
+    assert [row["raw"] for row in rows] == ["status 413: fault 413"] * 2
 
 
 #: Arguments that are wrong, and what the error must say.
@@ -358,7 +395,7 @@ def test_equal_photos_are_asked_about_once(data, tmp_path, small_manifest):
     assert (server.count, result.record["counts"]["different"]) == (1, 1)
 
 
-def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
+def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick, small_manifest):
     with FakeServer() as server:
         estimate = describe(data, tmp_path / "c", server, dry_run=True, prices=(2.5, 10))
         assert (estimate.requests, estimate.measured, server.count) == (12, 0, 0)
@@ -369,9 +406,13 @@ def test_a_dry_run_sends_and_writes_nothing(data, tmp_path, quick):
         server.faults = lambda number: "500" if number > 4 else None
         with pytest.raises(StoppedError):
             describe(data, tmp_path / "c", server, concurrency=1)
+        photos = small_manifest.paths("vision")
+        photos[26].write_bytes(photos[26].read_bytes()[:-40])
+        photos[30].unlink()
         estimate = describe(data, tmp_path / "c", server, dry_run=True)
-    assert (estimate.requests, estimate.measured, estimate.tokens) == (8, 4, (5600, 240))
-    assert re.search(" 8, none for photos", str(estimate))
+    assert (estimate.requests, estimate.measured, estimate.tokens) == (6, 4, (4200, 180))
+    assert estimate.unreadable == 2
+    assert re.search(" 6, none for photos", str(estimate))
 
 
 def test_the_client_is_loaded_when_a_server_is_asked_and_missed_in_one_line(

@@ -21,8 +21,8 @@ from palpate import __version__
 from palpate.captions.columns import template_texts
 from palpate.captions.photos import checked_crop, sent_size
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.querying import Photos, Question, query_all
-from palpate.captions.replies import Describer, Reply, ReplyLog, read_replies
+from palpate.captions.querying import Pending, Photos, Question, query_all
+from palpate.captions.replies import Describer, Replies, ReplyLog, read_replies
 from palpate.captions.server import Server
 from palpate.captions.units import Per, Units, units_of
 from palpate.core import (
@@ -38,9 +38,10 @@ from palpate.core import (
     short,
     write_json,
 )
+from palpate.data.images import check_image, in_threads
 from palpate.data.manifest import Manifest
 from palpate.data.reading import load
-from palpate.data.texts import TABLE, TEXTS_FORMAT, texts_digest, write_texts
+from palpate.data.texts import TABLE, TEXTS_FORMAT, image_digests, texts_digest, write_texts
 
 LIST = pl.List(pl.String)
 RECORD, REPLIES = "record.json", "replies.jsonl"
@@ -104,14 +105,16 @@ class Estimate:
     """What captions will take. Print it.
 
     Attributes:
-        photos: all of them; ``requests`` are those without a reply so far.
+        photos: all of them; ``requests`` are those without an answer so far.
+        unreadable: photos that no request is sent for.
         tokens: of the requests and of the replies.
         seconds: in all, with the requested number of requests at once.
         price: in all, if prices were given.
-        measured: replies that the estimate is taken from; 0 means assumptions.
+        measured: described photos that the estimate is taken from; 0 means assumptions.
     """
 
     photos: int
+    unreadable: int
     requests: int
     tokens: tuple[int, int]
     seconds: float
@@ -128,11 +131,12 @@ class Estimate:
         minutes = self.seconds / 60
         rows = {
             "photos": f"{self.photos:,}",
+            "unreadable": f"{self.unreadable:,}" if self.unreadable else None,
             "requests": f"{self.requests:,}, none for photos that are answered or equal",
             "tokens": f"{self.tokens[0]:,} in, {self.tokens[1]:,} out",
             "time": f"{minutes / 60:.1f} h" if minutes > 90 else f"{minutes:.1f} min",
             "price": None if self.price is None else f"{self.price:.2f}",
-            "from": f"{self.measured:,} replies so far" if self.measured else assumed,
+            "from": f"{self.measured:,} photos so far" if self.measured else assumed,
         }
         kept = {name: value for name, value in rows.items() if value is not None}
         return "\n".join(["No photo was sent", *fact_lines(kept)])
@@ -214,25 +218,26 @@ def caption(  # noqa: PLR0913 (a public verb)
         if dry_run:
             replies, _ = read_replies(output / REPLIES)
             photos = Photos.of(manifest, units, question, progress)
-            threads = describer.threads or concurrency
-            return _estimate(photos, question, replies, threads, prices, again=again)
+            pending = photos.pending(replies, instruction, again=again)
+            how = {"threads": describer.threads or concurrency, "prices": prices}
+            return _estimate(photos, pending, question, replies, progress=progress, **how)
         with locked(output), closing(ReplyLog(output / REPLIES)) as log:
             photos = Photos.of(manifest, units, question, progress)
-            pending = photos.pending(log.replies, question.prompt, again=again)
+            answers = log.replies.answers
+            pending = photos.pending(log.replies, instruction, again=again)
             threads = min(describer.threads or concurrency, len(pending))
             try:
                 problems = query_all(
                     pending, question, describer, log, threads=threads, progress=progress
                 )
             except PalpateError as error:
-                if not log.appended:
+                if not log.answered:
                     raise
-                raise StoppedError(
-                    error, photos.answered(log.replies), len(photos), output
-                ) from None
+                done = sum(key in answers for key in photos.keys)
+                raise StoppedError(error, done, len(photos), output) from None
             made = _made(question, photos, log.replies, server) | {"per": per}
             problems = [*photos.unreadable(), *problems]
-            descriptions = photos.descriptions(log.replies, question.prompt, problems)
+            descriptions = photos.descriptions(answers, instruction, problems)
             return _write(manifest, units, descriptions, output, made, problems=problems)
 
 
@@ -256,11 +261,13 @@ def _describer(
 
 
 def _made(
-    question: Question, photos: Photos, replies: Mapping[str, Reply], server: str | None
+    question: Question, photos: Photos, replies: Replies, server: str | None
 ) -> dict[str, Any]:
     """What the record says of the model and of its replies."""
-    prompt = question.prompt
-    answers = _answers(photos, replies)
+    prompt, keys = question.prompt, photos.distinct
+    answers = [replies.answers[key] for key in keys if key in replies.answers]
+    inward, outward, _ = _spent(replies, keys)
+    unused = Counter(reply.unused or "asked again" for reply in replies.others_of(keys))
     return {
         "model": question.model,
         "server": server,
@@ -270,10 +277,8 @@ def _made(
         "schema": prompt.schema,
         "parameters": question.parameters,
         "replies": len(answers),
-        "tokens": {
-            "in": sum(reply.tokens[0] for reply in answers),
-            "out": sum(reply.tokens[1] for reply in answers),
-        },
+        "unused": dict(sorted(unused.items())),
+        "tokens": {"in": inward, "out": outward},
     }
 
 
@@ -301,27 +306,32 @@ def _of_columns(
         return _write(manifest, units, descriptions, output, {"per": per, "seed": seed, **made})
 
 
-def _answers(photos: Photos, replies: Mapping[str, Reply]) -> list[Reply]:
-    """The replies about these photos, each once."""
-    keys = sorted({key for key in photos.keys if key is not None and key in replies})
-    return [replies[key] for key in keys]
+def _spent(replies: Replies, keys: Sequence[str]) -> tuple[int, int, float]:
+    """Tokens in and out, and seconds, of all replies to these keys."""
+    every = [replies.answers[key] for key in keys if key in replies.answers]
+    every += replies.others_of(keys)
+    inward, outward = (sum(reply.tokens[k] for reply in every) for k in (0, 1))
+    return inward, outward, sum(reply.seconds for reply in every)
 
 
 def _estimate(
     photos: Photos,
+    pending: Sequence[Pending],
     question: Question,
-    replies: Mapping[str, Reply],
+    replies: Replies,
+    *,
     threads: int,
     prices: Sequence[float] | None,
-    *,
-    again: bool,
+    progress: Progress,
 ) -> Estimate:
     """What the remaining requests take, by the replies so far or by assumptions."""
-    count = len(photos.pending(replies, question.prompt, again=again))
-    known = _answers(photos, replies)
+    paths = [photo.path for photo in pending]
+    reasons = [reason for _, reason in in_threads(check_image, paths, "checking photos", progress)]
+    count = reasons.count(None)
+    unreadable = len(photos.unreadable()) + len(reasons) - count
+    known = [key for key in photos.distinct if key in replies.answers]
     if known:
-        inward, outward = (sum(r.tokens[k] for r in known) / len(known) for k in (0, 1))
-        seconds = sum(reply.seconds for reply in known) / len(known)
+        inward, outward, seconds = (n / len(known) for n in _spent(replies, known))
     else:
         sizes = sent_size(photos.first, question.crop)
         patches = sum(ceil(width / PATCH) * ceil(height / PATCH) for width, height in sizes)
@@ -330,7 +340,8 @@ def _estimate(
     price = None
     if prices is not None:
         price = sum(n * each for n, each in zip(tokens, prices, strict=True)) / 1e6
-    return Estimate(len(photos), count, tokens, count * seconds / threads, price, len(known))
+    seconds *= count / threads
+    return Estimate(len(photos), unreadable, count, tokens, seconds, price, len(known))
 
 
 def _write(
@@ -374,7 +385,7 @@ def _write(
     source = [made["model"] or f"template {made['template']!r}", prompt, f"per {made['per']}"]
     source = ", ".join([*filter(None, source), f"captions {short(digest)}"])
     path = output / TABLE
-    write_texts(table, path, source)
+    write_texts(table, path, source, image_digests(manifest))
     write_json(output / RECORD, record)
     return Captions(table, record, path, problems, _notes(manifest, units, made))
 

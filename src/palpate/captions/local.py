@@ -15,7 +15,7 @@ from typing import Any
 
 from PIL import Image
 
-from palpate.captions.replies import Reply, Request
+from palpate.captions.replies import RejectedError, Reply, Request
 from palpate.core import MissingExtraError, PalpateError, digest_json, digest_lines, short
 
 SERVE = "Use another model, or serve this one (vLLM, SGLang) and name the server"
@@ -60,6 +60,13 @@ class Local:
 
     def describe(self, request: Request) -> Reply:
         """Generate an answer; see :class:`palpate.captions.replies.Describer`."""
+        try:
+            return self._generated(request)
+        except Exception as error:  # transformers and torch raise many kinds, memory among them
+            got = " ".join(f"{type(error).__name__} {error}".split())[:200]
+            raise RejectedError(got) from None
+
+    def _generated(self, request: Request) -> Reply:
         images = [Image.open(io.BytesIO(image)).convert("RGB") for image in request.images]
         start = time.perf_counter()
         with self._lock, self._torch.inference_mode():

@@ -11,7 +11,14 @@ from palpate.captions.captioning import RECORD, Captions
 from palpate.captions.reading import SCHEMA, read_captions
 from palpate.captions.vocabulary import Vocabulary
 from palpate.core import PalpateError, short, write_json
-from palpate.data.texts import TABLE, TEXTS_FORMAT, texts_digest, write_texts
+from palpate.data.texts import (
+    TABLE,
+    TEXTS_FORMAT,
+    image_digests,
+    read_texts,
+    texts_digest,
+    write_texts,
+)
 
 
 def mask_captions(
@@ -58,6 +65,8 @@ def mask_captions(
         "counts": counts,
     }
     source = f"{source}, without names of materials {short(digest)}"
-    write_texts(table, output / TABLE, source)
+    own = isinstance(captions, str | Path) and (Path(captions) / TABLE).is_file()
+    images = read_texts(Path(captions)).images if own else image_digests(manifest)
+    write_texts(table, output / TABLE, source, images)
     write_json(output / RECORD, record)
     return Captions(table, record, output / TABLE)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from palpate.captions.photos import QUALITY, SIDE, Crop, file_digest, prepared
 from palpate.captions.prompts import Description, Prompt
-from palpate.captions.replies import Describer, RejectedError, Reply, ReplyLog, Request
+from palpate.captions.replies import Describer, RejectedError, Replies, Reply, ReplyLog, Request
 from palpate.captions.units import Units
 from palpate.core import PalpateError, Problem, Progress, digest_json
 from palpate.data.images import in_threads
@@ -61,11 +61,19 @@ class Question:
 
 @dataclass(frozen=True)
 class Pending:
-    """A photo without a reply: the key of the reply, the sample's id, the file."""
+    """A photo without an answer.
+
+    Attributes:
+        key: of the answer.
+        sample: the sample's id.
+        path: the file.
+        tries: replies to it so far, which could not be used.
+    """
 
     key: str
     sample: str
     path: Path
+    tries: tuple[Reply, ...]
 
 
 @dataclass(frozen=True)
@@ -99,30 +107,27 @@ class Photos:
         return sum(path is not None for path in self.paths)
 
     @property
+    def distinct(self) -> list[str]:
+        """The keys, each once, in a fixed order."""
+        return sorted({key for key in self.keys if key is not None})
+
+    @property
     def first(self) -> Path:
         """One of the photos."""
         return next(path for path in self.paths if path is not None)
 
-    def pending(
-        self, replies: Mapping[str, Reply], prompt: Prompt, *, again: bool = False
-    ) -> list[Pending]:
-        """Photos without a reply, each once; with ``again`` also those without a usable one."""
+    def pending(self, replies: Replies, prompt: Prompt, *, again: bool = False) -> list[Pending]:
+        """Photos without an answer, each once; with ``again`` also those without a usable one."""
 
         def open_(key: str) -> bool:
-            if key not in replies:
-                return True
-            reply = replies[key]
-            return again and prompt.read(reply.raw, refused=reply.refused).text is None
+            answer = replies.answers.get(key)
+            return answer is None or (again and answer.read(prompt).text is None)
 
         pending: dict[str, Pending] = {}
         for key, sample, path in zip(self.keys, self.samples, self.paths, strict=True):
             if key is not None and path is not None and key not in pending and open_(key):
-                pending[key] = Pending(key, sample, path)
+                pending[key] = Pending(key, sample, path, replies.tries(key))
         return list(pending.values())
-
-    def answered(self, replies: Mapping[str, Reply]) -> int:
-        """How many photos have a reply."""
-        return sum(key in replies for key in self.keys)
 
     def unreadable(self) -> list[Problem]:
         """Photos whose files cannot be read."""
@@ -131,17 +136,14 @@ class Photos:
         return [Problem(str(path), "bad-image", "cannot be read") for path in paths]
 
     def descriptions(
-        self, replies: Mapping[str, Reply], prompt: Prompt, problems: Iterable[Problem]
+        self, answers: Mapping[str, Reply], prompt: Prompt, problems: Iterable[Problem]
     ) -> list[Description]:
-        """What the replies say of every unit."""
+        """What the answers say of every unit."""
         kinds = {problem.where: problem.kind for problem in problems}
         result: list[Description] = []
         for path, key in zip(self.paths, self.keys, strict=True):
-            if key is not None and key in replies:
-                reply = replies[key]
-                description = prompt.read(reply.raw, refused=reply.refused)
-                if description.text is None and reply.finish == "length":
-                    description = replace(description, flags=("truncated",))
+            if key is not None and key in answers:
+                description = answers[key].read(prompt)
             else:
                 kind = "no-photo" if path is None else kinds[str(path)]
                 description = Description(None, flags=(kind,))
@@ -173,10 +175,12 @@ def query_all(
         except PalpateError as error:
             return Problem(str(photo.path), "bad-image", error.got)
         try:
-            reply = _query(images, question, describer)
+            for reply in _replies(images, photo.tries, question, describer):
+                log.append(photo.key, photo.sample, question.prompt.name, reply)
         except RejectedError as error:
+            reply = Reply(str(error), question.model, finish="rejected", unused="rejected")
+            log.append(photo.key, photo.sample, question.prompt.name, reply)
             return Problem(str(photo.path), "rejected", str(error))
-        log.append(photo.key, photo.sample, question.prompt.name, reply)
         return None
 
     problems: list[Problem] = []
@@ -191,29 +195,34 @@ def query_all(
             problems.append(result)
             rejected += result.kind == "rejected"
             if rejected >= ALL_REJECTED and not answered:
-                must, fix = "must take the requests", "Check the model and the further fields"
-                raise PalpateError(must, result.text, fix, argument="server")
+                must, fix = "The model must take the requests", "Check it and the further fields"
+                raise PalpateError(must, result.text, fix)
         progress("describing", done, len(pending))
     return sorted(problems, key=lambda problem: problem.where)
 
 
-def _query(images: tuple[bytes, ...], question: Question, describer: Describer) -> Reply:
-    """The first reply that can be used, or the last one; tokens and seconds are of all tries."""
+def _replies(
+    images: tuple[bytes, ...], tries: Sequence[Reply], question: Question, describer: Describer
+) -> Iterator[Reply]:
+    """Replies until one can be used or there were ``ATTEMPTS``; all but the last are ``unused``."""
     request = Request(images, question.prompt, question.max_tokens, 0.0, question.seed)
-    reply, tokens, seconds = None, (0, 0), 0.0
-    for tries in range(1, ATTEMPTS + 1):
-        answer = describer.describe(request)
-        tokens = (tokens[0] + answer.tokens[0], tokens[1] + answer.tokens[1])
-        seconds = round(seconds + answer.seconds, 3)
-        reply = replace(answer, tries=tries, tokens=tokens, seconds=seconds)
-        if question.prompt.read(reply.raw, refused=reply.refused).answered:
+    for reply in tries:
+        request = _next(request, reply)
+    for left in range(ATTEMPTS - 1 - len(tries), -1, -1):
+        reply = describer.describe(request)
+        description = reply.read(question.prompt)
+        if description.answered or not left:
+            yield reply
             break
-        room = request.max_tokens * (2 if reply.finish == "length" else 1)
-        request = replace(
-            request, max_tokens=room, temperature=AGAIN_TEMPERATURE, seed=request.seed + 1
-        )
-    assert reply is not None
-    return reply
+        yield replace(reply, unused=description.flags[0])
+        request = _next(request, reply)
+
+
+def _next(request: Request, reply: Reply) -> Request:
+    """The request after a reply that cannot be used: sampled, with more room if that was cut."""
+    room = request.max_tokens * (2 if reply.finish == "length" else 1)
+    seed = request.seed + 1
+    return replace(request, max_tokens=room, temperature=AGAIN_TEMPERATURE, seed=seed)
 
 
 def in_daemons(

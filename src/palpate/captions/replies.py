@@ -5,11 +5,13 @@ arrives and never changed::
 
     {"key": "<sha256>", "id": "video/frame", "prompt": "touch-adjectives/1", "model": "...",
      "raw": "{...}", "refused": false, "finish": "stop", "tokens": [812, 31], "seconds": 1.42,
-     "tries": 1, "fingerprint": null}
+     "fingerprint": null, "unused": null}
 
 ``key`` is SHA-256 over the model, the digest of the prompt, the bytes of the image file and the
 parameters. Whoever asks the same again finds the answer; a killed run loses what was in flight. A
-last line without its end was cut by a kill or a full disk and is dropped.
+reply that was asked for again says why under ``unused`` (``invalid``, ``truncated``), and so does
+the error of a request that the server does not take (``rejected``): these are no answers, but their
+tokens count. A last line without its end was cut by a kill or a full disk and is dropped.
 """
 
 from __future__ import annotations
@@ -17,11 +19,13 @@ from __future__ import annotations
 import json
 import os
 import threading
-from dataclasses import asdict, dataclass
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from palpate.captions.prompts import Prompt
+from palpate.captions.prompts import Description, Prompt
 from palpate.core import PalpateError
 
 
@@ -63,8 +67,8 @@ class Reply:
         finish: why it ended: ``stop``, or ``length`` where it was cut.
         tokens: of the request and of the reply.
         seconds: from request to reply.
-        tries: requests until it could be used.
         fingerprint: of the server's configuration, if it says so.
+        unused: why it is not the answer; None where it is.
     """
 
     raw: str
@@ -73,8 +77,15 @@ class Reply:
     finish: str = "stop"
     tokens: tuple[int, int] = (0, 0)
     seconds: float = 0.0
-    tries: int = 1
     fingerprint: str | None = None
+    unused: str | None = None
+
+    def read(self, prompt: Prompt) -> Description:
+        """What it says."""
+        description = prompt.read(self.raw, refused=self.refused)
+        if description.text is None and self.finish == "length":
+            return replace(description, flags=("truncated",))
+        return description
 
 
 class Describer(Protocol):
@@ -106,17 +117,48 @@ class RejectedError(Exception):
     """The server does not take this one request (too large, no valid image ...)."""
 
 
-def read_replies(path: Path) -> tuple[dict[str, Reply], int]:
-    """Read a log; of two replies to one key the later counts.
+class Replies:
+    """Replies by key.
+
+    Attributes:
+        answers: the one that counts: the last that is not ``unused``.
+        others: those that came before it.
+    """
+
+    def __init__(self) -> None:
+        self.answers: dict[str, Reply] = {}
+        self.others: defaultdict[str, list[Reply]] = defaultdict(list)
+
+    def add(self, key: str, reply: Reply) -> None:
+        """Add the next reply to a key."""
+        if reply.unused is not None:
+            self.others[key].append(reply)
+        else:
+            if key in self.answers:
+                self.others[key].append(self.answers[key])
+            self.answers[key] = reply
+
+    def tries(self, key: str) -> tuple[Reply, ...]:
+        """Replies that led to no answer so far, without rejected requests."""
+        if key in self.answers:
+            return ()
+        return tuple(reply for reply in self.others.get(key, ()) if reply.unused != "rejected")
+
+    def others_of(self, keys: Iterable[str]) -> list[Reply]:
+        """The other replies to these keys."""
+        return [reply for key in keys for reply in self.others.get(key, ())]
+
+
+def read_replies(path: Path) -> tuple[Replies, int]:
+    """Read a log.
 
     Returns:
-        The replies by key, and the bytes of whole lines.
+        The replies, and the bytes of whole lines.
 
     Raises:
         PalpateError: if it is another program's file.
     """
-    replies: dict[str, Reply] = {}
-    end = 0
+    replies, end = Replies(), 0
     if not path.exists():
         return replies, end
     with open(path, "rb") as file:
@@ -128,7 +170,7 @@ def read_replies(path: Path) -> tuple[dict[str, Reply], int]:
                 row = json.loads(line)
                 fields = {name: row[name] for name in Reply.__dataclass_fields__}
                 fields["tokens"] = (int(row["tokens"][0]), int(row["tokens"][1]))
-                replies[row["key"]] = Reply(**fields)
+                replies.add(row["key"], Reply(**fields))
             except (ValueError, TypeError, LookupError):
                 must, got = f"{path} must hold replies only", f"another line {number}"
                 fix = "Choose another folder, or remove the line"
@@ -137,11 +179,11 @@ def read_replies(path: Path) -> tuple[dict[str, Reply], int]:
 
 
 class ReplyLog:
-    """The replies of an output folder, by key. The file begins with the first reply.
+    """The replies of an output folder. The file begins with the first reply.
 
     Attributes:
-        replies: by key.
-        appended: how many were added.
+        replies: all of them.
+        answered: how many answers were added.
 
     Raises:
         PalpateError: if the file is another program's.
@@ -149,7 +191,7 @@ class ReplyLog:
 
     def __init__(self, path: Path) -> None:
         self.replies, end = read_replies(path)
-        self.appended = 0
+        self.answered = 0
         self._path, self._lock, self._open = path, threading.Lock(), True
         self._file: BinaryIO | None = None
         if path.exists() and path.stat().st_size > end:
@@ -165,8 +207,8 @@ class ReplyLog:
             self._file = self._file or open(self._path, "ab")  # noqa: SIM115 (closed by close)
             self._file.write(line)
             self._file.flush()
-            self.replies[key] = reply
-            self.appended += 1
+            self.replies.add(key, reply)
+            self.answered += reply.unused is None
 
     def close(self) -> None:
         """End writing."""

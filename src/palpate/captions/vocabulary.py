@@ -1,8 +1,9 @@
 """Words in captions: names of materials with their inflections and synonyms, and visual words.
 
 A word names a material if one of its forms is one of the name's: ``wooden``, ``woods``, ``woody``
-are forms of ``wood``. Synonyms are in ``words/materials.tsv``; a label that is not there is matched
-by its words.
+are forms of ``wood``, ``tiled`` is one of ``tile``, ``furry`` of ``fur``, ``plasticky`` of
+``plastic``. Synonyms are in ``words/materials.tsv``; a label that is not there is matched by its
+words.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ _ENDINGS = (
     ("ves", ("f", "fe")),
     ("es", ("", "e")),
     ("s", ("",)),
-    ("y", ("", "e")),
-    ("en", ("", "e")),
-    ("ic", ("",)),
+    ("like", ("",)),
+    *((e, ("", "e")) for e in ("y", "ey", "ish", "en", "ic", "ed", "ing", "ized", "ised")),
 )
+#: Words that look like an inflection of a material's name and are none, or say what was done to it.
+_OTHER = {"rugged", "tiny", "tired", "hiding", "logic", "soiled", "ironed", "sanded", "sanding"}
 #: Parts of labels that say nothing by themselves.
 _ARTICLES = {"a", "an", "and", "of", "or", "the", "with"}
 _EMPTY = _ARTICLES | {"material", "surface", "natural", "synthetic", "other", "others"}
@@ -37,11 +39,11 @@ def words_of(text: str) -> list[str]:
 def forms_of(word: str) -> frozenset[str]:
     """The word and the lemmas that it may be an inflection of."""
     forms = {word}
-    for ending, stems in _ENDINGS:
+    for ending, stems in _ENDINGS if word not in _OTHER else ():
         if word.endswith(ending) and len(word) - len(ending) >= 3:
             bare = word.removesuffix(ending)
             forms |= {bare + stem for stem in stems}
-            if ending in ("en", "ic") and bare[-1] == bare[-2]:  # woollen, metallic
+            if bare[-1] == bare[-2] or bare.endswith("ck"):  # woolly, metallic; plasticky
                 forms.add(bare[:-1])
     return frozenset(forms)
 

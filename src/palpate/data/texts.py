@@ -4,7 +4,12 @@ or any table with the columns ``id`` and ``text``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from math import ceil
 from pathlib import Path
 
 import polars as pl
@@ -17,6 +22,8 @@ from palpate.data.tables import open_table
 TEXTS_FORMAT = "palpate-captions/1"
 #: The table in the folder that ``palpate caption`` writes.
 TABLE = "captions.parquet"
+#: So many images, spread over the samples, tell whether texts were made for them.
+WITNESSES = 64
 
 
 @dataclass(frozen=True)
@@ -27,11 +34,13 @@ class Texts:
         of: id -> text, only where there is one.
         ids: all ids of the table.
         source: where they come from, with a digest: kept in manifests and in models.
+        images: :func:`image_digests` of the samples that they were made for.
     """
 
     of: dict[str, str]
     ids: frozenset[str]
     source: str
+    images: Mapping[str, str] = field(default_factory=dict)
 
 
 def texts_digest(table: pl.DataFrame) -> str:
@@ -40,9 +49,29 @@ def texts_digest(table: pl.DataFrame) -> str:
     return digest_lines(f"{name}\t{text}" for name, text in pairs)
 
 
-def write_texts(table: pl.DataFrame, path: Path, source: str) -> None:
-    """Write a table of texts, with where they come from."""
+def image_digests(manifest: Manifest, ids: Iterable[str] | None = None) -> dict[str, str]:
+    """SHA-256 of the photo, or else the tactile image, by id; without files that cannot be read.
+
+    Args:
+        manifest: the samples.
+        ids: of which of them; by default at most ``WITNESSES``, spread evenly.
+    """
+    table = manifest.table.select("id", image=pl.coalesce("vision", "tactile")).drop_nulls()
+    if ids is None:
+        table = table.gather_every(max(1, ceil(len(table) / WITNESSES)))
+    else:
+        table = table.filter(pl.col("id").is_in(list(ids)))
+    digests: dict[str, str] = {}
+    for name, image in table.iter_rows():
+        with suppress(OSError):
+            digests[name] = hashlib.sha256(manifest.path(image).read_bytes()).hexdigest()
+    return digests
+
+
+def write_texts(table: pl.DataFrame, path: Path, source: str, images: Mapping[str, str]) -> None:
+    """Write a table of texts, with where they come from and digests of the samples' images."""
     facts = {"format": TEXTS_FORMAT, "digest": texts_digest(table), "source": source}
+    facts["images"] = json.dumps(images)
     write_parquet(table, path, {f"palpate.{name}": value for name, value in facts.items()})
 
 
@@ -73,7 +102,8 @@ def read_texts(path: Path) -> Texts:
         with open(path, "rb") as file:
             metadata = pl.read_parquet_metadata(file)
     source = metadata.get("palpate.source") or f"{path.name}, captions {short(texts_digest(rows))}"
-    return Texts(texts, frozenset(pairs), source)
+    images = json.loads(metadata.get("palpate.images", "{}"))
+    return Texts(texts, frozenset(pairs), source, images)
 
 
 def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) -> Manifest:
@@ -86,13 +116,16 @@ def joined(manifest: Manifest, texts: Texts, where: Path, *, keep: bool = True) 
         keep: samples without a text there keep theirs.
 
     Raises:
-        PalpateError: if the table has none of the samples.
+        PalpateError: if the table has none of the samples, or was made for others of their names.
     """
-    ids = manifest.ids
+    ids, must, fix = manifest.ids, "The texts must be of these samples", "Use those made for them"
     if texts.ids.isdisjoint(ids):
         got = f"{where}, with ids as {min(texts.ids, default='')!r} instead of {ids[0]!r}"
-        fix = "Use the texts made for this data set"
-        raise PalpateError("The texts must be of these samples", got, fix)
+        raise PalpateError(must, got, fix)
+    for name, digest in image_digests(manifest, texts.images).items():
+        if digest != texts.images[name]:
+            got = f"{where}, made for another image of {name!r}"
+            raise PalpateError(must, got, f"{fix}; a table of only id and text joins by id alone")
     old = manifest.column("text") if keep else [None] * len(ids)
     new = [texts.of.get(name, text) for name, text in zip(ids, old, strict=True)]
     table = manifest.table.with_columns(text=pl.Series(new, dtype=pl.String))
@@ -103,7 +136,7 @@ def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
     """An import with texts from a table; samples without one there keep theirs.
 
     Raises:
-        PalpateError: if the table has none of the samples.
+        PalpateError: as :func:`joined`.
     """
     manifest = joined(imported.manifest, texts, where)
     suspicious = list(imported.suspicious)
