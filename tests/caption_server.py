@@ -115,12 +115,12 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             if server.delay:
                 time.sleep(server.delay)
-            self.reply(server.faults(number), image)
+            self.reply(server.faults(number), image, payload)
         finally:
             with server.lock:
                 server.now -= 1
 
-    def reply(self, fault, image):
+    def reply(self, fault, image, payload):
         """Answer, with a fault or without."""
         status, _, rest = str(fault or "").partition(" ")
         if status.isdigit():
@@ -130,6 +130,9 @@ class _Handler(BaseHTTPRequestHandler):
         if fault == "hang":
             time.sleep(3)
         answer = {"adjectives": adjectives_of(image), "surface_visible": True}
+        if "sentence" in payload["response_format"]["json_schema"]["schema"]["properties"]:
+            words = answer.pop("adjectives")
+            answer["sentence"] = f"{', '.join(words)} surface typical of a thing"
         texts = {
             "prose": "The surface feels rough and hard.",
             "fenced": f"Here you are:\n```json\n{json.dumps(answer)}\n```",

@@ -24,7 +24,7 @@ def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
     (tmp_path / "data" / "splits" / "Orig.json").rename(tmp_path / "noleak.json")
     assert Split.load("noleak.json").counts()["test"]
     text = PAGE.read_text(encoding="utf-8")
-    with FakeServer() as server:
+    with FakeServer(model="allenai/Molmo-7B-D-0924") as server:
         for block in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             for line in block.replace("http://localhost:8000/v1", server.url).splitlines():
                 assert main(shlex.split(line)[1:]) == 0, line
@@ -33,7 +33,19 @@ def test_the_blocks_of_the_page_run(tmp_path, monkeypatch, capsys):
     assert "material accuracy from the text" in capsys.readouterr().out
 
 
-def test_every_flag_has_an_example():
+@pytest.mark.parametrize("verb", ["caption", "caption check"])
+def test_every_option_has_an_example(verb, capsys):
+    with pytest.raises(SystemExit):
+        main([*verb.split(), "--help"])
+    options = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", capsys.readouterr().out)) - {"--help"}
+    text = PAGE.read_text(encoding="utf-8")
+    examples = " ".join(re.findall(r"^```(?:sh|console)\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+    short = {"--output": "-o", "--quiet": "-q"}
+    assert len(options) > 9
+    assert [o for o in sorted(options) if short.get(o, o) not in examples.split()] == []
+
+
+def test_every_flag_of_a_caption_has_an_example():
     flags = re.findall(r"^\| `([a-z-]+)` \| ", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     sources = (PAGE.parents[1] / "src" / "palpate" / "captions").glob("*.py")
     code = "".join(path.read_text(encoding="utf-8") for path in sources)
