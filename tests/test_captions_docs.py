@@ -39,7 +39,9 @@ def test_every_option_has_an_example(verb, capsys):
         main([*verb.split(), "--help"])
     options = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", capsys.readouterr().out)) - {"--help"}
     text = PAGE.read_text(encoding="utf-8")
-    examples = " ".join(re.findall(r"^```(?:sh|console)\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+    examples = " ".join(
+        re.findall(r"^```(?:sh|console)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    )
     short = {"--output": "-o", "--quiet": "-q"}
     assert len(options) > 9
     assert [o for o in sorted(options) if short.get(o, o) not in examples.split()] == []
