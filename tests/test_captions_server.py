@@ -172,7 +172,7 @@ def test_what_stays_unusable_is_flagged_kept_and_asked_again_on_request(data, tm
         result = describe(data, tmp_path / "c", server, again=True)
     assert (server.count, result.record["counts"]["texts"]) == (48, 12)
     assert result.record["counts"]["flags"] == {}
-    assert result.record["unused"] == {"asked again": 12, "truncated": 24}
+    assert result.record["unused"] == {"repeated": 12, "truncated": 24}
     assert result.record["tokens"]["out"] == 48 * 30
 
 

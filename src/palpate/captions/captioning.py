@@ -267,7 +267,7 @@ def _made(
     prompt, keys = question.prompt, photos.distinct
     answers = [replies.answers[key] for key in keys if key in replies.answers]
     inward, outward, _ = _spent(replies, keys)
-    unused = Counter(reply.unused or "asked again" for reply in replies.others_of(keys))
+    unused = Counter(reply.unused or "repeated" for reply in replies.others_of(keys))
     return {
         "model": question.model,
         "server": server,

@@ -8,10 +8,10 @@ arrives and never changed::
      "fingerprint": null, "unused": null}
 
 ``key`` is SHA-256 over the model, the digest of the prompt, the bytes of the image file and the
-parameters. Whoever asks the same again finds the answer; a killed run loses what was in flight. A
-reply that was asked for again says why under ``unused`` (``invalid``, ``truncated``), and so does
-the error of a request that the server does not take (``rejected``): these are no answers, but their
-tokens count. A last line without its end was cut by a kill or a full disk and is dropped.
+parameters. The same request finds its answer there; a killed run loses what was in flight. A reply
+after which the request was repeated says why under ``unused`` (``invalid``, ``truncated``), and so
+does the error of a request that the server does not take (``rejected``): these are no answers, but
+their tokens count. A last line without its end was cut by a kill or a full disk and is dropped.
 """
 
 from __future__ import annotations
