@@ -33,7 +33,7 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
         return
     for table in score_tables(result.scores):
         console.print(Text(table.title, "bold"))
-        _print_rows(_score_rows(table), console)
+        _print_rows(score_rows(table), console)
         marked = [cell for column in table.columns for cell in column.cells]
         if ranked := rankings(table):
             console.print(Text(RANKED, "bold"))
@@ -41,7 +41,7 @@ def print_result(result: Results | Audit, console: Console, style: Style = COMMA
         elif table.differences:
             marked += [d.cell for d in table.differences]
             console.print(Text("Paired differences, a - b", "bold"))
-            _print_rows(_difference_rows(table), console)
+            _print_rows(difference_rows(table), console)
         notes = {k: table.notes[k - 1] for cell in marked for k in cell.footnotes}
         lines = [f"({k}) {sentence(note, style)}" for k, note in sorted(notes.items())]
         if any(cell.best for column in table.columns for cell in column.cells):
@@ -62,7 +62,8 @@ def as_text(result: Results | Audit, width: int = 140) -> str:
     return "\n".join(line.rstrip() for line in file.getvalue().rstrip().splitlines())
 
 
-def _score_rows(table: Table) -> list[dict[str, str]]:
+def score_rows(table: Table) -> list[dict[str, str]]:
+    """Return the scores of a table, a row each."""
     return [
         {
             "metric": f"{column.metric} {column.arrow}",
@@ -81,7 +82,8 @@ def _score_rows(table: Table) -> list[dict[str, str]]:
     ]
 
 
-def _difference_rows(table: Table) -> list[dict[str, str]]:
+def difference_rows(table: Table) -> list[dict[str, str]]:
+    """Return the paired differences of a table, a row each."""
     return [
         {
             "metric": f"{d.metric} {d.arrow}",
@@ -159,4 +161,4 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     return "\n".join([*lines, *(audit_text(other, style) for other in audit.others)])
 
 
-__all__ = ["as_text", "audit_text", "print_result"]
+__all__ = ["as_text", "audit_text", "difference_rows", "print_result", "score_rows"]
