@@ -31,7 +31,6 @@ WORLD = {
     "contacts_per_video": 4,
     "two_videos": 0.0,
     "seed": 7,
-    "captions": "label",
 }
 SMALL = WORLD | {"objects_per_material": 2, "contacts_per_video": 2, "frames_per_contact": 2}
 
