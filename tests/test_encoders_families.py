@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import polars as pl
 import pytest
 import torch
 from PIL import Image
@@ -18,9 +19,13 @@ from transformers import (
     SiglipModel,
 )
 
+from palpate import probe
 from palpate.core import PalpateError
+from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet
 from palpate.encoders.tokenizer import save_tokenizer, train_tokenizer
+from palpate.report.notes import sentence
+from test_evaluation_guard import by_video
 
 SIZE = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2}
 SIZE |= {"num_attention_heads": 2}
@@ -136,3 +141,43 @@ def test_other_models_are_named(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "bert"}))
     with pytest.raises(PalpateError, match=r"must be one of clip, siglip, .*'bert'"):
         EncoderSet.load(tmp_path)
+
+
+CARDS = {
+    "license: mit\ndatasets: [HCT, a/b]": ("mit", ("HCT", "a/b")),
+    "license: other\nlicense_name: dinov3-license\ndatasets: HCT": ("dinov3-license", ("HCT",)),
+    "tags: [vision]": ("unknown", ()),
+    "license: [": ("unknown", ()),
+    None: ("unknown", ()),
+}
+
+
+@pytest.mark.parametrize(("head", "facts"), CARDS.items())
+def test_license_and_data_sets_are_those_of_the_models_card(tmp_path, head, facts):
+    write("siglip", tmp_path / "model")
+    if head is not None:
+        (tmp_path / "model" / "README.md").write_text(f"---\n{head}\n---\n# A model\n")
+    encoders = EncoderSet.load(tmp_path / "model")
+    encoders.save(tmp_path / "saved")  # as part of what is trained with it
+    for each in (encoders, EncoderSet.load(tmp_path / "saved")):
+        for modality in ("vision", "text"):
+            encoder = Encoder(each, modality)
+            assert (encoder.license, encoder.trained_on) == facts
+    assert f"license: {facts[0]}\n" in (tmp_path / "saved" / "clip" / "README.md").read_text()
+
+
+def test_a_probe_prints_the_license_and_refuses_data_of_the_models_card(tmp_path, small_manifest):
+    write("siglip", tmp_path / "model")
+    (tmp_path / "model" / "README.md").write_text("---\nlicense: mit\ndatasets: [HCT]\n---\n")
+    table = small_manifest.table.with_columns(text=pl.col("id"))
+    split = by_video(small_manifest, "v0", "v1", "v2")
+    options = {"encoder": str(tmp_path / "model"), "modality": "vision"}
+    results = probe(Manifest(table, small_manifest.root), split, **options)
+    noted = (n for s in results for n in s.notes if n.code == "encoder-license")
+    notes = {n.params["modality"]: n for n in noted}
+    assert notes.keys() == {"vision", "text"}
+    assert "whose license is mit" in sentence(notes["vision"])
+    seen = Manifest(table, small_manifest.root, {"dataset": "HCT"})
+    with pytest.raises(PalpateError, match="images of HCT, with which its authors trained it"):
+        probe(seen, split, **options)
+    assert Encoder.from_pretrained("palpate/mini", modality="text").license == "apache-2.0"

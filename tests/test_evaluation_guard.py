@@ -10,12 +10,14 @@ from PIL import Image
 from safetensors.numpy import save_file
 
 from mini_fixtures import make_encoders
-from palpate import probe, score
+from palpate import audit, probe, score
 from palpate.core import PalpateError, Split
 from palpate.data.manifest import Manifest
 from palpate.encoders import Encoder, EncoderSet, train_encoder
 from palpate.encoders.preprocess import digest_images, union
 from palpate.evaluation.inputs import guard
+from palpate.report.notes import COMMAND_LINE, sentence
+from palpate.report.terminal import audit_text
 
 
 def by_video(manifest, *train):
@@ -90,10 +92,32 @@ def test_seen_test_images_are_refused_in_probe_and_score_unless_allowed(
                 assert (note.params["seen"], note.params["n"]) == (refused, n)
 
 
+def test_the_impact_of_a_leak_is_not_measured_by_an_encoder_that_saw_the_samples(
+    trained, small_manifest, tmp_path
+):
+    encoders, split = trained
+    encoders.save(tmp_path / "e")
+    options = {"split": split, "images": False, "impact": True, "encoder": tmp_path / "e"}
+    result = audit(small_manifest, **options)
+    assert result.impact is None
+    (note,) = (note for note in result.notes if note.code == "impact-failed")
+    assert "24 of 48 that it was trained on" in sentence(note)
+    assert sentence(note, COMMAND_LINE).endswith("E.g. --allow-seen")
+    result = audit(small_manifest, **options, allow_seen=True)
+    assert {row.features for row in result.impact.rows} == {
+        f"{m} encoder, trained on some of these images" for m in ("vision", "tactile")
+    }
+    for text in (result.impact.headline, audit_text(result), str(result.to_json())):
+        assert "trained on some of these images" in text
+    assert "The tactile encoder was trained on 24 of the 48 images" in audit_text(result)
+    result = audit(small_manifest, **options | {"encoder": "palpate/mini"})
+    assert {row.features for row in result.impact.rows} == {"vision encoder", "tactile encoder"}
+
+
 def test_a_declared_data_set_is_refused(encoders, small_manifest):
     public = replace(encoders)
     facts = SimpleNamespace(name="X", license="MIT", trained_on=("Touch and Go", "YCB-Slide"))
-    public.public = lambda modality: facts
+    public.origin = lambda modality: facts
     for dataset, refused in (("Touch and Go", 1), ("HCT + YCB-Slide", 1), ("VisGel", 0), ("", 0)):
         manifest = Manifest(small_manifest.table, small_manifest.root, {"dataset": dataset})
         if refused:

@@ -76,15 +76,16 @@ class Encoder:
 
     @property
     def license(self) -> str | None:
-        """The license of its weights, if it is known."""
-        public = self.encoders.public(self.modality)
-        return public.license if public else None
+        """The license of its weights: ``unknown`` if others state none, None if you state none."""
+        origin, tactile = self.encoders.origin(self.modality), self.modality == "tactile"
+        card = self.encoders.card if tactile else self.encoders.clip.card
+        return origin.license if origin else card.get("license")
 
     @property
     def trained_on(self) -> tuple[str, ...]:
         """Data sets that the encoder's authors trained it on."""
-        public = self.encoders.public(self.modality)
-        return public.trained_on if public else ()
+        origin = self.encoders.origin(self.modality)
+        return origin.trained_on if origin else ()
 
     def saw(
         self, inputs: Any, *, batch: int = 128, progress: Progress = quiet

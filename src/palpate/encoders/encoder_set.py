@@ -57,6 +57,7 @@ from palpate.core import (
 )
 from palpate.data.manifest import Manifest
 from palpate.encoders.models import (
+    Origin,
     architecture,
     digest_modules,
     find_encoder,
@@ -69,6 +70,7 @@ from palpate.encoders.models import (
     round_to_half,
     save_model,
     silent,
+    stated,
 )
 from palpate.encoders.preprocess import (
     SAVE_AGAIN,
@@ -78,7 +80,7 @@ from palpate.encoders.preprocess import (
     digest_images,
     load_frames,
 )
-from palpate.encoders.tactile import Format, TactileModule, load_tactile
+from palpate.encoders.tactile import TactileModule, load_tactile
 from palpate.encoders.tokenizer import save_tokenizer
 from palpate.training.cards import write_model_cards
 
@@ -123,7 +125,7 @@ class ClipEncoders:
             vision encoder alone.
         preprocess: for the vision encoder.
         name: hub id or folder it came from, or the preset that made it.
-        card: how it was trained, if palpate trained it.
+        card: how it was trained, if palpate trained it; else ``license`` and ``trained_on``.
         seen: digests of the images that the vision encoder was trained on; None: unknown.
     """
 
@@ -258,7 +260,9 @@ def load_clip(source: str | Path, *, device: str = "cpu") -> ClipEncoders:
     size = int(model.config.vision_config.image_size) if sized else None
     preprocess = Preprocess.from_config(folder / "preprocessor_config.json", size)
     clip = ClipEncoders(model, tokenizer, preprocess, str(source))
-    if note.is_file():
+    if not note.is_file():
+        clip.card = stated(folder)
+    else:
         about = _read_card(folder, CLIP_FORMAT)
         clip.card = about["card"]
         clip.name = clip.name if is_shipped(source) else str(about["name"])
@@ -390,9 +394,10 @@ class EncoderSet:
         Returns:
             (n,) booleans; all false where the encoder's images are not known (public ones).
         """
-        known, preprocess = self.seen_by(modality), self.preprocess(modality)
+        known = self.seen_by(modality)
         if known is None:
             return np.zeros(len(images), bool)
+        preprocess = self.preprocess(modality)
         files: Sequence[Frame] = (
             preprocess.frames(images, modality).files
             if isinstance(images, Manifest)
@@ -405,10 +410,14 @@ class EncoderSet:
             progress("looking for known images", start + len(pixels), len(files))
         return seen
 
-    def public(self, modality: str) -> Format | None:
-        """What is known of a public tactile encoder."""
-        known = modality == "tactile" and isinstance(self.tactile, TactileModule)
-        return self.tactile.format if known and self.tactile is not None else None  # type: ignore[return-value]
+    def origin(self, modality: str) -> Origin | None:
+        """What is known of an encoder that others trained; None of palpate's and one's own."""
+        if modality == "tactile":
+            return self.tactile.format if isinstance(self.tactile, TactileModule) else None
+        clip = self._clip(modality)
+        if "trained_on" not in clip.card:
+            return None
+        return Origin(clip.name, clip.card["license"], tuple(clip.card["trained_on"]))
 
     def halve(self) -> float:
         """Round all weights to 16 bits in place; see ``models.round_to_half``."""

@@ -25,6 +25,7 @@ import pickle
 import re
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -64,7 +65,7 @@ UNREADABLE = (
 )
 #: What palpate's saved folders hold, and the small files of a single model.
 PATTERNS = ("*.json", "*.txt", "*.md", "*.safetensors")
-SMALL_FILES = ("config.json", "palpate.json", "preprocessor_config.json")
+SMALL_FILES = ("README.md", "config.json", "palpate.json", "preprocessor_config.json")
 #: Settings of a transformers or diffusers model that decide what it computes; others name files or
 #: versions.
 ARCHITECTURE = """
@@ -79,6 +80,21 @@ ARCHITECTURE = """
     out_channels resnet_time_scale_shift scaling_factor time_embedding_type timestep_post_act
     transformer_layers_per_block up_block_types use_linear_projection vq_embed_dim
 """.split()  # noqa: SIM905 - readable as a list of words
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What is known of an encoder that others trained.
+
+    Attributes:
+        name: of the encoder.
+        license: of its weights; ``unknown`` without a word on it.
+        trained_on: data sets whose images it has seen, by its authors.
+    """
+
+    name: str
+    license: str
+    trained_on: tuple[str, ...]
 
 
 def shipped_root() -> Path:
@@ -185,6 +201,19 @@ def find_single(source: str | Path, part: Part, what: str, fix: str) -> tuple[st
         return str(source), _fetch(str(source), SMALL_FILES, what, fix)
     folder = find_model(source, part, what, fix)
     return str(folder), folder
+
+
+def stated(folder: Path) -> dict[str, Any]:
+    """License and data sets of a model of others, by the head of its card (``README.md``)."""
+    from huggingface_hub.repocard import metadata_load
+
+    try:
+        head = metadata_load(folder / "README.md") or {}
+    except Exception:  # no card, or one of broken YAML: neither keeps a model from its use
+        head = {}
+    terms, sets = head.get("license_name") or head.get("license"), head.get("datasets") or []
+    terms, sets = (v if isinstance(v, list) else [v] for v in (terms or "unknown", sets))
+    return {"license": ", ".join(map(str, terms)), "trained_on": [str(v) for v in sets if v]}
 
 
 def _fetch(name: str, patterns: Sequence[str], what: str, fix: str) -> Path:

@@ -38,7 +38,7 @@ from torch.nn.functional import gelu, normalize, scaled_dot_product_attention
 from transformers import CLIPVisionConfig, CLIPVisionModel
 
 from palpate.core import PalpateError
-from palpate.encoders.models import UNREADABLE, first_line
+from palpate.encoders.models import UNREADABLE, Origin, first_line
 from palpate.encoders.preprocess import Preprocess
 
 State = Mapping[str, Tensor]
@@ -53,21 +53,15 @@ HEAD = 64
 
 
 @dataclass(frozen=True)
-class Format:
+class Format(Origin):
     """A public encoder.
 
     Attributes:
-        name: of the encoder.
-        license: of its weights.
-        trained_on: data sets whose images it has seen, by its authors.
         prefix: of the names of its weights; others are not read. '' reads all.
         mark: a name after the prefix by which it is recognized.
         build: makes the module for given weights.
     """
 
-    name: str
-    license: str
-    trained_on: tuple[str, ...]
     prefix: str
     mark: str
     build: Callable[[State], TactileModule]

@@ -727,7 +727,7 @@ def load_encoders(encoder: Any, progress: Progress) -> Any:
         find_encoder(part)  # a wrong name answers at once; torch takes seconds to import
     from palpate.encoders.encoder_set import EncoderSet
 
-    return EncoderSet.load(encoder)
+    return EncoderSet.load(encoder, device="auto")
 
 
 def guard(
@@ -747,7 +747,7 @@ def guard(
 
     Args:
         encoders: the set.
-        modality: whose encoder judges them, ``vision`` or ``tactile``.
+        modality: whose encoder judges; of a text encoder no image is known.
         images: what is judged: a manifest, or (n, h, w, 3) uint8.
         split: of which ``images`` are the test part.
         allow_seen: add a note where the guard would raise.
@@ -764,9 +764,9 @@ def guard(
     judged: Any = [*map(Image.fromarray, images)] if isinstance(images, np.ndarray) else images
     dataset = str(getattr(images, "facts", {}).get("dataset") or "")
     notes: list[Note] = []
-    public = encoders.public(modality)
+    origin = encoders.origin(modality)
     seen = encoders.saw(modality, judged, progress=progress)
-    trained_on = public.trained_on if public else ()
+    trained_on = origin.trained_on if origin else ()
     declared = [name for name in trained_on if name.lower() in dataset.lower()]
     if seen.any():
         params = {"modality": modality, "seen": int(seen.sum()), "n": len(seen)}
@@ -785,15 +785,15 @@ def guard(
             "Judge other images or use another encoder, or allow it: every score then says so",
             example={"allow_seen": True},
         )
-    if public:
-        params = {"modality": modality, "name": public.name, "license": public.license}
+    if origin:
+        params = {"modality": modality, "name": origin.name, "license": origin.license}
         notes.append(Note("encoder-license", params))
     if modality != "tactile":
         return notes
     card, simulated = encoders.card, getattr(images, "synthetic", None)
     if card.get("synthetic") and not simulated:
         notes.append(Note("synthetic-encoder", {"real": simulated is False}))
-    unknown = not trained_on and not encoders.knows_seen(modality)
+    unknown = origin is None and not encoders.knows_seen(modality)
     if split is not None and unknown and card.get("split") != split.digest:
         known = card.get("split") is not None
         notes.append(Note("encoder-of-other-split" if known else "encoder-without-split"))

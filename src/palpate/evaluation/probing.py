@@ -102,7 +102,8 @@ def probe(  # noqa: PLR0913 - one argument a choice
         encoder: name or folder of a set of encoders, or an ``EncoderSet``. Several, as a list or
             name -> encoders, are compared; not together with several splits.
         modality: whose encoder.
-        label: columns to predict; those that the data lack are left out, with a note.
+        label: columns to predict; those that the data lack, or that have one value in train, are
+            left out, with a note.
         group: column whose values stay together in cross-validation and intervals; ``auto`` takes
             what the split kept whole, else the video.
         neighbors: k of k-NN.
@@ -122,8 +123,8 @@ def probe(  # noqa: PLR0913 - one argument a choice
         class; retrieval in both directions within the test part; and paired differences.
 
     Raises:
-        PalpateError: if train has fewer than two classes, nothing can be measured, images are
-            missing or unreadable, or the encoder was trained on test images.
+        PalpateError: if nothing can be measured, images are missing or unreadable, or the encoder
+            was trained on test images.
     """
     require_choice("modality", modality, ("tactile", "vision"))
     manifest = load_manifest(data)
@@ -221,13 +222,13 @@ def measure(
         if missing := len(parts[1]) - len(ids):
             result.notes.append(Note("probe-some-partners", {"modality": other, "count": missing}))
         test = parts[1].take(ids)
-        notes += guard(encoders, other, test, **how) if other != "text" else []
+        notes += guard(encoders, other, test, **how)
         pair = features[1].take(ids), embed(test, encoders, other, **options)
         _retrieve(result, test, *pair, other, plan=plan, common=common)
     if not result.means:
-        must = "There must be a label, or another modality to retrieve"
+        must = "There must be a label of two classes, or another modality to retrieve"
         fix = "Name a column with labels, or add texts or photos"
-        raise PalpateError(must, "neither in the test part", fix, argument="label")
+        raise PalpateError(must, "neither", fix, example={"label": "material"})
     noted = lambda score: replace(score, notes=[*score.notes, *notes])  # noqa: E731
     result.means = [replace(mean, score=noted(mean.score)) for mean in result.means]
     result.medians = [noted(score) for score in result.medians]
@@ -249,6 +250,9 @@ def _classify(
     if lacking := [name for name, column in zip(names, values, strict=True) if not any(column)]:
         note = {"label": label, "part": " and ".join(lacking)}
         result.notes.append(Note("probe-no-label", note))
+        return
+    if len(only := {*values[0]} - {""}) == 1:
+        result.notes.append(Note("probe-one-class", {"label": label, "only": only.pop()}))
         return
     if without := values[1].count(""):
         result.notes.append(Note("probe-unlabeled", {"label": label, "count": without}))

@@ -612,7 +612,7 @@ class _Run:
 
         real, manifest = self.inputs.reference.manifest, samples.manifest
         assert manifest is not None
-        needy = self.encoders.preprocess("tactile").subtract or self.encoders.public("tactile")
+        needy = self.encoders.preprocess("tactile").subtract or self.encoders.origin("tactile")
         if real is None or not needy or "sensor" in manifest.filled().columns:
             return manifest
         gels = [gel and str(real.path(gel).resolve()) for gel in real.column("background")]

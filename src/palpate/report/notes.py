@@ -377,7 +377,12 @@ LEAKAGE: dict[str, Sentence] = {
         "What leaking costs was not measured: without contact, or with images that are similar, "
         "a classifier recognizes recordings by the drift of the sensor, not materials"
     ),
-    "impact-failed": "What leaking costs could not be measured: {reason}",
+    "impact-failed": lambda p, style: " ".join(
+        [
+            f"What leaking costs could not be measured: {p['reason']}",
+            *(f"E.g. {style:{name}={value}}" for name, value in p.get("example", {}).items()),
+        ]
+    ),
     "missing-materials": _listed(
         "Could be in every part, but not together with the others: {materials}"
     ),
@@ -449,9 +454,10 @@ EVALUATION: dict[str, Sentence] = {
     "probe-no-label": "The samples have no {label} in {part}: nothing was predicted from it",
     "probe-unlabeled": "{count} test samples without a {label} are excluded from its accuracy",
     "probe-unseen-classes": lambda p, _: (
-        f"{p['subject']}: test samples of a {p['label']} that train lacks count as wrong "
+        f"{p['subject']}: test samples whose {p['label']} train lacks count as wrong "
         f"({few(p['classes'])})"
     ),
+    "probe-one-class": "All train samples have the {label} {only!r}: there is nothing to classify",
     "probe-no-encoder": "These encoders include none of {modality}: no retrieval with it",
     "probe-no-partner": "The test samples have no {modality}: no retrieval with it",
     "probe-some-partners": (
@@ -516,7 +522,10 @@ EVALUATION: dict[str, Sentence] = {
         "The {modality} encoder was trained on {dataset}: it may have seen the images that it "
         "judges here"
     ),
-    "encoder-license": "The {modality} encoder is {name}, whose weights are under {license}",
+    "encoder-license": lambda p, _: (
+        f"The {p['modality']} encoder is {p['name']}, whose license is "
+        + ("not stated: see its page" if p["license"] == "unknown" else p["license"])
+    ),
     "encoder-of-other-split": (
         "The tactile encoder was trained on another split: it may have seen test samples"
     ),
