@@ -134,13 +134,17 @@ def test_splits_are_compared_with_pools_of_one_size(manifest, encoders):
 def test_several_labels_and_rows_without_one(manifest, split, encoders):
     rng = np.random.default_rng(0)
     hard = [None if k % 5 == 0 else str(rng.integers(2)) for k in range(len(manifest))]
-    table = with_columns(manifest, hardness=pl.Series(hard, dtype=pl.String))
-    results = probe(table, split, encoder=encoders, label=["material", "hardness"], top=())
+    table = with_columns(
+        manifest, hardness=pl.Series(hard, dtype=pl.String), sensor=pl.lit("DIGIT")
+    )
+    labels = ["material", "hardness", "sensor"]
+    results = probe(table, split, encoder=encoders, label=labels, top=())
     known = sum(
         v is not None for v, i in zip(hard, table.ids, strict=True) if split.parts[i] == "test"
     )
     assert results["hardness accuracy", "real"].n == known
-    assert "probe-unlabeled" in {note.code for note in results.notes}
+    assert [note.code for note in results.notes] == ["probe-unlabeled", "probe-one-class"]
+    assert not [s for s in results if "sensor" in s.metric]
     assert results["material accuracy", "real"].n == 24
 
 
@@ -182,7 +186,7 @@ def test_a_vision_encoder_needs_no_tactile_encoder(manifest, split):
         ({"top": (0, 1)}, "`top` must be ranks from 1"),
         ({"pool": 100}, "`pool` must lie in 2 to 24"),
         ({"encoder": []}, "`encoder` must hold at least one"),
-        ({"label": "session", "top": ()}, "a label, or another modality"),
+        ({"label": "session", "top": ()}, "a label of two classes, or another"),
     ],
 )
 def test_what_cannot_be_probed_is_refused(manifest, split, encoders, options, match):

@@ -5,16 +5,19 @@ import os
 import signal
 import subprocess
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from palpate.cli import main
+from palpate.cli.presets import EncoderPresetName
 from palpate.core import PalpateError, Split
 from palpate.data import Manifest
 
 pytest.importorskip("torch")
+from palpate.encoders.presets import PRESETS
 from palpate.studies.split_study import compare_splits
 
 
@@ -100,6 +103,10 @@ def test_a_killed_study_ends_as_one_that_was_not(data, tmp_path):
     splits = [tmp_path / "orig.json", tmp_path / "noleak.json"]
     whole = compare_splits(data, splits, work=tmp_path / "whole", preset="tiny", seeds=(0, 1))
     assert [s["value"] for s in scores] == [s.value for s in whole]
+
+
+def test_every_preset_of_train_encoder_is_taken():
+    assert set(get_args(EncoderPresetName)) == set(PRESETS)
 
 
 def test_a_study_needs_seeds_and_either_encoders_or_training(data, tmp_path, capsys, monkeypatch):

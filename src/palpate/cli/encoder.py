@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.presets import Machine, preset_flags, print_plan, with_flags
+from palpate.cli.presets import EncoderPresetName, Machine, preset_flags, print_plan, with_flags
 from palpate.cli.terminal import Common, OutPath, Switch, Terminal, require_extra
 from palpate.encoders.presets import PRESETS, EncoderPreset
 
@@ -29,7 +29,7 @@ class Options(Common):
     clip: str | None = None
     """Hub id or folder of a pretrained CLIP, or palpate/mini. Default: the preset's, or a small one
     that is trained first on the same train part."""
-    preset: Literal["mini", "tiny", "tvl-tiny", "tvl-small", "tvl-base", "paper"] = "mini"
+    preset: EncoderPresetName = "mini"
     """Size and course; `tvl-*` are TVL's and `paper` is the paper's, for GPUs."""
     epochs: float | None = None
     """Default: the preset's."""

@@ -18,6 +18,8 @@ import tyro
 from palpate.cli.terminal import Switch, Terminal
 from palpate.training.options import Compute, LoopOptions, changed
 
+#: Presets of ``palpate train encoder``.
+EncoderPresetName = Literal["mini", "tiny", "tvl-tiny", "tvl-small", "tvl-base", "paper"]
 #: Fields that have another name on the command line.
 WORDS = {"batch": "batch_size"}
 

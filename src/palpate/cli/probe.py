@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from palpate.cli.presets import EncoderPresetName, Machine
 from palpate.cli.terminal import (
     Common,
     OptionalOutPath,
@@ -27,7 +28,7 @@ class Training:
 
     train: Switch = False
     """Train and score one encoder for each split and seed. Run again to resume."""
-    preset: Literal["mini", "tiny", "paper"] = "mini"
+    preset: EncoderPresetName = "mini"
     """As in `palpate train encoder`."""
     clip: str | None = None
     """As in `palpate train encoder`."""
@@ -37,8 +38,6 @@ class Training:
     """One training each; intervals are over videos and seeds."""
     work: Path = Path("runs/probe")
     """Folder of the trained encoders and caches, kept for the next run."""
-    device: str = "auto"
-    """auto, cpu, cuda, mps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +80,8 @@ class Options(Common):
     seed: int = 0
     """Of the folds of the cross-validation, pools and the queries on the page."""
     training: Training = field(default_factory=Training)
+    machine: Machine = field(default_factory=Machine)
+    """How to train on the machine at hand."""
 
 
 def run(options: Options, terminal: Terminal) -> dict[str, Any]:
@@ -102,8 +103,9 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         if training.train:
             from palpate.studies.split_study import compare_splits
 
-            more = ("preset", "clip", "epochs", "seeds", "work", "device")
+            more = ("preset", "clip", "epochs", "seeds", "work")
             arguments |= {name: getattr(training, name) for name in more}
+            arguments |= {name: getattr(options.machine, name) for name in ("device", "compute")}
             arguments["print_line"] = terminal.print_line
             results = compare_splits(
                 options.manifest, list(options.split), progress=progress, **arguments

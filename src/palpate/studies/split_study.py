@@ -14,6 +14,7 @@ from typing import Any
 
 from palpate.core import PalpateError, Progress, Split, locked, quiet
 from palpate.encoders import EncoderSet, train_encoder
+from palpate.encoders.encoder_set import load_clip
 from palpate.evaluation.probing import (
     Plan,
     Probed,
@@ -25,6 +26,7 @@ from palpate.evaluation.probing import (
 )
 from palpate.report.results import Results
 from palpate.studies.stages import Run
+from palpate.training.options import Compute
 
 
 def compare_splits(
@@ -37,6 +39,7 @@ def compare_splits(
     epochs: float | None = None,
     seeds: Sequence[int] = (0, 1, 2),
     device: str = "auto",
+    compute: Compute | None = None,
     print_line: Callable[[str], None] = lambda line: None,
     progress: Progress = quiet,
     **options: Any,
@@ -52,6 +55,7 @@ def compare_splits(
         epochs: see :func:`palpate.train_encoder`.
         seeds: one training each.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        compute: how to train on the machine at hand; see :func:`palpate.train_encoder`.
         print_line: called with one line a training.
         progress: called with what is done.
         options: of probing; see :func:`palpate.probe`.
@@ -73,6 +77,7 @@ def compare_splits(
     plan = Plan(**options, allow_seen=True, axis=axis, trained=True)
     plan = plan_of(manifest, loaded, plan)
     training: dict[str, Any] = {"preset": preset, "clip": clip, "epochs": epochs, "device": device}
+    frozen = {} if clip is None else _digests(clip)
     runs: dict[str, list[Probed]] = {}
     facts: dict[str, dict[str, Any]] = {}
     with locked(folder):
@@ -86,13 +91,20 @@ def compare_splits(
                 ) -> dict[str, Any]:
                     output = place / "encoders"
                     encoders = train_encoder(
-                        manifest, split, output=output, seed=number, progress=progress, **training
+                        manifest,
+                        split,
+                        output=output,
+                        seed=number,
+                        compute=compute,
+                        progress=progress,
+                        **training,
                     )
                     return {"tactile": encoders.digest("tactile")}
 
                 inputs = {"manifest": manifest.digest, "split": split.digest, "seed": number}
+                inputs |= frozen
                 done = run.stage(stage, inputs | training, build)
-                encoders = EncoderSet.load(done.folder / "encoders")
+                encoders = EncoderSet.load(done.folder / "encoders", device=device)
                 facts[stage] = {"encoder": done.facts["tactile"], "seconds": done.seconds}
                 probed = measure(
                     manifest, split, encoders, name, plan, cache=folder / "cache", progress=progress
@@ -100,5 +112,13 @@ def compare_splits(
                 runs.setdefault(name, []).append(probed)
     results = results_of("Encoders trained on each split", runs, plan, manifest, loaded)
     settings = {**training, "preset": getattr(preset, "name", preset), "seeds": list(seeds)}
+    settings |= frozen
     more = {"training": settings, "trainings": facts}
     return replace(results, settings={**results.settings, **more})
+
+
+def _digests(clip: str) -> dict[str, str]:
+    """Digests of frozen encoders: another model of one name makes other stages."""
+    encoders = load_clip(clip)
+    modalities = ("vision", "text") if encoders.tokenizer is not None else ("vision",)
+    return {f"{modality} encoder": encoders.digest(modality) for modality in modalities}
