@@ -18,7 +18,7 @@ SIGNATURES = {
     "audit": (
         "train_or_data test * split pretrain by near_frames identity images modalities "
         "false_positives encoder impact name worst cache threads root reading ids_in_time "
-        "skip_bad progress"
+        "skip_bad progress allow_seen"
     ),
     "caption": (
         "data output * server model local template prompt per crop concurrency timeout max_tokens "

@@ -53,6 +53,8 @@ class Comparison:
     """Trained encoders (a folder or an id) whose embeddings replace the images."""
     impact: Switch = False
     """Also measure what leaking costs in material accuracy."""
+    allow_seen: Switch = False
+    """Measure it by an encoder that was trained on some of the samples; every output says so."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import inspect
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any
 
-from palpate.core import FeatureSet, Progress, Split, quiet
+from palpate.core import FeatureSet, Note, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
+from palpate.evaluation.guard import guard
 from palpate.leakage.auditing import audit as audit_leakage
 from palpate.report.results import Audit, Impact
+
+if TYPE_CHECKING:
+    from palpate.encoders.encoder_set import EncoderSet
 
 
 def audit(
@@ -18,6 +24,7 @@ def audit(
     *,
     encoder: str | Path | None = None,
     impact: bool = False,
+    allow_seen: bool = False,
     cache: str | Path | None = None,
     progress: Progress = quiet,
     **options: Any,
@@ -29,6 +36,8 @@ def audit(
         test: the test samples.
         encoder: an id, or a folder, of encoders whose embeddings replace the images.
         impact: measure what leaking costs in material accuracy, too; needs ``split``.
+        allow_seen: measure it by embeddings of an encoder that was trained on some of the samples;
+            every output says so.
         cache: folder that keeps decoded images and embeddings.
         progress: callback.
         options: of :func:`palpate.leakage.audit`.
@@ -38,31 +47,37 @@ def audit(
     """
     folder = None if cache is None else Path(cache)
 
-    def embed(samples: Manifest, modality: str) -> FeatureSet:
-        from palpate.encoders.embed import embed as embed_samples
+    @lru_cache
+    def encoders() -> EncoderSet:
         from palpate.encoders.encoder_set import EncoderSet
 
-        encoders = EncoderSet.load(str(encoder))
-        return embed_samples(
-            samples, encoders, cast("Any", modality), cache=folder, progress=progress
-        )
+        return EncoderSet.load(str(encoder))
+
+    def embed(samples: Manifest, modality: Any) -> FeatureSet:
+        from palpate.encoders.embed import embed as embed_samples
+
+        return embed_samples(samples, encoders(), modality, cache=folder, progress=progress)
 
     def measure(samples: Manifest, split: Split, group: str, name: str) -> Impact:
         from palpate.evaluation.impact import impact as measure_impact
 
         features: Any = "pixels"
-        if encoder is not None:
-            known = [m for m in MODALITIES if samples.table[m].null_count() < len(samples)]
-            features = {f"{m} encoder": embed(samples, m) for m in known}
-        return measure_impact(
-            samples,
-            split,
-            group=group,
-            features=features,
-            name=name,
-            cache=folder,
-            progress=progress,
-        )
+        notes: list[Note] = []
+        if encoder is not None:  # every sample is in the test part of some leak-free split
+            judged = samples.take([i for part in ("train", "test") for i in split.ids(part)])
+            there = [m for m in MODALITIES if judged.table[m].null_count() < len(judged)]
+            known: list[Any] = [m for m in there if m in encoders().modalities]
+            how: Any = {"allow_seen": allow_seen, "progress": progress}
+            features = {}
+            for m in known:
+                notes += (new := guard(encoders(), m, judged, **how))
+                seen = any(note.code.startswith("seen-") for note in new)
+                # In its name, so that headline, table and plot are marked, too.
+                mark = ", trained on some of these images" if seen else ""
+                features[f"{m} encoder{mark}"] = embed(samples, m)
+        how = {"features": features, "name": name, "cache": folder, "progress": progress}
+        result = measure_impact(samples, split, group=group, **how)
+        return replace(result, notes=[*notes, *result.notes])
 
     return audit_leakage(
         train_or_data,
@@ -75,9 +90,10 @@ def audit(
     )
 
 
-# In the order of leakage.audit, with the types of the two that differ.
+# In the order of leakage.audit, with the types of the two that differ, and the one more.
 _SIGNATURE = inspect.signature(audit_leakage)
 _TYPED = inspect.signature(audit).parameters
+_ALL = {**_SIGNATURE.parameters, "allow_seen": _TYPED["allow_seen"]}
 audit.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
-    parameters=[_TYPED.get(name, p) for name, p in _SIGNATURE.parameters.items()]
+    parameters=[_TYPED.get(name, p) for name, p in _ALL.items()]
 )

@@ -191,7 +191,8 @@ def audit(  # noqa: PLR0913
             try:
                 result = replace(result, impact=impact(whole, parted, result.group, title))
             except PalpateError as error:  # the audit itself must not be lost
-                notes.append(Note("impact-failed", {"reason": str(error)}))
+                bare = PalpateError(*error.args, argument=error.argument)
+                notes.append(Note("impact-failed", {"reason": f"{bare}", "example": error.example}))
     if pretrain is not None:
         title = f"{_name(pretrain, 'pretraining')} / test"
         against = _compare(parts[-1], test_part, options, title, against="pretraining")

@@ -158,6 +158,7 @@ def audit_text(audit: Audit, style: Style = PYTHON) -> str:
     lines += [sentence(note, style) for note in audit.notes]
     if audit.impact is not None:
         lines.append(audit.impact.headline)
+        lines += [f"  {sentence(note, style)}" for note in audit.impact.notes]
     return "\n".join([*lines, *(audit_text(other, style) for other in audit.others)])
 
 
