@@ -29,7 +29,7 @@ from palpate.studies.stages import Run
 from palpate.training.options import Compute
 
 
-def compare_splits(
+def compare_splits(  # noqa: PLR0913 - those of training
     data: Any,
     splits: Any,
     *,
