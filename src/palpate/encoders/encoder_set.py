@@ -177,12 +177,15 @@ class ClipEncoders:
     def digest(self, modality: str) -> str:
         """SHA-256 of the vision or the text encoder."""
         config, model = _config(self.model), self.model
-        if modality == "vision" and self.family == "clip":
-            return vision_digest(model, config.vision_config, self.preprocess)
         if modality == "vision":
-            facts = {"preprocess": self.preprocess.facts, "family": self.family}
+            facts: dict[str, Any] = {"preprocess": self.preprocess.facts}
             facts |= architecture(getattr(config, "vision_config", config))
-            return digest_modules({"tower": getattr(model, "vision_model", model)}, facts)
+            parts = {"tower": getattr(model, "vision_model", model)}
+            if self.family == "clip":
+                parts |= {"projection": model.visual_projection}
+            else:
+                facts |= {"family": self.family}
+            return digest_modules(parts, facts)
         facts = {"tokenizer": _tokenizer_digest(self.tokenizer)}
         facts |= architecture(config.text_config)
         parts = {"tower": model.text_model}
@@ -529,12 +532,6 @@ def new_tactile(config: CLIPVisionConfig, seed: int) -> CLIPVisionModelWithProje
 def encode_tactile(tactile: nn.Module, pixels: Tensor) -> Tensor:
     """Preprocessed pixels (n, 3, size, size) to (n, dim), L2-normalized; differentiable."""
     return normalize(tactile(pixel_values=pixels).image_embeds, dim=-1)
-
-
-def vision_digest(model: Any, config: Any, preprocess: Preprocess) -> str:
-    """SHA-256 of a CLIP vision encoder with its projection."""
-    parts = {"tower": model.vision_model, "projection": model.visual_projection}
-    return digest_modules(parts, {"preprocess": preprocess.facts, **architecture(config)})
 
 
 def require_files(folder: Path, files: Mapping[str, Sequence[str]], fix: str) -> None:

@@ -46,6 +46,8 @@ Images = NDArray[np.uint8]
 Name = Literal["fid", "kid", "prdc", "cmmd", "ssim", "psnr", "ms-ssim", "contact", "lpips"]
 #: With more rows the companions that form all pairs must be requested by name.
 MANY = 50_000
+#: The CLIP of published CMMD (arXiv 2401.09603).
+CMMD_CLIP = "openai/clip-vit-large-patch14-336"
 #: Pairs whose contacts are cut out at a time.
 BATCH = 256
 
@@ -217,11 +219,11 @@ def _require(
     if name in FEATURES and not (encoder or standard):
         fix = "Pass an encoder"
         if name != "prdc":
-            from palpate.encoders.standard import CLIP_FIX, INCEPTION_FIX
+            from palpate.encoders.inception import FIX
 
             kind = weights.for_features(name)[0]
-            weights_fix = {"inception": INCEPTION_FIX, "clip": CLIP_FIX}[kind]
-            fix = f"{fix}, or weights of {kind}. {weights_fix}"
+            where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
+            fix = f"{fix}, or weights of {kind}. {where[kind]}"
         must = "must need no features of images without an encoder"
         raise PalpateError(must, name, fix, example={"encoder": "palpate/mini"}, **argument)
 

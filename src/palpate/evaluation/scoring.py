@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -666,20 +667,25 @@ class _Run:
         reference: Any,
     ) -> Features:
         """The same sets with features of Inception or CLIP."""
-        from palpate.encoders.standard import load_standard
-
         name, source = kind
-        encoder = load_standard(str(source), kind=name)
-        embedded = {
-            n: s.feature_set(encoder.embed(images[n], progress=self.progress), encoder.digest)
-            for n, s in subjects.items()
-        }
-        real = encoder.embed(reference, progress=self.progress)
+        if name == "inception":
+            from palpate.encoders.inception import load_inception
+
+            inception = load_inception(str(source))
+            embed, digest = partial(inception.embed, progress=self.progress), inception.digest
+        else:
+            from palpate.encoders.embed import embed_images
+            from palpate.encoders.encoder_set import EncoderSet, load_clip
+
+            clip = EncoderSet(load_clip(str(source)))
+            options: dict[str, Any] = {"modality": "vision", "progress": self.progress}
+            embed, digest = partial(embed_images, encoders=clip, **options), clip.digest("vision")
+        embedded = {n: s.feature_set(embed(images[n]), digest) for n, s in subjects.items()}
         return replace(
             features,
             generators={n: embedded[n] for n in features.generators},
             controls={n: embedded[n] for n in features.controls},
-            reference=self.inputs.reference.feature_set(real, encoder.digest),
+            reference=self.inputs.reference.feature_set(embed(reference), digest),
             name={"inception": "Inception", "clip": "CLIP"}[name],
         )
 

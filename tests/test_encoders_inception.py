@@ -1,0 +1,137 @@
+"""Inception from a local TorchScript file; its digest."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from palpate.core import FeatureSet, PalpateError
+from palpate.encoders.inception import load_inception
+
+
+def embed(images, path, **options):
+    encoder = load_inception(path)
+    return encoder.embed(images, **options), encoder.digest
+
+
+class Pooled(torch.nn.Module):
+    """As the published file: logits, or with a keyword the pooled features of uint8 images."""
+
+    def __init__(self, width: int = 5):
+        super().__init__()
+        self.conv = torch.nn.Conv2d(3, width, 3)
+        self.out = torch.nn.Linear(width, 11)
+
+    def forward(self, img: torch.Tensor, return_features: bool = False) -> torch.Tensor:
+        x = self.conv(img.to(torch.float32) / 127.5 - 1).relu().mean(dim=[2, 3])
+        return x if return_features else self.out(x)
+
+
+class Plain(torch.nn.Module):
+    def forward(self, img: torch.Tensor) -> torch.Tensor:
+        return img.to(torch.float64).mean(dim=[2, 3], keepdim=True)
+
+
+class Flat(torch.nn.Module):
+    def forward(self, img: torch.Tensor) -> torch.Tensor:
+        return img.to(torch.float32).mean()
+
+
+def script(module, path):
+    torch.manual_seed(0)
+    torch.jit.script(module.eval()).save(str(path))
+    return path
+
+
+@pytest.fixture
+def images():
+    return np.random.default_rng(0).integers(0, 256, (7, 20, 24, 3)).astype(np.uint8)
+
+
+def test_inception_features_are_those_of_the_module_called_for_features(tmp_path, images):
+    torch.manual_seed(1)
+    module = Pooled().eval()
+    path = script(module, tmp_path / "inception.pt")
+    result, digest = embed(images, path, batch=3)
+    # An independent convolution: windows and sums in float64.
+    weight, bias = (
+        p.detach().numpy().astype(np.float64) for p in (module.conv.weight, module.conv.bias)
+    )
+    windows = np.lib.stride_tricks.sliding_window_view(images / 127.5 - 1, (3, 3), axis=(1, 2))
+    expect = np.maximum(
+        np.einsum("nhwcij,ocij->nohw", windows, weight) + bias[:, None, None], 0
+    ).mean(axis=(2, 3))
+    assert result.dtype == np.float32
+    np.testing.assert_allclose(result, expect, atol=1e-6)
+    np.testing.assert_allclose(embed(images, path, batch=64)[0], result, atol=1e-6)
+    assert len(digest) == 64
+    FeatureSet([str(i) for i in range(7)], result, encoder=digest)
+
+
+def test_a_module_without_the_keyword_and_with_maps_of_one_pixel_is_taken(tmp_path, images):
+    result, _ = embed(images, script(Plain(), tmp_path / "plain.pt"))
+    np.testing.assert_allclose(result, images.mean(axis=(1, 2)), rtol=1e-6)
+    traced = tmp_path / "traced.pt"
+    torch.jit.trace(Plain(), torch.zeros(2, 3, 8, 8, dtype=torch.uint8)).save(str(traced))
+    np.testing.assert_allclose(embed(images, traced)[0], result, rtol=1e-6)
+
+
+def test_the_digest_is_that_of_the_weights(tmp_path, images):
+    torch.manual_seed(2)
+    one = script(Pooled(), tmp_path / "one.pt")
+    same = tmp_path / "renamed.pt"
+    same.write_bytes(one.read_bytes())
+    torch.manual_seed(3)
+    other = script(Pooled(), tmp_path / "other.pt")
+    assert load_inception(one).digest == load_inception(same).digest != load_inception(other).digest
+
+
+class Bomb:
+    def __reduce__(self):
+        return (pytest.fail, ("unpickled",))
+
+
+def test_files_that_are_no_torchscript_are_rejected_and_never_unpickled(tmp_path):
+    with pytest.raises(
+        PalpateError, match=r"absent\.pt must be a file.*inception-2015-12-05\.pt .*https://nvlabs"
+    ):
+        load_inception(tmp_path / "absent.pt")
+    with open(tmp_path / "inception-v3.pkl", "wb") as file:
+        pickle.dump(Bomb(), file)
+    torch.save({"weight": torch.ones(2)}, tmp_path / "state.pth")
+    torch.save(Bomb(), tmp_path / "bomb.pth")
+    (tmp_path / "empty.pt").write_bytes(b"")
+    for name in ("inception-v3.pkl", "state.pth", "bomb.pth", "empty.pt"):
+        with pytest.raises(
+            PalpateError, match=f"{name} must be a TorchScript module.*pickles are never loaded"
+        ):
+            load_inception(tmp_path / name)
+
+
+def test_modules_that_give_no_features_are_rejected(tmp_path, images):
+    with pytest.raises(
+        PalpateError, match=r"must map 7 uint8 images to floats \(7, d\). Got Tensor of shape \(\)"
+    ):
+        embed(images, script(Flat(), tmp_path / "flat.pt"))
+    with pytest.raises(PalpateError, match="must map 7 uint8 images"):
+        embed(
+            images[:, :2, :2], script(Pooled(), tmp_path / "pooled.pt")
+        )  # smaller than its window
+
+
+def test_images_must_be_8_bit_rgb(tmp_path, images):
+    path = script(Plain(), tmp_path / "plain.pt")
+    for bad in (images / 255, images[0], images[..., :1]):
+        with pytest.raises(PalpateError, match=r"uint8 of shape \(n, h, w, 3\)"):
+            embed(bad, path)
+
+
+def test_progress_and_mapped_files(tmp_path, images):
+    np.save(tmp_path / "images.npy", images)
+    calls = []
+    mapped = np.load(tmp_path / "images.npy", mmap_mode="r")
+    path = script(Plain(), tmp_path / "plain.pt")
+    result, _ = embed(mapped, path, batch=3, progress=lambda *a, **_: calls.append(a[1:3]))
+    np.testing.assert_allclose(result, images.mean(axis=(1, 2)), rtol=1e-6)
+    assert calls == [(3, 7), (6, 7), (7, 7)]
