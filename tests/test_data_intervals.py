@@ -6,7 +6,6 @@ import pytest
 
 from data_fixtures import number, tree, write_frames, write_video
 from palpate.core import PalpateError, ProblemsError, Split
-from palpate.data.formats.touch_and_go import import_touch_and_go
 from palpate.data.images import read_image
 from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.listing import read_list
@@ -40,7 +39,7 @@ def test_intervals_give_what_a_frame_list_of_the_same_contacts_gives(tmp_path, r
     (root / "classes.txt").write_text("Wood: 3\nRock: 15\n")
     options = {"classes": root / "classes.txt"}
     result = import_dataset(root / "list.csv", tmp_path / "out", sensor="GelSight'17", **options)
-    expected = import_touch_and_go(root, tmp_path / "tag_out")
+    expected = import_dataset(root, tmp_path / "tag_out", format="touch-and-go")
     assert result.manifest.require_valid().digest == expected.manifest.digest
     assert result.inconclusive == 1  # intervals here, frames there
     frames = [*range(10, 16), *range(17, 20)]
@@ -207,5 +206,5 @@ def test_the_real_clips_by_intervals_are_those_by_frames(real_data, tmp_path):
     contacts.drop("contact").write_csv(path)
     result = import_dataset(path, tmp_path / "out", root=root, sensor="GelSight'17", size=64)
     assert len(result.manifest) == 436
-    expected = import_touch_and_go(root, tmp_path / "tag", size=64)
+    expected = import_dataset(root, tmp_path / "tag", size=64, format="touch-and-go")
     assert result.manifest.digest == expected.manifest.digest

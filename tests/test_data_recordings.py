@@ -6,8 +6,7 @@ import pytest
 import palpate.data.recordings as recordings
 from data_fixtures import tree, write_image
 from palpate.core import ProblemsError, Split
-from palpate.data.formats.touch_and_go import import_touch_and_go
-from palpate.data.importing import validate, write_lists
+from palpate.data.importing import import_dataset, validate, write_lists
 from palpate.data.manifest import Manifest
 from palpate.data.reading import read_samples
 from test_data_touch_and_go import make_recordings, shown
@@ -29,9 +28,9 @@ def test_validation_decodes_raw_videos_as_an_import_does(tmp_path):
     validation = validate(root)
     assert [p.kind for p in validation.invalid] == ["bad-video"]
     with pytest.raises(ProblemsError) as caught:
-        import_touch_and_go(root, tmp_path / "out")
+        import_dataset(root, tmp_path / "out", format="touch-and-go")
     assert list(caught.value.problems) == list(validation.invalid)
-    imported = import_touch_and_go(root, tmp_path / "out", skip_bad=True)
+    imported = import_dataset(root, tmp_path / "out", skip_bad=True, format="touch-and-go")
     assert validation.samples == len(imported.manifest) < 18
     assert validate(root, check="header").ok
     assert len(read_samples(root)[0]) == 18  # who only wants the samples waits for no decoding
@@ -42,13 +41,13 @@ def test_a_stray_number_costs_nothing_and_what_looks_wrong_reaches_the_user(tmp_
     lines = [f"a/{k:010d}.jpg,3" for k in range(3)]
     root = make_recordings(tmp_path / "tag", extracted=("a", "spare"), lines=lines)
     place = root / "dataset" / "a"
-    expected = import_touch_and_go(root, tmp_path / "expected").manifest
+    expected = import_dataset(root, tmp_path / "expected", format="touch-and-go").manifest
     for side in ("gelsight_frame", "video_frame"):
         write_image(place / side / "999999999999.jpg", 3)
         write_image(place / side / "99999999999999999999.jpg", 3)
     write_image(place / "video_frame" / "000001.jpg", 77)
     write_image(place / "video_frame" / "1.png", 78)
-    imported = import_touch_and_go(root, tmp_path / "out")
+    imported = import_dataset(root, tmp_path / "out", format="touch-and-go")
     assert imported.manifest.ids == expected.ids
     assert shown(imported.manifest, "vision") == [0, 1, 2]
     validation = validate(root)
@@ -84,10 +83,10 @@ def test_a_custom_table_of_classes_is_kept_for_the_lists_of_a_split(tmp_path):
     root = make_recordings(tmp_path / "tag", extracted=("a",))
     lines = sorted((root / "label.txt").read_text().splitlines())
     (root / "category_reference.txt").write_text("Mat 3: 3\nWood: 15\n")
-    manifest = import_touch_and_go(root, tmp_path / "out").manifest
+    manifest = import_dataset(root, tmp_path / "out", format="touch-and-go").manifest
     assert set(manifest.column("material")) == {"Mat 3", "Wood"}
     split = Split(dict.fromkeys(manifest.ids, "train"))
     (path,) = write_lists(Manifest.load(tmp_path / "out"), split, tmp_path / "lists")
     assert sorted(path.read_text().splitlines()) == lines
     (root / "category_reference.txt").unlink()
-    assert "classes" not in import_touch_and_go(root, tmp_path / "plain").facts
+    assert "classes" not in import_dataset(root, tmp_path / "plain", format="touch-and-go").facts

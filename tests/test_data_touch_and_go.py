@@ -1,6 +1,5 @@
 """Touch and Go: every layout, every kind of bad input, resume, backgrounds, and the real clips."""
 
-import shutil
 
 import numpy as np
 import polars as pl
@@ -10,8 +9,9 @@ from PIL import Image
 import palpate.data.recordings as recordings
 from data_fixtures import number, tree, write_frames, write_image, write_video
 from palpate.core import PalpateError, ProblemsError, Split
-from palpate.data.formats.touch_and_go import find_videos, import_touch_and_go, write_lists
+from palpate.data.formats.touch_and_go import find_videos, write_lists
 from palpate.data.images import read_image
+from palpate.data.importing import import_dataset
 from palpate.data.listing import read_list
 from palpate.data.manifest import Manifest
 
@@ -19,6 +19,10 @@ av = pytest.importorskip("av", reason="PyAV is not installed")
 
 #: Contacts of every recording of 40 frames: label 3 from 10 to 15, label 15 from 17 to 19.
 LABELS = {**dict.fromkeys(range(10, 16), 3), **dict.fromkeys(range(17, 20), 15)}
+
+
+def import_touch_and_go(root, out, **options):
+    return import_dataset(root, out, format="touch-and-go", overwrite=True, **options)
 
 
 def lines_of(video, frames, label=3):
@@ -63,7 +67,8 @@ def test_every_layout_gives_the_same_samples(tmp_path, layout, place):
     facts = {name: result.facts[name] for name in ("layout", "license", "text_source")}
     assert facts == {"layout": layout, "license": "CC BY 4.0", "text_source": "none"}
     assert manifest.column("text") == [None] * 18
-    assert manifest.root == (root if layout == "extracted" else tmp_path / "out").resolve()
+    roots = {"extracted": root, "raw": tmp_path / "out", "mixed": tmp_path}
+    assert manifest.root == roots[layout].resolve()
     again = Manifest.load(tmp_path / "out")
     assert again.digest == manifest.digest
     assert again.require_valid().root == manifest.root
@@ -207,16 +212,6 @@ def test_without_a_frame_before_the_contact_a_typical_one_is_the_background(tmp_
     nearest = {k for k, d in distance.items() if d == min(distance.values())}
     assert set(shown(Manifest(manifest.table[:8], manifest.root), "background")) <= nearest
     assert len(nearest) < 5
-
-
-def test_a_mixed_import_can_be_moved_as_one_folder(tmp_path):
-    root = make_recordings(tmp_path / "tag", raw=("a",), extracted=("b",))
-    result = import_touch_and_go(root, tmp_path / "out.partial")
-    (tmp_path / "out.partial").rename(tmp_path / "out")
-    shutil.rmtree(root)
-    again = Manifest.load(tmp_path / "out").require_valid()
-    assert again.digest == result.manifest.digest
-    assert shown(again, "tactile") == shown(again, "vision") == again.column("frame")
 
 
 def test_inconclusive_frames_and_other_lists_count_as_contact(tmp_path):

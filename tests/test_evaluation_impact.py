@@ -14,7 +14,7 @@ from PIL import Image
 
 from palpate.core import FeatureSet, PalpateError, ProblemsError, Split
 from palpate.core.records import from_plain
-from palpate.data.formats.touch_and_go import import_touch_and_go
+from palpate.data.importing import import_dataset
 from palpate.data.manifest import Manifest
 from palpate.evaluation import impact_features, impact_scores
 from palpate.evaluation.impact import impact
@@ -459,8 +459,8 @@ sys.exit("torch" in sys.modules)
 def test_the_five_real_clips_can_be_compared_by_contact_only(
     real_data: Path, tmp_path: Path
 ) -> None:
-    manifest = import_touch_and_go(
-        real_data / "touch_and_go" / "clips", tmp_path / "out", size=64
+    manifest = import_dataset(
+        real_data / "touch_and_go" / "clips", tmp_path / "out", size=64, format="touch-and-go"
     ).manifest
     split = by_frame(manifest, every=5)
     with pytest.raises(PalpateError, match=r"Got 0 of 5 .5 one video.*group='contact'"):

@@ -264,9 +264,11 @@ def test_many_rows_of_one_image_and_tiny_sets_are_answered(tmp_path):
 
 @pytest.mark.slow
 def test_real_clips_without_metadata(real_data, tmp_path):
-    from palpate.data.formats.touch_and_go import import_touch_and_go
+    from palpate.data.importing import import_dataset
 
-    manifest = import_touch_and_go(real_data / "touch_and_go" / "clips", tmp_path).manifest
+    manifest = import_dataset(
+        real_data / "touch_and_go" / "clips", tmp_path, format="touch-and-go"
+    ).manifest
     odd = np.arange(len(manifest)) % 2 == 1
     hidden = anonymous(manifest)
     part = lambda keep: Manifest(hidden.table.filter(pl.Series(keep)), hidden.root)  # noqa: E731

@@ -13,9 +13,10 @@ from palpate.data.formats.base import (
     MISSING,
     WORLD,
     Facts,
+    Into,
     Scan,
     finished,
-    import_scanned,
+    imported_of,
     manifest_of,
     world_facts,
 )
@@ -72,30 +73,28 @@ def import_dataset(
         must, fix = "must hold no manifest yet", "Choose another folder, or replace this one"
         example = {"overwrite": True}
         raise PalpateError(must, str(output), fix, argument="output", example=example)
-    common: dict[str, Any] = {"skip_bad": skip_bad, "check": check, "progress": progress}
+    common: dict[str, Any] = {"check": check, "progress": progress}
     texts = None if text is None else read_texts(Path(text))
     with locked(output), removing_on_error(output) as created:
-        if text is None or texts is None:
-            return _imported(source, output, format, common, options)
-        if format == "auto" and has_manifest(source):
+        if text is not None and format == "auto" and has_manifest(source):
             imported = reimported(source)
         else:
-            imported = _imported(source, output, format, common, options)
-            written = [output / "manifest.parquet", *(output / "splits").glob("*.json")]
-            created += [] if overwrite else written
-        return with_texts(imported, texts, Path(text)).save(output, created)
+            into = Into(output, created, skip_bad)
+            imported = _imported(source, format, into, common, options)
+        if text is not None and texts is not None:
+            imported = with_texts(imported, texts, Path(text))
+        return imported.save(output, created)
 
 
 def _imported(
-    source: Path, output: Path, given: str, common: dict[str, Any], options: dict[str, Any]
+    source: Path, given: str, into: Into, common: dict[str, Any], options: dict[str, Any]
 ) -> Imported:
     name, form = recognized(source, given, options)
-    options = _given(name, form, options)
-    if form.run is not None:
-        return form.run(source, output, **common, **options)
-    scan = form.scan(source, progress=common["progress"], **options)
+    scanning = scan_options(name, form, options | common)
+    scan = form.scan(source, **scanning, **({"into": into} if form.writes else {}))
     facts = {**form.facts.of_manifest(), "format": name}
-    return import_scanned(scan, source, output, facts, **common)
+    common = common | ({"check": "none"} if form.writes else {})  # they were checked on the way
+    return imported_of(scan, source, facts, skip_bad=into.skip_bad, **common)
 
 
 def validate(

@@ -7,7 +7,6 @@ sees everything that is wrong with a data set at once.
 from __future__ import annotations
 
 import os
-import shutil
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -32,7 +31,6 @@ from palpate.data.frames import (
 )
 from palpate.data.images import Check, check_image, in_threads
 from palpate.data.listing import FrameList, FrameTable
-from palpate.data.manifest import Manifest
 from palpate.data.streams import Finding, findings
 
 #: The background is this many frames before the contact.
@@ -119,7 +117,6 @@ class Recordings:
         background_frames: contact -> the frame before it that is its background, if there is one.
         typical_of: contacts without such a frame -> their recording.
         extracted: whether frames of videos are files by now.
-        moved: image -> its copy below ``out``, where some recordings are videos and others folders.
         modalities: those that every recording has.
     """
 
@@ -137,7 +134,6 @@ class Recordings:
     background_frames: dict[str, int] = field(default_factory=dict)
     typical_of: dict[str, str] = field(default_factory=dict)
     extracted: bool = False
-    moved: dict[Path, Path] = field(default_factory=dict)
     modalities: tuple[str, ...] = MODALITIES
 
     def open(self, rows: Sequence[Row], progress: Progress) -> list[Row]:
@@ -304,10 +300,7 @@ class Recordings:
         self.extracted = True
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
         there = lambda r, m: self.frames[r.video][m].path(r.frame).is_file()  # noqa: E731
-        rows = [row for row in rows if all(there(row, m) for m in self._videos_of(row))]
-        if self.layout(rows) == "mixed":
-            self._gather(rows)
-        return rows
+        return [row for row in rows if all(there(row, m) for m in self._videos_of(row))]
 
     def layout(self, rows: Iterable[Row]) -> str:
         """``raw`` if the frames are those of videos, ``extracted`` if of folders, or ``mixed``."""
@@ -375,21 +368,6 @@ class Recordings:
         self.backgrounds |= chosen
         self.problems.sort(key=place_of)
 
-    def _gather(self, rows: Sequence[Row]) -> None:
-        """Link (or copy) images of folders below ``out``, so that one root holds all."""
-        for row in rows:
-            for modality, path in self._folder_images(row):
-                target = self.out / "images" / row.video / modality / path.name
-                self.moved[path] = target
-                if target.is_file():
-                    continue
-                target.parent.mkdir(parents=True, exist_ok=True)
-                self.created.append(target)
-                try:
-                    os.link(path, target)
-                except OSError:
-                    shutil.copyfile(path, target)
-
     def _require_same_settings(self, jobs: Sequence[_Job]) -> None:
         """Record the settings of extracted frames; reject a folder with others."""
         videos = [job[:2] for job in jobs if self._is_video(*job[:2])]
@@ -436,7 +414,6 @@ class Recordings:
         def relative(frames: Frames, path: Path | None) -> str | None:
             if path is None or (isinstance(frames, VideoFrames) and not self.extracted):
                 return None
-            path = self.moved.get(path, path)
             return f"{folder(path.parent)}/{path.name}".removeprefix("./")
 
         tables = {name: table.values for name, table in (words or {}).items() if table is not None}
@@ -453,26 +430,23 @@ class Recordings:
             cells.append(values)
         return cells
 
-    def manifest(
-        self,
-        rows: Sequence[Row],
-        facts: Mapping[str, str],
-        sensor: str,
-        words: Mapping[str, FrameTable | None],
-    ) -> Manifest:
-        """The manifest of the rows.
-
-        Its root is the data set if all recordings are folders of frames, else ``out``.
-        """
-        layout = self.layout(rows)
-        root = (self.root if layout == "extracted" else self.out).resolve()
+    def facts(self, rows: Sequence[Row]) -> dict[str, str]:
+        """How the frames are stored, and how many contacts have which background."""
         kinds: Counter[str] = Counter()
         for contact in {row.contact for row in rows}:
             kind = "frame" if contact in self.background_frames else "typical"
             kinds[kind if contact in self.backgrounds else "none"] += 1
         backgrounds = ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()))
-        facts = {**facts, "layout": layout, "backgrounds": backgrounds}
-        return Manifest.from_rows(self.cells(rows, root, sensor, words), root, facts)
+        return {"layout": self.layout(rows), "backgrounds": backgrounds}
+
+    def base(self, rows: Sequence[Row]) -> Path:
+        """The folder that holds all images: the data set, ``out``, or the one around both."""
+        roots = {"extracted": [self.root], "raw": [self.out]}
+        return Path(
+            os.path.commonpath(
+                [p.resolve() for p in roots.get(self.layout(rows), [self.root, self.out])]
+            )
+        )
 
 
 def place_of(problem: Problem) -> tuple[str, int]:

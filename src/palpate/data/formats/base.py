@@ -3,7 +3,7 @@
 A format is one file with ``FACTS``, ``LOOKS_FOR``, ``detect``, ``scan`` and a ``FORMAT`` that joins
 them, named in ``palpate.data.formats.FORMATS``. The scan reads lists and folders and returns every
 row with everything that is wrong. An import and a validation share :func:`finished`, so both see
-the same problems. A format whose frames must be decoded first has a ``run``, too.
+the same problems. A format whose frames must be decoded or written first takes ``into``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 from palpate.core import Problem, Progress, Split, inside, quiet, read_json
 from palpate.data.images import Check, check_image, in_threads
-from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
+from palpate.data.imported import Imported, raise_if, require_some
 from palpate.data.manifest import IMAGE_COLUMNS, Manifest
 from palpate.data.recordings import place_of
 
@@ -137,6 +137,21 @@ class Scan:
             self.suspicious.append(Problem(str(where), kind, text))
 
 
+@dataclass(frozen=True)
+class Into:
+    """Where an import writes images that are no files yet.
+
+    Attributes:
+        out: its folder.
+        created: every new file is added here.
+        skip_bad: skip bad rows instead of raising before images are written.
+    """
+
+    out: Path
+    created: list[Path]
+    skip_bad: bool
+
+
 def few(names: Iterable[object]) -> str:
     """How many there are, and the first of them: ``"12: a, b, c ..."``, or ``"none"``."""
     names = [str(name) for name in names]
@@ -153,8 +168,8 @@ class Format:
         detect: whether a source looks like it; must be quick and must not raise.
         looks_for: what ``detect`` expects, for the error message.
         scan: ``scan(source, *, progress, ...) -> Scan``; further keywords are the format's options.
-        run: ``run(source, out, *, skip_bad, check, progress, ...) -> Imported``, for formats that
-            write images instead of pointing at them.
+            A format that writes images has ``into: Into | None``, None where nothing is written,
+            and ``check``.
         write_lists: ``write_lists(manifest, split, folder) -> files``: a split in the data set's
             own form, if it has one.
         remote: the source may be a name instead of a path on disk.
@@ -164,46 +179,47 @@ class Format:
     detect: Callable[[Path], bool]
     looks_for: str
     scan: Callable[..., Scan]
-    run: Callable[..., Imported] | None = None
     write_lists: Callable[[Manifest, Split, Path], list[Path]] | None = None
     remote: bool = False
 
     @property
     def options(self) -> list[str]:
         """The format's own keywords and the common ones."""
-        parameters = inspect.signature(self.run or self.scan).parameters.values()
-        names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+        parameters = inspect.signature(self.scan).parameters.values()
+        names = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name != "into"]
         return list(dict.fromkeys([*names, "skip_bad", "check", "progress"]))
 
+    @property
+    def writes(self) -> bool:
+        """Whether an import writes images, and does not point at those of the data set."""
+        return "into" in inspect.signature(self.scan).parameters
 
-def import_scanned(
+
+def imported_of(
     scan: Scan,
     source: Path,
-    out: Path,
     facts: Mapping[str, str],
     *,
     skip_bad: bool,
     check: Check,
     progress: Progress = quiet,
 ) -> Imported:
-    """Make a manifest of a scan and write it to ``out``; images stay where they are.
+    """A scan as an import that is not written yet.
 
     Raises:
-        ProblemsError: with every bad row and file, unless ``skip_bad``; nothing is written.
+        ProblemsError: with every bad row and file, unless ``skip_bad``.
         PalpateError: if no usable row is left.
     """
     rows = finished(scan, check, progress)
     raise_if(scan.problems, skip_bad)
     require_some(len(rows), source, scan.problems)
-    with removing_on_error(out) as created:
-        manifest = manifest_of(scan, rows, {**facts, **scan.facts})
-        ids = set(manifest.ids)
-        splits: dict[str, Split] = {}
-        for name, split in scan.splits.items():
-            if parts := {i: part for i, part in split.parts.items() if i in ids}:
-                splits[name] = Split(parts, split.rule, manifest.digest)
-        imported = Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious)
-        return imported.save(out, created)
+    manifest = manifest_of(scan, rows, {**facts, **scan.facts})
+    ids = set(manifest.ids)
+    splits: dict[str, Split] = {}
+    for name, split in scan.splits.items():
+        if parts := {i: part for i, part in split.parts.items() if i in ids}:
+            splits[name] = Split(parts, split.rule, manifest.digest)
+    return Imported(manifest, scan.problems, splits, scan.inconclusive, scan.suspicious)
 
 
 def manifest_of(scan: Scan, rows: Iterable[Row], facts: Mapping[str, str]) -> Manifest:

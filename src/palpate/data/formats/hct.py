@@ -196,7 +196,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return files
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
 
 
 def _is_rig(folder: Path) -> bool:

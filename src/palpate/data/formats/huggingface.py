@@ -31,10 +31,9 @@ import polars as pl
 from PIL import Image
 
 from palpate.core import PalpateError, Progress, atomic_path, inside, quiet
-from palpate.data.formats.base import Cells, Facts, Format, Scan, import_scanned
+from palpate.data.formats.base import Cells, Facts, Format, Into, Scan
 from palpate.data.formats.huggingface_source import ROW, Source, first_line, open_source
 from palpate.data.images import BROKEN, Check, opened
-from palpate.data.imported import Imported, removing_on_error
 from palpate.data.manifest import CLIMBS, IMAGE_COLUMNS, SCHEMA
 from palpate.data.mapping import ColumnMaps, compile_maps, text_of
 from palpate.data.rows import PART_NAMES, manifest_rows, odd_groups, read_classes
@@ -72,9 +71,10 @@ def scan(
     config: str | None = None,
     revision: str | None = None,
     check: Check = "decode",
+    into: Into | None = None,
     progress: Progress = quiet,
 ) -> Scan:
-    """Check a data set without writing anything; rows carry no paths of images.
+    """Read a data set; without ``into`` nothing is written, and rows carry no paths of images.
 
     Args:
         source: folder, or name on the hub.
@@ -83,6 +83,7 @@ def scan(
         config: which configuration of the data set.
         revision: of a hub data set: branch, tag or commit.
         check: how images are checked.
+        into: images go to its ``images``, which becomes the manifest's root.
         progress: called with the number of rows read.
 
     Raises:
@@ -90,43 +91,16 @@ def scan(
         MissingExtraError: if ``datasets`` is not installed.
     """
     opened = open_source(source, config, revision)
-    result = _scan(opened, columns or {}, classes, _Store(None, [], check), progress)
-    for _, row in result.rows:
+    folder, created = (into.out / "images", into.created) if into else (None, list[Path]())
+    result = _scan(opened, columns or {}, classes, _Store(folder, created, check), progress)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    for _, row in result.rows if folder is None else ():
         row |= dict.fromkeys(IMAGE_COLUMNS)
     return result
 
 
-def run(
-    source: Path,
-    out: Path,
-    *,
-    columns: Mapping[str, str] | None = None,
-    classes: Path | None = None,
-    config: str | None = None,
-    revision: str | None = None,
-    skip_bad: bool = False,
-    check: Check = "decode",
-    progress: Progress = quiet,
-) -> Imported:
-    """Import a data set; its images go to ``out/images``, which becomes the manifest's root.
-
-    The options are those of :func:`scan`; ``skip_bad`` skips and lists bad rows.
-
-    Raises:
-        PalpateError: if the source cannot be opened or lacks a needed column.
-        ProblemsError: with every bad row, unless ``skip_bad``; nothing is left behind.
-        MissingExtraError: if ``datasets`` is not installed.
-    """
-    opened = open_source(source, config, revision)
-    with removing_on_error(out) as created:
-        store = _Store(Path(out) / "images", created, check)
-        result = _scan(opened, columns or {}, classes, store, progress)
-        result.base.mkdir(parents=True, exist_ok=True)
-        options: dict[str, Any] = {"skip_bad": skip_bad, "check": "none", "progress": progress}
-        return import_scanned(result, Path(source), Path(out), {}, **options)
-
-
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, run, remote=True)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, remote=True)
 
 
 @dataclass

@@ -28,17 +28,15 @@ from pathlib import Path
 import polars as pl
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet, write_text
-from palpate.data.formats.base import Facts, Format, Scan
+from palpate.data.formats.base import Facts, Format, Into, Scan
 from palpate.data.formats.touch_and_go import (
-    extracted,
+    add_frames,
     require_frame_options,
     require_videos,
-    scan_rows,
     usable,
 )
 from palpate.data.frames import FolderFrames, ImageFormat
 from palpate.data.images import Check
-from palpate.data.imported import Imported, removing_on_error
 from palpate.data.listing import FrameTable
 from palpate.data.manifest import Manifest
 from palpate.data.mapping import compile_maps
@@ -94,7 +92,7 @@ def detect(source: Path) -> bool:
     return _is_bare(header) or all(set(NAMES[name]) & set(header) for name in NEEDED)
 
 
-def scan(
+def scan(  # noqa: PLR0913 (a public verb)
     source: Path,
     *,
     root: Path | None = None,
@@ -102,10 +100,14 @@ def scan(
     classes: Path | None = None,
     half_open: bool = False,
     every: int = 1,
+    sensor: str | None = None,
+    image_format: ImageFormat = "jpg",
+    size: int | None = None,
     check: Check = "decode",
+    into: Into | None = None,
     progress: Progress = quiet,
 ) -> Scan:
-    """Check a list and its recordings without writing anything.
+    """Read a list and its recordings; without ``into`` nothing is written.
 
     Args:
         source: the list.
@@ -114,69 +116,32 @@ def scan(
         classes: table of classes, whose numbers are the labels.
         half_open: ``end`` is the first frame after the contact.
         every: take every n-th frame of a contact, from its first.
+        sensor: the tactile sensor.
+        image_format: of the extracted frames.
+        size: their shorter side is reduced to so many pixels.
         check: how extracted images are checked; ``decode`` also decodes the used frames of videos.
+        into: where frames of raw videos go, to ``images/<video>/{vision,tactile}/``; after an
+            interruption the same call continues.
         progress: progress callback.
 
     Raises:
         PalpateError: if the list or the recordings are missing, a column is lacking, or an option
             is out of range.
-    """
-    source, base = Path(source), _root(source, root)
-    work = _Whole(base, base, require_videos(base), {}, "jpg", None, [])
-    listed = _read(work, source, columns, classes, half_open)
-    rows, contacts = _prepared(work, listed, every, check, progress)
-    rows = work.decode(rows, progress, videos=check == "decode")
-    if check == "decode":
-        work.check_streams(progress)
-    words = _words(rows, contacts)
-    result = Scan(base, _facts(source, columns, words), scan_rows(work, rows, check, None, words))
-    result.problems, result.suspicious = work.problems, work.suspicious
-    result.inconclusive = sum(i.inconclusive for i in listed)
-    return result
-
-
-def run(  # noqa: PLR0913 (a public verb)
-    source: Path,
-    out: Path,
-    *,
-    root: Path | None = None,
-    columns: Mapping[str, str] | None = None,
-    classes: Path | None = None,
-    half_open: bool = False,
-    every: int = 1,
-    sensor: str | None = None,
-    skip_bad: bool = False,
-    image_format: ImageFormat = "jpg",
-    size: int | None = None,
-    check: Check = "decode",
-    progress: Progress = quiet,
-) -> Imported:
-    """Import the contacts of an interval list; options as in :func:`scan`.
-
-    Frames of raw videos go to ``out/images/<video>/{vision,tactile}/`` as ``image_format``, their
-    shorter side reduced to ``size`` pixels; after an interruption the same call continues.
-    ``sensor`` names the tactile sensor; ``skip_bad`` skips and lists bad intervals and frames.
-
-    Raises:
-        PalpateError: if the list or the recordings are missing, a column is lacking, or an option
-            is out of range.
-        ProblemsError: with everything bad, unless ``skip_bad``; nothing is left behind.
+        ProblemsError: with ``into``, before frames are written, unless bad rows are skipped.
     """
     source, base = Path(source), _root(source, root)
     require_frame_options(image_format, size)
-    with removing_on_error(out) as created:
-        work = _Whole(base, Path(out), require_videos(base), {}, image_format, size, created)
-        listed = _read(work, source, columns, classes, half_open)
-        rows, contacts = _prepared(work, listed, every, check, progress)
-        rows = extracted(work, rows, source, skip_bad=skip_bad, progress=progress)
-        words = _words(rows, contacts)
-        facts = {**FACTS.of_manifest(), "format": "intervals", **_facts(source, columns, words)}
-        manifest = work.manifest(rows, facts, "", words)
-        table = manifest.table.with_columns(sensor=pl.lit(sensor, dtype=pl.String))
-        manifest = Manifest(table, manifest.root, manifest.facts)
-        inconclusive = sum(i.inconclusive for i in listed)
-        result = Imported(manifest, work.problems, {}, inconclusive, work.suspicious)
-        return result.save(out, created)
+    out, created = (into.out, into.created) if into else (base, list[Path]())
+    work = _Whole(base, out, require_videos(base), {}, image_format, size, created)
+    listed = _read(work, source, columns, classes, half_open)
+    rows, contacts = _prepared(work, listed, every, check, progress)
+    words = _words(rows, contacts)
+    column = f"column {(columns or {}).get('text', 'text')}"
+    facts = {"dataset": source.stem, "text_source": column if words["text"].values else "none"}
+    result = Scan(base, facts, inconclusive=sum(i.inconclusive for i in listed))
+    more = {"sensor": sensor, "words": words}
+    add_frames(result, work, rows, check=check, into=into, progress=progress, **more)
+    return result
 
 
 def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
@@ -209,7 +174,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return files
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, run, write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
 
 
 def _is_bare(header: list[str]) -> bool:
@@ -224,13 +189,6 @@ def _root(source: Path, root: Path | None) -> Path:
         must = "must be the folder of the recordings"
         raise PalpateError(must, f"no folder {base}", "Check the path", argument="root")
     return base
-
-
-def _facts(
-    source: Path, columns: Mapping[str, str] | None, words: Mapping[str, FrameTable]
-) -> dict[str, str]:
-    column = f"column {(columns or {}).get('text', 'text')}"
-    return {"dataset": source.stem, "text_source": column if words["text"].values else "none"}
 
 
 def _words(rows: Sequence[Row], contacts: Mapping[str, Interval]) -> dict[str, FrameTable]:

@@ -102,4 +102,4 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return write_split(manifest, split, Path(folder) / "split.json", convert)
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)

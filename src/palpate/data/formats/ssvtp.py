@@ -117,7 +117,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return files
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
 
 
 def _images(result: Scan, side: str) -> Images[str]:

@@ -116,7 +116,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return write_split(manifest, split, Path(folder) / LIST)
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists=write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
 
 
 def _scenes(side: Path) -> dict[str, list[str]]:

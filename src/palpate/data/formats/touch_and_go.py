@@ -25,11 +25,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet, require_choice, write_text
-from palpate.data.formats.base import WORLD, Facts, Format, Row, Scan, world_facts
+from palpate.data.formats.base import WORLD, Cells, Facts, Format, Into, Scan, world_facts
 from palpate.data.formats.layout import require_folder, subfolders
 from palpate.data.frames import IMAGE_FORMATS, ImageFormat
 from palpate.data.images import Check
-from palpate.data.imported import Imported, raise_if, removing_on_error, require_some
+from palpate.data.imported import raise_if, require_some
 from palpate.data.listing import (
     INCONCLUSIVE,
     FrameList,
@@ -92,86 +92,66 @@ def find_videos(root: Path) -> dict[str, VideoFiles]:
     return videos
 
 
-def import_touch_and_go(
-    root: Path,
-    out: Path,
-    *,
-    labels: Sequence[Path] | Path | None = None,
-    skip_bad: bool = False,
-    image_format: ImageFormat = "jpg",
-    size: int | None = None,
-    check: Check = "decode",
-    max_per_contact: int | None = None,
-    seed: int = 0,
-    progress: Progress = quiet,
-) -> Imported:
-    """Write ``out/manifest.parquet``, ``out/splits/Orig.json`` and the frames of raw videos.
-
-    Args:
-        root: the data set.
-        out: folder to write to. Frames of raw videos go to
-            ``out/images/<video>/{vision,tactile}/``, where frames of the other recordings are
-            linked if there are both. After an interruption the same call continues.
-        labels: frame lists; default ``label.txt``, else ``train.txt`` and ``test.txt``.
-        skip_bad: skip bad rows and list them, instead of raising.
-        image_format: of the cached frames.
-        size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
-        check: how extracted images are checked.
-        max_per_contact: keep that many evenly spaced frames of a contact.
-        seed: with ``max_per_contact``: 0 takes the middle of each of the equal stretches, any other
-            a random place in them.
-        progress: progress callback.
-
-    Raises:
-        PalpateError: if the root, the list or the recordings are missing, or ``out`` holds frames
-            of other settings.
-        ProblemsError: with everything bad in the whole data set; nothing is left behind.
-    """
-    root, out = require_folder(root, FACTS.name), Path(out)
-    require_frame_options(image_format, size)
-    if max_per_contact is not None and max_per_contact < 1:
-        got = str(max_per_contact)
-        raise PalpateError("must be at least 1", got, "", argument="max_per_contact")
-    videos = require_videos(root)
-    lists = _read_lists(root, labels)
-    with removing_on_error(out) as created:
-        work = Recordings(root, out, videos, lists.in_contact, image_format, size, created)
-        rows = thin(rows_of(lists.listed), max_per_contact, seed)
-        rows = _prepared(work, lists, rows, check, progress)
-        rows = extracted(work, rows, root, skip_bad=skip_bad, progress=progress)
-        manifest = work.manifest(rows, lists.facts, lists.sensor, lists.words)
-        splits, inconclusive = _splits(manifest, lists.official), lists.listed.inconclusive
-        result = Imported(manifest, work.problems, splits, inconclusive, work.suspicious)
-        return result.save(out, created)
-
-
 def scan(
     root: Path,
     *,
     labels: Sequence[Path] | Path | None = None,
+    image_format: ImageFormat = "jpg",
+    size: int | None = None,
+    max_per_contact: int | None = None,
+    seed: int = 0,
     check: Check = "decode",
+    into: Into | None = None,
     progress: Progress = quiet,
 ) -> Scan:
-    """Check a data set without writing anything: lists, recordings, frames and images.
+    """Read lists, recordings, frames and images.
 
-    With ``check="decode"`` the frames in use are decoded as an import would, those of raw videos
-    too. Rows carry paths of extracted frames only if ``check`` is ``none``.
+    Without ``into`` nothing is written: with ``check="decode"`` the frames in use are decoded as an
+    import would, those of raw videos too; rows carry paths of extracted frames only if ``check`` is
+    ``none``.
+
+    Args:
+        root: the data set.
+        labels: frame lists; default ``label.txt``, else ``train.txt`` and ``test.txt``.
+        image_format: of the cached frames.
+        size: shorter side of the cached frames in pixels, if they are larger; None keeps them.
+        max_per_contact: import that many evenly spaced frames of a contact.
+        seed: with ``max_per_contact``: 0 takes the middle of each of the equal stretches, any other
+            a random place in them.
+        check: how extracted images are checked.
+        into: where frames of raw videos go, to ``images/<video>/{vision,tactile}/``. After an
+            interruption the same call continues.
+        progress: progress callback.
 
     Raises:
-        PalpateError: if the root, the list or the recordings are missing.
+        PalpateError: if the root, the list or the recordings are missing, or ``into`` holds frames
+            of other settings.
+        ProblemsError: with ``into``, before frames are written, unless bad rows are skipped.
     """
     root = require_folder(root, FACTS.name)
-    videos = require_videos(root)
-    lists = _read_lists(root, labels)
-    work = Recordings(root, root, videos, lists.in_contact, "jpg", None, [])
-    rows = _prepared(work, lists, rows_of(lists.listed), check, progress)
-    rows = work.decode(rows, progress, videos=check == "decode")
-    if check == "decode":
-        work.check_streams(progress)
-    result = Scan(root, lists.facts)
-    result.rows = scan_rows(work, rows, check, lists.sensor, lists.words)
-    result.problems, result.suspicious = work.problems, work.suspicious
-    result.inconclusive = lists.listed.inconclusive
+    require_frame_options(image_format, size)
+    if max_per_contact is not None and max_per_contact < 1:
+        got = str(max_per_contact)
+        raise PalpateError("must be at least 1", got, "", argument="max_per_contact")
+    videos, lists = require_videos(root), _read_lists(root, labels)
+    out, created = (into.out, into.created) if into else (root, list[Path]())
+    work = Recordings(root, out, videos, lists.in_contact, image_format, size, created)
+    work.problems += lists.problems
+    every = rows_of(lists.listed)
+    rows = work.open(thin(every, max_per_contact, seed) if into else every, progress)
+    listed = set(lists.listed.contact["video"])
+    rows = usable(work, rows, first_frames(every), listed, check=check, progress=progress)
+    result = Scan(root, lists.facts, inconclusive=lists.listed.inconclusive)
+    more = {"sensor": lists.sensor, "words": lists.words}
+    add_frames(result, work, rows, check=check, into=into, progress=progress, **more)
+    if lists.official is not None:
+        part_of = {name: part for part, name in OFFICIAL.items()}
+        cells = lists.official.rows.select("video", "frame", "source").iter_rows()
+        parts = {(video, frame): part_of[Path(source).name] for video, frame, source in cells}
+        for _, row in result.rows:
+            row["split"] = parts.get((row["video"], row["frame"]))
+        result.split_name = "Orig"
+        result.split_rule = {"method": "official", "files": list(OFFICIAL.values())}
     return result
 
 
@@ -212,7 +192,7 @@ def write_lists(manifest: Manifest, split: Split, folder: Path) -> list[Path]:
     return files
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, import_touch_and_go, write_lists)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, write_lists)
 
 
 # --- Steps that interval lists share
@@ -291,19 +271,34 @@ def usable(
     return rows
 
 
-def scan_rows(
+def add_frames(
+    result: Scan,
     work: Recordings,
-    rows: Sequence[FrameRow],
+    rows: list[FrameRow],
+    *,
     check: Check,
+    into: Into | None,
+    progress: Progress,
     sensor: str | None = None,
     words: Mapping[str, FrameTable | None] | None = None,
-) -> list[Row]:
-    """Rows of a scan; with paths if they are still to be checked and the frames are files."""
-    cells = work.cells(rows, work.root.resolve(), sensor, words)
-    if check != "none":
-        for row in cells:
-            row |= dict.fromkeys((*MODALITIES, "background"))
-    return [(row.where, cell) for row, cell in zip(rows, cells, strict=True)]
+) -> None:
+    """Add usable rows to a scan, after extracting their frames, or only decoding them.
+
+    Without ``into`` they have paths only if they are still to be checked and are files.
+    """
+    hidden: Cells = {}
+    if into is not None:
+        rows = extracted(work, rows, result.base, skip_bad=into.skip_bad, progress=progress)
+        result.facts |= work.facts(rows)
+        result.base = work.base(rows)
+    else:
+        rows = work.decode(rows, progress, videos=check == "decode")
+        if check == "decode":
+            work.check_streams(progress)
+        hidden = {} if check == "none" else dict.fromkeys((*MODALITIES, "background"))
+    cells = work.cells(rows, result.base.resolve(), sensor, words)
+    result.rows = [(row.where, cell | hidden) for row, cell in zip(rows, cells, strict=True)]
+    result.problems, result.suspicious = work.problems, work.suspicious
 
 
 # --- Lists
@@ -367,27 +362,3 @@ def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
     tables = [listed, *words.values(), official if official is not listed else None]
     problems = [problem for table in tables if table for problem in table.skipped]
     return _Lists(listed, official, words, in_contact, facts, sensor, problems)
-
-
-def _prepared(
-    work: Recordings, lists: _Lists, rows: list[FrameRow], check: Check, progress: Progress
-) -> list[FrameRow]:
-    """The usable rows, up to extraction; what is wrong is added to ``work``."""
-    work.problems += lists.problems
-    starts, videos = first_frames(rows_of(lists.listed)), set(lists.listed.contact["video"])
-    rows = work.open(rows, progress)
-    return usable(work, rows, starts, videos, check=check, progress=progress)
-
-
-def _splits(manifest: Manifest, official: FrameList | None) -> dict[str, Split]:
-    """``Orig``: the official parts of the samples at hand, by recording and frame number."""
-    if official is None:
-        return {}
-    part_of = {name: part for part, name in OFFICIAL.items()}
-    columns = ("video", "frame", "source")
-    rows = official.rows.select(columns).iter_rows()
-    parts = {(video, frame): part_of[Path(source).name] for video, frame, source in rows}
-    samples = manifest.table.select("id", "video", "frame").iter_rows()
-    listed = {i: parts[video, k] for i, video, k in samples if (video, k) in parts}
-    rule = {"method": "official", "files": list(OFFICIAL.values())}
-    return {"Orig": Split(listed, rule, manifest.digest)} if listed else {}

@@ -29,17 +29,16 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Problem, ProblemsError, Progress, Split, quiet
+from palpate.core import PalpateError, Problem, ProblemsError, Progress, quiet
 from palpate.data.contacts import Contacts, find_contacts, thumbnail
 from palpate.data.formats import touch_and_go
-from palpate.data.formats.base import Cells, Facts, Format, Scan, few
+from palpate.data.formats.base import Cells, Facts, Format, Into, Scan, few
 from palpate.data.formats.layout import require_folder
 from palpate.data.formats.pairs import Side, name_apart, templates_of
 from palpate.data.formats.touch_and_go import extracted, require_frame_options
 from palpate.data.frames import MOVING, ImageFormat, streams_of
 from palpate.data.images import SUFFIXES, Check, in_threads, read_image
-from palpate.data.imported import Imported, removing_on_error
-from palpate.data.manifest import SCHEMA, Manifest
+from palpate.data.manifest import SCHEMA
 from palpate.data.recordings import Recordings, Row, VideoFiles, thin
 from palpate.data.rows import PART_NAMES
 from palpate.data.streams import Finding, findings
@@ -85,7 +84,7 @@ def is_templated(source: Path, templates: Mapping[str, str]) -> bool:
     return any(assign(files, parsed).values())
 
 
-def scan(
+def scan(  # noqa: PLR0913 (a public verb)
     source: Path,
     *,
     vision: str | None = None,
@@ -95,10 +94,14 @@ def scan(
     every: int | None = None,
     max_per_contact: int | None = None,
     seed: int = 0,
+    sensor: str | None = None,
+    image_format: ImageFormat = "jpg",
+    size: int | None = None,
     check: Check = "decode",
+    into: Into | None = None,
     progress: Progress = quiet,
 ) -> Scan:
-    """Check a folder of videos without writing anything.
+    """Read a folder of videos; without ``into`` nothing is written.
 
     Args:
         source: the folder.
@@ -110,78 +113,46 @@ def scan(
         every: take every n-th frame of whole videos, in contact or not.
         max_per_contact: keep that many evenly spaced frames of a contact.
         seed: with ``max_per_contact``: 0 takes the middle of each stretch, others a random place.
-        check: ``decode`` decodes all; otherwise no contacts are found, and all frames are listed.
+        sensor: the tactile sensor.
+        image_format: of the extracted frames.
+        size: their shorter side is reduced to so many pixels.
+        check: without ``into``: ``decode`` decodes all; otherwise no contacts are found, and all
+            frames are listed.
+        into: where frames go, to ``images/<video>/{vision,tactile}/``; after an interruption the
+            same call continues.
         progress: progress callback.
 
     Raises:
         PalpateError: if the source is no folder, a template cannot be read or matches nothing, or
             an option is out of range.
-    """
-    given = {"vision": vision, "tactile": tactile, "background": background}
-    videos, result = _videos(require_folder(source, FACTS.name), given, side)
-    decoded = check == "decode"
-    _require_amounts(videos, every if decoded else 1, max_per_contact)
-    work = _opened(result, videos, result.base, progress, "jpg", None, [])
-    contacts = _contacts(work, videos, progress) if decoded else {}
-    rows = _rows(work, videos, contacts, every if decoded else 1)
-    rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
-    for row, cell in zip(rows, _cells(work, rows, videos, None), strict=True):
-        result.rows.append((row.where, cell | dict.fromkeys(ORDER)))
-    return result
-
-
-def run(  # noqa: PLR0913 (a public verb)
-    source: Path,
-    out: Path,
-    *,
-    vision: str | None = None,
-    tactile: str | None = None,
-    background: str | None = None,
-    side: Side | None = None,
-    every: int | None = None,
-    max_per_contact: int | None = None,
-    seed: int = 0,
-    sensor: str | None = None,
-    skip_bad: bool = False,
-    image_format: ImageFormat = "jpg",
-    size: int | None = None,
-    check: Check = "decode",
-    progress: Progress = quiet,
-) -> Imported:
-    """Import a folder of videos; options as in :func:`scan`.
-
-    Frames go to ``out/images/<video>/{vision,tactile}/`` as ``image_format``, their shorter side
-    reduced to ``size`` pixels; after an interruption the same call continues. ``sensor`` names the
-    tactile sensor; ``skip_bad`` skips and lists bad videos.
-
-    Raises:
-        PalpateError: as :func:`scan`.
-        ProblemsError: with everything bad, unless ``skip_bad``; nothing is left behind.
+        ProblemsError: with ``into``, before frames are written, unless bad videos are skipped.
     """
     require_frame_options(image_format, size)
     given = {"vision": vision, "tactile": tactile, "background": background}
     videos, result = _videos(require_folder(source, FACTS.name), given, side)
-    _require_amounts(videos, every, max_per_contact)
-    with removing_on_error(out) as created:
-        work = _opened(result, videos, Path(out), progress, image_format, size, created)
-        contacts = _contacts(work, videos, progress)
-        rows = _rows(work, videos, contacts, every)
-        rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
+    decoded = check == "decode" or into is not None
+    _require_amounts(videos, every if decoded else 1, max_per_contact)
+    out, created = (into.out, into.created) if into else (result.base, list[Path]())
+    work = _opened(result, videos, out, progress, image_format, size, created)
+    contacts = _contacts(work, videos, progress) if decoded else {}
+    rows = _rows(work, videos, contacts, every if decoded else 1)
+    rows = rows if max_per_contact is None else thin(rows, max_per_contact, seed)
+    hidden: Cells = dict.fromkeys(ORDER)
+    if into is not None:
         _require_contact(work, rows)
-        rows = extracted(work, rows, result.base, skip_bad=skip_bad, progress=progress)
+        rows = extracted(work, rows, result.base, skip_bad=into.skip_bad, progress=progress)
         _copy_images(work, rows, videos)
-        cells = _cells(work, rows, videos, sensor)
-        parts = {cell["id"]: PART_NAMES[cell.pop("split")] for cell in cells if "split" in cell}
-        facts = {**FACTS.of_manifest(), "format": "videos", **result.facts}
-        facts["frames"] = "in contact" if every is None else f"every {every} of whole videos"
-        manifest = Manifest.from_rows(cells, work.out.resolve(), facts, result.more)
-        rule = {"method": "official", "column": "split"}
-        splits = {"Orig": Split(parts, rule, manifest.digest)} if parts else {}
-        imported = Imported(manifest, work.problems, splits, 0, work.suspicious)
-        return imported.save(out, created)
+        result.base, hidden = work.out, {}
+        result.facts["frames"] = "in contact" if every is None else f"every {every} of whole videos"
+    for row, cell in zip(rows, _cells(work, rows, videos, sensor), strict=True):
+        if "split" in cell:
+            cell["split"] = PART_NAMES[cell["split"]]
+            result.split_name, result.split_rule = "Orig", {"method": "official", "column": "split"}
+        result.rows.append((row.where, cell | hidden))
+    return result
 
 
-FORMAT = Format(FACTS, detect, LOOKS_FOR, scan, run)
+FORMAT = Format(FACTS, detect, LOOKS_FOR, scan)
 
 
 def _videos(
