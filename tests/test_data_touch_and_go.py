@@ -1,6 +1,5 @@
 """Touch and Go: every layout, every kind of bad input, resume, backgrounds, and the real clips."""
 
-
 import numpy as np
 import polars as pl
 import pytest

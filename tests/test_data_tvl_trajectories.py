@@ -3,7 +3,6 @@
 import json
 import shutil
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -11,8 +10,8 @@ from format_trees import PHOTO, gel, kinds, make_hct, name_of, photo, put, write
 from format_trees import TACTILE as SENSOR
 from format_trees import TVL_COLUMNS as COLUMNS
 from format_trees import make_trajectory as trajectory
-from palpate.core import PalpateError, ProblemsError, Split, quiet
-from palpate.data.formats import hct, swapped
+from palpate.core import PalpateError, ProblemsError, Split
+from palpate.data.formats import hct
 from palpate.data.formats.hct import TRAJECTORY
 from palpate.data.importing import import_dataset as read
 from palpate.data.importing import validate, write_lists
@@ -208,14 +207,9 @@ def named(problems):
     return {place(p.where) for p in problems if p.kind == "swapped-folders"}
 
 
-@pytest.mark.parametrize(
-    "sizes",
-    [(PHOTO, SENSOR), (SENSOR, SENSOR), ((640, 480), (240, 320))],
-    ids=["foreign sizes", "equal sizes", "true sizes"],
-)
 @pytest.mark.parametrize("swapped", [set(), {2, 5, 11}])
-def test_swapped_folders_are_reported_and_fixed(tmp_path, sizes, swapped):
-    rig_of(tmp_path, swapped=swapped, sizes=sizes)
+def test_swapped_folders_are_reported_and_fixed(tmp_path, swapped):
+    rig_of(tmp_path, swapped=swapped, sizes=((640, 480), (240, 320)))
     result = read(tmp_path, tmp_path / "a")
     assert named(result.suspicious) == swapped
     assert all("vision/" in p for p in result.manifest.column("vision"))
@@ -232,68 +226,14 @@ def test_swapped_folders_are_reported_and_fixed(tmp_path, sizes, swapped):
         read(tmp_path, tmp_path / "out", swap="yes")
 
 
-def test_a_rig_that_is_swapped_as_a_whole_is_recognized(tmp_path):
-    rig_of(tmp_path, swapped=set(range(12)) - {3}, sizes=(SENSOR, SENSOR))
-    assert named(read(tmp_path, tmp_path / "a").suspicious) == set(range(12)) - {3}
-
-
-def test_sides_that_look_similar_and_too_few_recordings_are_not_called_swapped(tmp_path):
-    sizes = (SENSOR, SENSOR)
-    rig_of(tmp_path / "1", swapped={1}, sizes=sizes, tactile=lambda n: photo(n + 7, SENSOR))
-    rig_of(tmp_path / "2", swapped={1}, sizes=sizes, count=2)
-    rig = rig_of(tmp_path / "3", swapped=set(), sizes=sizes)
-    for path in (rig / "3-1300.5" / "tactile").iterdir():  # tactile images on both sides
-        shutil.copy(path, rig / "3-1300.5" / "vision" / path.name)
-    for name in "123":
-        assert read(tmp_path / name, tmp_path / "out" / name).suspicious == [], name
-
-
-def constant(*levels):
-    return [swapped.Look((240, 320), np.full((8, 8, 3), level)) for level in levels]
-
-
-def swaps(pairs) -> set[int]:
-    looks = {str(k): pair for k, pair in enumerate(pairs)}
-    return {int(k) for k in swapped.swapped(looks, (240, 320))}
-
-
-def test_swaps_by_color_over_many_rigs():
-    """Precision and recall on 60 rigs whose gel drifts and whose photos share a tint."""
-    planted = 0
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        base, tint = rng.uniform(0.2, 0.6, (8, 8, 3)), rng.uniform(0.2, 0.8, 3)
-        truth = set(rng.permutation(30)[: rng.integers(0, 7)].tolist())
-        pairs = []
-        for k in range(30):
-            tactile = base + rng.normal(0, 0.01) + rng.normal(0, 0.02, (8, 8, 3))
-            vision = 0.5 * tint + 0.5 * rng.uniform(0, 1, (8, 8, 3))
-            looks = [swapped.Look((240, 320), x.clip(0, 1)) for x in (vision, tactile)]
-            pairs.append((looks[1], looks[0]) if k in truth else (looks[0], looks[1]))
-        assert swaps(pairs) == truth, seed
-        planted += len(truth)
-    assert planted > 100
-
-
-def test_colors_that_prove_nothing_are_not_used():
-    gels, views = constant(*np.linspace(0.30, 0.34, 9)), constant(*np.linspace(0.1, 0.9, 9))
-    far = tuple(constant(0.6, 0.95))  # one side is nearer to the gel, but neither is one
-    assert swaps([*zip(views, gels, strict=True), far]) == set()
-    for seed in range(20):  # both sides vary equally: nobody knows the gel
-        levels = np.random.default_rng(seed).uniform(0, 1, (2, 25))
-        assert swaps(zip(constant(*levels[0]), constant(*levels[1]), strict=True)) == set()
-
-
-def test_looks_skip_what_cannot_be_read(tmp_path):
-    (tmp_path / "cut.jpg").write_bytes(b"")
-    put(tmp_path / "a.jpg", gel(1))
-    assert swapped.look([tmp_path / "cut.jpg", tmp_path / "none.jpg"]) is None
-    seen = swapped.look([tmp_path / "cut.jpg", tmp_path / "a.jpg"])
-    assert seen is not None
-    assert seen.size == SENSOR
-    small = np.asarray(gel(1).resize((8, 8), Image.Resampling.BOX)) / 255
-    assert np.abs(seen.thumbnail - small).max() < 0.06
-    assert swapped.looks({"x": ([tmp_path / "cut.jpg"], [tmp_path / "a.jpg"])}, quiet) == {}
+def test_sides_of_one_size_and_unreadable_ones_are_not_called_swapped(tmp_path):
+    rig_of(tmp_path / "1", swapped={1}, sizes=(SENSOR, SENSOR))
+    rig = rig_of(tmp_path / "2", swapped={1}, sizes=(PHOTO, SENSOR))
+    for path in (rig / "3-1100.5").glob("*/*.jpg"):
+        path.write_bytes(b"")
+    for name in "12":
+        seen = read(tmp_path / name, tmp_path / "out" / name, check="none").suspicious
+        assert named(seen) == set(), name
 
 
 # --- Bad input

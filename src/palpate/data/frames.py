@@ -186,19 +186,14 @@ def save_frame(path: Path, image: NDArray[np.uint8], size: int | None) -> None:
         frame.save(part, format="JPEG" if options else "PNG", **options)
 
 
-def nearest_to_median(frames: Frames, indices: Sequence[int]) -> tuple[int, NDArray[np.uint8]]:
-    """The frame with the least mean absolute difference to the pixelwise median of some frames.
-
-    Returns:
-        Its number and its image, (h, w, 3), 0 to 255.
+def nearest_to_median(images: Sequence[NDArray[np.uint8]], source: Path) -> int:
+    """Which of some frames (h, w, 3) has the least mean difference to their pixelwise median.
 
     Raises:
-        PalpateError: if a frame is unreadable, or the frames differ in size.
+        PalpateError: if the frames of ``source`` differ in size.
     """
-    numbers, images = zip(*frames.read(sorted(indices)), strict=True)
     if len({image.shape for image in images}) > 1:
-        must = f"The frames in {frames.source} must have one size"
+        must = f"The frames in {source} must have one size"
         raise PalpateError(must, "several", "Extract them again from the video")
     median = np.median(np.stack(images), axis=0).astype(np.float32)
-    best = int(np.argmin([np.abs(image - median).mean() for image in images]))
-    return numbers[best], images[best]
+    return int(np.argmin([np.abs(image - median).mean() for image in images]))

@@ -348,11 +348,12 @@ class Recordings:
 
         def choose(video: str) -> None:
             frames = self.frames[video]["tactile"]
-            k, image = nearest_to_median(frames, self._without_contact(video))
-            path = typical[video] = frames.path(k)
+            numbers, images = zip(*frames.read(self._without_contact(video)), strict=True)
+            best = nearest_to_median(images, frames.source)
+            path = typical[video] = frames.path(numbers[best])
             if save and not path.is_file():
                 self.created.append(path)
-                save_frame(path, image, self.size)
+                save_frame(path, images[best], self.size)
 
         def attempt(job: _Job) -> str | None:
             try:

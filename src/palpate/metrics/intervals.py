@@ -269,10 +269,9 @@ class Estimate:
         errors: (K,) standard errors.
         df: their degrees of freedom.
         method: in words.
-        replicates: (G, K) values without each unit.
+        replicates: (G, K) values without each unit, or (C, 4) without each class.
         units: (G,) units.
-        without_class: (C, 4) the first four values without each class; empty with fewer than three.
-        of_classes: whether the errors are those over classes.
+        of_classes: whether classes are left out.
     """
 
     values: Array
@@ -281,7 +280,6 @@ class Estimate:
     method: str
     replicates: Array = field(repr=False)
     units: Index = field(repr=False)
-    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
     of_classes: bool = False
 
     def interval(self, k: int, level: float) -> Interval | None:
@@ -311,17 +309,15 @@ def class_estimate(sums: PairSums, statistic: Callable[[Totals], Array], unit: s
     errors then.
     """
     over_units, classes = estimate(sums, statistic, unit), sums.segments // 2
-    if classes < 3:
+    if classes < 3 or np.isfinite(over_units.errors[0]):
         return over_units
     without = np.array([statistic(without_set(sums.totals, c))[:4] for c in range(classes)])
-    if np.isfinite(over_units.errors[0]):
-        return replace(over_units, without_class=without)
     errors = np.full(len(over_units.values), np.nan)
     errors[: without.shape[1]] = jackknife_errors(without)
     reason = f"(a class has too few {unit}s to leave one out)"
     method = f"leave-one-class-out jackknife, t, {classes - 1} df {reason}"
-    of_classes = replace(over_units, errors=errors, df=classes - 1, method=method, of_classes=True)
-    return replace(of_classes, without_class=without)
+    of_classes = {"errors": errors, "df": classes - 1, "replicates": without, "of_classes": True}
+    return replace(over_units, method=method, **of_classes)
 
 
 def without_set(t: Totals, c: int) -> Totals:
@@ -339,14 +335,12 @@ class Scored:
     Attributes:
         score: the score.
         replicates: (G,) the value without each unit.
-        units: (G,) names of the units; see :func:`over_classes` for the other choice.
+        units: (G,) names of the units: groups or samples, or classes where these cannot spare one.
         excess: (G,) of I- and CI-TMMD, the between-group excess E without each unit.
         design: what the value depends on besides the features: of halves of whole groups how their
-            sizes turn E into dist^2 (:class:`palpate.metrics.mmd.Design`), of other biased
+            sizes turn E into dist^2 (:func:`palpate.metrics.mmd.design_of`), of other biased
             values 1/m + 1/m' of the halves; empty where it depends on neither.
-        groups: names of all units that the set has.
-        without_class: (C, 2 or more) the value without each class, and what ``excess`` has; empty
-            with fewer than three classes.
+        groups: names of all groups or samples that the set has.
     """
 
     score: Score
@@ -355,33 +349,6 @@ class Scored:
     excess: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     design: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     groups: Sequence[str] = ()
-    without_class: Array = field(default_factory=lambda: np.zeros((0, 4)), repr=False)
-
-
-def over_classes(result: Scored) -> Scored:
-    """The same with classes left out in turn instead of units; ``details["left_out"]`` records it.
-
-    For classes that cannot spare a unit, and for comparisons with a set that has such classes.
-    """
-    if not len(result.without_class):
-        return result
-    details = {**result.score.details, "left_out": "class"}
-    return replace(
-        result,
-        score=replace(result.score, details=details),
-        replicates=result.without_class[:, 0],
-        units=details["classes"],
-        excess=result.without_class[:, 1] if "E" in details else np.zeros(0),
-    )
-
-
-def same_units(*sets: Scored) -> Sequence[Scored]:
-    """The sets with the same units left out, or the same classes; unchanged where neither works."""
-    by_class = [over_classes(s) for s in sets]
-    for choice in (sets, by_class):
-        if all(list(s.units) == list(choice[0].units) for s in choice):
-            return choice
-    return sets
 
 
 @dataclass(frozen=True)

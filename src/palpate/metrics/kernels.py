@@ -227,6 +227,8 @@ def median_distance(
 
 Backend = Literal["auto", "blocked", "moments"]
 BACKENDS = ("auto", "blocked", "moments")
+#: Largest bound that ``auto`` accepts, at scale 1000.
+TOLERANCE = 1e-4
 #: ``auto`` tries moments from so many rows on, in units of the width and in all.
 ROWS_A_WIDTH, LEAST_ROWS = 8, 4096
 #: Bytes of the moments of all items: at most, and four times that where pairs would take hours; up
@@ -256,7 +258,7 @@ def kernel_sums(
     kernel: Kernel,
     bound: Callable[[PairSums], float],
     backend: Backend = "auto",
-    tolerance: float = 1e-4,
+    tolerance: float = TOLERANCE,
     block: int = 1024,
     weights: Sequence[Array] = (),
 ) -> PairSums:

@@ -50,9 +50,9 @@ grouped       grouped    group    sum                ratio_of_means  the default
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal
 
 import numpy as np
 
@@ -72,6 +72,7 @@ from palpate.metrics.inputs import (
 from palpate.metrics.intervals import PairSums, Totals
 from palpate.metrics.kernels import (
     BACKENDS,
+    TOLERANCE,
     Backend,
     Kernel,
     Sigma,
@@ -188,7 +189,7 @@ def distance(  # noqa: PLR0913
     groups_y: Any = None,
     normalize: Normalize = "check",
     backend: Backend = "auto",
-    tolerance: float = 1e-4,
+    tolerance: float = TOLERANCE,
     block: int = 1024,
     names: tuple[str, str] = ("x", "y"),
 ) -> Distance:
@@ -269,55 +270,27 @@ def distance(  # noqa: PLR0913
     return Distance(value, bound, *how, m=len(x), n=len(y))
 
 
-class Options(TypedDict, total=False):
+@dataclass(frozen=True)
+class Options:
     """Options of ``tmmd``, ``i_tmmd``, ``ci_tmmd``, ``d_tmmd``; each records those that bear on it.
 
-    Keys:
+    Attributes:
         preset: one of ``PRESETS``; default ``"grouped"`` where groups are known (for TMMD also
             where ids are shared), else ``"paper"``.
         estimator, halves, denominator, aggregate: override one entry of the preset.
-        sigma: kernel bandwidth, default 10; several are averaged; ``"median"``: the median distance
-            of the reference; ``"multi"``: five bandwidths around it
-            (:mod:`palpate.metrics.kernels`).
+        sigma: kernel bandwidth; several are averaged; ``"median"``: the median distance of the
+            reference; ``"multi"``: five bandwidths around it (:mod:`palpate.metrics.kernels`).
         kernel: instead of the Gaussian of ``sigma``, e.g. :class:`palpate.metrics.Polynomial`.
-        scale: factor on the result, default 1000.
-        normalize: rows that are not of unit length: ``"check"`` rejects them (default), True
-            divides by the norm, False takes them as they are.
-        backend: ``"auto"`` (default), ``"blocked"`` or ``"moments"``
-            (:mod:`palpate.metrics.kernels`).
-        tolerance: largest bound with which ``auto`` takes moments, default 1e-4 at scale 1000.
-        block: rows of a kernel block, default 1024.
-        permutations: relabelings of the permutation test of TMMD, default 999; 0 for none.
-        level: coverage of intervals, default 0.95.
-        min_samples: a class with fewer is excluded, at least 4, default 4.
-        seed: of random halves, default 0.
-        subject: what is scored, default ``"generated"``.
+        scale: factor on the result.
+        normalize: rows that are not of unit length: ``"check"`` rejects them, True divides by the
+            norm, False takes them as they are.
+        backend: ``"auto"``, ``"blocked"`` or ``"moments"`` (:mod:`palpate.metrics.kernels`).
+        permutations: relabelings of the permutation test of TMMD; 0 for none.
+        level: coverage of intervals.
+        seed: of random halves.
+        subject: what is scored.
         split: digest of the split, kept with the score.
     """
-
-    preset: str | None
-    estimator: Estimator
-    halves: Halves
-    denominator: Denominator
-    aggregate: Aggregate
-    sigma: Sigma
-    kernel: Kernel | None
-    scale: float
-    normalize: Normalize
-    backend: Backend
-    tolerance: float
-    block: int
-    permutations: int
-    level: float
-    min_samples: int
-    seed: int
-    subject: str
-    split: str | None
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Options with nothing left open; the fields are those of :class:`Options`."""
 
     preset: str
     estimator: Estimator
@@ -329,28 +302,25 @@ class Plan:
     scale: float = 1000.0
     normalize: Normalize = "check"
     backend: Backend = "auto"
-    tolerance: float = 1e-4
-    block: int = 1024
     permutations: int = 999
     level: float = 0.95
-    min_samples: int = 4
     seed: int = 0
     subject: str = "generated"
     split: str | None = None
 
 
-PRESETS: dict[str, Plan] = {
+PRESETS: dict[str, Options] = {
     plan.preset: plan
     for plan in (
-        Plan("paper", "unbiased", "random", "sum", "mean_of_ratios"),
-        Plan("paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"),
-        Plan("cmmd", "biased", "random", "sum", "mean_of_ratios"),
-        Plan("grouped", "grouped", "group", "sum", "ratio_of_means"),
+        Options("paper", "unbiased", "random", "sum", "mean_of_ratios"),
+        Options("paper-tables", "biased", "ordered", "mean_off_diagonal", "mean_of_ratios"),
+        Options("cmmd", "biased", "random", "sum", "mean_of_ratios"),
+        Options("grouped", "grouped", "group", "sum", "ratio_of_means"),
     )
 }
 
 
-def plan_for(options: Options, *, grouped: bool) -> Plan:
+def plan_for(options: Mapping[str, Any], *, grouped: bool) -> Options:
     """The options completed; ``grouped``: whether groups are known.
 
     Raises:
@@ -360,18 +330,15 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     preset = options.get("preset") or ("grouped" if grouped else "paper")
     require_choice("preset", preset, tuple(PRESETS))
     given: dict[str, Any] = {k: v for k, v in options.items() if k != "preset"}
-    names = [f.name for f in fields(Plan)]
+    names = [f.name for f in fields(Options)]
     if unknown := sorted(set(given) - set(names)):
         must = f"must not be given: options are {', '.join(names)}"
         raise invalid(unknown[0], must, ", ".join(unknown), "Check the spelling")
-    plan = Plan(**{**asdict(PRESETS[preset]), **given})
+    plan = Options(**{**asdict(PRESETS[preset]), **given})
     for name, choices in CHOICES.items():
         require_choice(name, getattr(plan, name), choices)
     checked_number(positive=True, scale=plan.scale)
-    checked_number(tolerance=plan.tolerance)
-    checked_whole(1, block=plan.block)
     checked_whole(0, permutations=plan.permutations, seed=plan.seed)
-    checked_whole(4, min_samples=plan.min_samples)  # two for each half
     checked_level(plan.level)
     checked_kernel(plan.kernel)
     for name, value in (("estimator", "grouped"), ("halves", "group")):
@@ -381,12 +348,14 @@ def plan_for(options: Options, *, grouped: bool) -> Plan:
     return plan
 
 
+#: A set with fewer samples is not halved: two for each half.
+LEAST = 4
 #: More samples than this are left out in so many random blocks; in fewer where there are so many
 #: that only moments are quick, whose size grows with the number of units.
 BLOCKS, MANY, BLOCKS_OF_MANY = 1000, 100_000, 50
 
 
-def half_of(ids: Sequence[str], within: Index, plan: Plan) -> Index:
+def half_of(ids: Sequence[str], within: Index, plan: Options) -> Index:
     """0 or 1 for each sample: halves of each value of ``within``, equal in size to one sample.
 
     ``random`` depends on (seed, ids) and ``ordered`` on the order of the ids as strings, neither on
@@ -420,31 +389,24 @@ def sample_units(ids: Sequence[str], seed: int) -> tuple[Index, str, list[str]]:
     return units, "random-block", [f"block {k}" for k in range(blocks)]
 
 
-@dataclass(frozen=True)
-class Design:
-    """How E turns into dist^2 between halves, by the sizes of the groups alone.
+def design_of(t: Totals, plan: Options) -> Array:
+    """(2, K) how E turns into dist^2 between halves of K sets, by the sizes of the groups alone.
 
-    ``dist^2 = of_excess * E + of_spread * (mean diagonal k - b)``.
+    ``dist^2 = first * E + second * (mean diagonal k - b)``: first ``sum s_g(s_g-1) / (m(m-1))``, or
+    with m^2 below for the biased form; second 0, or n / m^2 for the biased form.
 
-    Attributes:
-        of_excess: (K,) ``sum s_g(s_g-1) / (m(m-1))``, or with m^2 below for the biased form.
-        of_spread: (K,) 0, or n / m^2 for the biased form.
+    Args:
+        t: 2K segments.
+        plan: the estimator.
     """
-
-    of_excess: Array
-    of_spread: Array
-
-
-def design_of(t: Totals, plan: Plan) -> Design:
-    """The design of K sets, given 2K segments."""
     t = whole_sets(t)
     inner, m, biased = np.diagonal(t.pairs) - t.n, t.n / 2, plan.estimator == "biased"
     with np.errstate(divide="ignore", invalid="ignore"):
         of_excess = inner / (m**2 if biased else m * (m - 1))
-        return Design(of_excess, t.n / m**2 if biased else np.zeros(len(t.n)))
+        return np.stack([of_excess, t.n / m**2 if biased else np.zeros(len(t.n))])
 
 
-def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple[Array, Array]:
+def self_distances(t: Totals, plan: Options, design: Array | None = None) -> tuple[Array, Array]:
     """dist^2 between the halves of each of K sets (Eq. 3, Eq. 5), and E.
 
     Args:
@@ -453,7 +415,7 @@ def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple
         plan: halves, estimator, scale. ``"grouped"`` acts as ``"unbiased"`` here: halves of whole
             groups share no group already, and without same-group pairs inside the halves the
             expectation would be 0 again.
-        design: sizes of the groups to take instead of those of ``t``. dist^2 falls as the number of
+        design: of the sizes to take instead of those of ``t``. dist^2 falls as the number of
             groups grows, so values without each group in turn must be those of the full design:
             else a jackknife takes the smaller number for noise (its intervals then covered 100 %
             with three videos a class). Ignored where it is of another number of sets.
@@ -466,12 +428,12 @@ def self_distances(t: Totals, plan: Plan, design: Design | None = None) -> tuple
     within, between, same = _even_means(whole.even or whole)
     excess, spread = within - between, same - between  # E = w - b
     pairs = np.diagonal(whole.pairs)  # whole numbers, unlike sums of weights
-    bad = ~np.isfinite(excess) | (whole.n < 4) | (pairs == whole.n) | (pairs == whole.n**2)
+    bad = ~np.isfinite(excess) | (whole.n < LEAST) | (pairs == whole.n) | (pairs == whole.n**2)
     excess, spread = (np.where(bad, np.nan, plan.scale * a) for a in (excess, spread))
     if plan.halves == "group":
-        if design is None or len(design.of_excess) != len(whole.n):
+        if design is None or design.shape[1] != len(whole.n):
             design = design_of(t, plan)
-        return design.of_excess * excess + design.of_spread * spread, excess
+        return design[0] * excess + design[1] * spread, excess
     return _between_halves(mmd_matrix(t, _estimator(plan), plan.scale)), excess
 
 
@@ -483,7 +445,7 @@ def _even_means(t: Totals) -> tuple[Array, Array, Array]:
         return inside / (pairs - t.squares), between, t.diagonal / t.n
 
 
-def halves_bound(sums: PairSums, plan: Plan) -> Array:
+def halves_bound(sums: PairSums, plan: Options) -> Array:
     """(K,) what :func:`self_distances` may be off by; zeros where sums are exact."""
     remainder = (sums.even or sums).bound if plan.halves == "group" else sums.bound
     if remainder is None:
@@ -491,11 +453,11 @@ def halves_bound(sums: PairSums, plan: Plan) -> Array:
     if plan.halves != "group":
         return _between_halves(mmd_bound(remainder.totals, _estimator(plan), plan.scale))
     within, between, _ = _even_means(whole_sets(remainder.totals))
-    design = design_of(sums.totals, plan)
-    return plan.scale * (design.of_excess * (within + between) + design.of_spread * between)
+    of_excess, of_spread = design_of(sums.totals, plan)
+    return plan.scale * (of_excess * (within + between) + of_spread * between)
 
 
-def _estimator(plan: Plan) -> str:
+def _estimator(plan: Options) -> str:
     return "biased" if plan.estimator == "biased" else "unbiased"
 
 
@@ -515,7 +477,7 @@ def halves_of(n: Array) -> Array:
     return np.stack([np.ceil(n / 2), np.floor(n / 2)], axis=1)
 
 
-def dispersion_of(t: Totals, plan: Plan) -> Array:
+def dispersion_of(t: Totals, plan: Options) -> Array:
     """(K,) average of the biased dist^2 over random halves of each of K segments.
 
     ``(1/m + 1/m') * scale * (mean diagonal k - mean off-diagonal k)``.

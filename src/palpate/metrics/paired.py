@@ -23,25 +23,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, Unpack, cast
+from typing import Any
 
 import numpy as np
 from scipy import special
 
 from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
-from palpate.metrics.intervals import (
-    Interval,
-    Scored,
-    jackknife_errors,
-    mean_interval,
-    same_units,
-    t_interval,
-)
+from palpate.metrics.intervals import Interval, Scored, jackknife_errors, mean_interval, t_interval
+from palpate.metrics.kernels import TOLERANCE
 from palpate.metrics.means import Mean, spread_of
-from palpate.metrics.mmd import Options
 from palpate.metrics.tactile import (
-    LOOSE_BOUND,
     UNBOUNDED,
     floors_of,
     four_of,
@@ -69,7 +61,7 @@ class Comparison:
 
 
 def compare(
-    generators: Mapping[str, Any], reference: Any, *, floor: Any = None, **options: Unpack[Options]
+    generators: Mapping[str, Any], reference: Any, *, floor: Any = None, **options: Any
 ) -> Comparison:
     """TMMD, I-, CI- and D-TMMD of several generators on the same samples, with paired differences.
 
@@ -86,8 +78,7 @@ def compare(
     reference = feature_set(reference, argument="reference")
     sets = same_samples(generators)
     scores = {
-        name: four_of(of, reference, cast("Options", {**options, "subject": name}))
-        for name, of in sets.items()
+        name: four_of(of, reference, {**options, "subject": name}) for name, of in sets.items()
     }
     floors: list[Scored | None] = [None] * 4
     if floor is not None:
@@ -111,9 +102,7 @@ def _compared(
     return Comparison([s.score for row in sets.values() for s in row if s], differences)
 
 
-def compare_tmmd(
-    generators: Mapping[str, Any], reference: Any, **options: Unpack[Options]
-) -> Comparison:
+def compare_tmmd(generators: Mapping[str, Any], reference: Any, **options: Any) -> Comparison:
     """As :func:`compare`, TMMD alone.
 
     With ``kernel=Polynomial()``, ``normalize=False`` and ``preset="paper"`` it is KID, with
@@ -124,7 +113,7 @@ def compare_tmmd(
     """
     reference = feature_set(reference, argument="reference")
     sets = {
-        name: [tmmd_scored(of, reference, cast("Options", {**options, "subject": name}))]
+        name: [tmmd_scored(of, reference, {**options, "subject": name})]
         for name, of in same_samples(generators).items()
     }
     return _compared(sets, [None])
@@ -183,7 +172,7 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     """
     require_comparable([a.score, b.score])
     use_floor = floor is not None and not not_comparable(a, floor)
-    a, b, *others = same_units(a, b, *([floor] if floor and use_floor else []))
+    others = [floor] if floor and use_floor else []
     x, y = a.score, b.score
     if x.value is None or y.value is None:
         return _as_difference(x, y, None, {}, note=Note("undefined", {"reason": "score"}))
@@ -223,7 +212,7 @@ def excess_of(result: Scored) -> Scored | None:
     known = bound <= 2 * score.scale
     interval = d.get("E_interval") if known else None
     notes = [] if known else [UNBOUNDED]
-    if known and bound > LOOSE_BOUND * score.scale / 1000:
+    if known and bound > TOLERANCE * score.scale / 1000:
         notes = [Note("within-bound", {"bound": bound})]
     kept = ("unit", "left_out", "units", "backend", "version", "classes", "excluded")
     of_excess = replace(
@@ -240,8 +229,7 @@ def excess_of(result: Scored) -> Scored | None:
         details={k: d[k] for k in kept if k in d} | {"bound": bound if known else None},
     )
     units = result.units if len(result.excess) else ()
-    without = result.without_class[:, 1:]
-    return Scored(of_excess, result.excess, units, groups=result.groups, without_class=without)
+    return Scored(of_excess, result.excess, units, groups=result.groups)
 
 
 def _error(replicates: Array) -> float:

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
-from typing import Any, ClassVar, Self, Unpack
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from palpate.metrics.inputs import (
     invalid,
     to_host,
 )
-from palpate.metrics.mmd import Options, plan_for
+from palpate.metrics.mmd import plan_for
 from palpate.metrics.tactile import ci_tmmd_of, d_tmmd_of, i_tmmd_of, reference_free, tmmd_scored
 
 COLUMNS = ("ids", "labels", "groups")
@@ -147,11 +147,7 @@ class StreamingMetric:
     needs_real: ClassVar[bool] = False
 
     def __init__(
-        self,
-        *,
-        encoder: str | None = None,
-        reset_real_features: bool = True,
-        **options: Unpack[Options],
+        self, *, encoder: str | None = None, reset_real_features: bool = True, **options: Any
     ) -> None:
         self.encoder, self.reset_real_features, self.options = encoder, reset_real_features, options
         self.plan = plan_for(options, grouped=True)  # checks; groups are known with the rows

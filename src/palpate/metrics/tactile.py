@@ -24,9 +24,9 @@ Inception. CMMD (Jayasumana et al., arXiv 2401.09603): the biased one with a Gau
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 
@@ -51,16 +51,21 @@ from palpate.metrics.intervals import (
     Totals,
     class_estimate,
     estimate,
-    over_classes,
     permutation_test,
 )
-from palpate.metrics.kernels import Kernel, Polynomial, centered_squares, gaussian, kernel_sums
+from palpate.metrics.kernels import (
+    TOLERANCE,
+    Kernel,
+    Polynomial,
+    centered_squares,
+    gaussian,
+    kernel_sums,
+)
 from palpate.metrics.mmd import (
     AGGREGATES,
     DENOMINATORS,
-    Design,
+    LEAST,
     Options,
-    Plan,
     design_of,
     dispersion_of,
     half_of,
@@ -138,11 +143,11 @@ class Table:
 def build_table(
     generated: FeatureSet,
     reference: FeatureSet | None,
-    plan: Plan,
+    plan: Options,
     *,
     grouped: bool,
     median_of: FeatureSet | None = None,
-    further: Callable[[Table, Plan], float] | None = None,
+    further: Callable[[Table, Options], float] | None = None,
 ) -> Table:
     """Check the sets and pass once over all their pairs.
 
@@ -197,9 +202,8 @@ def build_table(
         segments=reference_segment + 1,
         kernel=kernel,
         backend=plan.backend,
-        tolerance=plan.tolerance * plan.scale / 1000,
+        tolerance=TOLERANCE * plan.scale / 1000,
         bound=bound,
-        block=plan.block,
         weights=_even_weights(units, segment, len(generated.ids)) if grouped else (),
     )
     copies = copies_across(*parts) if reference is not None else 0
@@ -217,7 +221,7 @@ def _even_weights(unit: Index, segment: Index, generated: int) -> list[Array]:
     return weights
 
 
-def _segments(generated: FeatureSet, plan: Plan) -> tuple[list[str], Index]:
+def _segments(generated: FeatureSet, plan: Options) -> tuple[list[str], Index]:
     """The classes, and (n,) the segment of each sample."""
     ids = [str(i) for i in generated.ids]
     labels = [""] * len(ids)
@@ -229,7 +233,7 @@ def _segments(generated: FeatureSet, plan: Plan) -> tuple[list[str], Index]:
     return classes, 4 * label + 2 * half_of(ids, label, plan) + half_of(ids, whole, plan)
 
 
-def _bound(table: Table, plan: Plan) -> float:
+def _bound(table: Table, plan: Options) -> float:
     """What moments may change in TMMD, I-TMMD or an entry of the matrix D, at most."""
     halves, reference = table.set_halves(), table.sums.segment == table.sums.segments - 1
     bounds = [largest_bound(table.whole_classes(), plan.estimator, plan.scale)]
@@ -240,8 +244,6 @@ def _bound(table: Table, plan: Plan) -> float:
     return max(b if np.isfinite(b) else np.inf for b in bounds)
 
 
-#: A bound at scale 1000 from which a note reports it.
-LOOSE_BOUND = 1e-4
 #: Designs that differ by less have one floor: the change is far below the noise of any floor.
 SAME_DESIGN = 0.01
 UNBOUNDED = Note("undefined", {"reason": "moments"})
@@ -251,7 +253,7 @@ def scored(  # noqa: PLR0913
     metric: str,
     table: Table,
     generated: FeatureSet,
-    plan: Plan,
+    plan: Options,
     settings: Sequence[str],
     *,
     estimate: Estimate | None = None,
@@ -284,7 +286,7 @@ def scored(  # noqa: PLR0913
     notes = list(notes)
     if value is not None and not bound <= (2 * plan.scale if limit is None else limit):
         value, notes = None, [UNBOUNDED]
-    elif value is not None and bound > LOOSE_BOUND * (plan.scale / 1000 if limit is None else 1):
+    elif value is not None and bound > TOLERANCE * (plan.scale / 1000 if limit is None else 1):
         notes.insert(0, Note("within-bound", {"bound": float(bound)}))
     interval = estimate.interval(0, plan.level) if estimate and value is not None else None
     if value is None:
@@ -316,11 +318,12 @@ def scored(  # noqa: PLR0913
     design = np.zeros(0) if design is None else design
     if estimate is None or not len(estimate.units):
         return Scored(score, design=design)
-    names = [table.names[int(u)] for u in estimate.units]
+    names = units = [table.names[int(u)] for u in estimate.units]
+    if estimate.of_classes:
+        units = score.details["classes"]
+        score = replace(score, details={**score.details, "left_out": "class"})
     excess = estimate.replicates[:, 1] if "E" in details else np.zeros(0)
-    replicates, without = estimate.replicates[:, 0], estimate.without_class
-    result = Scored(score, replicates, names, excess, design, names, without)
-    return over_classes(result) if estimate.of_classes else result
+    return Scored(score, estimate.replicates[:, 0], units, excess, design, names)
 
 
 def not_comparable(result: Scored, floor: Scored) -> str:
@@ -386,7 +389,7 @@ def tmmd(
     reference_ids: Any = None,
     reference_groups: Any = None,
     encoder: str | None = None,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Score:
     """TMMD: dist^2 between generated and real samples (paper, Eq. 2).
 
@@ -425,7 +428,7 @@ def tmmd(
     return tmmd_scored(x, y, options).score
 
 
-def tmmd_scored(generated: FeatureSet, reference: FeatureSet, options: Options) -> Scored:
+def tmmd_scored(generated: FeatureSet, reference: FeatureSet, options: Mapping[str, Any]) -> Scored:
     """TMMD with its leave-one-unit-out values."""
     require_one_encoder(generated, reference, "reference")
     grouped = generated.groups is not None and reference.groups is not None
@@ -439,7 +442,7 @@ def shared_ids(generated: FeatureSet, reference: FeatureSet) -> int:
     return len({str(i) for i in generated.ids} & {str(i) for i in reference.ids})
 
 
-def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Plan) -> Scored:
+def tmmd_of(table: Table, generated: FeatureSet, reference: FeatureSet, plan: Options) -> Scored:
     """TMMD from a table."""
     sums, notes = table.tmmd(), list[Note]()
     est = estimate(sums, lambda t: mmd_matrix(t, plan.estimator, plan.scale)[:1, 1], table.unit)
@@ -483,7 +486,7 @@ def i_tmmd(
     labels: Any = None,
     groups: Any = None,
     encoder: str | None = None,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Score:
     """I-TMMD: dist^2 between two halves of the generated samples (paper, Eq. 3).
 
@@ -517,11 +520,11 @@ def ci_tmmd(
     labels: Any = None,
     groups: Any = None,
     encoder: str | None = None,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Score:
     """CI-TMMD: the mean over classes of dist^2 between two halves of a class (paper, Eq. 4).
 
-    A class counts with at least ``min_samples`` samples and, for halves by group, two groups of
+    A class counts with at least four samples and, for halves by group, two groups of
     which one has two samples. Arguments and errors as :func:`i_tmmd`.
 
     Returns:
@@ -539,7 +542,7 @@ def d_tmmd(
     labels: Any = None,
     groups: Any = None,
     encoder: str | None = None,
-    **options: Unpack[Options],
+    **options: Any,
 ) -> Score:
     """D-TMMD: how much a class differs from itself, against how much from the others (Eq. 5-7).
 
@@ -560,7 +563,7 @@ def d_tmmd(
 
 
 def reference_free(
-    metric: Any, generated: FeatureSet, real: FeatureSet | None, options: Options
+    metric: Any, generated: FeatureSet, real: FeatureSet | None, options: Mapping[str, Any]
 ) -> Scored:
     """One of the reference-free metrics, with real samples for its floor."""
     [result] = _from_one_table([metric], generated, options, real)
@@ -571,7 +574,10 @@ def reference_free(
 
 
 def _from_one_table(
-    metrics: Sequence[Any], features: FeatureSet, options: Options, median_of: FeatureSet | None
+    metrics: Sequence[Any],
+    features: FeatureSet,
+    options: Mapping[str, Any],
+    median_of: FeatureSet | None,
 ) -> list[Scored]:
     """Reference-free metrics of one set from one pass over its pairs."""
     grouped = features.groups is not None
@@ -582,18 +588,18 @@ def _from_one_table(
     return [metric(table, features, plan) for metric in metrics]
 
 
-def i_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
+def i_tmmd_of(table: Table, generated: FeatureSet, plan: Options) -> Scored:
     """I-TMMD from a table."""
     sums = table.set_halves()
     reason, details, notes = unfit(sums, [0, 1], plan), dict[str, Any](), list[Note]()
     if reason:
-        least, n = plan.min_samples, len(generated.ids)
-        notes = [Note("undefined", {"reason": reason, "least": least, "n": n})]
+        params = {"reason": reason, "least": LEAST, "n": len(generated.ids)}
+        notes = [Note("undefined", params)]
     given: dict[str, Any] = {"spread": table.spread(), "details": details, "notes": notes}
     return _mean_of_halves("I-TMMD", table, generated, plan, sums=sums, **given)
 
 
-def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
+def ci_tmmd_of(table: Table, generated: FeatureSet, plan: Options) -> Scored:
     """CI-TMMD from a table."""
     kept, details = _usable(table, plan)
     if not len(kept):
@@ -617,7 +623,7 @@ def _mean_of_halves(
     metric: str,
     table: Table,
     generated: FeatureSet,
-    plan: Plan,
+    plan: Options,
     *,
     sums: PairSums,
     spread: Array,
@@ -640,12 +646,12 @@ def _mean_of_halves(
     details |= {"units": len(sums.units), "E": None, "E_interval": None, "E_bound": None}
     if table.grouped:
         # dist^2 of halves of whole groups is E times a number of the design.
-        positive = (design.of_excess > 0).all()
+        positive = (design[0] > 0).all()
         details["E"], details["E_interval"] = est.values[1], est.interval(1, plan.level)
         if sums.bound is None:
             details["E_bound"] = 0.0
         elif positive:
-            details["E_bound"] = float((bounds / design.of_excess).mean())
+            details["E_bound"] = float((bounds / design[0]).mean())
     # 95 % of random halves; the true distribution leans to the right where few directions dominate.
     null = (center - 1.96 * sd, center + 1.96 * sd) if np.isfinite(sd + center) else None
     return scored(
@@ -664,7 +670,7 @@ def _mean_of_halves(
     )
 
 
-def _halves_notes(plan: Plan, sums: PairSums, *, grouped: bool) -> list[Note]:
+def _halves_notes(plan: Options, sums: PairSums, *, grouped: bool) -> list[Note]:
     """Notes of a metric of halves."""
     if not sums.rows.any() and not sums.diagonal.any():
         return [Note("collapse")]
@@ -672,7 +678,7 @@ def _halves_notes(plan: Plan, sums: PairSums, *, grouped: bool) -> list[Note]:
     return [Note("random-halves")] * random + [INDEPENDENT] * (not grouped)
 
 
-def _halves_fields(plan: Plan) -> dict[str, Any]:
+def _halves_fields(plan: Options) -> dict[str, Any]:
     """Estimator, seed and direction of a metric of halves."""
     return {
         "higher_is_better": None,  # the paper says lower; a collapsed generator is lowest
@@ -681,15 +687,15 @@ def _halves_fields(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _design(design: Design, sizes: Array, plan: Plan) -> Array:
+def _design(design: Array, sizes: Array, plan: Options) -> Array:
     """What the value depends on besides the features, see :class:`Scored`."""
     if plan.halves == "group":
-        return np.concatenate([design.of_excess, design.of_spread])
+        return design.ravel()
     with np.errstate(divide="ignore"):
         return (1 / sizes).sum(axis=1) if plan.estimator == "biased" else np.zeros(0)
 
 
-def unfit(sums: PairSums, segments: list[int], plan: Plan) -> str:
+def unfit(sums: PairSums, segments: list[int], plan: Options) -> str:
     """Why these segments cannot be cut into halves together; '' if they can.
 
     Returns:
@@ -697,14 +703,14 @@ def unfit(sums: PairSums, segments: list[int], plan: Plan) -> str:
     """
     at = np.isin(sums.segment, segments)
     sizes = np.bincount(np.unique(sums.unit[at], return_inverse=True)[1], weights=sums.n[at])
-    if sizes.sum() < plan.min_samples:
+    if sizes.sum() < LEAST:
         return "few-samples"
     if plan.halves == "group" and len(sizes) < 2:
         return "one-group"
     return "single-samples" if plan.halves == "group" and sizes.max() < 2 else ""
 
 
-def _usable(table: Table, plan: Plan) -> tuple[Index, dict[str, Any]]:
+def _usable(table: Table, plan: Options) -> tuple[Index, dict[str, Any]]:
     """Classes that can be cut into halves; ``classes`` and ``excluded`` of details."""
     whole = table.whole_classes()
     names = table.classes
@@ -716,7 +722,7 @@ def _usable(table: Table, plan: Plan) -> tuple[Index, dict[str, Any]]:
     return kept, {"classes": [names[c] for c in kept], "excluded": excluded}
 
 
-def d_matrix(t: Totals, plan: Plan, design: Design | None = None) -> Array:
+def d_matrix(t: Totals, plan: Options, design: Array | None = None) -> Array:
     """D (C, C) from 2C segments: halves of a class on the diagonal (Eq. 5), Eq. 6 off it."""
     matrix = mmd_matrix(whole_sets(t), plan.estimator, plan.scale)
     np.fill_diagonal(matrix, self_distances(t, plan, design)[0])
@@ -741,7 +747,7 @@ def denominators(matrix: Array, denominator: str) -> Array:
     return matrix.sum(axis=1) / (1 if denominator == "sum" else len(matrix))
 
 
-def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
+def d_tmmd_of(table: Table, generated: FeatureSet, plan: Options) -> Scored:
     """D-TMMD from a table."""
     kept, details = _usable(table, plan)
     fields: dict[str, Any] = _halves_fields(plan) | {"estimator": plan.estimator}
@@ -782,7 +788,7 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     }
     bound, notes = _d_bound(sums, matrix, plan), list[Note]()
     if not np.isfinite(est.values[0]):
-        loose = largest_bound(sums, plan.estimator, plan.scale) > plan.tolerance * plan.scale / 1000
+        loose = largest_bound(sums, plan.estimator, plan.scale) > TOLERANCE * plan.scale / 1000
         unknown = not bound <= 1 and loose
         notes = [UNBOUNDED if unknown else Note("undefined", {"reason": "not-separate"})]
     elif unstable:
@@ -803,7 +809,7 @@ def d_tmmd_of(table: Table, generated: FeatureSet, plan: Plan) -> Scored:
     )
 
 
-def ratio_bound(table: Table, plan: Plan) -> float:
+def ratio_bound(table: Table, plan: Options) -> float:
     """How far D-TMMD from this table may be from the exact one; 0 where it is undefined."""
     kept, _ = _usable(table, plan)
     if len(kept) < 2:
@@ -812,7 +818,7 @@ def ratio_bound(table: Table, plan: Plan) -> float:
     return _d_bound(sums, d_matrix(sums.totals, plan), plan)
 
 
-def _d_bound(sums: PairSums, matrix: Array, plan: Plan) -> float:
+def _d_bound(sums: PairSums, matrix: Array, plan: Options) -> float:
     """As :func:`ratio_bound`: numerators and denominators moved apart by their bounds."""
     if sums.bound is None:
         return 0.0
@@ -829,11 +835,7 @@ def _d_bound(sums: PairSums, matrix: Array, plan: Plan) -> float:
 
 
 def four_scores(
-    generated: FeatureSet,
-    reference: FeatureSet,
-    *,
-    floor: FeatureSet | None = None,
-    **options: Unpack[Options],
+    generated: FeatureSet, reference: FeatureSet, *, floor: FeatureSet | None = None, **options: Any
 ) -> list[Score]:
     """TMMD, I-TMMD, CI-TMMD and D-TMMD from one sweep over the pairs.
 
@@ -857,7 +859,9 @@ def four_scores(
     return [result.score for result in (first, *others)]
 
 
-def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> list[Scored]:
+def four_of(
+    generated: FeatureSet, reference: FeatureSet, options: Mapping[str, Any]
+) -> list[Scored]:
     """The four metrics as :class:`Scored`, in the order of the paper."""
     require_one_encoder(generated, reference, "reference")
     both = generated.groups is not None and reference.groups is not None
@@ -871,7 +875,7 @@ def four_of(generated: FeatureSet, reference: FeatureSet, options: Options) -> l
 
 
 def floors_of(
-    floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Options
+    floor: FeatureSet, reference: FeatureSet, like: FeatureSet, options: Mapping[str, Any]
 ) -> list[Scored]:
     """I-, CI- and D-TMMD of real samples, computed as those of ``like``.
 

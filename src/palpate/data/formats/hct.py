@@ -24,8 +24,8 @@ are relative to its ``dataN/``, or start at ``dataN/`` or ``hct/``.
   Captions are no object labels: frames of one folder are worded differently.
 - **background**: the list's image if it is there, else ``digit_background.png``, else of up to 15
   frames of the trajectory in ``not_contact.json`` the one nearest to their median, else null.
-- **Swapped folders**: some trajectories have ``vision/`` and ``tactile/`` exchanged
-  (:mod:`palpate.data.formats.swapped`).
+- **Swapped folders**: some trajectories have ``vision/`` and ``tactile/`` exchanged. Where the two
+  differ in size and vision has the sensor's, they are.
 - Photos of ``data3`` show the touched spot lower: TVL crops them 200 pixels further down.
 """
 
@@ -34,6 +34,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -45,8 +46,8 @@ from palpate.core import PalpateError, Progress, Split, inside, quiet
 from palpate.data.formats import tvl
 from palpate.data.formats.base import WORLD, Cells, Facts, Format, Row, Scan, world_facts
 from palpate.data.formats.layout import read_json_file, report_missing_folders, subfolders
-from palpate.data.formats.swapped import looks, swapped
-from palpate.data.images import check_image, read_image
+from palpate.data.frames import nearest_to_median
+from palpate.data.images import BROKEN, check_image, in_threads, opened, read_image
 from palpate.data.listing import contact_names
 from palpate.data.manifest import CLIMBS, Manifest
 from palpate.data.recordings import MEDIAN_OF
@@ -324,26 +325,32 @@ def _located(cell: str, rig: str) -> str:
 
 def _swap(result: Scan, swap: Swap, progress: Progress) -> set[str]:
     """Report swapped trajectories; with ``fix`` swap their paths back and return their names."""
-    files: dict[str, tuple[list[Path], list[Path]]] = {}
-    for video, group in _by_video(result.rows).items():
-        some = [group[k] for k in sorted({0, len(group) // 2, len(group) - 1})]
-        sides = [[result.base / row[side] for row in some] for side in ("vision", "tactile")]
-        files[video] = sides[0], sides[1]
-    seen = looks(files, progress)
-    evidence: dict[str, str] = {}
-    for rig in sorted({row["domain"] for _, row in result.rows}):
-        of_rig = {video: pair for video, pair in seen.items() if video.startswith(f"{rig}/")}
-        evidence |= swapped(of_rig, tvl.IMAGE_SIZE)
+    of_video = _by_video(result.rows)
+
+    def sizes(video: str) -> list[tuple[int, int] | None]:
+        return [_size(result.base / of_video[video][0][side]) for side in ("vision", "tactile")]
+
+    seen = dict(in_threads(sizes, of_video, "looking for swapped folders", progress))
     done = "their paths were swapped back" if swap == "fix" else "swap='fix' swaps them back"
-    for video, text in evidence.items():
+    swapped = {v for v in of_video if seen[v][0] == tvl.IMAGE_SIZE != seen[v][1] is not None}
+    for video in (v for v in of_video if v in swapped):
+        vision, tactile = (f"{size[0]}x{size[1]}" for size in seen[video] if size)
+        text = f"frames of vision are {vision} pixels as the sensor's should be, tactile {tactile}"
         result.suspect(video, "swapped-folders", f"{text}; {done}")
-    fixed = set(evidence) if swap == "fix" else set[str]()
+    fixed = swapped if swap == "fix" else set[str]()
     state = "fixed" if fixed else "as they are"
-    result.facts["swapped_folders"] = f"{len(evidence)}, {state}" if evidence else "none"
+    result.facts["swapped_folders"] = f"{len(swapped)}, {state}" if swapped else "none"
     for _, row in result.rows:
         if row["video"] in fixed:
             row["vision"], row["tactile"] = row["tactile"], row["vision"]
     return fixed
+
+
+def _size(path: Path) -> tuple[int, int] | None:
+    """(width, height) of an image, or None if it cannot be read."""
+    with suppress(*BROKEN), opened(path) as image:
+        return image.size
+    return None
 
 
 def _choose_backgrounds(
@@ -387,10 +394,9 @@ def _choose_backgrounds(
 def _typical(root: Path, names: Sequence[str]) -> str | None:
     """Of up to 15 evenly spaced whole images the one nearest to their median, or None."""
     whole = [name for name in names if inside(root, name) and check_image(root / name) is None]
-    places = np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round().astype(int)
-    some = [whole[k] for k in np.unique(places)]
-    images = [np.asarray(read_image(root / name)) for name in some]
-    if len({image.shape for image in images}) != 1:
-        return None
-    median = np.median(images, axis=0).astype(np.float32)
-    return some[int(np.argmin([np.abs(image - median).mean() for image in images]))]
+    places = np.unique(np.linspace(0, len(whole) - 1, min(MEDIAN_OF, len(whole))).round())
+    some = [whole[int(k)] for k in places]
+    with suppress(PalpateError):  # of several sizes
+        images = [np.asarray(read_image(root / name)) for name in some]
+        return some[nearest_to_median(images, root)] if some else None
+    return None

@@ -43,8 +43,6 @@ FACTS = Facts(
 )
 LOOKS_FOR = "<object>/tactile_data/<trial>/0/gelsight/"
 METADATA = "objectfolder_real_metadata.csv"
-MATERIALS = ("Ceramic", "Wood", "Steel", "Iron", "Plastic", "Glass", "Polycarbonate")
-OBJECTS = 100
 
 
 def detect(source: Path) -> bool:
@@ -65,8 +63,6 @@ def scan(source: Path, *, metadata: Path | None = None, progress: Progress = qui
         progress("reading objects", done, len(objects))
         _object(result, name, materials.get(int(name)))
     _suspect_unnumbered(result, ".")
-    unknown = [name for name in objects if not 1 <= int(name) <= OBJECTS]
-    result.suspect(root, "unknown-object", f"objects outside 1 to {OBJECTS}", unknown)
     bare = [name for name in objects if materials and int(name) not in materials]
     result.suspect(METADATA, "no-material", "objects that the table lacks", bare)
     return result
@@ -138,6 +134,4 @@ def _materials(result: Scan, given: Path | None) -> dict[int, str]:
         elif (before := materials.setdefault(int(index), material)) != material:
             result.problem(where, "two-labels", f"object {index} is {before} on an earlier line")
     result.problems += table.problems
-    unknown = sorted(set(materials.values()) - set(MATERIALS))
-    result.suspect(path, "unknown-material", f"other than {', '.join(MATERIALS)}", unknown)
     return materials

@@ -49,11 +49,6 @@ FACTS = Facts(
     group="video (= scene); there are few, so leave whole scenes out in turn",
 )
 LOOKS_FOR = "vision/ and touch/ with folders named <scene>_40_30"
-_SCENES = (
-    "conference_room clothes office_1 office_2 stairs table_outdoor workroom bench snow bus_stop "
-    "chair_outdoor table_indoor lounge"
-)
-SCENES = frozenset(_SCENES.split())
 #: Names of scenes in the ``touch_bg`` folders of the public code; that of office_2 is uncertain.
 BACKGROUND_NAMES = {
     "bench": "bench_outdoor_1",
@@ -95,9 +90,6 @@ def scan(source: Path, *, scale: str | None = None, progress: Progress = quiet) 
         view = _view_scale(scene, vision.get(scene, []), scale)
         used |= {view} if scene in tactile and scene in vision else set()
         _scene(result, scene, view, ids)
-    known = SCENES.union(BACKGROUND_NAMES.values())
-    unknown = [scene for scene in sorted(tactile) if scene.removesuffix("_colmap") not in known]
-    result.suspect("touch", "unknown-scene", "scenes not named in the publication", unknown)
     names = [name for side in ("touch", "vision") for name in subfolders(root / side)]
     odd = [name for name in names if not re.fullmatch(SCALED, name)]
     result.suspect(root, "unknown-folder", "skipped, as not named <scene>_<scale>", odd)

@@ -51,11 +51,6 @@ FACTS = Facts(
     group_column="object",
 )
 LOOKS_FOR = "real/<object>/dataset_0/ or sim/<object>/00/tactile_images/"
-_OBJECTS = (
-    "004_sugar_box 005_tomato_soup_can 006_mustard_bottle 021_bleach_cleanser 025_mug "
-    "035_power_drill 037_scissors 042_adjustable_wrench 048_hammer 055_baseball"
-)
-OBJECTS = _OBJECTS.split()
 LOGS = range(5)
 #: Part -> (name of a log's folder, its tactile folder, name of a frame).
 LAYOUT = {
@@ -91,7 +86,6 @@ def scan(source: Path, *, part: Part | None = None, progress: Progress = quiet) 
         progress("reading logs", done, len(logs))
         sparsh = None if part == "sim" or log not in LOGS else "test" if log == 4 else "train"
         _log(result, part, name, f"{part}/{name}/{folder}", sparsh)
-    _compare_with_publication(result, part, logs)
     return result
 
 
@@ -139,17 +133,3 @@ def _log(result: Scan, part: str, name: str, place: str, sparsh: str | None) -> 
             "split": sparsh,
         }
         result.rows.append((tactile.path(k), row))
-
-
-def _compare_with_publication(result: Scan, part: str, logs: list[tuple[str, int, str]]) -> None:
-    """Report objects and logs that differ from the published ones."""
-    names = dict.fromkeys(name for name, _, _ in logs)
-    unknown = [name for name in names if name not in OBJECTS]
-    result.suspect(part, "unknown-object", "not in the publication", unknown)
-    absent = [name for name in OBJECTS if name not in names]
-    result.suspect(part, "missing-object", f"not here, of {len(OBJECTS)} objects", absent)
-    for name in names:
-        numbers = [log for other, log, _ in logs if other == name]
-        if numbers != list(LOGS):
-            text = f"the logs {', '.join(map(str, numbers))} are here; 0 to 4 were published"
-            result.suspect(f"{part}/{name}", "missing-log", text)
