@@ -1,5 +1,6 @@
 """The loss against a slow loop; training of a tactile encoder and of a fresh CLIP."""
 
+import colorsys
 import math
 from dataclasses import replace
 
@@ -28,7 +29,8 @@ from palpate.encoders.losses import (
     three_way,
 )
 from palpate.encoders.presets import preset
-from palpate.encoders.rows import subsets_of
+from palpate.encoders.rows import augmented, draw, subsets_of
+from palpate.training.steps import Step
 
 TINY = preset("tiny")
 FEELS = {
@@ -200,6 +202,40 @@ def test_parts_of_a_list_of_adjectives():
         "warm",
     }
     assert subsets_of("soft grass") == ["soft grass"]
+
+
+def test_views_change_colors_as_the_color_wheel_does():
+    """Against the standard library's HSV and the mean of the channels, a row at a time."""
+    image = torch.rand(1, 3, 5, 4, generator=torch.Generator().manual_seed(0))
+    whole = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
+    none = {"window": whole, "gain": torch.zeros(1), "offset": torch.zeros(1)}
+
+    def view(saturation, hue, x=image):
+        colors = {"saturation": torch.tensor([saturation]), "hue": torch.tensor([hue])}
+        return augmented(x, {**none, **colors})
+
+    assert torch.allclose(view(0.0, 0.0), image, atol=1e-5)
+    assert torch.allclose(view(0.3, 0.1, 0.4 * torch.ones_like(image)), torch.tensor(0.4))
+    luma = (torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1) * image).sum(1, keepdim=True)
+    assert torch.allclose(view(-1.0, 0.0), luma.expand_as(image), atol=1e-5)
+    assert torch.allclose(view(0.5, 0.0), luma + 1.5 * (image - luma), atol=1e-5)
+    # A third of a turn takes each primary color nearest to the next one on the wheel.
+    primaries = torch.eye(3).view(3, 3, 1, 1)
+    for k in range(3):
+        turned = view(0.0, 1 / 3, primaries[k : k + 1])[0, :, 0, 0].tolist()
+        hue = colorsys.rgb_to_hsv(*(max(0.0, v) for v in turned))[0]
+        assert abs((hue - (k + 1) / 3 + 0.5) % 1 - 0.5) < 0.06
+
+
+def test_a_share_of_the_images_changes_color():
+    step = Step(0, np.arange(4000), 0)
+    drawn = draw(preset("tvl-tiny").tactile_course.augment, step)
+    changed = drawn["hue"] != 0
+    assert float(changed.float().mean()) == pytest.approx(0.8, abs=0.03)
+    for name in ("gain", "offset", "saturation"):
+        assert ((drawn[name] != 0) == changed).all()
+    assert float(drawn["saturation"].abs().max()) == pytest.approx(0.2, abs=1e-3)
+    assert float(drawn["hue"].abs().max()) == pytest.approx(0.05, abs=1e-3)
 
 
 def test_photos_may_be_missing_partners_may_learn_and_videos_may_be_held_out(world, clip, tmp_path):

@@ -8,7 +8,9 @@ import signal
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors import safe_open
+from tensorboardX.proto.event_pb2 import Event
 from torch import nn
 
 from palpate.core import PalpateError, quiet
@@ -422,3 +424,62 @@ def test_half_precision_learns(tmp_path, whole, precision, lines):
     log = fit(Net(), loss, N, options(), tmp_path, compute)
     for row, plain in list(zip(log, whole[1], strict=True))[:lines]:
         assert row["loss"] == pytest.approx(plain["loss"], rel=0.01)
+
+
+def a_sheet(module):
+    assert not module.training
+    value = float(module.b.weight.detach().abs().mean())
+    return np.full((4, 6, 3), round(255 * min(1, value)), np.uint8)
+
+
+def test_samples_are_drawn_with_each_checkpoint_and_change_nothing(tmp_path, whole):
+    net = Net()
+    fit(net, loss, N, options(), tmp_path, ALWAYS, samples=a_sheet)
+    assert same(weights(net), whole[0])
+    drawn = sorted((tmp_path / "samples").iterdir())
+    assert [p.name for p in drawn] == [f"{k:07}.png" for k in range(1, STEPS + 1)]
+    shown = np.asarray(Image.open(drawn[-1]))
+    assert (shown == a_sheet(net)).all()  # the averaged weights, which are the result
+    fit(Net(), loss, N, options(), tmp_path / "once", samples=a_sheet)
+    assert [p.name for p in (tmp_path / "once" / "samples").iterdir()] == [drawn[-1].name]
+
+
+def events(file):
+    """The records of a TensorBoard file: length, checksum, event, checksum."""
+    data = file.read_bytes()
+    while data:
+        n = int.from_bytes(data[:8], "little")
+        yield Event.FromString(data[12 : 12 + n])
+        data = data[16 + n :]
+
+
+def test_tensorboard_has_the_log_and_the_samples(tmp_path):
+    compute = Compute(trackers=("tensorboard",))
+    log = fit(Net(), loss, N, options(), tmp_path, compute, samples=a_sheet)
+    (file,) = (tmp_path / "tensorboard").glob("*tfevents*")
+    values, images = {}, []
+    for event in events(file):
+        for value in event.summary.value:
+            if value.HasField("image"):
+                images.append((event.step, value.image.height, value.image.width))
+            else:
+                values[event.step, value.tag] = value.simple_value
+    assert images == [(STEPS, 4, 6)]
+    for line in log:
+        for name in ("loss", "lr"):
+            assert values[line["step"], name] == pytest.approx(line[name], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "apart"),
+    [
+        pytest.param({"compile": True}, 1e-5, marks=pytest.mark.slow),
+        ({"channels_last": True}, 1e-6),
+        ({"gradient_checkpointing": True}, 0),
+        ({"tf32": False}, 0),
+    ],
+)
+def test_how_it_is_run_changes_rounding_alone(tmp_path, whole, change, apart):
+    log = fit(Net(), loss, N, options(), tmp_path, Compute(**change))
+    for row, plain in zip(log, whole[1], strict=True):
+        assert row["loss"] == pytest.approx(plain["loss"], abs=apart)

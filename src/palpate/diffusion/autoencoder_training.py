@@ -32,11 +32,14 @@ from palpate.diffusion.autoencoder import Autoencoder, to_bytes
 from palpate.diffusion.options import AutoencoderOptions
 from palpate.encoders.encoder_set import seeded
 from palpate.encoders.preprocess import to_unit
+from palpate.encoders.rows import evenly
 from palpate.metrics.images import per_image
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.options import Compute, LoopOptions
 from palpate.training.processes import gather_rows
 from palpate.training.steps import Step
+
+SHOWN = 8  # held-out samples that are drawn while a model trains
 
 
 def build_autoencoder(options: AutoencoderOptions) -> Autoencoder:
@@ -76,7 +79,7 @@ def train_autoencoder(
         options: see :class:`AutoencoderOptions`.
         folder: for checkpoints.
         held_out: bytes (m, h, w, 3) of other videos; the card then says how well they are
-            reconstructed.
+            reconstructed, and some are drawn with each checkpoint.
         seed: of weights, order, crops and noise.
         key: digest of the images.
         device: where to train.
@@ -97,9 +100,17 @@ def train_autoencoder(
     free = LoopOptions(options.steps_free, options.batch, options.lr, weight_decay=1e-4, seed=seed)
     last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
 
+    shown = np.empty(0) if held_out is None else held_out[evenly(len(held_out), SHOWN)]
+
     def run(what: str, course: LoopOptions, stage: str, *, quantize: bool) -> None:
+        def samples(module: nn.Module) -> NDArray[np.uint8]:
+            assert isinstance(module, Autoencoder)
+            latents = module.latents(to_unit(shown, device, signed=True))
+            return sheet(shown, to_bytes(module.image(latents, quantize=quantize)[0]))
+
         loss = _Loss(images, options, quantize=quantize)
-        task = Task(what, len(images), loss.load, loss, key)
+        draw = samples if len(shown) else None
+        task = Task(what, len(images), loss.load, loss, key, samples=draw)
         fit(model, task, course, folder / stage, compute=compute, progress=progress)
 
     run("autoencoder", free, "free", quantize=False)
@@ -109,6 +120,11 @@ def train_autoencoder(
     if held_out is not None and len(held_out):
         model.card["held_out"] = asdict(measure_reconstruction(model, held_out))
     return model.eval().requires_grad_(False)
+
+
+def sheet(*rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Images of one size, (n, h, w, 3) a row, as one image."""
+    return np.vstack([np.hstack(list(row)) for row in rows])
 
 
 class _Loss:

@@ -15,7 +15,7 @@ Options beyond the paper: v-prediction (Salimans & Ho 2022), whose target is ``s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -40,7 +40,7 @@ from palpate.core import (
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats
-from palpate.diffusion.autoencoder_training import train_autoencoder
+from palpate.diffusion.autoencoder_training import SHOWN, sheet, train_autoencoder
 from palpate.diffusion.denoiser import Denoiser, build_unet
 from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
 from palpate.diffusion.pipeline import TactilePipeline
@@ -49,6 +49,7 @@ from palpate.encoders.contrastive import load_manifest, train_part
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, pick_device
+from palpate.encoders.rows import evenly
 from palpate.training.engine import Batch, Losses, Task, fit
 from palpate.training.estimate import estimate
 from palpate.training.options import Compute, LoopOptions
@@ -278,6 +279,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     with first_alone():
         rows, held = encoded(train, ""), manifest.part(split, "val")
         others = encoded(held, "val-") if len(held) else None
+        shown = _shown(manifest, split, columns, preset.size, encoders)
     key = [digest_lines(texts), *(image_stamp(train, c) for c in ("vision", *columns))]
     key += [train.digest, held.digest if len(held) else "", autoencoder.digest]
     key += [encoders.digest(source) for source in SOURCES]
@@ -286,6 +288,17 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
     policy = policy if source is None else replace(policy, source=source)
     loop = preset.loop_for(len(train), seed=seed)
     loop = loop if steps is None else replace(loop, steps=steps)
+
+    def samples(module: nn.Module) -> NDArray[np.uint8]:
+        assert isinstance(module, Denoiser)
+        assert shown is not None
+        parts = (autoencoder, module, stats, preset.schedule, preset.sampler, preset.size)
+        ids, conditions, photos, tactile, *gel = shown
+        made = TactilePipeline(*parts).sample(
+            conditions, ids, seed=seed, background=gel[0] if gel else None
+        )
+        return sheet(photos, tactile, made)
+
     denoiser = train_denoiser(
         rows.latents,
         rows.conditions,
@@ -300,6 +313,7 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         start=start.denoiser if start else None,
         key=digest_json(key),
         names=train.ids,
+        samples=samples if shown else None,
         device=where,
         compute=compute,
         progress=progress,
@@ -336,6 +350,25 @@ def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the traini
         EncoderSet(encoders.clip),  # the tactile encoder scores, it does not generate
         preset.name,
         record,
+    )
+
+
+def _shown(
+    manifest: Manifest, split: Split, columns: Sequence[str], size: int, encoders: EncoderSet
+) -> tuple[Any, ...] | None:
+    """Some samples outside of train: ids, vision embeddings, photos and images of ``columns``."""
+    columns = ("vision", *columns)
+    held = manifest.part(split, "val")
+    held = held if len(held) else manifest.part(split, "test")
+    cells = zip(held.ids, *(held.column(c) for c in columns), strict=True)
+    whole = [name for name, *images in cells if all(images)]
+    if not whole:
+        return None
+    some = held.take([whole[k] for k in evenly(len(whole), SHOWN)])
+    return (
+        some.ids,
+        embed(some, encoders, "vision").features,
+        *(cached_images(some, column, size) for column in columns),
     )
 
 
@@ -411,6 +444,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     start: Denoiser | None = None,
     key: str = "",
     names: Sequence[str] | None = None,
+    samples: Callable[[nn.Module], NDArray[np.uint8]] | None = None,
     device: str | torch.device = "cpu",
     compute: Compute | None = None,
     progress: Progress = quiet,
@@ -433,6 +467,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
             means are those of ``conditions`` all the same.
         key: digest of latents, conditions and background, which are not read for it.
         names: of the rows, for errors.
+        samples: see :class:`~palpate.training.engine.Task`.
         device: where to train.
         compute: how to run it on the machine at hand.
         progress: called after each step.
@@ -478,7 +513,7 @@ def train_denoiser(  # noqa: PLR0913 - one row per part of the model
     facts = [asdict(settings) for settings in (stats, unet, policy, schedule)]
     begin = [] if start is None else [digest_tensors(start.unet.state_dict())]
     key = digest_json([key, background is not None, *facts, *begin])
-    task = Task("generator", len(latents), loss.load, loss, key, names, others)
+    task = Task("generator", len(latents), loss.load, loss, key, names, others, None, samples)
     fit(model, task, loop, folder, compute=compute, progress=progress)
     return model.eval().requires_grad_(False)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import affine_grid, grid_sample
 
@@ -108,7 +109,7 @@ class Rows:
 
     def features(self, encode: Callable[[Tensor], Tensor], device: torch.device) -> FeatureSet:
         """Embeddings of at most :data:`PROBED` evenly spaced tactile images, with materials."""
-        some = np.unique(np.linspace(0, len(self.images) - 1, PROBED).astype(int))
+        some = evenly(len(self.images), PROBED)
         parts: list[Tensor] = []
         for start in range(0, len(some), 128):
             pixels = torch.from_numpy(np.array(self.images[some[start : start + 128]])).to(device)
@@ -120,19 +121,24 @@ class Rows:
 
 
 def draw(augment: Augment, step: Step) -> dict[str, Tensor]:
-    """The random numbers of a batch: a window (b, 2, 3), a gain and an offset (b,) each."""
+    """The random numbers of a batch: a window (b, 2, 3), and changes of color (b,) each."""
     scale = 1 - augment.crop * step.rand()
     shift = (2 * step.rand(2) - 1) * (1 - scale)[:, None]
     turns = step.randint(4) * augment.quarter_turns
     mirror = 1.0 - 2.0 * step.randint(2, 2) * augment.flips
-    gain = torch.exp(augment.gain * step.randn())
-    offset = augment.offset * step.randn()
+    changes = {"gain": augment.gain * step.randn(), "offset": augment.offset * step.randn()}
+    if augment.saturation or augment.hue:
+        changes["saturation"] = augment.saturation * (2 * step.rand() - 1)
+        changes["hue"] = augment.hue * (2 * step.rand() - 1)
+    if augment.share < 1:
+        changed = step.rand() < augment.share
+        changes = {name: change * changed for name, change in changes.items()}
     angle = turns * (torch.pi / 2)
     cos, sin = scale * torch.cos(angle), scale * torch.sin(angle)
     rows = [torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)]
     window = torch.stack(rows, 1)
     window[:, :, :2] *= mirror[:, None]
-    return {"window": window, "gain": gain, "offset": offset}
+    return {"window": window, **changes}
 
 
 def augmented(images: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
@@ -144,7 +150,24 @@ def augmented(images: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
         return images
     grid = affine_grid(drawn["window"], list(images.shape), align_corners=False)
     images = grid_sample(images, grid, align_corners=False, padding_mode="reflection")
-    return images * drawn["gain"].view(-1, 1, 1, 1) + drawn["offset"].view(-1, 1, 1, 1)
+    if "hue" in drawn:
+        colors = color_matrices(drawn["saturation"], drawn["hue"])
+        images = torch.einsum("bij,bjhw->bihw", colors, images)
+    return images * drawn["gain"].exp().view(-1, 1, 1, 1) + drawn["offset"].view(-1, 1, 1, 1)
+
+
+def color_matrices(saturation: Tensor, hue: Tensor) -> Tensor:
+    """Matrices (b, 3, 3) that stretch colors by 1 + saturation and turn them by hue turns.
+
+    In YIQ, whose first row is the luma, which stays; grays stay gray.
+    """
+    yiq = saturation.new_tensor(
+        [[0.299, 0.587, 0.114], [0.596, -0.274, -0.322], [0.211, -0.523, 0.312]]
+    )
+    length, angle = 1 + saturation, 2 * torch.pi * hue
+    cos, sin, zero = length * angle.cos(), length * angle.sin(), torch.zeros_like(hue)
+    rows = [zero + 1, zero, zero, zero, cos, sin, zero, -sin, cos]
+    return yiq.inverse() @ torch.stack(rows, 1).view(-1, 3, 3) @ yiq
 
 
 def unit(images: Tensor) -> Tensor:
@@ -155,6 +178,11 @@ def unit(images: Tensor) -> Tensor:
 def numbers(values: Sequence[str]) -> Tensor:
     """Each value's index among the sorted distinct values, (n,) int64."""
     return torch.from_numpy(np.unique(np.array(values, dtype=object), return_inverse=True)[1])
+
+
+def evenly(n: int, most: int) -> NDArray[np.int64]:
+    """At most so many of ``n`` rows, evenly spaced."""
+    return np.linspace(0, n - 1, min(n, most)).astype(np.int64)
 
 
 def subsets_of(text: str) -> list[str]:

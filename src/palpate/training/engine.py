@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from PIL import Image
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -36,6 +38,7 @@ Batch = dict[str, Tensor]
 #: The data of a step, on the CPU; called in a thread, ahead of the step.
 Load = Callable[[Step], Batch]
 CHECKPOINT, BEST, LOG = "checkpoint.safetensors", "best.safetensors", "log.jsonl"
+SAMPLES = "samples"
 MOMENTS = ("exp_avg", "exp_avg_sq")  # of AdamW
 DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 EVERY = 10  # steps between two lines of the log
@@ -71,6 +74,8 @@ class Task:
         names: of the rows, for errors.
         held_out: rows of the held-out part, and ``load`` of it.
         probe: numbers to log at each evaluation, of the module in evaluation mode.
+        samples: an image, bytes (h, w, 3), of what the module makes of a few samples; drawn with
+            each checkpoint.
     """
 
     what: str
@@ -81,6 +86,7 @@ class Task:
     names: Sequence[str] | None = None
     held_out: tuple[int, Load] | None = None
     probe: Callable[[nn.Module], dict[str, float]] | None = None
+    samples: Callable[[nn.Module], NDArray[np.uint8]] | None = None
 
 
 def fit(
@@ -98,9 +104,10 @@ def fit(
         module: parameters that require gradients are trained, on the module's device.
         task: see :class:`Task`.
         options: see :class:`LoopOptions`; no batch is larger than the set.
-        folder: receives ``checkpoint.safetensors`` and ``log.jsonl``, and ``best.safetensors``
-            where there is a held-out part. A checkpoint of other rows, options, shapes or ``key``
-            is ignored and then replaced. Several processes must share it.
+        folder: receives ``checkpoint.safetensors`` and ``log.jsonl``, ``best.safetensors`` where
+            there is a held-out part, and ``samples/<step>.png`` where the task draws them. A
+            checkpoint of other rows, options, shapes or ``key`` is ignored and then replaced.
+            Several processes must share it.
         compute: see :class:`Compute`.
         progress: called after each step with the smoothed loss as remark.
 
@@ -216,8 +223,10 @@ class _Run:
                 break
             if time.monotonic() - saved > 60 * self.compute.checkpoint_minutes:
                 self.save()
+                self.draw()
                 saved = time.monotonic()
         self.save(wait=True)
+        self.draw()
 
     def load(self, step: int) -> Batch:
         """The data of this process's rows, ready to be copied to the device."""
@@ -302,15 +311,13 @@ class _Run:
         """Log the held-out loss and the probe of the weights that would be the result now."""
         self.check()
         values: dict[str, float] = {}
-        with self.averaged(), torch.no_grad():
-            self.module.eval()
+        with self.evaluating():
             if self.task.held_out is not None:
                 values["held_out"] = self.held_out_loss(*self.task.held_out)
             if self.task.probe is not None:
                 values |= self.task.probe(self.module)
             if "held_out" in values and values["held_out"] < self.best[0] and not self.part[0]:
                 _save(_copies(self.module.state_dict()), self.folder / BEST)
-            self.module.train()
         self.write_log({"step": step - 1} | values)
 
     def held_out_loss(self, n: int, load: Load) -> float:
@@ -339,12 +346,27 @@ class _Run:
         return patience is not None and self.best[1] >= patience
 
     @contextmanager
-    def averaged(self) -> Generator[None]:
-        """The averaged weights in place of the last ones, inside."""
+    def evaluating(self) -> Generator[None]:
+        """The averaged weights in place of the last ones, in evaluation mode, inside."""
         last = {name: self.parameters[name].detach().clone() for name in self.average}
         self.copy(self.average)
-        yield
+        self.module.eval()
+        with torch.no_grad():
+            yield
+        self.module.train()
         self.copy(last)
+
+    def draw(self) -> None:
+        """Draw what the weights that would be the result now make of a few samples."""
+        if self.task.samples is None or self.part[0]:
+            return
+        with self.evaluating():
+            image = self.task.samples(self.module)
+        with atomic_path(self.folder / SAMPLES / f"{self.step:07}.png") as part:
+            Image.fromarray(image).save(part)
+        for tracker in self.trackers:
+            layout = {"dataformats": "NHWC"} if tracker.name == "tensorboard" else {}
+            tracker.log_images({"samples": image[None]}, step=self.step, **layout)
 
     def copy(self, weights: dict[str, Tensor]) -> None:
         """Copy these weights into the module."""

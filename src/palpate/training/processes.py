@@ -149,8 +149,11 @@ def work_folder(output: Path | None) -> Generator[Path]:
 
 
 def keep_logs(work: Path, output: Path) -> None:
-    """Copy the logs of a training to its result: ``log-<stage>.jsonl``, and TensorBoard's files."""
+    """Copy what a training wrote to its result: ``log-<stage>.jsonl``, images of samples, and
+    TensorBoard's files.
+    """
     for log in sorted(work.rglob("log.jsonl")):
         shutil.copy(log, output / f"log-{log.parent.name}.jsonl")
-        if (board := log.parent / "tensorboard").is_dir():
-            shutil.copytree(board, output / "tensorboard" / log.parent.name)
+        for name in ("samples", "tensorboard"):
+            if (folder := log.parent / name).is_dir():
+                shutil.copytree(folder, output / name / log.parent.name)
