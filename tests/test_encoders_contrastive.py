@@ -257,10 +257,14 @@ def test_photos_may_be_missing_partners_may_learn_and_videos_may_be_held_out(wor
     assert lines.count("held_out") == lines.count("probe") > 1
 
 
-def test_a_batch_of_one_is_rejected(world, clip, tmp_path):
+def test_a_batch_of_one_and_one_sample_are_rejected(world, clip, tmp_path):
     one = Split.from_ids(train=world.ids[:1])
-    with pytest.raises(PalpateError, match="`batch` must be at least 2"):
+    with pytest.raises(PalpateError, match="must hold two samples"):
         train_tactile(world, one, clip, TINY, tmp_path, device="cpu")
+    for batch, must in ((1, "`batch` must be at least 2"), (0, "`batch` must be at least 1")):
+        preset = quick(tactile_course=replace(TINY.tactile_course, batch=batch))
+        with pytest.raises(PalpateError, match=must):
+            train_tactile(world, by_video(world), clip, preset, tmp_path, device="cpu")
 
 
 @pytest.mark.parametrize("weights", [(1, 1), (0, 0, 0), (1, -1, 1), (math.nan,) * 3])

@@ -4,11 +4,15 @@ import json
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 
 from palpate.cli import main
 from palpate.core import PalpateError, Split
+from palpate.data.manifest import Manifest
 from palpate.diffusion import TactilePipeline, train_generator
 from palpate.encoders import EncoderSet, train_encoder
+from palpate.training.processes import connect, place, work_folder
 
 
 @pytest.fixture
@@ -51,6 +55,10 @@ def test_encoders_and_a_generator_from_the_command_line(data, tmp_path, capsys, 
     assert (facts["digest"], facts["steps"], facts["source"]) == (pipeline.digest, 2, "text")
     assert pipeline.encoders.digest("vision") == encoders.digest("vision")
     assert pipeline.autoencoder.card["held_out"]["n"] == len(data[1].ids("test"))
+    # Of eight test samples: photo, real and generated; image and reconstruction.
+    for stage, rows in (("denoiser", 3), ("free", 2), ("quantized", 2)):
+        (drawn,) = (tmp_path / "model" / "samples" / stage).iterdir()
+        assert Image.open(drawn).size == (8 * 32, rows * 32)
     photo = data[0].paths("vision")[0]
     assert main(["generate", str(photo), "--model", "model", "-o", "t.png"]) == 0
     assert not [p.name for p in tmp_path.iterdir() if p.name.endswith(".work")]
@@ -117,3 +125,39 @@ def test_a_set_of_encoders_or_a_clip_conditions_a_generator(data, tmp_path):
 def test_mistakes_are_explained(data, call, message):
     with pytest.raises(PalpateError, match=message):
         call(*data)
+
+
+def test_the_split_that_lies_with_the_data_is_the_default(data, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    common = ["train", "encoder", "tag", "--preset", "tiny", "--clip", "palpate/mini", "-o", "e"]
+    assert main(common) == 2
+    assert "--split must be given unless one lies with the data" in capsys.readouterr().err
+    (tmp_path / "tag" / "splits").mkdir()
+    data[1].save(tmp_path / "tag" / "splits" / "Orig.json")
+    assert main([*common, "--dry-run"]) == 0
+    assert main([*common, "--json", "--epochs", "0.1"]) == 0
+    assert EncoderSet.load(tmp_path / "e").card["split"] == data[1].digest
+
+
+def test_what_is_rejected_leaves_no_folder_and_keeps_another_run_s(data, tmp_path):
+    manifest, split = data
+    bare = Manifest.from_rows(
+        [{**row, "tactile": None} for row in manifest.table.iter_rows(named=True)], manifest.root
+    )
+    with pytest.raises(PalpateError, match="tactile"):
+        train_encoder(bare, split, preset="tiny", clip="palpate/mini", output=tmp_path / "out")
+    assert not list(tmp_path.glob(".out*"))
+    with work_folder(tmp_path / "out") as work:
+        with pytest.raises(PalpateError, match="must be written by one run"):
+            train_encoder(manifest, split, preset="tiny", output=tmp_path / "out")
+        assert work.is_dir()
+
+
+def test_several_processes_need_torch_with_its_distributed_part(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr(torch.distributed, "is_available", lambda: False)
+    with pytest.raises(PalpateError, match="a build without it"):
+        connect("cpu")
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    assert connect("cpu") == "cpu"
+    assert place() == (0, 1)

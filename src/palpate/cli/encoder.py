@@ -22,13 +22,14 @@ class Options(Common):
 
     data: Annotated[Path, tyro.conf.Positional]
     """Manifest file, the folder of an import, or a data set."""
-    split: Path
-    """Split file; only its train part is trained on."""
     output: OutPath
     """Folder for the encoders; must be new or empty."""
     clip: str | None = None
     """Hub id or folder of a pretrained CLIP, or palpate/mini. Default: the preset's, or a small one
     that is trained first on the same train part."""
+    split: Path | None = None
+    """Split file; only its train part is trained on. Default: the one that lies with the data, in
+    `splits/`."""
     preset: EncoderPresetName = "mini"
     """Size and course; `tvl-*` are TVL's and `paper` is the paper's, for GPUs."""
     epochs: float | None = None
@@ -86,6 +87,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "tactile": encoders.digest("tactile"),
         "clip": encoders.clip.name,
         "split": encoders.card["split"],
+        "text_source": encoders.card["text_source"],
         "processes": encoders.card["processes"],
         "learning_rate": encoders.card["options"]["lr"],
     }

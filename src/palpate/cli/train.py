@@ -23,8 +23,6 @@ class Options(Common):
 
     data: Annotated[Path, tyro.conf.Positional]
     """Manifest file, the folder of an import, or a data set."""
-    split: Path
-    """Split file; only its train part is trained on."""
     clip: str
     """Encoders that condition the generator: folder of `palpate train encoder` or of a CLIP, hub
     id, or palpate/mini."""
@@ -33,6 +31,9 @@ class Options(Common):
     autoencoder: str | None = None
     """Hub id or folder of a pretrained VQ model (diffusers VQModel), or palpate/mini. Default: a
     small one, trained first on the train part."""
+    split: Path | None = None
+    """Split file; only its train part is trained on. Default: the one that lies with the data, in
+    `splits/`."""
     preset: Literal["mini", "tiny", "paper"] = "mini"
     """Geometry, schedule and length; `paper` is the paper's, for GPUs."""
     source: Literal["text", "vision", "mixed"] | None = None
@@ -88,6 +89,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         "learning_rate": record["loop"]["lr"],
         "learning_rate_if_the_batch_is_each_of_two_gpus": 2 * record["loop"]["lr"],
         "processes": record["processes"],
+        "text_source": record["text_source"],
         "source": record["source"],
         "background": record["background"],
     }

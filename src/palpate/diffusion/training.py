@@ -45,7 +45,7 @@ from palpate.diffusion.denoiser import Denoiser, build_unet
 from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_named
-from palpate.encoders.contrastive import load_manifest, train_part
+from palpate.encoders.contrastive import load_manifest, load_split, train_part
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, pick_device
@@ -79,7 +79,7 @@ class Encoded:
 
 def train_generator(  # noqa: PLR0913 - a public verb
     data: Manifest | str | Path,
-    split: Split | str | Path,
+    split: Split | str | Path | None,
     clip: EncoderSet | str | Path,
     *,
     preset: str | DiffusionPreset = "mini",
@@ -97,7 +97,8 @@ def train_generator(  # noqa: PLR0913 - a public verb
 
     Args:
         data: a manifest, or anything that :func:`palpate.data.load` reads.
-        split: a split or its file; its digest goes into the pipeline.
+        split: a split or its file; its digest goes into the pipeline. None: the one that lies with
+            the data.
         clip: vision and text encoders that condition the generator: a set of encoders, its folder,
             the folder or hub id of a CLIP, or ``palpate/mini``.
         preset: geometry, schedule and length: ``mini``, ``tiny`` or ``paper``, or a preset.
@@ -125,7 +126,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
         must, fix = f"must be given for the preset {chosen.name}", "Pass a hub id or a folder"
         raise PalpateError(must, "none", fix, argument="autoencoder")
     device = connect(device)
-    manifest, split = load_manifest(data), Split.load(split)
+    manifest, split = load_manifest(data), load_split(data, split)
     encoders = clip if isinstance(clip, EncoderSet) else EncoderSet(load_clip(clip))
     output = None if output is None else Path(output)
     with work_folder(output) as work:
@@ -176,7 +177,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
 
 def plan_generator(
     data: Manifest | str | Path,
-    split: Split | str | Path,
+    split: Split | str | Path | None = None,
     *,
     preset: str | DiffusionPreset = "mini",
     steps: int | None = None,
@@ -191,7 +192,7 @@ def plan_generator(
         see :func:`palpate.training.estimate.estimate`.
     """
     chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
-    train = train_part(load_manifest(data), Split.load(split))
+    train = train_part(load_manifest(data), load_split(data, split))
     loop = chosen.loop_for(len(train))
     loop = loop if steps is None else replace(loop, steps=steps)
     vq, width = chosen.autoencoder, chosen.condition.width
@@ -208,7 +209,8 @@ def plan_generator(
         tokens = torch.zeros(rows, chosen.condition.tokens, width, device=where)
         return denoiser(z, torch.zeros(rows, dtype=torch.long, device=where), tokens)
 
-    return estimate(build, forward, loop, len(train), pick_device(device))
+    plan = estimate(build, forward, loop, len(train), pick_device(device))
+    return plan | {"learning_rate_if_the_batch_is_each_of_two_gpus": 2 * loop.lr}
 
 
 def train_pipeline(  # noqa: PLR0913, PLR0917 - one row per choice of the training

@@ -74,7 +74,7 @@ Partners = Literal["frozen", "trainable"]
 
 def train_encoder(  # noqa: PLR0913 - a public verb
     data: Manifest | str | Path,
-    split: Split | str | Path,
+    split: Split | str | Path | None = None,
     *,
     preset: str | EncoderPreset = "mini",
     clip: str | Path | ClipEncoders | None = None,
@@ -97,8 +97,10 @@ def train_encoder(  # noqa: PLR0913 - a public verb
 
     Args:
         data: a manifest, or anything that :func:`palpate.data.load` reads.
-        split: a split or its file; its digest goes into the card.
-        preset: ``mini``, ``tiny`` or ``paper``, or a preset.
+        split: a split or its file; its digest goes into the card. Default: the one that lies with
+            the data.
+        preset: ``mini``, ``tiny``, ``tvl-tiny``, ``tvl-small``, ``tvl-base`` or ``paper``, or a
+            preset.
         clip: hub id or folder of a frozen CLIP, or ``palpate/mini``. Default: the preset's, or a
             small one that is trained first on the same train part.
         output: folder for the encoders, new or empty; None keeps them in memory.
@@ -124,7 +126,7 @@ def train_encoder(  # noqa: PLR0913 - a public verb
         raise PalpateError("must be a positive number", str(epochs), fix, argument="epochs")
     require_weights(weights)
     chosen, device = preset_of(preset), connect(device)
-    manifest, split = load_manifest(data), Split.load(split)
+    manifest, split = load_manifest(data), load_split(data, split)
     output = None if output is None else Path(output)
     with work_folder(output) as work:
         common: dict[str, Any] = {"seed": seed, "targets": targets, "cache": work / "cache"}
@@ -155,7 +157,7 @@ def train_encoder(  # noqa: PLR0913 - a public verb
 
 def plan_encoder(
     data: Manifest | str | Path,
-    split: Split | str | Path,
+    split: Split | str | Path | None = None,
     *,
     preset: str | EncoderPreset = "mini",
     epochs: float | None = None,
@@ -167,7 +169,7 @@ def plan_encoder(
     Returns:
         see :func:`palpate.training.estimate.estimate`.
     """
-    chosen, split = preset_of(preset), Split.load(split)
+    chosen, split = preset_of(preset), load_split(data, split)
     train, _ = _parts(load_manifest(data), split, held_out, 0)
 
     def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
@@ -187,6 +189,22 @@ def load_manifest(data: Manifest | str | Path) -> Manifest:
     from palpate.data import load
 
     return load(data)
+
+
+def load_split(data: Manifest | str | Path, split: Split | str | Path | None = None) -> Split:
+    """A split as it is, or from its file, or the only one that lies with the data.
+
+    Raises:
+        PalpateError: if there is none with the data, or several.
+    """
+    if split is not None:
+        return Split.load(split)
+    stated = [] if isinstance(data, Manifest) else sorted(Path(data).glob("splits/*.json"))
+    if len(stated) != 1:
+        must, fix = "must be given unless one lies with the data", "Make one with: palpate split"
+        got = ", ".join(path.name for path in stated) or "none there"
+        raise PalpateError(must, got, fix, argument="split")
+    return Split.load(stated[0])
 
 
 def preset_of(name: str | EncoderPreset) -> EncoderPreset:
@@ -312,9 +330,12 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     tactile, preprocess = _first_weights(preset, clip.dim, rows.images, seed, start)
     course, mode = preset.tactile_course, targets or preset.targets
     options = course.options(len(train), seed, epochs)
+    if len(train) == 1:
+        must = "The train part must hold two samples: the loss compares them with each other"
+        raise PalpateError(must, f"one, {train.ids[0]}", "Make another split: palpate split")
     if options.batch == 1:
         must, fix = "must be at least 2: the loss compares rows", "Pass a larger one"
-        raise PalpateError(must, f"1, of {len(train)} rows", fix, argument="batch")
+        raise PalpateError(must, "1", fix, argument="batch")
     facts = _facts(preset, train, split, (rows.captions, rows.text_source), options) | {
         "targets": mode,
         "weights": list(weights),

@@ -88,8 +88,9 @@ class Course:
 
     def options(self, n: int, seed: int, epochs: float | None = None) -> LoopOptions:
         """Return the options for ``n`` rows; no batch is larger than the set."""
-        batch = max(1, min(self.batch, n))
-        steps = max(1, math.ceil((self.epochs if epochs is None else epochs) * n / batch))
+        batch = min(self.batch, n)
+        rows = (self.epochs if epochs is None else epochs) * n
+        steps = max(1, math.ceil(rows / max(1, batch)))
         return LoopOptions(
             steps,
             batch,

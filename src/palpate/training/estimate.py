@@ -62,7 +62,6 @@ def estimate(
         "batch": batch,
         "learning_rate": options.lr,
         "learning_rate_per_sample": options.lr / batch,
-        "learning_rate_if_the_batch_is_each_of_two_gpus": 2 * options.lr,
         "state_bytes": (4 + (options.ema is not None)) * weights,
         "activation_bytes": activations * batch,
         "flop_per_step": row * batch,

@@ -137,13 +137,13 @@ def work_folder(output: Path | None) -> Generator[Path]:
         yield work
         barrier()
         return
-    try:
-        with locked(work, output):
+    with locked(work, output):
+        try:
             yield work
-    except PalpateError:
-        if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
-            shutil.rmtree(work)
-        raise
+        except PalpateError:
+            if not any(p.is_file() for p in work.rglob("*")):  # rejected before any work was done
+                shutil.rmtree(work)
+            raise
     barrier()
     shutil.rmtree(work, ignore_errors=True)
 
