@@ -130,7 +130,8 @@ def test_when_a_process_dies_the_others_end_without_a_traceback_and_the_run_can_
     done = subprocess.run(script, cwd=place, env=ENV, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     lines = [line for line in done.stderr.splitlines() if line.startswith("palpate train")]
-    assert len(lines) <= 1
+    assert len(lines) == 1
+    assert "All processes must stay alive. Got one has ended" in lines[0]
     assert not any("bug in palpate" in line for line in done.stderr.splitlines())
     run(place, "encoder", "out", *more)  # in one process, from the checkpoint of two
     run(place, "encoder", "whole", *more)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -45,6 +46,7 @@ def connect(device: str = "auto") -> str:
     state = PartialState(cpu=device == "cpu", timeout=PATIENCE)
     if not joined:
         atexit.register(state.destroy_process_group)
+        signal.signal(signal.SIGTERM, _terminated)
     return str(state.device) if device in ("auto", "cuda") and state.device else device
 
 
@@ -109,8 +111,14 @@ def gather_rows(rows: Tensor) -> Tensor:
 
 
 def _ended(error: RuntimeError) -> PalpateError:
-    got = f"one has ended ({str(error).splitlines()[0][-80:]})"
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # torchrun's, which is faster or slower than this
+    got = f"one has ended ({str(error).splitlines()[0][:120]})"
     return PalpateError("All processes must stay alive", got, "Run the same command again")
+
+
+def _terminated(*_: object) -> None:
+    """Torchrun ends the others when a process has ended."""
+    raise _ended(RuntimeError("SIGTERM"))
 
 
 @contextmanager
