@@ -1,6 +1,7 @@
 """``palpate import``: a data set on disk becomes a manifest.
 
-The options that name a source are shared with ``palpate validate``.
+The options that name a source are shared with ``palpate validate``, those of lists, tables and
+folders also with ``palpate audit`` and ``palpate split``.
 """
 
 from __future__ import annotations
@@ -23,19 +24,16 @@ Maps = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableOptions:
-    """Folders of images, tables, interval lists, Hugging Face data sets."""
+class Reading:
+    """How lists, tables and folders are read."""
 
     vision: str | None = None
-    """Where the photos of a folder are: `"{object}/press_{contact}/photo/{frame}.jpg"`; videos or
-    stacks of frames (.npy) likewise: `"{object}_{video}.mov"`. Fields are
-    columns and join the sides; `{frame:d}` takes digits, `{video:**}` folders of any depth, `*` and
-    `**` what does not matter. Without a template the folder is searched for its layout.
-    """
+    """Where the photos are, as a template of paths: `"{object}/press_{contact}/photo/{frame}.jpg"`;
+    videos or stacks of frames (.npy) likewise: `"{object}_{video}.mov"`. Fields are columns and
+    join the sides; `{frame:d}` takes digits, `{video:**}` folders of any depth, `*` and `**` what
+    does not matter. Without a template the layout is recognized."""
     tactile: str | None = None
-    """Where its tactile images are, likewise."""
-    background: str | None = None
-    """Where its tactile images without contact are, likewise."""
+    """Where the tactile images are, likewise."""
     columns: Maps = ()
     """Manifest columns as columns of yours, or as polars SQL over them (over the fields and `path`
     for a folder of images):
@@ -46,10 +44,30 @@ class TableOptions:
     """What the images of a folder show, if all show one thing."""
     classes: Path | None = None
     """Table of classes (`Name: id` or `id,name` per line) for materials that are numbers; -1 is
-    inconclusive and skipped.
-    """
+    inconclusive and skipped."""
     names: str | None = None
     """Columns of a table without a header line, separated by commas."""
+
+    def options(self) -> dict[str, Any]:
+        """As keywords."""
+        given = vars(self) | {"columns": columns_of(self.columns)}
+        return {name: value for name, value in given.items() if value}
+
+    def arguments(self) -> list[str]:
+        """As they were written on the command line."""
+        words = [word for group in self.columns for word in ("--map", *group)]
+        for name in ("vision", "tactile", "side", "root", "classes", "names"):
+            if (value := getattr(self, name)) is not None:
+                words += [f"--{'as' if name == 'side' else name}", str(value)]
+        return words
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableOptions(Reading):
+    """Folders of images, tables, interval lists, Hugging Face data sets."""
+
+    background: str | None = None
+    """Where the tactile images without contact are, as a template."""
     half_open: Switch = False
     """The end of an interval is the first frame after the contact."""
     every: int | None = None

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from palpate.cli.sources import Reading
+from palpate.cli.importing import Reading
 from palpate.cli.terminal import (
     FAILED_CHECK,
     Common,

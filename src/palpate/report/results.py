@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -417,27 +417,15 @@ class Results:
         from palpate.report.notes import sentence
 
         names = (
-            "metric",
-            "subject",
-            "value",
-            "interval",
-            "level",
-            "interval_method",
-            "null",
-            "floor",
+            "metric subject value level interval_method floor estimator bandwidth scale n m seed"
         )
-        names += ("estimator", "bandwidth", "scale", "n", "m", "seed", "higher_is_better")
-        names += ("encoder", "reference", "split")
+        names += " higher_is_better encoder reference split"
         rows: list[dict[str, Any]] = []
         for score in self.scores:
-            row: dict[str, Any] = {}
-            for name in names:
-                value = getattr(score, name)
-                if name in ("interval", "null"):
-                    low, high = value or (None, None)
-                    row |= {f"{name}_low": low, f"{name}_high": high}
-                else:
-                    row[name] = value
+            row = {name: getattr(score, name) for name in names.split()}
+            for name in ("interval", "null"):
+                low, high = getattr(score, name) or (None, None)
+                row |= {f"{name}_low": low, f"{name}_high": high}
             preset = score.settings.get("preset")
             notes = "; ".join(map(sentence, score.notes))  # flat, so that the frame fits a CSV
             rows.append(row | {"preset": preset, "notes": notes})
@@ -454,40 +442,7 @@ class Results:
     def with_paths(self, change: Callable[[str], str | None]) -> Results:
         """The results with ``change`` applied to the path of every image; None removes it."""
 
-        def path(name: str | None) -> str | None:
-            return None if name is None else change(name)
-
-        def sample(ref: SampleRef) -> SampleRef:
-            names = ("vision", "tactile", "background")
-            return replace(ref, **{name: path(getattr(ref, name)) for name in names})
-
-        def pairs(rows: Sequence[LeakPair]) -> list[LeakPair]:
-            return [replace(p, test=sample(p.test), train=sample(p.train)) for p in rows]
-
-        def audit(a: Audit) -> Audit:
-            signals = [replace(s, worst=pairs(s.worst)) for s in a.signals]
-            others = [audit(other) for other in a.others]
-            return replace(a, worst=pairs(a.worst), signals=signals, others=others)
-
-        gallery = [
-            replace(
-                row,
-                sample=sample(row.sample),
-                generated=path(row.generated),
-                background=path(row.background),
-            )
-            for row in self.gallery
-        ]
-        strips = [
-            replace(
-                strip,
-                query=sample(strip.query),
-                matches=[replace(m, sample=sample(m.sample)) for m in strip.matches],
-            )
-            for strip in self.strips
-        ]
-        audits = [audit(a) for a in self.audits]
-        return replace(self, audits=audits, gallery=gallery, strips=strips)
+        return _with_paths(self, change)
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object with ``format: palpate-results/2``."""
@@ -515,6 +470,24 @@ class Results:
         with reading_entry(path, "The results"):
             results = cls.from_json(data)
         return results.with_paths(lambda name: os.path.normpath(path.parent / name))
+
+
+#: Fields of a sample, and of a row of the gallery, that are paths of images.
+_PATHS = {SampleRef: ("vision", "tactile", "background"), GalleryItem: ("generated", "background")}
+
+
+def _with_paths(value: Any, change: Callable[[str], str | None]) -> Any:
+    """A result, or a part of one, with ``change`` applied to the path of every image in it."""
+    if isinstance(value, list | tuple):
+        return [_with_paths(item, change) for item in value]
+    if not isinstance(
+        value, (SampleRef, LeakPair, Signal, Audit, GalleryItem, Match, Strip, Results)
+    ):
+        return value
+    new = {field.name: _with_paths(getattr(value, field.name), change) for field in fields(value)}
+    paths = {name: new[name] for name in _PATHS.get(type(value), ())}
+    new |= {name: None if path is None else change(path) for name, path in paths.items()}
+    return replace(value, **new)
 
 
 def _writer(name: str) -> Any:
