@@ -21,7 +21,7 @@ from palpate.cli.terminal import (
     guard_output,
     require_extra,
 )
-from palpate.core import PalpateError, is_stream, write_text
+from palpate.core import PalpateError, is_stream, require, write_text
 from palpate.report.results import Audit
 
 TABLE_FORMAT = "palpate-audit-table/1"
@@ -152,8 +152,8 @@ def _check(options: Options) -> None:
             f"{len(options.paths)} path(s) {'with' if options.split else 'without'} a split",
             "E.g. palpate audit train.txt test.txt",
         )
-    if not 0 <= outputs.fail_over <= 1:
-        raise PalpateError("must lie in [0, 1]", str(outputs.fail_over), "", argument="fail_over")
+    share = outputs.fail_over
+    require(0 <= share <= 1, "fail_over", "must lie in [0, 1]", share)
     for argument, path, suffixes in (
         ("table", outputs.table, (".parquet", ".csv")),
         ("page", outputs.page, (".html",)),

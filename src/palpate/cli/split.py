@@ -23,6 +23,7 @@ from palpate.core import (
     Split,
     atomic_folder,
     digest_file,
+    require,
     require_new_folder,
     write_json,
     write_text,
@@ -153,8 +154,9 @@ def _check(options: Options) -> None:
             " and ".join(used),
             "Choose one",
         )
-    if options.seeds is not None and options.seeds < 1:
-        raise PalpateError("must be at least 1", str(options.seeds), "", argument="seeds")
+    require(
+        options.seeds is None or options.seeds >= 1, "seeds", "must be at least 1", options.seeds
+    )
     if not options.paths and options.noleak != "touch-and-go":
         raise PalpateError(
             "A split needs samples", "no path", "E.g. palpate split tag/ -o noleak.json"

@@ -19,6 +19,7 @@ from palpate.core.errors import (
     Problem,
     ProblemsError,
     problem_lines,
+    require,
     require_choice,
 )
 from palpate.core.features import FeatureSet
@@ -72,6 +73,7 @@ __all__ = [
     "read_json",
     "read_record",
     "reading_entry",
+    "require",
     "require_choice",
     "require_comparable",
     "require_new_folder",

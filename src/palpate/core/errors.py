@@ -89,6 +89,19 @@ def require_choice(argument: str, value: Any, choices: Iterable[str]) -> None:
         raise PalpateError(must, repr(value), "Choose one of these", argument=argument)
 
 
+def require(
+    holds: bool, argument: str, must: str, got: Any, example: Any = None, *, fix: str = ""
+) -> None:
+    """Check an argument: ``require(0 < share < 1, "share", "must lie in (0, 1)", share, 0.5)``.
+
+    Raises:
+        PalpateError: unless it ``holds``.
+    """
+    if not holds:
+        shown = {} if example is None else {argument: example}
+        raise PalpateError(must, repr(got), fix, argument=argument, example=shown)
+
+
 class PalpateWarning(UserWarning):
     """A result that needs a second look; results carry the same fact as a :class:`Note`."""
 

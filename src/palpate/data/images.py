@@ -32,6 +32,7 @@ from palpate.core import (
     atomic_path,
     digest_json,
     quiet,
+    require,
     short,
 )
 from palpate.data.manifest import Manifest
@@ -244,8 +245,7 @@ def in_threads(
         threads: how many; default: the number of cores, 16 at most.
         stop: set when the caller leaves early, for functions that run long and look at it.
     """
-    if threads is not None and threads < 1:
-        raise PalpateError("must be at least 1", str(threads), "", argument="threads")
+    require(threads is None or threads >= 1, "threads", "must be at least 1", threads)
     threads = threads or min(16, os.cpu_count() or 1)
     remaining = iter(items)
     report = progress if what else None

@@ -24,6 +24,7 @@ from palpate.core import (
     Progress,
     digest_json,
     quiet,
+    require,
     require_choice,
     short,
 )
@@ -225,10 +226,7 @@ def _forward(
 
 def _require(modality: str, batch: int) -> None:
     require_choice("modality", modality, MODALITIES)
-    if batch < 1:
-        raise PalpateError(
-            "must be at least 1", str(batch), "", argument="batch", example={"batch": 128}
-        )
+    require(batch >= 1, "batch", "must be at least 1", batch, 128)
 
 
 def _column(manifest: Manifest, name: str) -> list[str] | None:

@@ -35,7 +35,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet
+from palpate.core import FeatureSet, Note, PalpateError, Progress, Split, quiet, require
 from palpate.data.manifest import Manifest
 from palpate.evaluation.impact_features import (
     Rows,
@@ -132,7 +132,10 @@ def impact(
             on features that are missing, of another length, or not finite.
         ProblemsError: naming every missing or unreadable image.
     """
-    _check(features, seeds)
+    known = not isinstance(features, str) or features == "pixels"
+    require(known, "features", "must be 'pixels' or a mapping", features)
+    once = 0 < len(seeds) == len(set(seeds))
+    require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
     design = _design(manifest, split, group, seeds)
     coarser, more = _coarser(manifest, split, design, seeds)
     notes = [*design.notes, *more]
@@ -145,7 +148,7 @@ def impact(
     rows, facts = _measure(design, sources, progress)
     settings = {
         **design.settings,
-        "size": size if features == "pixels" else None,
+        "size": size if isinstance(features, str) else None,
         "components": COMPONENTS,
         "features": facts,
         "interval": "leave-one-group-out jackknife over test groups, paired, t, 95 %",
@@ -215,17 +218,6 @@ def _coarser(
 def _shares(table: pl.DataFrame, column: str) -> bool:
     """Whether a group of a column is in two parts."""
     return table.select(column, "part").n_unique() > table[column].n_unique()
-
-
-def _check(features: Features, seeds: Sequence[int]) -> None:
-    if isinstance(features, str) and features != "pixels":
-        fix = "Pass name -> embeddings"
-        raise PalpateError(
-            "must be 'pixels' or a mapping", repr(features), fix, argument="features"
-        )
-    if not seeds or len(set(seeds)) < len(seeds):
-        must, example = "must hold at least one seed, each once", {"seeds": (0, 1, 2)}
-        raise PalpateError(must, f"{list(seeds)}", "", argument="seeds", example=example)
 
 
 def _design(manifest: Manifest, split: Split, group: str, seeds: Sequence[int]) -> _Design:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.core import FeatureSet, Note, PalpateError, Progress, quiet, rng_for
+from palpate.core import FeatureSet, Note, PalpateError, Progress, quiet, require, rng_for
 from palpate.data.images import cached_images
 from palpate.data.manifest import Manifest
 
@@ -88,9 +88,7 @@ def pixel_sources(
         PalpateError: if there are neither vision nor tactile images, or only some samples have one.
         ProblemsError: naming every missing or unreadable file.
     """
-    if size < 4:
-        fix, example = "Choose a larger size", {"size": 32}
-        raise PalpateError("must be at least 4", f"{size}", fix, argument="size", example=example)
+    require(size >= 4, "size", "must be at least 4", size, 32)
     nulls = {
         name: manifest.table[name].null_count() for name in ("tactile", "vision", "background")
     }

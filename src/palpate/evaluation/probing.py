@@ -23,6 +23,7 @@ from palpate.core import (
     Score,
     Split,
     quiet,
+    require,
     require_choice,
     rng_for,
 )
@@ -167,17 +168,14 @@ def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan
     labels = [plan.label] if isinstance(plan.label, str) else list(plan.label)
     for name in labels:
         manifest.column(name)  # raises for a column that is not there
-    if plan.neighbors < 1:
-        raise PalpateError("must be at least 1", f"{plan.neighbors}", "", argument="neighbors")
-    if plan.top and min(plan.top) < 1:
-        raise PalpateError("must be ranks from 1", f"{min(plan.top)}", "", argument="top")
+    require(plan.neighbors >= 1, "neighbors", "must be at least 1", plan.neighbors)
+    require(min(plan.top, default=1) >= 1, "top", "must be ranks from 1", [*plan.top])
     groups = {str(split.rule.get("group", "video")) for split in splits.values()}
     group = plan.group if plan.group != "auto" else groups.pop() if len(groups) == 1 else "video"
     sizes = [len(split.ids("test")) for split in splits.values()]
     pool = min(sizes) if plan.pool is None and len(sizes) > 1 else plan.pool
-    if plan.pool is not None and not 2 <= plan.pool <= min(sizes):
-        must = f"must lie in 2 to {min(sizes)}, the number of test samples"
-        raise PalpateError(must, f"{plan.pool}", "Choose a smaller pool", argument="pool")
+    must = f"must lie in 2 to {min(sizes)}, the number of test samples"
+    require(plan.pool is None or 2 <= plan.pool <= min(sizes), "pool", must, plan.pool)
     return replace(plan, label=labels, top=tuple(plan.top), group=group, pool=pool)
 
 

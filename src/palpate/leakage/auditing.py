@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from palpate.core import Note, PalpateError, Progress, Split, quiet, require_choice
+from palpate.core import Note, PalpateError, Progress, Split, quiet, require, require_choice
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.content import shows_nothing
 from palpate.leakage.groups import GROUPS, shared_groups
@@ -29,7 +29,6 @@ from palpate.leakage.inputs import (
     Identity,
     number_contacts,
     read_all,
-    require,
     shared_names,
     tell_apart,
 )

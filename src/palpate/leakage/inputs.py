@@ -34,17 +34,6 @@ NAMES = ("id", "video", "contact", "object", "session")
 DECLARING = (None, "pairs", "intervals", "hf")
 
 
-def require(ok: bool, argument: str, must: str, got: Any, example: Any = None) -> None:
-    """Raise unless an option is as it must be.
-
-    Raises:
-        PalpateError: naming the argument, with an example that would do.
-    """
-    if not ok:
-        shown = {} if example is None else {argument: example}
-        raise PalpateError(must, repr(got), "", argument=argument, example=shown)
-
-
 @dataclass(frozen=True)
 class Source:
     """What a source holds: samples, the splits that it states by name, and notes."""

@@ -14,7 +14,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from palpate.core import Note, PalpateError, Progress, Split, quiet
+from palpate.core import Note, PalpateError, Progress, Split, quiet, require
 from palpate.data.manifest import MODALITIES, Manifest
 from palpate.leakage.groups import (
     Ints,
@@ -24,7 +24,7 @@ from palpate.leakage.groups import (
     nested_groups,
     shared_groups,
 )
-from palpate.leakage.inputs import Data, read, read_all, require
+from palpate.leakage.inputs import Data, read, read_all
 from palpate.leakage.noleak import HCT_GROUPS, published, require_hct
 from palpate.leakage.program import EXACT, RESOLUTION, Optimum, Problem, draw, optimize
 

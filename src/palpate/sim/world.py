@@ -15,7 +15,7 @@ from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, SupportsIndex
 
-from palpate.core import PalpateError, Progress, Split, quiet
+from palpate.core import PalpateError, Progress, Split, quiet, require
 from palpate.data.formats.hct import sessions_of
 from palpate.data.formats.touch_and_go import CATEGORIES
 from palpate.data.manifest import Manifest
@@ -51,8 +51,7 @@ class World:
         if isinstance(options, str) and options not in PRESETS:
             must = f"must be options, or one of {', '.join(PRESETS)}"
             raise PalpateError(must, repr(options), "Choose a preset", argument="options")
-        if cache < 1:
-            raise PalpateError("must be at least 1", str(cache), "", argument="cache")
+        require(cache >= 1, "cache", "must be at least 1", cache)
         self.options = PRESETS[options] if isinstance(options, str) else options or WorldOptions()
         self.cache = cache
         self._video = lru_cache(cache)(partial(Video, self.options))

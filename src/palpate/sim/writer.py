@@ -34,6 +34,7 @@ from palpate.core import (
     locked,
     quiet,
     read_json,
+    require,
     require_new_folder,
     write_json,
     write_text,
@@ -100,8 +101,7 @@ def write_world(
         OSError: if the disk is full; finished videos stay, and the same call continues.
     """
     options, output = options or WorldOptions(), Path(output)
-    if workers < 1:
-        raise PalpateError("must be at least 1", str(workers), "", argument="workers")
+    require(workers >= 1, "workers", "must be at least 1", workers)
     if options.layout == "videos" and importlib.util.find_spec("av") is None:
         raise MissingExtraError("av", "video", "Writing a world as videos")
     folder = output.resolve()

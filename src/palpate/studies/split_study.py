@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, Split, locked, quiet
+from palpate.core import Progress, Split, locked, quiet, require
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.encoders.encoder_set import load_clip
 from palpate.evaluation.probing import (
@@ -67,9 +67,8 @@ def compare_splits(  # noqa: PLR0913 - those of training
     Raises:
         PalpateError: without seeds, or as training and probing do.
     """
-    if not seeds or len(set(seeds)) < len(seeds):
-        must, example = "must hold at least one seed, each once", {"seeds": (0, 1, 2)}
-        raise PalpateError(must, f"{list(seeds)}", "", argument="seeds", example=example)
+    once = 0 < len(seeds) == len(set(seeds))
+    require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
     manifest, folder = load_manifest(data), Path(work)
     loaded = {name: Split.load(split) for name, split in named(splits, "split").items()}
     axis = "split" if len(loaded) > 1 else ""
