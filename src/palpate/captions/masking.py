@@ -26,8 +26,8 @@ def mask_captions(
 ) -> Captions:
     """Write captions without the names of materials.
 
-    Adjectives that name one go; inside a phrase ``material`` takes its place. A caption that is
-    nothing else becomes empty.
+    Adjectives that name a material are removed; in a phrase the name is replaced by ``material``. A
+    caption of nothing but names becomes empty.
 
     Args:
         captions: as in :func:`palpate.captions.check_captions`.
@@ -65,8 +65,8 @@ def mask_captions(
         "counts": counts,
     }
     source = f"{source}, without names of materials {short(digest)}"
-    own = isinstance(captions, str | Path) and (Path(captions) / TABLE).is_file()
-    images = read_texts(Path(captions)).images if own else image_digests(manifest)
+    folder = isinstance(captions, str | Path) and (Path(captions) / TABLE).is_file()
+    images = read_texts(Path(captions)).images if folder else image_digests(manifest)
     write_texts(table, output / TABLE, source, images)
     write_json(output / RECORD, record)
     return Captions(table, record, output / TABLE)

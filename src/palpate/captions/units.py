@@ -17,12 +17,12 @@ PER: tuple[Per, ...] = ("frame", "contact", "object")
 
 @dataclass(frozen=True)
 class Units:
-    """Which photo describes which samples.
+    """Groups of samples that share one caption, and the photo that it is written from.
 
     Attributes:
-        of: (n samples) number of the unit of every sample.
-        described: (n units) row of the sample whose photo is described; None without a photo.
-        alone: samples without a value in the requested column, each a unit by itself.
+        of: (n samples) number of the unit of each sample.
+        described: (n units) row of the sample whose photo goes to the model; None without a photo.
+        alone: number of samples without a value in the requested column, each a unit by itself.
     """
 
     of: Sequence[int]
@@ -31,7 +31,9 @@ class Units:
 
 
 def units_of(manifest: Manifest, per: Per) -> Units:
-    """Group samples, and choose the middle one of those with a photo, by video and frame.
+    """Group samples by contact, object or frame, and take the middle photo of each group.
+
+    The middle one is that of the samples with a photo, in the order of video and frame.
 
     Raises:
         PalpateError: if no sample has a value in the requested column.

@@ -23,6 +23,7 @@ from palpate.sim import (
 )
 from palpate.sim.options import option_groups
 
+#: Kinds of options that are neither a number nor a choice -> type, and how the help shows them.
 _TYPES: dict[str, Any] = {
     "span": tuple[float, float],
     "series": tuple[float, ...],

@@ -1,4 +1,4 @@
-"""A sample as results refer to it: its names and the places of its images."""
+"""How results refer to a sample: its names and the paths of its images."""
 
 from __future__ import annotations
 

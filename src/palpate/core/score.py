@@ -44,7 +44,8 @@ class Score:
         interval: (low, high), or None where none can be given.
         level: coverage the interval aims at.
         interval_method: e.g. ``"leave-one-video-out jackknife, t, 23 df"``.
-        null: the range that a meaningless difference would fall into, or None.
+        null: the range that the score falls into if generated and real images do not differ, or
+            None.
         floor: the same metric on real images of other videos, or None.
         estimator: ``"unbiased"``, ``"biased"``, ``"grouped"``, ``"per-image mean"``.
         bandwidth: kernel bandwidth sigma, or None.

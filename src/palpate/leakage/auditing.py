@@ -29,8 +29,8 @@ from palpate.leakage.inputs import (
     Identity,
     number_contacts,
     read_all,
+    rename_unrelated,
     shared_names,
-    tell_apart,
 )
 from palpate.leakage.signals import (
     Flags,
@@ -311,7 +311,7 @@ def _compare(
     """Audit one part against another."""
     group = _group(train, test, options)
     shared = shared_names(train, test, options.identity)
-    train, test, equal = tell_apart(train, test, shared, (against, "test"))
+    train, test, equal = rename_unrelated(train, test, shared, (against, "test"))
     a, b = train.table, test.table
     groups = [set(t[group].drop_nulls()) if group != NO_GROUP else set[str]() for t in (a, b)]
     in_both = sorted(groups[0] & groups[1])

@@ -70,8 +70,9 @@ def read(
         return Source(manifest, {}, _notes(skipped))
     source = paths[0] if len(paths) == 1 and not isinstance(paths[0], dict) else data
     path = Path(source) if isinstance(source, (str, Path)) else None
-    plain = path is None or not path.is_file() or is_manifest(path) or is_list(path)
-    named = None if plain or path is None else read_names(path, **options, root=root)
+    # A table may name images that are not at hand; everything else is read as `palpate.load` does.
+    table = path if path and path.is_file() and not (is_manifest(path) or is_list(path)) else None
+    named = None if table is None else read_names(table, **options, root=root)
     if named is not None:
         manifest, skipped, split = named
         if skipped and not skip_bad:
@@ -148,12 +149,12 @@ def shared_names(train: Manifest, test: Manifest, identity: Identity) -> tuple[s
     """The columns in which equal values of both parts mean the same thing."""
     facts = [[m.facts.get(fact) for fact in ("format", "dataset", "digest")] for m in (train, test)]
     published = {form.facts.name for form in FORMATS.values()}
-    one = train.root.resolve() == test.root.resolve() or (
+    same = train.root.resolve() == test.root.resolve() or (
         facts[0] == facts[1] and (facts[0][1] in published or facts[0][2] is not None)
     )
     if identity != "auto":
         return NAMES if identity == "names" else ()
-    return NAMES if one else tuple(c for c in NAMES if _declares(train, c) and _declares(test, c))
+    return NAMES if same else tuple(c for c in NAMES if _declares(train, c) and _declares(test, c))
 
 
 def _declares(manifest: Manifest, column: str) -> bool:
@@ -167,7 +168,7 @@ def _declares(manifest: Manifest, column: str) -> bool:
     return column != "id" or not table.select(pl.any_horizontal(*stems).any()).item()
 
 
-def tell_apart(
+def rename_unrelated(
     train: Manifest, test: Manifest, shared: Sequence[str], parts: tuple[str, str]
 ) -> tuple[Manifest, Manifest, dict[str, int]]:
     """Rename what has equal names in both parts without being the same thing.

@@ -94,9 +94,9 @@ def average(tensors: Sequence[Tensor]) -> None:
 def gather_rows(rows: Tensor) -> Tensor:
     """The rows of all processes, (processes * n, ...), differentiable.
 
-    Every process computes the same loss of all rows, and gradients are averaged over the processes:
-    so the gradient of these rows counts as often as there are processes. Other rows' gradients
-    are computed where these rows are.
+    Every process computes the same loss over all rows, and :func:`average` divides the gradients by
+    the number of processes. So the rows of this process get their gradient times that number; the
+    others are constants here and get theirs in their own process.
     """
     rank, size = place()
     if size == 1:
@@ -106,7 +106,7 @@ def gather_rows(rows: Tensor) -> Tensor:
         dist.all_gather(parts, rows.detach().contiguous())
     except RuntimeError as error:
         raise _ended(error) from None
-    parts[rank] = rows.detach() + size * (rows - rows.detach())
+    parts[rank] = rows.detach() + size * (rows - rows.detach())  # the value of rows, size gradients
     return torch.cat(parts)
 
 
