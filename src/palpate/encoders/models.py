@@ -18,6 +18,7 @@ is computed in 32 bits.
 
 from __future__ import annotations
 
+import argparse
 import copy
 import hashlib
 import json
@@ -28,6 +29,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from zipfile import is_zipfile
 
 from safetensors import SafetensorError
 
@@ -236,6 +238,30 @@ def first_line(error: Exception) -> str:
     if "weights_only" in str(error) or isinstance(error, pickle.UnpicklingError):
         return "a pickle that holds more than weights, which could run any program"
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def read_weights(path: Path, fix: str) -> dict[str, Tensor]:
+    """All tensors of a file, by name; those under ``model`` or ``state_dict`` if it nests them.
+
+    Raises:
+        PalpateError: if it is unreadable, or holds more than weights.
+    """
+    import torch
+    from safetensors.torch import load_file
+
+    must = f"{path} must hold weights and nothing else"
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        with torch.serialization.safe_globals([argparse.Namespace]):  # TVL keeps its options so
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_zipfile(path))
+    except (*UNREADABLE, EOFError) as error:
+        raise PalpateError(must, first_line(error)[:160], fix) from None
+    for key in ("model", "state_dict"):
+        content = content.get(key, content) if isinstance(content, Mapping) else content
+    if not isinstance(content, Mapping):
+        raise PalpateError(must, type(content).__name__, fix)
+    return {str(name): value for name, value in content.items() if hasattr(value, "shape")}
 
 
 def load_model(kind: Any, name: str, must: str, fix: str, **options: Any) -> Any:

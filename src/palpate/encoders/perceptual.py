@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, relu
 
 from palpate.core import PalpateError, Progress, quiet
 from palpate.encoders.embed import exact
-from palpate.encoders.models import UNREADABLE, digest_modules, first_line, pick_device
+from palpate.encoders.models import digest_modules, pick_device, read_weights
+from palpate.metrics.images import image_pairs
 
 #: Below this the last stage has no pixel left that saw the whole image.
 SMALLEST = 32
@@ -115,7 +115,7 @@ def load_lpips(backbone: Path, heads: Path, *, device: str = "cpu") -> Lpips:
     if missing := [str(path) for path in files if not path.is_file()]:
         must = "LPIPS must have the files of its backbone and of its heads"
         raise PalpateError(must, f"no {', no '.join(missing)}", FIX)
-    states = [_read(path) for path in files]
+    states = [read_weights(path, FIX) for path in files]
     network = Lpips()
     for k, (index, *_) in enumerate(LAYERS):
         for part in ("weight", "bias"):
@@ -157,12 +157,8 @@ def lpips_per_image(
         PalpateError: on other shapes, dtypes, ranges (image numbers are named), or images smaller
             than 32 x 32.
     """
-    generated, reference = _images("generated", generated), _images("reference", reference)
+    generated, reference = image_pairs(generated, reference)
     shape = generated.shape
-    if reference.shape != shape:
-        must, got = "must have the shape of the generated images", f"{reference.shape} and {shape}"
-        fix = "Pass the same samples in the same order and size"
-        raise PalpateError(must, got, fix, argument="reference")
     if min(shape[1:3]) < SMALLEST:
         must, got = (
             f"must be at least {SMALLEST} x {SMALLEST} for LPIPS",
@@ -186,24 +182,10 @@ def lpips_per_image(
     return distances
 
 
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (*UNREADABLE, EOFError) as error:
-        got = first_line(error)[:160]
-        raise PalpateError(f"{path} must hold weights and nothing else", got, FIX) from None
-    if not isinstance(state, Mapping):
-        must, got = f"{path} must hold a table of weights by name", type(state).__name__
-        raise PalpateError(must, got, FIX)
-    return state
-
-
-def _fill(parameter: Tensor, state: Mapping[str, Any], name: str, path: Path) -> None:
+def _fill(parameter: Tensor, state: Mapping[str, Tensor], name: str, path: Path) -> None:
     value, shape = state.get(name), tuple(parameter.shape)
-    if not isinstance(value, Tensor) or tuple(value.shape) != shape:
-        got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else "none of that name"
+    if value is None or tuple(value.shape) != shape:
+        got = "none of that name" if value is None else f"shape {tuple(value.shape)}"
         raise PalpateError(f"{path} must hold {name} of shape {shape}", got, FIX)
     if not bool(torch.isfinite(value).all()):
         must, fix = f"{name} in {path} must be finite", "Fetch the file again"
@@ -215,20 +197,3 @@ def _fill(parameter: Tensor, state: Mapping[str, Any], name: str, path: Path) ->
 def _pixels(images: NDArray[Any], device: torch.device) -> Tensor:
     unit = np.array(images, dtype=np.float32) / (255 if images.dtype == np.uint8 else 1)
     return torch.from_numpy(unit).to(device).permute(0, 3, 1, 2).expand(-1, 3, -1, -1) * 2 - 1
-
-
-def _images(argument: str, images: Any) -> NDArray[Any]:
-    """Images as an array of the documented shape, dtype and range."""
-    images = np.asarray(images.detach().cpu() if isinstance(images, Tensor) else images)
-    if images.ndim != 4 or images.shape[3] not in (1, 3) or 0 in images.shape:
-        must, got = "must have shape (n, h, w, 3), n >= 1", f"shape {images.shape}"
-        raise PalpateError(must, got, "Stack the images with channels last", argument=argument)
-    if images.dtype != np.uint8 and images.dtype.kind != "f":
-        must, got = "must be uint8, or floats in [0, 1]", f"dtype {images.dtype}"
-        raise PalpateError(must, got, "Convert the images", argument=argument)
-    for number, image in enumerate(images if images.dtype.kind == "f" else ()):
-        low, high = float(image.min()), float(image.max())
-        if not (low >= -1e-6 and high <= 1 + 1e-6):  # also false for NaN
-            got = f"[{low:.4g}, {high:.4g}] in image {number}"
-            raise PalpateError("must lie in [0, 1]", got, "Scale the images", argument=argument)
-    return images

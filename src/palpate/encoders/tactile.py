@@ -24,7 +24,6 @@ one Sparsh file disagree in size and background, so that preprocessing is part o
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,13 +31,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import gelu, normalize, scaled_dot_product_attention
 from transformers import CLIPVisionConfig, CLIPVisionModel
 
 from palpate.core import PalpateError
-from palpate.encoders.models import UNREADABLE, Origin, first_line
+from palpate.encoders.models import Origin, first_line, read_weights
 from palpate.encoders.preprocess import Preprocess
 
 State = Mapping[str, Tensor]
@@ -322,7 +320,7 @@ def load_tactile(path: Path) -> TactileModule:
         PalpateError: for a file that holds more than weights, of no known format, or whose weights
             lack a name, have one more, or another shape.
     """
-    state = _read(path)
+    state = read_weights(path, f"Pass {KNOWN}")
     form = next((f for f in FORMATS if f.prefix + f.mark in state), None)
     if form is None:
         must = f"{path} must be a tactile encoder that is recognized by the names of its weights"
@@ -341,8 +339,8 @@ def load_tactile(path: Path) -> TactileModule:
         raise PalpateError(must, f"other names or shapes: {first_line(error)}", "") from None
     wrong = [f"no {name}" for name in wanted if name not in given]
     wrong += [f"also {name}" for name in given if name not in wanted]
-    wrong += [f"{k} of shape {given[k]}, not {wanted[k]}" for k in wanted if k in given
-              and given[k] != wanted[k]]  # fmt: skip
+    both = [name for name in wanted if given.get(name, wanted[name]) != wanted[name]]
+    wrong += [f"{name} of shape {given[name]}, not {wanted[name]}" for name in both]
     if wrong:
         got = f"{len(wrong)} of them otherwise, first {', '.join(wrong[:3])}"
         raise PalpateError(must, got, "Fetch the file again; weights are never filled in")
@@ -351,23 +349,6 @@ def load_tactile(path: Path) -> TactileModule:
     module.load_state_dict({name: state[name].float() for name in wanted}, assign=True)
     module.format = form
     return module.eval().requires_grad_(False)
-
-
-def _read(path: Path) -> dict[str, Tensor]:
-    """All tensors of a file, by name; those under ``model`` or ``state_dict`` if it nests them."""
-    must, fix = f"{path} must hold weights and nothing else", f"Pass {KNOWN}"
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        with torch.serialization.safe_globals([argparse.Namespace]):  # TVL keeps its options so
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except (*UNREADABLE, EOFError) as error:
-        raise PalpateError(must, first_line(error)[:160], fix) from None
-    for key in ("model", "state_dict"):
-        content = content.get(key, content) if isinstance(content, Mapping) else content
-    if not isinstance(content, Mapping):
-        raise PalpateError(must, type(content).__name__, fix)
-    return {str(k): v for k, v in content.items() if isinstance(v, Tensor)}
 
 
 def sensor_numbers(names: list[str], device: torch.device) -> Tensor:
