@@ -320,7 +320,9 @@ WRONG = {
     "body": ("--server {url} --body [1]", "a JSON object"),
     "nothing": ("", "one of server, local, template"),
     "two": ("--server {url} --template", "server and template"),
-    "concurrency": ("--server {url} --concurrency 0", "at least 1"),
+    "concurrency": ("--server {url} --concurrency 0", "--concurrency must be a positive number"),
+    "timeout": ("--server {url} --timeout -1", "--timeout must be a positive number"),
+    "reply": ("--server {url} --max-tokens 0", "--max-tokens must be a positive number"),
     "prompt": ("--server {url} --prompt none.txt", "touch-sentence/1"),
 }
 
@@ -380,8 +382,22 @@ def test_a_photo_that_is_none_is_listed_and_costs_no_request(data, tmp_path, sma
     assert result.record["counts"]["flags"] == {"bad-image": 2}
 
 
+def test_broken_photos_of_equal_bytes_are_all_listed(data, tmp_path, small_manifest):
+    paths = small_manifest.paths("vision")
+    for path in paths[:24]:
+        path.write_bytes(b"")
+    with FakeServer() as server:
+        result = describe(data, tmp_path / "c", server)
+        estimate = describe(data, tmp_path / "c", server, dry_run=True)
+    assert (server.count, estimate.requests, estimate.unreadable) == (6, 0, 6)
+    assert [problem.where for problem in result.problems] == sorted(map(str, paths[2:24:4]))
+    assert result.record["counts"]["flags"] == {"bad-image": 6}
+
+
 def test_samples_without_photos(small_manifest, tmp_path):
-    bare = replace(small_manifest, table=small_manifest.table.with_columns(vision=None))
+    bare = replace(
+        small_manifest, table=small_manifest.table.with_columns(vision=None, contact=None)
+    )
     with FakeServer() as server, pytest.raises(PalpateError, match="must have vision images"):
         caption(bare, tmp_path / "c", server=server.url)
 

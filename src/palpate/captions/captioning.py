@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
 from typing import Any
 
@@ -200,15 +200,17 @@ def caption(  # noqa: PLR0913 (a public verb)
         StoppedError: if the server stops in the middle; what it answered stays.
     """
     _require_one(server=server, local=local, template=template)
-    if concurrency < 1:
-        raise PalpateError("must be at least 1", str(concurrency), "", argument="concurrency")
+    limits = {"concurrency": concurrency, "timeout": timeout, "max_tokens": max_tokens}
+    for name, limit in limits.items():
+        if not 0 < limit < inf:
+            raise PalpateError("must be a positive number", str(limit), "", argument=name)
     manifest, output = load(data, progress=progress), Path(output)
+    if template is None and not manifest.table["vision"].count():
+        must, fix = "must have vision images", "Map the column vision to the photos"
+        raise PalpateError(must, "samples without any", fix, argument="data")
     units = units_of(manifest, per)
     if template is not None:
         return _of_columns(template, manifest, units, output, per=per, seed=seed, dry_run=dry_run)
-    if not manifest.table["vision"].count():
-        must, fix = "must have vision images", "Map the column vision to the photos"
-        raise PalpateError(must, "samples without any", fix, argument="data")
     instruction = prompt if isinstance(prompt, Prompt) else Prompt.load(prompt)
     area = checked_crop(crop)
     options = {"key_variable": key_variable, "body": body, "timeout": timeout}
@@ -219,8 +221,16 @@ def caption(  # noqa: PLR0913 (a public verb)
             replies, _ = read_replies(output / REPLIES)
             photos = Photos.of(manifest, units, question, progress)
             pending = photos.pending(replies, instruction, again=again)
-            how = {"threads": describer.threads or concurrency, "prices": prices}
-            return _estimate(photos, pending, question, replies, progress=progress, **how)
+            threads = describer.threads or concurrency
+            return _estimate(
+                photos,
+                pending,
+                question,
+                replies,
+                threads=threads,
+                prices=prices,
+                progress=progress,
+            )
         with locked(output), closing(ReplyLog(output / REPLIES)) as log:
             photos = Photos.of(manifest, units, question, progress)
             answers = log.replies.answers
@@ -236,7 +246,7 @@ def caption(  # noqa: PLR0913 (a public verb)
                 done = sum(key in answers for key in photos.keys)
                 raise StoppedError(error, done, len(photos), output) from None
             made = _made(question, photos, log.replies, server) | {"per": per}
-            problems = [*photos.unreadable(), *problems]
+            problems = photos.problems(problems)
             descriptions = photos.descriptions(answers, instruction, problems)
             return _write(manifest, units, descriptions, output, made, problems=problems)
 
@@ -326,9 +336,9 @@ def _estimate(
 ) -> Estimate:
     """What the remaining requests take, by the replies so far or by assumptions."""
     paths = [photo.path for photo in pending]
-    reasons = [reason for _, reason in in_threads(check_image, paths, "checking photos", progress)]
-    count = reasons.count(None)
-    unreadable = len(photos.unreadable()) + len(reasons) - count
+    checked = in_threads(check_image, paths, "checking photos", progress)
+    broken = [Problem(str(path), "bad-image", reason) for path, reason in checked if reason]
+    unreadable, count = len(photos.problems(broken)), len(pending) - len(broken)
     known = [key for key in photos.distinct if key in replies.answers]
     if known:
         inward, outward, seconds = (n / len(known) for n in _spent(replies, known))

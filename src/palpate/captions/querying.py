@@ -129,11 +129,13 @@ class Photos:
                 pending[key] = Pending(key, sample, path, replies.tries(key))
         return list(pending.values())
 
-    def unreadable(self) -> list[Problem]:
-        """Photos whose files cannot be read."""
+    def problems(self, queried: Sequence[Problem] = ()) -> list[Problem]:
+        """Photos whose files cannot be read, and those of requests with a problem or equal ones."""
         pairs = zip(self.paths, self.keys, strict=True)
-        paths = dict.fromkeys(path for path, key in pairs if path is not None and key is None)
-        return [Problem(str(path), "bad-image", "cannot be read") for path in paths]
+        keys = {str(path): key for path, key in pairs if path is not None}
+        of = {keys[problem.where]: problem for problem in queried}
+        of |= {None: Problem("", "bad-image", "cannot be read")}
+        return [replace(of[key], where=path) for path, key in sorted(keys.items()) if key in of]
 
     def descriptions(
         self, answers: Mapping[str, Reply], prompt: Prompt, problems: Iterable[Problem]
@@ -198,7 +200,7 @@ def query_all(
                 must, fix = "The model must take the requests", "Check it and the further fields"
                 raise PalpateError(must, result.text, fix)
         progress("describing", done, len(pending))
-    return sorted(problems, key=lambda problem: problem.where)
+    return problems
 
 
 def _replies(
