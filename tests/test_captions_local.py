@@ -1,6 +1,8 @@
 """A local vision-language model: a tiny one, made here from a configuration (62,000 parameters)."""
 
 import json
+import sys
+from dataclasses import replace
 
 import pytest
 
@@ -17,65 +19,137 @@ CHAT = (
     "{% if c['type'] == 'image' %}<image>{% else %}{{ c['text'] }}{% endif %}{% endfor %}\n"
     "{% endfor %}{% if add_generation_prompt %}assistant: {% endif %}"
 )
-MARKS = ["<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>", "<pad>"]
+
+SMALL = {
+    "hidden_size": 32,
+    "intermediate_size": 64,
+    "num_hidden_layers": 1,
+    "num_attention_heads": 2,
+}
+VISION = SMALL | {"image_size": 56, "patch_size": 14}
+TEXT = SMALL | {"num_key_value_heads": 2, "max_position_embeddings": 4096}
+SQUARE = {"height": 56, "width": 56}
+
+
+def tokens(*marks, **named):
+    """A tokenizer of bytes and special tokens."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+
+    bytes_of = Tokenizer(models.BPE())
+    bytes_of.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    bytes_of.decoder = decoders.ByteLevel()
+    special = ["<pad>", "<eos>", "<bos>", *marks]
+    alphabet = pre_tokenizers.ByteLevel.alphabet()
+    trainer = trainers.BpeTrainer(special_tokens=special, initial_alphabet=alphabet)
+    bytes_of.train_from_iterator(["rough, hard"], trainer)
+    ends = {"pad_token": "<pad>", "eos_token": "<eos>", "bos_token": "<bos>"}
+    return transformers.PreTrainedTokenizerFast(
+        tokenizer_object=bytes_of, additional_special_tokens=list(marks), **ends, **named
+    )
+
+
+def idefics3():
+    """62,000 parameters."""
+    from transformers.models.idefics3.image_processing_pil_idefics3 import Idefics3ImageProcessorPil
+
+    rows = [f"<row_{r}_col_{c}>" for r in range(1, 7) for c in range(1, 7)]
+    marks = ["<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>"]
+    words = tokens(*marks, *rows)
+    config = transformers.Idefics3Config(
+        vision_config=VISION,
+        text_config=TEXT | {"model_type": "llama", "vocab_size": len(words), "pad_token_id": 0},
+        scale_factor=2,
+        image_token_id=words.convert_tokens_to_ids("<image>"),
+        pad_token_id=0,
+    )
+    longest = {"longest_edge": 56}
+    images = Idefics3ImageProcessorPil(
+        size=longest, max_image_size=longest, do_image_splitting=False
+    )
+    processor = transformers.Idefics3Processor(images, words, image_seq_len=4, chat_template=CHAT)
+    return transformers.Idefics3ForConditionalGeneration(config), processor
+
+
+def llava():
+    from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
+
+    words = tokens("<image>")
+    config = transformers.LlavaConfig(
+        vision_config=VISION | {"model_type": "clip_vision_model", "projection_dim": 32},
+        text_config=TEXT | {"model_type": "llama", "vocab_size": len(words)},
+        image_token_index=words.convert_tokens_to_ids("<image>"),
+    )
+    processor = transformers.LlavaProcessor(
+        CLIPImageProcessorPil(size={"shortest_edge": 56}, crop_size=SQUARE),
+        words,
+        patch_size=14,
+        vision_feature_select_strategy="default",
+        num_additional_image_tokens=1,
+        chat_template=CHAT,
+    )
+    return transformers.LlavaForConditionalGeneration(config), processor
+
+
+def paligemma():
+    """It has no chat template."""
+    from transformers.models.siglip.image_processing_pil_siglip import SiglipImageProcessorPil
+
+    words = tokens("<image>")
+    images = SiglipImageProcessorPil(size=SQUARE)
+    images.image_seq_length = 16
+    processor = transformers.PaliGemmaProcessor(images, words)
+    config = transformers.PaliGemmaConfig(
+        vision_config=VISION | {"model_type": "siglip_vision_model", "vision_use_head": False},
+        text_config=TEXT | {"model_type": "gemma", "head_dim": 16, "vocab_size": len(words)},
+        image_token_index=processor.image_token_id,
+        projection_dim=32,
+    )
+    return transformers.PaliGemmaForConditionalGeneration(config), processor
+
+
+def gemma3():
+    from transformers.models.gemma3.image_processing_pil_gemma3 import Gemma3ImageProcessorPil
+
+    names = {"image_token": "<image_soft_token>", "boi_token": "<image>", "eoi_token": "<end>"}
+    words = tokens(*names.values(), extra_special_tokens=names)
+    ids = {f"{name}_index": words.convert_tokens_to_ids(mark) for name, mark in names.items()}
+    config = transformers.Gemma3Config(
+        vision_config=VISION | {"model_type": "siglip_vision_model", "vision_use_head": False},
+        text_config=TEXT | {"model_type": "gemma3_text", "head_dim": 16, "vocab_size": len(words)},
+        mm_tokens_per_image=4,
+        **ids,
+    )
+    images = Gemma3ImageProcessorPil(size=SQUARE)
+    processor = transformers.Gemma3Processor(images, words, chat_template=CHAT, image_seq_length=4)
+    return transformers.Gemma3ForConditionalGeneration(config), processor
+
+
+def saved(make, folder):
+    """A folder with a model of random weights and its processor."""
+    import torch
+
+    torch.manual_seed(0)
+    for part in make():
+        part.save_pretrained(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    """A folder with an Idefics3 model of random weights and its processor."""
-    import torch
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
-    from transformers import Idefics3Config, Idefics3ForConditionalGeneration, Idefics3Processor
-    from transformers.models.idefics3.image_processing_pil_idefics3 import Idefics3ImageProcessorPil
+    return saved(idefics3, tmp_path_factory.mktemp("vlm"))
 
-    torch.manual_seed(0)
-    bytes_of = Tokenizer(models.BPE())
-    bytes_of.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    bytes_of.decoder = decoders.ByteLevel()
-    rows = [f"<row_{r}_col_{c}>" for r in range(1, 7) for c in range(1, 7)]
-    alphabet = pre_tokenizers.ByteLevel.alphabet()
-    trainer = trainers.BpeTrainer(special_tokens=[*MARKS, *rows], initial_alphabet=alphabet)
-    bytes_of.train_from_iterator(["rough, hard"], trainer)
-    tokenizer = transformers.PreTrainedTokenizerFast(
-        tokenizer_object=bytes_of,
-        pad_token="<pad>",
-        eos_token="<end_of_utterance>",
-        additional_special_tokens=MARKS,
-    )
-    vision = {
-        "hidden_size": 32,
-        "intermediate_size": 64,
-        "num_hidden_layers": 1,
-        "num_attention_heads": 2,
-        "image_size": 56,
-        "patch_size": 14,
-    }
-    text = {
-        "model_type": "llama",
-        "hidden_size": 32,
-        "intermediate_size": 64,
-        "num_hidden_layers": 1,
-        "num_attention_heads": 2,
-        "num_key_value_heads": 2,
-        "vocab_size": len(tokenizer),
-        "max_position_embeddings": 4096,
-        "pad_token_id": tokenizer.pad_token_id,
-    }
-    config = Idefics3Config(
-        vision_config=vision,
-        text_config=text,
-        scale_factor=2,
-        image_token_id=tokenizer.convert_tokens_to_ids("<image>"),
-        pad_token_id=tokenizer.pad_token_id,
-    )
-    images = Idefics3ImageProcessorPil(
-        size={"longest_edge": 56}, max_image_size={"longest_edge": 56}, do_image_splitting=False
-    )
-    processor = Idefics3Processor(images, tokenizer, image_seq_len=4, chat_template=CHAT)
-    folder = tmp_path_factory.mktemp("vlm")
-    Idefics3ForConditionalGeneration(config).save_pretrained(folder)
-    processor.save_pretrained(folder)
-    return folder
+
+@pytest.mark.parametrize("make", [idefics3, llava, paligemma, gemma3])
+@pytest.mark.parametrize("crop", [None, BOX])
+def test_families_whose_processor_needs_no_torchvision(
+    make, crop, small_manifest, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "torchvision", None)
+    first = replace(small_manifest, table=small_manifest.table.head(4))
+    options = {"local": str(saved(make, tmp_path / "vlm")), "max_tokens": 2, "crop": crop}
+    result = caption(first, tmp_path / "c", **options)
+    assert (result.record["replies"], result.problems) == (1, [])
+    assert result.record["tokens"]["out"] > 2
 
 
 def test_what_a_random_model_says_is_flagged_and_kept(model, small_manifest, tmp_path):

@@ -14,7 +14,7 @@ import polars as pl
 import pytest
 
 from caption_server import FakeServer
-from palpate.captions import StoppedError, caption
+from palpate.captions import StoppedError, caption, check_captions
 from palpate.captions.server import Server
 from palpate.cli import main
 from palpate.core import PalpateError
@@ -181,6 +181,14 @@ def test_a_server_that_answers_as_another_model_is_noted(data, tmp_path):
         result = describe(data, tmp_path / "c", server)
     assert [note.code for note in result.notes] == ["captions-other-model"]
     assert result.record["answered_as"] == {"other/model": 12}
+
+
+def test_one_reply_to_every_photo_is_counted_and_noted_by_the_check(data, tmp_path):
+    with FakeServer(lambda number: "duplicate") as server:
+        result = describe(data, tmp_path / "c", server)
+    assert (result.record["counts"]["texts"], result.record["counts"]["different"]) == (12, 1)
+    common = check_captions(tmp_path / "c", data)["share of captions", "the commonest text"]
+    assert (common.value, [note.code for note in common.notes]) == (1.0, ["captions-common"])
 
 
 def test_the_same_table_whatever_the_order(data, tmp_path):
