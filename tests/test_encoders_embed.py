@@ -92,7 +92,7 @@ def test_second_call_computes_nothing(world, encoders, encoder, tmp_path, count,
     first = embed(world, encoders, encoder, cache=tmp_path / "cache")
     assert sum(count) == (4 if encoder == "text" else 12)  # equal texts are computed once
     count.clear()
-    monkeypatch.setattr(module, "cached_images", None)  # nor is an image decoded
+    monkeypatch.setattr(module, "load_frames", None)  # nor is an image decoded
     again = embed(world, encoders, encoder, cache=tmp_path / "cache")
     assert count == []
     assert np.array_equal(again.features, first.features)
@@ -164,19 +164,8 @@ def test_arrays_and_files_agree_also_when_resized(world, encoders):
     assert result.groups is None
 
 
-def test_other_columns(world, encoders):
-    background = Manifest.from_rows(
-        [{**r, "background": r["tactile"], "tactile": None} for r in world.table.to_dicts()],
-        world.root,
-    )
-    assert np.allclose(
-        embed(background, encoders, "tactile", column="background").features,
-        embed(world, encoders, "tactile").features,
-        atol=1e-6,
-    )
-    assert list(
-        embed(world, encoders, "tactile", labels="video", groups="id").labels
-    ) == world.column("video")
+def test_other_groups(world, encoders):
+    assert list(embed(world, encoders, "tactile", groups="id").groups) == world.ids
 
 
 @pytest.mark.parametrize("cached", [True, False])

@@ -176,7 +176,7 @@ def test_files_are_rejected_by_name_and_never_unpickled(files, states, tmp_path)
         ):
             load_lpips(files[0], tmp_path / name)
     torch.save([1, 2], tmp_path / "list.pth")
-    with pytest.raises(PalpateError, match="weights and nothing else. Got list"):
+    with pytest.raises(PalpateError, match=r"weights and nothing else\. Got list"):
         load_lpips(files[0], tmp_path / "list.pth")
     with pytest.raises(
         PalpateError,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -72,7 +71,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         if output.is_dir() and not any(output.iterdir()):  # nothing was done
             output.rmdir()
         raise
-    results = results_of(demo, _command(options))
+    results = results_of(demo, terminal.command)
     page = output / "page.html"
     results.to_html(page)
     terminal.print("")
@@ -80,13 +79,3 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
         terminal.print(line)
     terminal.print(f"Page: {page}")
     return {"page": str(page), "facts": list(results.facts), "digests": results.settings["digests"]}
-
-
-def _command(options: Options) -> str:
-    """The command line that reproduces the run: every option that is not the default."""
-    words = ["palpate", "demo", "--preset", options.preset, "--seed", str(options.seed)]
-    for name in ("data", "clip", "autoencoder", "from_scratch", "by", "background", "skip_bad"):
-        value = getattr(options, name)
-        if value != getattr(Options, name):
-            words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
-    return shlex.join([*words, "--output", str(options.output)])

@@ -29,7 +29,7 @@ from palpate.core import (
     short,
 )
 from palpate.data.captions import NAMED, caption
-from palpate.data.images import REFETCH, cached_images, image_stamp
+from palpate.data.images import REFETCH, image_stamp
 from palpate.data.manifest import Manifest
 from palpate.encoders.encoder_set import MODALITIES, EncoderSet, Modality
 from palpate.encoders.preprocess import Frames, load_frames, to_unit
@@ -54,31 +54,25 @@ def texts_of(manifest: Manifest, *, seed: int = 0) -> tuple[list[str], str]:
     return texts, " and ".join(sorted(sources, key=lambda s: (s != default, s)))
 
 
-def embed(  # noqa: PLR0913
+def embed(
     manifest: Manifest,
     encoders: EncoderSet,
     modality: Modality = "tactile",
     *,
-    column: str | None = None,
-    labels: str = "material",
     groups: str = "video",
     cache: Path | None = None,
-    keep_pixels: bool = True,
     still: bool = False,
     batch: int = 128,
     progress: Progress = quiet,
 ) -> FeatureSet:
-    """Embeddings of every sample of a manifest.
+    """Embeddings of every sample of a manifest, with its material as label.
 
     Args:
         manifest: the samples, in the order of the result.
         encoders: see :class:`EncoderSet`.
         modality: ``tactile``, ``vision`` or ``text``.
-        column: image column to read; default: that of the modality.
-        labels: column to carry along as labels; one without any value gives None.
-        groups: the same, as groups.
-        cache: folder for ``<modality>-<key>.npz`` and the decoded pixels; None computes anew.
-        keep_pixels: keep the decoded pixels in the cache, for another encoder or other labels.
+        groups: column to carry along as groups; one without any value gives None.
+        cache: folder for ``<modality>-<key>.npz``; None computes anew.
         still: take each image alone, also for encoders that look at an earlier frame, too.
         batch: images at a time; changes the result by rounding only (1e-5).
         progress: called with the number of samples done.
@@ -95,29 +89,21 @@ def embed(  # noqa: PLR0913
     if not len(manifest):
         fix = "Check the split: is that part empty?"
         raise PalpateError("There must be samples to embed", "none", fix)
-    column = modality if column is None or modality == "text" else column
-    digest = encoders.digest(modality)
+    digest, frames = encoders.digest(modality), None
     texts = texts_of(manifest)[0] if modality == "text" else []
-    plain = modality == "text" or encoders.preprocess(modality).plain
-    inputs: list[Any] = texts or [image_stamp(manifest, column)]
-    frames = None if plain else encoders.preprocess(modality).frames(manifest, column, still=still)
-    inputs += frames.stamps(manifest.root) if frames else []
-    label, group = _column(manifest, labels), _column(manifest, groups)
-    key = digest_json(["palpate-embedding/1", digest, manifest.ids, column, inputs, label, group])
+    inputs: list[Any] = texts
+    if modality != "text":
+        frames = encoders.preprocess(modality).frames(manifest, modality, still=still)
+        inputs = [image_stamp(manifest, modality), *frames.stamps(manifest.root)]
+    label, group = _column(manifest, "material"), _column(manifest, groups)
+    key = digest_json(["palpate-embedding/2", digest, manifest.ids, inputs, label, group])
     file = Path(cache) / f"{modality}-{short(key)}.npz" if cache else None
     if file is not None and (cached := _cached(file)) is not None:
         progress(f"embedding {modality}", len(manifest), len(manifest), "cached")
         return cached
-    if modality == "text":
+    if frames is None:
         features = embed_texts(texts, encoders, batch=batch, progress=progress)
-    elif frames is not None:
-        features = embed_frames(frames, encoders, modality, batch, progress)
-    elif cache is not None and keep_pixels:
-        size = encoders.preprocess(modality).resize
-        pixels = cached_images(manifest, column, size, cache, progress)
-        features = embed_images(pixels, encoders, modality, batch=batch, progress=progress)
     else:
-        frames = encoders.preprocess(modality).frames(manifest, column)
         features = embed_frames(frames, encoders, modality, batch, progress)
     result = FeatureSet(manifest.ids, features, label, group, digest)
     if file is not None:

@@ -559,7 +559,7 @@ class _Run:
         if self.encoders is not None and manifest is not None and photos:
             from palpate.encoders.embed import embed
 
-            options: dict[str, Any] = {"keep_pixels": False, "progress": self.progress}
+            options: dict[str, Any] = {"progress": self.progress}
             x, of = embed(manifest, self.encoders, "vision", **options).features, "photos"
         elif self.encoders is not None or real.features is not None:
             x, of = self._features(real).features, "the reference's features"
@@ -601,7 +601,7 @@ class _Run:
             return samples.feature_set(x, digest)
         folder = samples.folder(self.cache) if self.keep else None
         # Generated images have no earlier frame, so none is taken for real ones.
-        options: dict[str, Any] = {"keep_pixels": False, "still": True, "progress": self.progress}
+        options: dict[str, Any] = {"still": True, "progress": self.progress}
         x = embed(self._in_context(samples), self.encoders, "tactile", cache=folder, **options)
         return samples.feature_set(x.features, digest)
 
