@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -170,62 +171,45 @@ def choose(
         PalpateError: for an unknown name, or a companion whose inputs are not there.
     """
     has = {name: weights.for_features(name)[1] is not None for name in FEATURES if name != "prdc"}
+    able = {name: encoder or has.get(name, False) for name in FEATURES}
+    able |= dict.fromkeys(PAIRS, images)
+    able |= {"contact": images and background, "lpips": images and weights.lpips is not None}
+    names = list(dict.fromkeys(requested or ()))
     if requested is None:
-        names = [n for n in FEATURES if has.get(n) or (encoder and n != "cmmd")]
-        able = {"contact": background, "lpips": weights.lpips is not None}
-        names += [n for n in PAIRS if able.get(n, True)] if images else []
-    else:
-        names = list(dict.fromkeys(requested))
-    for name in names:
-        _require(
-            name,
-            weights,
-            images=images,
-            encoder=encoder,
-            background=background,
-            standard=has.get(name),
-        )
+        names = [name for name in able if able[name] and (name != "cmmd" or has[name])]
+    if lacking := next((name for name in names if not able.get(name)), None):
+        raise _lacking(lacking, weights, images=images)
     standard = [n for n in names if has.get(n)]
     features = [n for n in names if n in FEATURES and n not in standard]
     return Chosen(requested is None, features, standard, [n for n in names if n in PAIRS])
 
 
-def _require(
-    name: str,
-    weights: Weights,
-    *,
-    images: bool,
-    encoder: bool,
-    background: bool,
-    standard: bool | None,
-) -> None:
-    """Raise if a companion is unknown or lacks its inputs."""
+def _lacking(name: str, weights: Weights, *, images: bool) -> PalpateError:
+    """Why a companion cannot be computed."""
     argument: dict[str, Any] = {"argument": "companions"}
     if name not in (*FEATURES, *PAIRS):
         must = f"must be among {', '.join((*FEATURES, *PAIRS))}"
-        raise PalpateError(must, repr(name), "Check the spelling", **argument)
+        return PalpateError(must, repr(name), "Check the spelling", **argument)
     if name in PAIRS and not images:
         must = "must need no images for embeddings"
-        raise PalpateError(must, name, "Score folders of images, or drop it", **argument)
-    if name == "contact" and not background:
+        return PalpateError(must, name, "Score folders of images, or drop it", **argument)
+    if name == "contact":
         must = "must need no background images where the reference has none"
         fix = "Pass one no-contact image for all, a reference with a column background, or drop it"
-        example = {"background": "gel.png"}
-        raise PalpateError(must, name, fix, example=example, **argument)
-    if name == "lpips" and weights.lpips is None:
+        return PalpateError(must, name, fix, example={"background": "gel.png"}, **argument)
+    if name == "lpips":
         from palpate.encoders.perceptual import FIX
 
-        raise PalpateError("must hold the two files of LPIPS", "none", FIX, argument="lpips")
-    if name in FEATURES and not (encoder or standard):
-        fix = "Pass an encoder"
-        if name != "prdc":
-            from palpate.encoders.inception import FIX
+        return PalpateError("must hold the two files of LPIPS", "none", FIX, argument="lpips")
+    fix = "Pass an encoder"
+    if name != "prdc":
+        from palpate.encoders.inception import FIX
 
-            kind = weights.for_features(name)[0]
-            where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
-            fix = f"{fix}, or weights of {kind}. {where[kind]}"
-        must = "must need no features of images without an encoder"
-        raise PalpateError(must, name, fix, example={"encoder": "palpate/mini"}, **argument)
+        kind = weights.for_features(name)[0]
+        where = {"inception": FIX, "clip": f"Fetch one with: hf download {CMMD_CLIP}"}
+        fix = f"{fix}, or weights of {kind}. {where[kind]}"
+    must = "must need no features of images without an encoder"
+    return PalpateError(must, name, fix, example={"encoder": "palpate/mini"}, **argument)
 
 
 def score_features(
@@ -269,34 +253,39 @@ def _attempt(outcome: Outcome, name: str, run: Callable[[], Outcome], default: b
         outcome.notes.append(Note("companion-skipped", params))
 
 
-def _fid(features: Features, _: Progress) -> Outcome:
+def _compared(
+    compare: Callable[..., Any],
+    features: Features,
+    metric: str,
+    name: str | None = None,
+    **options: Any,
+) -> Outcome:
+    """Scores and differences of ``compare``, whose ``metric`` is renamed after the features."""
     outcome = Outcome()
     for sets in features.batches():
-        result = compare_fid(sets, features.reference, **features.common)
-        outcome.scores += _renamed(result.scores, "FID", features)
-        outcome.differences += _renamed(result.differences, "FID", features)
+        result = compare(sets, features.reference, **features.common, **options)
+        outcome.scores += _renamed(result.scores, metric, features, name)
+        outcome.differences += _renamed(result.differences, metric, features, name)
     return outcome
 
 
+def _fid(features: Features, _: Progress) -> Outcome:
+    return _compared(compare_fid, features, "FID")
+
+
+def _cmmd(features: Features, _: Progress) -> Outcome:
+    options: dict[str, Any] = {**features.family, "preset": "cmmd"}
+    return _compared(compare_tmmd, features, "TMMD", "CMMD", **options)
+
+
 def _kid(features: Features, _: Progress) -> Outcome:
-    options: dict[str, Any] = {
-        "kernel": Polynomial(),
-        "preset": "paper",
-        "normalize": False,
-        "permutations": 0,
-        **features.common,
-    }
-    outcome = Outcome()
-    for sets in features.batches():
-        result = compare_tmmd(sets, features.reference, **options)
-        for scores, results in (
-            (outcome.scores, result.scores),
-            (outcome.differences, result.differences),
-        ):
-            for s in _renamed(results, "TMMD", features, "KID"):
-                settings = {k: v for k, v in s.settings.items() if k != "preset"}
-                notes = [Note("kid-interval"), *s.notes] if results is result.scores else s.notes
-                scores.append(replace(s, settings=settings, notes=notes))
+    options: dict[str, Any] = {"preset": "paper", "normalize": False, "permutations": 0}
+    outcome = _compared(compare_tmmd, features, "TMMD", "KID", kernel=Polynomial(), **options)
+    for scores in (outcome.scores, outcome.differences):
+        noted = [Note("kid-interval")] if scores is outcome.scores else []
+        for k, s in enumerate(scores):
+            settings = {key: value for key, value in s.settings.items() if key != "preset"}
+            scores[k] = replace(s, settings=settings, notes=[*noted, *s.notes])
     return outcome
 
 
@@ -325,34 +314,12 @@ def _prdc(features: Features, progress: Progress) -> Outcome:
     return outcome
 
 
-def _cmmd(features: Features, _: Progress) -> Outcome:
-    options: dict[str, Any] = {**features.family, **features.common, "preset": "cmmd"}
-    outcome = Outcome()
-    for sets in features.batches():
-        result = compare_tmmd(sets, features.reference, **options)
-        outcome.scores += _renamed(result.scores, "TMMD", features, "CMMD")
-        outcome.differences += _renamed(result.differences, "TMMD", features, "CMMD")
-    return outcome
-
-
 def _renamed(
     scores: Sequence[Score], old: str, features: Features, new: str | None = None
 ) -> list[Score]:
     """Scores whose metric says where the features come from: ``FID (Inception)``."""
     label = f"{new or old} ({features.name})"
     return [replace(s, metric=label + s.metric.removeprefix(old)) for s in scores]
-
-
-def _ssim(pairs: Pairs) -> Outcome:
-    return _mean_of_pairs(pairs, "SSIM")
-
-
-def _psnr(pairs: Pairs) -> Outcome:
-    return _mean_of_pairs(pairs, "PSNR")
-
-
-def _ms_ssim(pairs: Pairs) -> Outcome:
-    return _mean_of_pairs(pairs, "MS-SSIM")
 
 
 def _mean_of_pairs(pairs: Pairs, metric: Literal["SSIM", "PSNR", "MS-SSIM"]) -> Outcome:
@@ -447,9 +414,9 @@ FEATURES: Mapping[str, Callable[[Features, Progress], Outcome]] = {
     "cmmd": _cmmd,
 }
 PAIRS: Mapping[str, Callable[[Pairs], Outcome]] = {
-    "ssim": _ssim,
-    "psnr": _psnr,
-    "ms-ssim": _ms_ssim,
+    "ssim": partial(_mean_of_pairs, metric="SSIM"),
+    "psnr": partial(_mean_of_pairs, metric="PSNR"),
+    "ms-ssim": partial(_mean_of_pairs, metric="MS-SSIM"),
     "contact": _contact,
     "lpips": _lpips,
 }
