@@ -389,7 +389,7 @@ def _row(
 ) -> ImpactRow:
     """One row from the accuracies under the given split and under the leak-free ones."""
     given, *others = means
-    names = np.concatenate([m.groups for m in others])
+    names = np.concatenate([m.groups for m in others]).tolist()
     hits = np.concatenate([m.values for m in others])
     clean = mean_of(classifier, hits, names, subject=features)
     cost = spread_of([[given], [clean]], lambda m: m[..., 0] - m[..., 1])

@@ -473,7 +473,10 @@ class Results:
 
 
 #: Fields of a sample, and of a row of the gallery, that are paths of images.
-_PATHS = {SampleRef: ("vision", "tactile", "background"), GalleryItem: ("generated", "background")}
+_PATHS: dict[type, tuple[str, ...]] = {
+    SampleRef: ("vision", "tactile", "background"),
+    GalleryItem: ("generated", "background"),
+}
 
 
 def _with_paths(value: Any, change: Callable[[str], str | None]) -> Any:
