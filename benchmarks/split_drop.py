@@ -26,12 +26,7 @@ LOOKS = {
     "gelsight": {"layout": "frames", "leak": "contact"},
     "digit": {"layout": "hct", "leak": "frame"},
 }
-WORLD = {
-    "objects_per_material": 6,
-    "contacts_per_video": 4,
-    "two_videos": 0.0,
-    "seed": 7,
-}
+WORLD = {"objects_per_material": 6, "contacts_per_video": 4, "two_videos": 0.0, "seed": 7}
 SMALL = WORLD | {"objects_per_material": 2, "contacts_per_video": 2, "frames_per_contact": 2}
 
 

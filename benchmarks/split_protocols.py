@@ -34,7 +34,7 @@ from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
 from palpate.core import FeatureSet, rng_for, short
-from palpate.metrics.intervals import mean_interval
+from palpate.metrics.means import spread_of_values
 from palpate.metrics.retrieval import retrieval
 from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.options import BACKGROUND_OFFSET
@@ -299,7 +299,7 @@ def combine(folds, chance):
     }
     for name in folds[0]["hits"]:
         hit = np.concatenate([f["hits"][name] for f in folds]).astype(float)
-        row[name] = (float(hit.mean()), mean_interval(hit, videos, 0.95)[0], chance)
+        row[name] = (float(hit.mean()), spread_of_values(hit, videos).interval(), chance)
     for name in folds[0]["across"]:
         values, intervals, chances = zip(*(f["across"][name] for f in folds), strict=True)
         value, interval = float(np.mean(values)), None

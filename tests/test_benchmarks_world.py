@@ -146,9 +146,7 @@ def test_folds_are_combined_over_their_frames_and_videos():
     )
     value, interval, chance = row["touch"]
     assert (value, chance, row["frames"], row["C"]) == (0.5, 0.25, (9, 4), {"touch": [0.01]})
-    assert (
-        interval == protocols.mean_interval(np.array([1.0, 1, 0, 0]), ["a", "a", "b", "c"], 0.95)[0]
-    )
+    assert interval == protocols.spread_of_values(np.array([1.0, 1, 0, 0]), list("aabc")).interval()
     np.testing.assert_allclose(row["top"][0], 0.3)
     np.testing.assert_allclose(
         row["top"][1], (0.3 - 0.1 / np.sqrt(2), 0.3 + 0.1 / np.sqrt(2))

@@ -16,7 +16,7 @@ from palpate.data.manifest import Manifest
 from palpate.evaluation import companions, inputs, score, scoring
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
 from palpate.metrics.distributions import prdc_rows
-from palpate.metrics.intervals import mean_interval
+from palpate.metrics.means import spread_of_values
 from palpate.metrics.mmd import sample_units
 from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
 
@@ -114,7 +114,7 @@ def test_differences_of_precision_take_the_groups_of_the_rows_they_average():
         delta = rows[0][metric] - rows[1][metric]
         got = scores[f"{metric} (embeddings) difference", "a - b", None]
         assert got.value == pytest.approx(delta.mean(), abs=1e-12)
-        interval = mean_interval(delta, groups, 0.95)[0]
+        interval = spread_of_values(delta, groups).interval()
         assert (got.interval is None) == (interval is None)
         assert interval is None or got.interval == pytest.approx(interval, abs=1e-9)
 

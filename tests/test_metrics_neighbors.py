@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from palpate.core import FeatureSet, Note, PalpateError, Score
 from palpate.metrics import distributions
 from palpate.metrics.distributions import prdc
-from palpate.metrics.intervals import mean_interval
+from palpate.metrics.means import spread_of_values
 
 NAMES = ["Precision", "Recall", "Density", "Coverage"]
 
@@ -66,7 +66,7 @@ def test_all_four_are_those_of_the_matrices(n, m, d, k, seed, block, far):
 
 
 def expected_interval(metric, rows, groups):
-    interval = mean_interval(rows.astype(np.float64), groups, 0.95)[0]
+    interval = spread_of_values(rows.astype(np.float64), groups).interval()
     return interval and (
         max(0.0, interval[0]),
         interval[1] if metric == "Density" else min(1.0, interval[1]),

@@ -61,7 +61,8 @@ from palpate.metrics.inputs import (
     feature_set,
     require_one_encoder,
 )
-from palpate.metrics.intervals import Scored, jackknife_errors, mean_interval, t_interval
+from palpate.metrics.intervals import Scored, jackknife_errors, t_interval
+from palpate.metrics.means import spread_of_values
 from palpate.metrics.paired import Comparison, difference, holm, same_samples
 
 #: Mean (d,) and factor (r, d) of a covariance F' F.
@@ -394,10 +395,8 @@ def prdc_rows(
     scores: list[Score] = []
     for metric, values in rows.items():
         over_real, balls = metric in ("Recall", "Coverage"), int(metric != "Recall")
-        interval, method = mean_interval(values, groups[over_real], level)
-        if interval is not None:  # a t interval may leave the bounds of a share
-            high = interval[1] if metric == "Density" else min(1.0, interval[1])
-            interval = (max(0.0, interval[0]), high)
+        spread = spread_of_values(values, groups[over_real])
+        interval = spread.interval(0.0, np.inf if metric == "Density" else 1.0, level)
         empty, of = int((radii[balls] == 0).sum()), ("generated", "real")[balls]
         details = {"radius_generated": median[0], "radius_real": median[1], "empty_balls": empty}
         notes = [
@@ -412,7 +411,7 @@ def prdc_rows(
                 float(values.mean()),
                 interval,
                 level,
-                method,
+                spread.method if interval else "",
                 estimator="per-row mean",
                 n=len(x),
                 m=len(y),

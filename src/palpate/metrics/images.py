@@ -29,7 +29,7 @@ from scipy import ndimage
 from palpate import __version__
 from palpate.core import Note, PalpateError, Score
 from palpate.metrics.inputs import as_array, checked_level, checked_names, to_host
-from palpate.metrics.intervals import mean_interval
+from palpate.metrics.means import spread_of_values
 
 Array = NDArray[np.float64]
 Border = Literal["valid", "mirror"]
@@ -177,9 +177,8 @@ def mean_score(
     groups = checked_names("groups", groups, n)
     kept, identical = values[finite], int(np.isinf(values).sum())
     kept_groups = None if groups is None else list(np.array(groups)[finite])
-    interval, method = mean_interval(kept, kept_groups, level)
-    if interval is not None:
-        interval = (max(bounds[0], interval[0]), min(bounds[1], interval[1]))
+    spread = spread_of_values(kept, kept_groups)
+    interval = spread.interval(*bounds, level)
     badness = np.where(finite, -values if higher_is_better else values, -np.inf)
     worst = [i for i in np.argsort(-badness, kind="stable")[:5] if finite[i]]
     details = {
@@ -197,7 +196,7 @@ def mean_score(
         value=float(kept.mean()) if len(kept) else None,
         interval=interval,
         level=level,
-        interval_method=method,
+        interval_method=spread.method if interval else "",
         estimator="per-image mean",
         n=n,
         m=n,

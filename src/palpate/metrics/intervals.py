@@ -1,4 +1,4 @@
-"""Uncertainty: the jackknife, the cluster-robust mean, and a permutation test, from kernel sums.
+"""Uncertainty: the jackknife and a permutation test, from kernel sums.
 
 **Kernel sums** are all that the metrics know of the pairs. A *segment* is a cell of (set, class,
 half); a *unit* is what a jackknife leaves out (a video; a sample where no videos are known); an
@@ -218,7 +218,7 @@ Interval = tuple[float, float]
 BATCH = 256
 
 
-def t_interval(value: float, error: float, df: int, level: float) -> Interval:
+def t_interval(value: float, error: float, df: float, level: float) -> Interval:
     """``value +- t * error`` with ``df`` degrees of freedom."""
     reach = float(special.stdtrit(df, 0.5 + level / 2)) * error
     return value - reach, value + reach
@@ -231,33 +231,6 @@ def jackknife_errors(replicates: Array) -> Array:
         return np.full(replicates.shape[1:], np.nan)
     with np.errstate(invalid="ignore"):
         return np.sqrt((g - 1) / g * ((replicates - replicates.mean(axis=0)) ** 2).sum(axis=0))
-
-
-def mean_interval(
-    values: Array, groups: Sequence[str] | None, level: float
-) -> tuple[Interval | None, str]:
-    """Interval of the mean of ``values``, robust to whole groups deviating together.
-
-    ``SE^2 = G/(G-1) * sum_g (sum_{i in g} (v_i - mean))^2 / n^2``; groups of equal size make it the
-    t interval over group means, and groups of one sample the standard interval.
-
-    Returns:
-        (interval or None, method).
-    """
-    if groups is None:
-        names, what, method = np.arange(len(values)), "image", "per image, taken as independent"
-    else:
-        names = np.unique(np.asarray(groups, dtype=str), return_inverse=True)[1]
-        what, method = "group", "cluster-robust over groups"
-    g = int(names.max(initial=-1)) + 1
-    if g < 2:
-        return None, ""
-    drift = np.bincount(names, weights=values - values.mean())
-    error = float(np.sqrt(g / (g - 1) * (drift**2).sum())) / len(values)
-    if error == 0:  # no variation between groups is no evidence of certainty
-        return None, ""
-    interval = t_interval(float(values.mean()), error, g - 1, level)
-    return interval, f"{method}, t, {g - 1} df ({g} {what}s)"
 
 
 @dataclass(frozen=True)

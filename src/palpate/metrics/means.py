@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from palpate.core import Score
 from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
@@ -70,12 +71,21 @@ class Spread:
         """Whether there is an error: no change without any group is no evidence of certainty."""
         return bool(1e-12 < self.error < np.inf)  # not for NaN
 
-    def interval(self, low: float, high: float, level: float = 0.95) -> Interval | None:
+    def interval(
+        self, low: float = -np.inf, high: float = np.inf, level: float = 0.95
+    ) -> Interval | None:
         """The t interval within [low, high], or None."""
         if not self.known:
             return None
-        a, b = t_interval(self.value, self.error, self.df, level)  # type: ignore[arg-type]
+        a, b = t_interval(self.value, self.error, self.df, level)
         return max(a, low), min(b, high)
+
+    def shares(self) -> tuple[float, float]:
+        """The shares of its t distribution below and above 0; halves where there is no error."""
+        if not self.known:
+            return 0.5, 0.5
+        below, above = special.stdtr(self.df, np.array([-1, 1]) * self.value / self.error)
+        return float(below), float(above)
 
 
 def mean_of(
@@ -105,6 +115,19 @@ def mean_of(
     interval = spread.interval(0.0, 1.0)
     method = spread.method if interval else ""
     return replace(mean, score=replace(score, interval=interval, interval_method=method))
+
+
+def spread_of_values(values: Array, groups: Sequence[str] | None) -> Spread:
+    """The mean of values (n,) with its error over groups, or over values taken as independent."""
+    if not len(values):
+        return Spread(np.nan, np.nan, 0, "")
+    names = np.arange(len(values)) if groups is None else np.asarray(groups)
+    score = Score("", "", float(values.mean()))
+    spread = spread_of([[Mean(score, values, np.ones(len(values)), names.astype(str))]])
+    if groups is None:
+        method = spread.method.replace("group", "image") + ", images taken as independent"
+        return replace(spread, method=method)
+    return spread
 
 
 def mean_over_groups(

@@ -26,13 +26,12 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
-from palpate.metrics.intervals import Interval, Scored, jackknife_errors, mean_interval, t_interval
+from palpate.metrics.intervals import Interval, Scored, jackknife_errors
 from palpate.metrics.kernels import TOLERANCE
-from palpate.metrics.means import Mean, spread_of
+from palpate.metrics.means import Mean, Spread, spread_of, spread_of_values
 from palpate.metrics.tactile import (
     UNBOUNDED,
     floors_of,
@@ -180,22 +179,23 @@ def difference(a: Scored, b: Scored, floor: Scored | None = None) -> Score:
     if not a.units or list(a.units) != list(b.units):
         reason = "different-units" if a.units else "no-units"
         return _as_difference(x, y, value, {}, note=Note("no-interval", {"reason": reason}))
-    tested = _test(value, _error(a.replicates - b.replicates), df, level)
-    interval, below, above = tested
+    spread = _spread(value, a.replicates - b.replicates, df)
+    interval = spread.interval(level=level)
     note = Note("no-interval", {"reason": "no-change"}) if interval is None else None
     unit = x.details.get("left_out", x.details["unit"])
     method = f"paired leave-one-{unit}-out jackknife, t, {df} df" if interval else ""
-    p = 2 * min(below, above) if interval else None
+    p = 2 * min(spread.shares()) if interval else None
     details: dict[str, Any] = {"p_value": p}
     if x.higher_is_better is not None:
-        details = _verdict(x, y, value, tested)
+        details = _verdict(x, y, spread, interval)
     elif others and others[0].score.value is not None and list(others[0].units) == list(a.units):
         real, center = others[0].replicates, others[0].score.value
         gap = abs(x.value - center) - abs(y.value - center)
         moved = np.abs(a.replicates - real) - np.abs(b.replicates - real)
-        of_gap = _test(gap, _error(moved), df, level)
-        details = {"gap": gap, "gap_interval": of_gap[0], "p_difference": p}
-        details |= _verdict(x, y, gap, of_gap)
+        of_gap = _spread(gap, moved, df)
+        gap_interval = of_gap.interval(level=level)
+        details = {"gap": gap, "gap_interval": gap_interval, "p_difference": p}
+        details |= _verdict(x, y, of_gap, gap_interval)
     return _as_difference(x, y, value, details, note=note, interval=interval, method=method)
 
 
@@ -232,33 +232,20 @@ def excess_of(result: Scored) -> Scored | None:
     return Scored(of_excess, result.excess, units, groups=result.groups)
 
 
-def _error(replicates: Array) -> float:
-    return float(jackknife_errors(replicates[:, None])[0])
+def _spread(value: float, replicates: Array, df: int) -> Spread:
+    return Spread(value, float(jackknife_errors(replicates[:, None])[0]), df, "")
 
 
-def _test(
-    value: float, error: float, df: int, level: float
-) -> tuple[Interval | None, float, float]:
-    """The t interval of a value, and the shares of its distribution below and above 0."""
-    if not (np.isfinite(error) and error > 0):
-        return None, 0.5, 0.5
-    below, above = (float(special.stdtr(df, s * value / error)) for s in (-1, 1))
-    return t_interval(value, error, df, level), below, above
-
-
-def _verdict(
-    x: Score, y: Score, value: float, tested: tuple[Interval | None, float, float]
-) -> dict[str, Any]:
-    """Which of two is ahead, where ``value`` is a difference of which 0 is a tie."""
-    interval, below, above = tested
-    ahead = value if x.higher_is_better else -value
+def _verdict(x: Score, y: Score, spread: Spread, interval: Interval | None) -> dict[str, Any]:
+    """Which of two is ahead, by a difference of which 0 is a tie."""
+    ahead = spread.value if x.higher_is_better else -spread.value
     better = x.subject if ahead > 0 else y.subject if ahead < 0 else None
     if interval is None:
         return {"better": better, "p_value": None}
     return {
         "better": better,
-        "p_better": above if x.higher_is_better else below,
-        "p_value": 2 * min(below, above),
+        "p_better": spread.shares()[bool(x.higher_is_better)],
+        "p_value": 2 * min(spread.shares()),
         "decided": not interval[0] <= 0 <= interval[1],
     }
 
@@ -309,20 +296,29 @@ def _difference_of_means(a: Sequence[Mean], b: Sequence[Mean]) -> Score:
     x, y = a[0].score, b[0].score
     require_comparable([x, y])
     spread = spread_of([a, b], lambda m: m[..., 0] - m[..., 1])
-    interval, below, above = spread.interval(-1.0, 1.0, x.level), 0.5, 0.5
-    if interval:
-        below, above = (
-            float(special.stdtr(spread.df, s * spread.value / spread.error)) for s in (-1, 1)
-        )
-    details = _verdict(x, y, spread.value, (interval, below, above))
+    more: dict[str, Any] = {}
     if min(run.score.value or 0 for run in a) > 0:
         with np.errstate(divide="ignore", invalid="ignore"):  # a mean may be 0 without one group
             relative = spread_of([a, b], lambda m: 1 - m[..., 1] / m[..., 0])
-        bounds = relative.interval(-np.inf, 1.0, x.level)
-        details |= {"relative": relative.value, "relative_interval": bounds}
-    method = f"paired, {spread.method}" if interval else ""
-    note = None if interval else Note("no-interval", {"reason": "no-change"})
-    return _as_difference(x, y, spread.value, details, note=note, interval=interval, method=method)
+        bounds = relative.interval(high=1.0, level=x.level)
+        more = {"relative": relative.value, "relative_interval": bounds}
+    return _by_spread(x, y, spread, (-1.0, 1.0), reason="no-change", **more)
+
+
+def _by_spread(
+    x: Score, y: Score, spread: Spread, bounds: Interval, *, reason: str, **more: Any
+) -> Score:
+    """The difference with the interval of a spread; ``reason`` where there is none."""
+    interval = spread.interval(*bounds, x.level)
+    return _as_difference(
+        x,
+        y,
+        spread.value,
+        {**_verdict(x, y, spread, interval), **more},
+        note=None if interval else Note("no-interval", {"reason": reason}),
+        interval=interval,
+        method=f"paired, {spread.method}" if interval else "",
+    )
 
 
 def mean_differences(
@@ -346,18 +342,11 @@ def mean_differences(
 def _mean_difference(x: Score, y: Score, delta: Array, groups: Sequence[str] | None) -> Score:
     require_comparable([x, y])
     finite = np.isfinite(delta)
-    kept = delta[finite]
-    names = None if groups is None else [g for g, ok in zip(groups, finite, strict=True) if ok]
-    if not len(kept):
+    if not finite.any():
         return _as_difference(x, y, None, {}, note=Note("undefined", {"reason": "no-images"}))
-    value, (interval, method) = float(kept.mean()), mean_interval(kept, names, x.level)
-    if interval is None:
-        note = Note("no-interval", {"reason": "few-images"})
-        return _as_difference(x, y, value, _verdict(x, y, value, (None, 0.5, 0.5)), note=note)
-    df = (len(kept) if names is None else len(set(names))) - 1
-    error = (interval[1] - interval[0]) / 2 / float(special.stdtrit(df, 0.5 + x.level / 2))
-    details = _verdict(x, y, value, _test(value, error, df, x.level))
-    return _as_difference(x, y, value, details, interval=interval, method=f"paired, {method}")
+    names = None if groups is None else list(np.asarray(groups)[finite])
+    spread = spread_of_values(delta[finite], names)
+    return _by_spread(x, y, spread, (-np.inf, np.inf), reason="few-images")
 
 
 def holm(differences: Sequence[Score]) -> list[Score]:
