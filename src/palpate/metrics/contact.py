@@ -284,7 +284,7 @@ def contact_images(generated: Any, reference: Any, background: Any) -> ContactIm
         masks[i] = kept
         for image, difference in zip(images, (made, real), strict=True):
             image[i][kept] = np.clip(0.5 + difference[kept], 0, 1)
-    return ContactImages(*images, masks)
+    return ContactImages(images[0], images[1], masks)
 
 
 def _checked(generated: Any, reference: Any, background: Any) -> tuple[NDArray[Any], ...]:

@@ -303,7 +303,8 @@ def _draw_parts(generated: FeatureSet, reference: FeatureSet, seed: int) -> _Par
         method = jackknife("group", "", units - 1)
         return _Parts(unit[:n], unit[n:], names, "group", units, "group", method)
     # the largest group first into the block that has least, ties at random: nearly equal sizes
-    size = sum(np.bincount(u, minlength=units) / len(u) for u in (unit[:n], unit[n:]))
+    sizes = [np.bincount(u, minlength=units) / len(u) for u in (unit[:n], unit[n:])]
+    size = sizes[0] + sizes[1]
     order, load, block = rng.permutation(units), np.zeros(BLOCKS), np.zeros(units, np.intp)
     for u in order[np.argsort(-size[order], kind="stable")]:
         block[u] = int(load.argmin())

@@ -299,7 +299,7 @@ def kernel_sums(
     if backend == "moments" or (backend == "auto" and not reason and cheap and many):
         sigma = float(kernel.bandwidth or 0)
         number = number.reshape(-1)
-        sums = _moments(parts, number, items.shape[1], sigma).sums(*items, segments)
+        sums = _moments(parts, number, items.shape[1], sigma).sums(items[0], items[1], segments)
         one_of = np.unique(number, return_index=True)[1]
         sums = replace(sums, weighings=[sums.weighed(w[one_of]) for w in weights])
         remainder = bound(sums)

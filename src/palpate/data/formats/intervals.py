@@ -24,6 +24,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
@@ -139,7 +140,7 @@ def scan(  # noqa: PLR0913 (a public verb)
     column = f"column {(columns or {}).get('text', 'text')}"
     facts = {"dataset": source.stem, "text_source": column if words["text"].values else "none"}
     result = Scan(base, facts, inconclusive=sum(i.inconclusive for i in listed))
-    more = {"sensor": sensor, "words": words}
+    more: dict[str, Any] = {"sensor": sensor, "words": words}
     add_frames(result, work, rows, check=check, into=into, progress=progress, **more)
     return result
 

@@ -23,6 +23,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from palpate.core import PalpateError, Problem, Progress, Split, quiet, require_choice, write_text
 from palpate.data.formats.base import WORLD, Cells, Facts, Format, Into, Scan, world_facts
@@ -142,7 +143,7 @@ def scan(
     listed = set(lists.listed.contact["video"])
     rows = usable(work, rows, first_frames(every), listed, check=check, progress=progress)
     result = Scan(root, lists.facts, inconclusive=lists.listed.inconclusive)
-    more = {"sensor": lists.sensor, "words": lists.words}
+    more: dict[str, Any] = {"sensor": lists.sensor, "words": lists.words}
     add_frames(result, work, rows, check=check, into=into, progress=progress, **more)
     if lists.official is not None:
         part_of = {name: part for part, name in OFFICIAL.items()}
