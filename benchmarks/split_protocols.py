@@ -34,7 +34,7 @@ from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
 from palpate.core import FeatureSet, rng_for, short
-from palpate.metrics.means import spread_of_values
+from palpate.metrics.intervals import spread_of_values
 from palpate.metrics.retrieval import retrieval
 from palpate.sim import PRESETS, VERSION, Video, plan_world
 from palpate.sim.options import BACKGROUND_OFFSET

@@ -16,7 +16,7 @@ from palpate.data.manifest import Manifest
 from palpate.evaluation import companions, inputs, score, scoring
 from palpate.metrics import Polynomial, compare, contact_scores, distance, i_tmmd, ssim
 from palpate.metrics.distributions import prdc_rows
-from palpate.metrics.means import spread_of_values
+from palpate.metrics.intervals import spread_of_values
 from palpate.metrics.mmd import sample_units
 from score_calls import DIM, FRAMES, GROUPS, IDS, by_key, codes, feature_sets, paint, unit
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from palpate.core import FeatureSet, Note, PalpateError, Score
 from palpate.metrics import distributions
 from palpate.metrics.distributions import prdc
-from palpate.metrics.means import spread_of_values
+from palpate.metrics.intervals import spread_of_values
 
 NAMES = ["Precision", "Recall", "Density", "Coverage"]
 

@@ -61,8 +61,7 @@ from palpate.metrics.inputs import (
     feature_set,
     require_one_encoder,
 )
-from palpate.metrics.intervals import Scored, jackknife_errors, t_interval
-from palpate.metrics.means import spread_of_values
+from palpate.metrics.intervals import Scored, jackknife_errors, spread_of_values, t_interval
 from palpate.metrics.paired import Comparison, difference, holm, same_samples
 
 #: Mean (d,) and factor (r, d) of a covariance F' F.

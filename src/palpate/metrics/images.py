@@ -29,7 +29,7 @@ from scipy import ndimage
 from palpate import __version__
 from palpate.core import Note, PalpateError, Score
 from palpate.metrics.inputs import as_array, checked_level, checked_names, to_host
-from palpate.metrics.means import spread_of_values
+from palpate.metrics.intervals import spread_of_values
 
 Array = NDArray[np.float64]
 Border = Literal["valid", "mirror"]

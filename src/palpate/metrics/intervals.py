@@ -234,6 +234,53 @@ def jackknife_errors(replicates: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """A statistic with its standard error, degrees of freedom, and how they came about."""
+
+    value: float
+    error: float
+    df: float
+    method: str
+
+    @property
+    def known(self) -> bool:
+        """Whether there is an error: no change without any group is no evidence of certainty."""
+        return bool(1e-12 < self.error < np.inf)  # not for NaN
+
+    def interval(
+        self, low: float = -np.inf, high: float = np.inf, level: float = 0.95
+    ) -> Interval | None:
+        """The t interval within [low, high], or None."""
+        if not self.known:
+            return None
+        a, b = t_interval(self.value, self.error, self.df, level)
+        return max(a, low), min(b, high)
+
+    def shares(self) -> tuple[float, float]:
+        """The shares of its t distribution below and above 0; halves where there is no error."""
+        if not self.known:
+            return 0.5, 0.5
+        below, above = special.stdtr(self.df, np.array([-1, 1]) * self.value / self.error)
+        return float(below), float(above)
+
+
+def spread_of_values(values: Array, groups: Sequence[str] | None) -> Spread:
+    """The mean of values (n,) with its error over groups, or over values taken as independent."""
+    n, each, tail = len(values), "group", ""
+    if groups is None:
+        groups, each, tail = list(map(str, range(n))), "image", ", images taken as independent"
+    of_group = np.unique(np.asarray(groups, dtype=str), return_inverse=True)[1]
+    total, size = np.bincount(of_group, values), np.bincount(of_group)
+    value = float(values.mean()) if n else np.nan
+    if len(size) < 2:
+        return Spread(value, np.nan, 0, "")
+    without = (total.sum() - total) / (n - size)
+    df = len(size) - 1
+    method = f"leave-one-{each}-out jackknife, t, {df} df{tail}"
+    return Spread(value, float(jackknife_errors(without[:, None])[0]), df, method)
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A statistic with its jackknife.
 

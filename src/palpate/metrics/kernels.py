@@ -389,14 +389,15 @@ class _Pairs:
 
     def __init__(self, x: Any, order: Index, kernel: Kernel) -> None:
         self.kernel, self.xp = kernel, array_namespace(x)
-        xp, single = self.xp, False
-        z = xp.astype(rows_at(x, order), xp.float64)
-        if kernel.stationary and len(order):
+        xp, z = self.xp, rows_at(x, order)
+        if not kernel.stationary:
+            z = xp.astype(z, xp.float64)
+        elif len(order):
             z -= xp.mean(z, axis=0)  # any center is right: float32 is near enough
         z /= kernel.unit(x.shape[1])
-        if x.dtype != xp.float64 and kernel.stationary:
-            single = float(row_norms(z).max(initial=0)) ** 2 <= FLOAT32_RADIUS
-        self.z = xp.astype(z, x.dtype) if single else z
+        if float(row_norms(z).max(initial=0)) ** 2 > FLOAT32_RADIUS:
+            z = xp.astype(z, xp.float64, copy=False)
+        self.z = z
         self.half = row_norms(self.z) ** 2 / 2
         self.shift = like(self.half, self.z)
 

@@ -20,10 +20,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from palpate.core import Score
-from palpate.metrics.intervals import Interval, jackknife_errors, t_interval
+from palpate.metrics.intervals import Spread, jackknife_errors
 
 Array = NDArray[np.float64]
 #: (..., K) means -> (...) their statistic.
@@ -57,37 +56,6 @@ class Mean:
             return np.where(below > 1e-9 * self.weights.sum(), above / below, np.nan)
 
 
-@dataclass(frozen=True)
-class Spread:
-    """A statistic with its standard error, degrees of freedom, and how they came about."""
-
-    value: float
-    error: float
-    df: float
-    method: str
-
-    @property
-    def known(self) -> bool:
-        """Whether there is an error: no change without any group is no evidence of certainty."""
-        return bool(1e-12 < self.error < np.inf)  # not for NaN
-
-    def interval(
-        self, low: float = -np.inf, high: float = np.inf, level: float = 0.95
-    ) -> Interval | None:
-        """The t interval within [low, high], or None."""
-        if not self.known:
-            return None
-        a, b = t_interval(self.value, self.error, self.df, level)
-        return max(a, low), min(b, high)
-
-    def shares(self) -> tuple[float, float]:
-        """The shares of its t distribution below and above 0; halves where there is no error."""
-        if not self.known:
-            return 0.5, 0.5
-        below, above = special.stdtr(self.df, np.array([-1, 1]) * self.value / self.error)
-        return float(below), float(above)
-
-
 def mean_of(
     metric: str,
     values: NDArray[Any],
@@ -115,19 +83,6 @@ def mean_of(
     interval = spread.interval(0.0, 1.0)
     method = spread.method if interval else ""
     return replace(mean, score=replace(score, interval=interval, interval_method=method))
-
-
-def spread_of_values(values: Array, groups: Sequence[str] | None) -> Spread:
-    """The mean of values (n,) with its error over groups, or over values taken as independent."""
-    if not len(values):
-        return Spread(np.nan, np.nan, 0, "")
-    names = np.arange(len(values)) if groups is None else np.asarray(groups)
-    score = Score("", "", float(values.mean()))
-    spread = spread_of([[Mean(score, values, np.ones(len(values)), names.astype(str))]])
-    if groups is None:
-        method = spread.method.replace("group", "image") + ", images taken as independent"
-        return replace(spread, method=method)
-    return spread
 
 
 def mean_over_groups(

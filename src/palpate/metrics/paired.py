@@ -29,9 +29,9 @@ import numpy as np
 
 from palpate.core import FeatureSet, Note, PalpateError, Score, require_comparable
 from palpate.metrics.inputs import Array, feature_set, require_one_encoder
-from palpate.metrics.intervals import Interval, Scored, jackknife_errors
+from palpate.metrics.intervals import Interval, Scored, Spread, jackknife_errors, spread_of_values
 from palpate.metrics.kernels import TOLERANCE
-from palpate.metrics.means import Mean, Spread, spread_of, spread_of_values
+from palpate.metrics.means import Mean, spread_of
 from palpate.metrics.tactile import (
     UNBOUNDED,
     floors_of,
