@@ -383,11 +383,14 @@ def test_a_photo_that_is_none_is_listed_and_costs_no_request(data, tmp_path, sma
     broken, gone = small_manifest.paths("vision")[2], small_manifest.paths("vision")[6]
     broken.write_bytes(b"no image")
     gone.unlink()
+    pipe = small_manifest.paths("vision")[10]
+    pipe.unlink()
+    os.mkfifo(pipe)
     with FakeServer() as server:
         result = describe(data, tmp_path / "c", server)
-    assert server.count == 10
-    assert [problem.kind for problem in result.problems] == ["bad-image"] * 2
-    assert result.record["counts"]["flags"] == {"bad-image": 2}
+    assert server.count == 9
+    assert [problem.kind for problem in result.problems] == ["bad-image"] * 3
+    assert result.record["counts"]["flags"] == {"bad-image": 3}
 
 
 def test_broken_photos_of_equal_bytes_are_all_listed(data, tmp_path, small_manifest):

@@ -5,7 +5,6 @@ A crop is a rectangle in shares of width and height. It follows the whole photo 
 
 from __future__ import annotations
 
-import hashlib
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,14 +67,6 @@ def _boxes(size: tuple[int, int], crop: Crop | None) -> list[tuple[int, int, int
         right, bottom = round(crop[2] * width), round(crop[3] * height)
         boxes.append((left, top, max(left + 1, right), max(top + 1, bottom)))
     return boxes
-
-
-def file_digest(path: Path) -> str | None:
-    """SHA-256 of a file's bytes; None if it cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return None
 
 
 def _jpeg(image: Image.Image) -> bytes:

@@ -9,12 +9,12 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from palpate.captions.photos import QUALITY, SIDE, Crop, file_digest, prepared
+from palpate.captions.photos import QUALITY, SIDE, Crop, prepared
 from palpate.captions.prompts import Description, Prompt
 from palpate.captions.replies import Describer, RejectedError, Replies, Reply, ReplyLog, Request
 from palpate.captions.units import Units
 from palpate.core import PalpateError, Problem, Progress, digest_json
-from palpate.data.images import in_threads
+from palpate.data.images import file_digest, in_threads
 from palpate.data.manifest import Manifest
 
 #: Requests until a reply can be used; from the second on the model samples.

@@ -9,6 +9,7 @@ stretched.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import struct
 import zlib
@@ -277,6 +278,15 @@ def file_stamp(path: Path) -> tuple[int, int]:
     except OSError:
         return (-1, -1)
     return (stat.st_size, stat.st_mtime_ns)
+
+
+def file_digest(path: Path) -> str | None:
+    """SHA-256 of a file's bytes; None if it cannot be read, or is a pipe."""
+    with suppress(OSError):
+        if path.is_file():
+            with open(path, "rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+    return None
 
 
 def _rgb(image: Image.Image) -> Image.Image:

@@ -4,10 +4,8 @@ or any table with the columns ``id`` and ``text``.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import ceil
 from pathlib import Path
@@ -15,6 +13,7 @@ from pathlib import Path
 import polars as pl
 
 from palpate.core import PalpateError, Problem, ProblemsError, Split, digest_lines, short
+from palpate.data.images import file_digest
 from palpate.data.imported import Imported
 from palpate.data.manifest import Manifest, write_parquet
 from palpate.data.tables import open_table
@@ -61,11 +60,8 @@ def image_digests(manifest: Manifest, ids: Iterable[str] | None = None) -> dict[
         table = table.gather_every(max(1, ceil(len(table) / WITNESSES)))
     else:
         table = table.filter(pl.col("id").is_in(list(ids)))
-    digests: dict[str, str] = {}
-    for name, image in table.iter_rows():
-        with suppress(OSError):
-            digests[name] = hashlib.sha256(manifest.path(image).read_bytes()).hexdigest()
-    return digests
+    digests = ((name, file_digest(manifest.path(image))) for name, image in table.iter_rows())
+    return {name: digest for name, digest in digests if digest is not None}
 
 
 def write_texts(table: pl.DataFrame, path: Path, source: str, images: Mapping[str, str]) -> None:
