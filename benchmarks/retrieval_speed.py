@@ -2,11 +2,12 @@
 
     python benchmarks/retrieval_speed.py --write docs/studies/retrieval_speed.md
 
-Random unit vectors, whose pairs correlate; all keys are ranked. `strict` is one direction and the
-other with the sample's own key right; `similar text` counts keys whose text has a cosine above
-0.6356 as well, all texts being distinct (the slowest case). Each row runs in a process of its own,
-whose peak resident memory, packages and inputs included, is shown. Time is the processor's: with
-one thread, what it takes on a core that nothing else uses. At most 60 s and 1,024 MB pass.
+Random unit vectors, whose pairs correlate; all keys are ranked. `strict` is both directions with
+the sample's own key right; `similar text` counts keys whose text has a cosine above 0.6356 as well,
+all texts being distinct (the slowest case: three products of all pairs instead of one). Each row
+runs in a process of its own, whose peak resident memory, packages and inputs included, is shown.
+Time is the processor's: with one thread, what it takes on a core that nothing else uses. Rows of
+width 128, that of palpate/mini, pass under 60 s and 1,024 MB.
 """
 
 import argparse
@@ -20,7 +21,13 @@ import sys
 import time
 from pathlib import Path
 
-ROWS = [(10_000, 128, False), (40_000, 128, False), (40_000, 768, False), (40_000, 128, True)]
+ROWS = [
+    (10_000, 128, False),
+    (40_000, 128, False),
+    (40_000, 128, True),
+    (40_000, 768, False),
+    (40_000, 768, True),
+]
 HEAD = "| samples | width | right keys | CPU seconds | elapsed seconds | peak memory, MB |"
 
 
@@ -84,7 +91,8 @@ def main():
         numbers = f"{result['cpu']:.1f} | {result['seconds']:.1f} | {result['memory']:.0f}"
         lines.append(f"| {n:,} | {width} | {kind} | {numbers} |")
         print(lines[-1], flush=True)
-        passed = passed and result["cpu"] < 60 and result["memory"] < 1024
+        if width == 128:
+            passed = passed and result["cpu"] < 60 and result["memory"] < 1024
     if chosen.write:
         chosen.write.write_text(page(lines, f"{Path(__file__).name} {' '.join(sys.argv[1:])}"))
     sys.exit(not passed)

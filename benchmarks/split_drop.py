@@ -18,6 +18,7 @@ from pathlib import Path
 
 from palpate.core import Split
 from palpate.data.importing import import_dataset
+from palpate.encoders.encoder_set import load_clip
 from palpate.leakage import split as leak_free_split
 from palpate.sim import PRESETS, write_world
 from palpate.studies.split_study import compare_splits
@@ -91,6 +92,12 @@ def table(results):
     return "\n".join(lines)
 
 
+def frozen():
+    """The partners' digests: those that ship may change."""
+    loaded = load_clip("palpate/mini")
+    return ", ".join(f"{m} {loaded.digest(m)[:12]}" for m in ("vision", "text"))
+
+
 def page(studies, command, seeds):
     """The whole Markdown file."""
     parts = []
@@ -115,8 +122,8 @@ Made by a committed command; do not edit by hand. Synthetic: the tables show a m
     {command}
 
 The paper's tables 1 and 2, left part, on the procedural world: a tactile encoder of preset `mini` is trained from scratch on each split with seeds
-{", ".join(map(str, seeds))}, against the frozen vision and text encoders of `palpate/mini` (which saw other worlds), and scored on the test part of its own
-split. The split is the table's axis. Intervals: 95 %, jackknife over videos and deviation of seeds; a difference loses a video from both sides at once.
+{", ".join(map(str, seeds))}, against the frozen vision and text encoders of `palpate/mini` ({frozen()}; they saw other worlds), and scored on the test part of
+its own split. The split is the table's axis. Intervals: 95 %, jackknife over videos and deviation of seeds; a difference loses a video from both sides at once.
 `similar text` counts a text as right from cosine 0.6356 (TVL's value, for another text encoder). {platform.machine()}, CPU; {datetime.date.today().isoformat()}.
 
 The same on real data: `palpate probe DATA --splits Orig.json NoLeak.json --train --clip openai/clip-vit-large-patch14 --preset paper -o drop.html`.

@@ -174,8 +174,7 @@ def both_ranks(
     if texts is None:
         return _own_ranks(a, b)
     distinct, code = np.unique(texts, axis=0, return_inverse=True)
-    code = code.reshape(-1)
-    return tuple(_similar_ranks(x, y, distinct, code, threshold) for x, y in ((a, b), (b, a)))  # type: ignore[return-value]
+    return _similar_ranks(a, b, distinct, code.reshape(-1), threshold)
 
 
 def unit_rows(x: NDArray[Any]) -> Floats:
@@ -209,21 +208,26 @@ def _own_ranks(a: Floats, b: Floats) -> tuple[Ranks, Ranks]:
 
 def _similar_ranks(
     a: Floats, b: Floats, texts: Floats, code: NDArray[np.intp], threshold: float
-) -> Ranks:
+) -> tuple[Ranks, Ranks]:
     n = len(a)
-    above, ties, wrong, right = np.zeros((4, n))
+    counts = np.zeros((2, 3, n))  # direction, (above, ties, wrong)
+    right = np.zeros(n)
     for rows in blocks(n, n):
-        similar = a[rows] @ b.T
         good = (texts[code[rows]] @ texts.T > threshold)[:, code]
         good[np.arange(len(good)), np.arange(rows.start, rows.stop)] = True
         right[rows] = _by_row(good)
         cells = np.flatnonzero(good)
-        row, values = cells // n, similar.reshape(-1)[cells]
-        best = np.maximum.reduceat(values, np.searchsorted(row, np.arange(len(good))))
-        above[rows] = _by_row(similar > (best + TIE)[:, None])
-        ties[rows] = _by_row(similar > (best - TIE)[:, None]) - above[rows]
-        wrong[rows] = ties[rows] - np.bincount(row, values > best[row] - TIE)
-    return Ranks(above, ties, wrong, right, n)
+        row = cells // n
+        starts = np.searchsorted(row, np.arange(len(good)))
+        for (above, ties, wrong), x, y in ((counts[0], a, b), (counts[1], b, a)):
+            similar = x[rows] @ y.T
+            values = similar.reshape(-1)[cells]
+            best = np.maximum.reduceat(values, starts)
+            above[rows] = _by_row(similar > (best + TIE)[:, None])
+            ties[rows] = _by_row(similar > (best - TIE)[:, None]) - above[rows]
+            wrong[rows] = ties[rows] - np.bincount(row, values > best[row] - TIE)
+    forth, back = (Ranks(*c, right, n) for c in counts)
+    return forth, back
 
 
 def _by_row(mask: NDArray[np.bool_]) -> Array:
