@@ -226,7 +226,7 @@ def _similar_ranks(
             above[rows] = _by_row(similar > (best + TIE)[:, None])
             ties[rows] = _by_row(similar > (best - TIE)[:, None]) - above[rows]
             wrong[rows] = ties[rows] - np.bincount(row, values > best[row] - TIE)
-    forth, back = (Ranks(*c, right, n) for c in counts)
+    forth, back = (Ranks(c[0], c[1], c[2], right, n) for c in counts)
     return forth, back
 
 
