@@ -3,13 +3,13 @@
 import hashlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from palpate.core import Split
@@ -75,14 +75,15 @@ def test_two_processes_take_the_steps_of_one(place):
 
 
 @pytest.mark.slow
-def test_killed_again_and_again_it_ends_in_the_same_bytes(place):
+@pytest.mark.parametrize(("processes", "most"), [(1, 3), (2, 1)])
+def test_killed_again_and_again_it_ends_in_the_same_bytes(place, processes, most):
     more = ("--clip", "palpate/mini", "--epochs", "8")
-    run(place, "encoder", "whole", *more)
+    run(place, "encoder", "whole", *more, processes=processes)
     rng, log = np.random.default_rng(0), place / ".killed.work" / "tactile" / "log.jsonl"
     kills = 0
-    for _ in range(3):
-        process = subprocess.Popen(
-            command("encoder", "killed", *more),
+    for _ in range(most):
+        process = psutil.Popen(
+            command("encoder", "killed", *more, processes=processes),
             cwd=place,
             env=ENV,
             stdout=subprocess.DEVNULL,
@@ -91,14 +92,17 @@ def test_killed_again_and_again_it_ends_in_the_same_bytes(place):
         while process.poll() is None and not log.exists():
             time.sleep(0.02)
         time.sleep(rng.uniform(0, 0.3))
-        process.send_signal(signal.SIGKILL)
+        family = [*process.children(recursive=True), process] if process.is_running() else []
+        for each in family:
+            each.kill()
+        psutil.wait_procs(family)
         if process.wait() == 0:
             break
         kills += 1
         log.unlink(missing_ok=True)
     assert kills > 0
     if not (place / "killed").exists():
-        run(place, "encoder", "killed", *more)
+        run(place, "encoder", "killed", *more, processes=processes)
     digests = [hashlib.sha256(weights(place / name)).hexdigest() for name in ("whole", "killed")]
     assert digests[0] == digests[1]
 

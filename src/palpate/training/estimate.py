@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils.flop_counter import FlopCounterMode
 
 from palpate.training.options import LoopOptions
@@ -39,10 +40,11 @@ def estimate(
         pass counts as two forward passes); seconds.
     """
     batch, meta = min(options.batch, n), torch.device("meta")
-    kept: list[int] = []
+    kept: dict[StorageWeakRef, int] = {}  # bytes; several operations may keep one tensor
 
     def pack(tensor: Tensor) -> Tensor:
-        kept.append(tensor.numel() * tensor.element_size())
+        storage = tensor.untyped_storage()
+        kept[StorageWeakRef(storage)] = storage.nbytes()
         return tensor
 
     with meta:
@@ -52,7 +54,9 @@ def estimate(
             forward(model, 1, meta)
     parameters = sum(p.numel() for p in model.parameters())
     weights = sum(p.numel() * p.element_size() for p in model.parameters())
-    activations = max(0, sum(kept) - weights)  # products keep their weights, too
+    for p in model.parameters():  # products keep their weights, too
+        kept.pop(StorageWeakRef(p.untyped_storage()), None)
+    activations = sum(kept.values())
     row = 3 * counter.get_total_flops()
     seconds = _seconds(build, forward, max(1, min(batch, int(PROBE // max(1, row)))), device)
     return {

@@ -1,0 +1,119 @@
+"""Each preset takes a real step; the paper's from training to the probe; what a plan counts."""
+
+import json
+import os
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+from transformers import CLIPConfig, CLIPModel
+
+from palpate.cli import main
+from palpate.core import Split
+from palpate.encoders.contrastive import new_clip, plan_encoder, train_tactile
+from palpate.encoders.encoder_set import ClipEncoders, EncoderSet, new_tactile
+from palpate.encoders.preprocess import Preprocess
+from palpate.encoders.presets import preset
+from palpate.encoders.tokenizer import train_tokenizer
+from palpate.training.estimate import estimate
+from palpate.training.options import Compute, LoopOptions
+
+WORDS = ["rough, hard", "soft, warm", "smooth, cold"]
+MEMORY = 14e9  # of the largest: weights, gradient, moments, their copies for the checkpoint
+
+
+@pytest.fixture
+def split(small_manifest):
+    """Four videos of three materials to train on, two to test."""
+    train = [i for i in small_manifest.ids if i < "v4"]
+    test = [i for i in small_manifest.ids if i not in train]
+    return Split.from_ids(train=train, test=test, manifest=small_manifest.digest)
+
+
+def free_memory():
+    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mini", "tvl-tiny", "tvl-small", "tvl-base", "paper"])
+def test_a_preset_takes_a_real_step_of_what_its_plan_says(name, small_manifest, split, tmp_path):
+    """With all its layers and pixels, on two samples, one at a time (cached gradients)."""
+    if name == "paper" and free_memory() < MEMORY:
+        pytest.skip(f"the preset paper needs {MEMORY / 1e9:.0f} GB of memory")
+    chosen = preset(name)
+    partners = new_clip(replace(preset("tiny"), dim=chosen.dim), WORDS, seed=0)
+    chosen = replace(chosen, tactile_course=replace(chosen.tactile_course, batch=2))
+    how = {"epochs": 1e-9, "device": "cpu", "compute": Compute(chunk=1)}
+    encoders = train_tactile(small_manifest, split, partners, chosen, tmp_path / "run", **how)
+    shutil.rmtree(tmp_path / "run")  # gigabytes
+    plan = plan_encoder(small_manifest, split, preset="tiny")
+    assert plan["train_samples"] == encoders.card["train_samples"]
+    assert encoders.card["steps"] == 1
+    (line,) = encoders.card["loss"]
+    assert 0 < line["loss"] < 10
+    assert encoders.tactile is not None
+    start = new_tactile(chosen.tactile_config(chosen.dim), 0).state_dict()
+    moved = encoders.tactile.state_dict()
+    assert start.keys() == moved.keys()
+    still = [k for k in start if torch.equal(start[k], moved[k])]
+    assert all("position_ids" in k or "k_proj.bias" in k for k in still)
+
+
+def write_clip(folder):
+    """A tiny CLIP as transformers saves it, that sees 224 pixels in patches of 14 as the L/14."""
+    tokenizer = train_tokenizer(WORDS, vocabulary=300, context=77)
+    size = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}
+    ids = {"pad_token_id": 0, "bos_token_id": 1, "eos_token_id": 3}
+    text = {**size, **ids, "vocab_size": len(tokenizer), "max_position_embeddings": 77}
+    vision = {**size, "image_size": 224, "patch_size": 14}
+    config = CLIPConfig(text_config=text, vision_config=vision, projection_dim=768)
+    ClipEncoders(CLIPModel(config), tokenizer, Preprocess(224, 224), "tiny L/14").save(folder)
+
+
+@pytest.mark.slow
+def test_the_paper_s_preset_from_training_to_the_probe(
+    small_manifest, split, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    write_clip(tmp_path / "clip")
+    small_manifest.save(tmp_path / "tag" / "manifest.parquet")
+    split.save(tmp_path / "split.json")
+    where = ["tag", "--split", "split.json"]
+    size = ["--tactile-width", "32", "--tactile-layers", "2", "--tactile-heads", "2"]
+    course = ["--clip", "clip", "--batch-size", "8", "--epochs", "1", "--chunk", "4", "-o", "out"]
+    assert main(["train", "encoder", *where, "--preset", "paper", *size, *course]) == 0
+    encoders = EncoderSet.load(tmp_path / "out")
+    assert encoders.tactile.config.patch_size == 14
+    assert (encoders.dim, encoders.card["targets"], encoders.card["steps"]) == (768, "diagonal", 4)
+    assert len((tmp_path / "out" / "log-tactile.jsonl").read_text().splitlines()) == 2
+    capsys.readouterr()
+    assert main(["probe", *where, "--encoder", "out", "--json"]) == 0
+    report = capsys.readouterr().out
+    assert json.loads(report)
+    assert "material" in report
+    assert encoders.digest("tactile") in report
+
+
+def test_a_plan_counts_what_can_be_counted_by_hand():
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.a, self.b = nn.Linear(5, 7), nn.Linear(7, 2)
+
+        def forward(self, x):
+            return self.b(torch.tanh(self.a(x)))
+
+    def forward(model, rows, device):
+        return model(torch.ones(rows, 5, device=device))
+
+    loop = LoopOptions(10, 4, 1e-3, ema=0.9)
+    plan = estimate(Net, forward, loop, 100, torch.device("cpu"))
+    parameters = 5 * 7 + 7 + 7 * 2 + 2
+    assert plan["parameters"] == parameters
+    assert plan["state_bytes"] == 5 * 4 * parameters  # weights, gradient, two moments, average
+    assert plan["activation_bytes"] == 4 * 4 * (5 + 7)  # the input, and tanh's output once
+    assert plan["flop_per_step"] == 3 * 4 * 2 * (5 * 7 + 7 * 2)
+    assert plan["flop"] == 10 * plan["flop_per_step"]
+    assert 0 <= plan["seconds"] < 60
