@@ -2,11 +2,12 @@
 
 For a train image its best match in *other videos* is known to be no leak. Their similarities are
 the null. A cosine c ends at 1, so tails are those of Fisher's z = artanh c: above its 90 % quantile
-u an exponential of mean excess b. What is over u comes from k videos only; with a prior that weighs
-as much as four videos of mean excess .07, n = k + 4 and B = (k b + .28) / n, the share of unrelated
-images that is expected above z is that of a Pareto distribution,
+u, at least .2, an exponential of mean excess b. What is over u, a share a, comes from k videos
+only; with a prior that weighs as much as four videos of mean excess .07, n = k + 4 and
+B = (k b + .28) / n, the share of unrelated images that is expected above z is that of a Pareto
+distribution,
 
-    .1 (1 + (z - u) / (n B))^-n,
+    a (1 + (z - u) / (n B))^-n,
 
 so thresholds rise where few videos are known, and the promised rate holds from three videos on
 (docs/studies/near_duplicates.md).
@@ -34,6 +35,9 @@ from palpate.leakage.neighbors import Floats, Ints
 #: Unrelated matches that a null needs.
 FEWEST = 20
 TAIL, BINS = 0.9, 50
+#: The least z of a tail and the fewest images in it: few images of the null may have a plausible
+#: edit, but those of a sensor that is mounted in another way have.
+LEAST, RARE = 0.2, 3
 #: The prior of a tail, its weight in videos and mean excess; the cosine at which z ends.
 PRIOR, EXCESS, END = 4, 0.07, 0.99999
 #: Flags that chance explains no more often than this are leaks, and a null that is over its
@@ -43,12 +47,13 @@ CHANCE, MISSED = 0.01, 3.0
 
 @dataclass(frozen=True)
 class Tail:
-    """The tail of a null: u, B and n of the formula above, and its share of the rate."""
+    """The tail of a null: u, B, n and a of the formula above, and its share of the rate."""
 
     location: float
     scale: float
     weight: int
     share: float
+    above: float = 0.1
 
     @classmethod
     def of(cls, null: Floats, groups: Ints, share: float) -> Tail | None:
@@ -57,12 +62,13 @@ class Tail:
         if known.sum() < FEWEST:
             return None
         z = _fisher(null[known])
-        location = float(np.quantile(z, TAIL))
+        location = max(float(np.quantile(z, TAIL)), LEAST)
         over = z > location
         videos = len(np.unique(groups[known][over]))
         excess = videos * float((z[over] - location).mean()) if videos else 0.0
         weight = videos + PRIOR
-        return cls(location, (excess + PRIOR * EXCESS) / weight, weight, share)
+        scale = (excess + PRIOR * EXCESS) / weight
+        return cls(location, scale, weight, share, max(int(over.sum()), RARE) / len(z))
 
     def surprise(self, similarity: Any) -> Any:
         """-log of the share of the tail that is expected above a similarity."""
@@ -73,7 +79,7 @@ class Tail:
 
     def surprise_at(self, rate: float) -> float:
         """The surprise that this question's share of a rate of unrelated images exceeds."""
-        return float(np.log((1 - TAIL) / (rate * self.share)))
+        return float(np.log(self.above / (rate * self.share)))
 
     def similarity(self, surprise: Any) -> Any:
         """The inverse of :meth:`surprise`."""
@@ -105,9 +111,10 @@ def tails(nulls: Sequence[Floats], groups: Ints, shares: Sequence[float]) -> lis
 
 def surprises(similarities: Any, fitted: Sequence[Tail]) -> Floats:
     """(questions, n): how rare answers are by chance, as surprises of the first question."""
+    weight = fitted[0].share / fitted[0].above
     return np.stack(
         [
-            t.surprise(s) + np.log(t.share / fitted[0].share)
+            t.surprise(s) + np.log(t.share / t.above / weight)
             for s, t in zip(similarities, fitted, strict=True)
         ]
     )
@@ -127,7 +134,7 @@ def threshold(fitted: Sequence[Tail], rate: float) -> float:
 def rate_of(score: float, fitted: Sequence[Tail]) -> float:
     """The share of unrelated images that exceeds a score: the inverse of :func:`threshold`."""
     over = np.exp(-max(float(fitted[0].surprise(score)), 0.0))
-    return float((1 - TAIL) * over / fitted[0].share)
+    return float(fitted[0].above * over / fitted[0].share)
 
 
 def _fisher(similarity: Any) -> Any:

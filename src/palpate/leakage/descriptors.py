@@ -18,8 +18,9 @@ would be taken for background where they are few.
 2. *Edited cells*, where no background is used. Queries in 8 turns and mirrors, each with red and
    blue swapped; train also as if cropped and slightly turned, each with a mean of its own.
    Candidates are found by keys that no turn, mirror or swap changes, the mean over all of them
-   of max(0, u A) with random A. An edit is tried only where the whitened length of the query,
-   over the least of all edits, is plausible: the light shows which edit was made.
+   of max(0, u A) with random A. Each crop and turn has a whitening of its own, and an edit is
+   plausible where the length of the query in it is near the least of all edits: the light and the
+   markers show which edit was made. Without a plausible edit the cosine is -1.
 
 Measured in docs/studies/near_duplicates.md.
 """
@@ -48,7 +49,7 @@ GEOMETRIES = ((1.0, 0.0), (0.9, 0.0), (1.0, 3.0), (1.0, -3.0))
 #: Shares of the side by which a copy may be moved.
 MOVES = [(y, x) for y in (0.0, -0.03, 0.03) for x in (0.0, -0.03, 0.03)]
 #: Whitened length, over the least of all edits, up to which an edit is plausible.
-PLAUSIBLE = 1.3
+PLAUSIBLE = 1.1
 #: Shares of the rate of false positives: slopes, cells, edits, which are rarer than contacts.
 SHARES = (0.4, 0.4, 0.2)
 #: Length of a key, and how many candidates it finds.
@@ -185,7 +186,7 @@ class Whitened(Descriptors):
         fit = fit[np.linspace(0, len(fit) - 1, min(len(fit), FITTED)).astype(np.int64)]
         self._samplers = [[_sampler(s, *g) for s in GRIDS] for g in GEOMETRIES]
         self._white = [Whitener() for _ in range(1 if gray else 3)]
-        cells, keys = [Whitener() for _ in GRIDS], Whitener()
+        coarse, fine, keys = [Whitener() for _ in GEOMETRIES], Whitener(), Whitener()
         sums = [[0.0 for _ in GRIDS] for _ in GEOMETRIES]
         for logs in map(self.logs, _blocks(fit)):
             for c, whiten in enumerate(self._white):
@@ -194,10 +195,10 @@ class Whitened(Descriptors):
                 signals = self.cells(logs, g)
                 for k, x in enumerate(signals):
                     total[k] = total[k] + x.sum(axis=0, dtype=np.float64)
+                coarse[g].add(signals[0])
                 if g == 0:
                     keys.add(self._swapped(signals[0]))
-                    for whiten, x in zip(cells, signals, strict=True):
-                        whiten.add(x)
+                    fine.add(signals[1])
         for whiten in self._white:
             whiten.fit(IMAGE_RIDGE)
             whiten.matrix = whiten.matrix @ whiten.directions.T
@@ -205,8 +206,9 @@ class Whitened(Descriptors):
         for logs in map(self.logs, _blocks(fit)):
             self._slopes.add(self._raw_slopes(logs))
         self._slopes.fit(SLOPE_RIDGE)
-        fitted = zip(cells, GRIDS.values(), strict=True)
-        self.matrices = [whiten.fit(ridge).matrix for whiten, ridge in fitted]
+        #: Whitening of coarse cells for each geometry, by whose lengths an edit is plausible.
+        self.edited = [whiten.fit(GRIDS[min(GRIDS)]) for whiten in coarse]
+        self.matrices = [self.edited[0].matrix, fine.fit(GRIDS[max(GRIDS)]).matrix]
         means = [[np.asarray(x / len(fit), np.float32) for x in total] for total in sums]
         #: For each grid (geometries, d) whitened means.
         self.means = [
@@ -225,7 +227,7 @@ class Whitened(Descriptors):
             (1, lambda rows: MoveIndex(self, rows)),
             (2, lambda rows: EditIndex(self, rows)),
         ]
-        if backgrounds is not None:  # over them the light no longer shows which edit was made
+        if backgrounds is not None:  # over them the light no longer tells which edit was made
             self.ways = self.ways[:2]
         self.shares = SHARES[: len(self.ways)]
 
@@ -359,38 +361,39 @@ class EditIndex:
             ],
             axis=1,
         )  # (n, geometries, candidates)
-        parts: list[tuple[Ints, Floats]] = []
+        found: list[tuple[Ints, Floats]] = []
         for block, signals in zip(_blocks(np.arange(len(rows))), cells, strict=True):
-            parts.append(self._compared(signals, near[block], count))
-        return np.concatenate([x for x, _ in parts]), np.concatenate([x for _, x in parts])
+            found.append(self._compared(signals, near[block], count))
+        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
 
     def _compared(self, cells: Sequence[Floats], near: Ints, count: int) -> tuple[Ints, Floats]:
         """Choose edits by the coarse grid, and compare the best candidates in full."""
         pool, every = self._pool, np.arange(len(near))
-        edited = np.stack([cells[0][:, at] for at in pool.edits[0]], axis=1) @ pool.matrices[0]
-        centered = edited[:, None] - pool.means[0][:, None]  # (n, geometries, edits, d)
-        lengths = np.linalg.norm(centered, axis=3)
+        edited = np.stack([cells[0][:, at] for at in pool.edits[0]], axis=1)
+        lengths = np.stack([np.linalg.norm(w(edited), axis=2) for w in pool.edited], axis=1)
         plausible = lengths <= PLAUSIBLE * lengths.min(axis=(1, 2), keepdims=True)
         plausible[:, 0, 0] = False  # as it is: another question
+        # (n, geometries, edits, d)
+        centered = (edited @ pool.matrices[0])[:, None] - pool.means[0][:, None]
+        centered /= np.maximum(np.linalg.norm(centered, axis=3, keepdims=True), 1e-9)
         geometry = np.arange(len(GEOMETRIES))[:, None]
         among = self._vectors[geometry, near][..., : self._coarse].astype(np.float32)
-        similarity = centered @ among.transpose(0, 1, 3, 2) / np.maximum(lengths, 1e-9)[..., None]
-        similarity[~plausible] = -np.inf
-        similarity.transpose(0, 1, 3, 2)[near < 0] = -np.inf
-        # (n, geometries, candidates)
-        edit, similarity = similarity.argmax(axis=2), similarity.max(axis=2)
-        best = np.argsort(-similarity.reshape(len(near), -1), axis=1, kind="stable")[:, : count + 2]
+        cosine = centered @ among.transpose(0, 1, 3, 2)
+        cosine[~plausible] = -1
+        cosine.transpose(0, 1, 3, 2)[near < 0] = -np.inf
+        edit, cosine = cosine.argmax(axis=2), cosine.max(axis=2)  # (n, geometries, candidates)
+        best = np.argsort(-cosine.reshape(len(near), -1), axis=1, kind="stable")[:, : count + 2]
         row, values = np.full(best.shape, -1), np.full(best.shape, np.nan, np.float32)
         for t, at in enumerate(best.T):
             g, k = np.divmod(at, near.shape[2])
-            known = np.isfinite(similarity[every, g, k])
-            row[:, t] = np.where(known, near[every, g, k], -1)
+            row[:, t] = near[every, g, k]
             chosen = [
                 np.take_along_axis(x, np.stack(columns)[edit[every, g, k]], axis=1)
                 for x, columns in zip(cells, pool.edits, strict=True)
             ]
             vectors = self._vectors[g, near[every, g, k]].astype(np.float32)
             values[:, t] = np.einsum("nd,nd->n", pool.vectors(chosen, g), vectors)
+            values[~plausible[every, g, edit[every, g, k]], t] = -1
         return _best(row, values, count)
 
 
