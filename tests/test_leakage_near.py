@@ -43,7 +43,7 @@ def test_planted_copies_are_found_and_others_are_not(leaky, modality, known):
     # In 45 videos little is learned of the gel: faint copies stay below a safe threshold.
     assert found.sum() >= (0.4 if modality == "tactile" else 0.9) * truth.sum()
     order = np.argsort(-flags.score)
-    assert truth[order[: round(0.6 * truth.sum())]].all()
+    assert truth[order[: round(0.5 * truth.sum())]].all()
     still = [k for k in copies if flags.flag[k] or "shift" not in leaky.change[test.ids[k]]]
     sources = [leaky.planted["near-duplicate"][test.ids[k]] for k in still]
     assert [train.ids[k] for k in flags.nearest[still]] == sources
