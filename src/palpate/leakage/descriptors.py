@@ -218,8 +218,7 @@ class Whitened(Descriptors):
         self._key = keys.fit(GRIDS[min(GRIDS)]).matrix
         self._key_means = [self._swapped(mean[0][None]) @ self._key for mean in means]
         self._random = random.standard_normal((len(self._key), KEY), dtype=np.float32)
-        self._moved = [_sampler(min(GRIDS), *GEOMETRIES[0], move) for move in MOVES]
-        self._finely_moved = [_sampler(max(GRIDS), *GEOMETRIES[0], move) for move in MOVES]
+        self._moved = [[_sampler(s, *GEOMETRIES[0], move) for s in GRIDS] for move in MOVES]
         self.edits = _edits(8 if gray else 16, 1 if gray else 3)
         self._turns = _edits(8, 1 if gray else 2)[0]
         self.ways = [
@@ -243,18 +242,20 @@ class Whitened(Descriptors):
         """Cells of each grid, (n, cells^2 x channels), before whitening."""
         return [_cells(logs, s) for s in self._samplers[geometry]]
 
-    def moved(self, rows: Ints) -> Iterator[list[Floats]]:
-        """Cells of images that are moved over their backgrounds, as they are first."""
+    def moved(self, rows: Ints, moves: Sequence[int], grids: int) -> Iterator[list[Floats]]:
+        """For each move the first ``grids`` cells of images that are moved over backgrounds."""
         logs = self._log(self._images[rows])
-        behind = [np.float32(0)] * len(GRIDS)
+        behind = [np.float32(0)] * grids
         if self._backgrounds is not None:
-            behind = self.cells(self._log(self._backgrounds[rows]))
-        for samplers in zip(self._moved, self._finely_moved, strict=True):
+            under = self._log(self._backgrounds[rows])
+            behind = [_cells(under, s) for s in self._samplers[0][:grids]]
+        for move in moves:
+            samplers = self._moved[move][:grids]
             yield [_cells(logs, s) - x for s, x in zip(samplers, behind, strict=True)]
 
     def vectors(self, cells: Sequence[Floats], geometry: int | Ints) -> Floats:
         """(n, d) unit vectors of cells, in which both grids weigh the same; coarse ones first."""
-        fitted = zip(cells, self.matrices, self.means, strict=True)
+        fitted = zip(cells, self.matrices, self.means, strict=False)  # one grid, or both
         parts = [unit(x @ matrix - means[geometry]) for x, matrix, means in fitted]
         return np.hstack(parts) / np.float32(np.sqrt(len(parts)))
 
@@ -293,12 +294,17 @@ class Whitened(Descriptors):
         """(n, channels x directions x cells^2)."""
         white = [w(logs[:, c]) for c, w in enumerate(self._white)]
         image = np.stack(white, axis=1).reshape(len(logs), -1, SIDE, SIDE)
-        down, right = np.gradient(image, axis=(2, 3))
-        pooled: list[Floats] = []
-        for angle in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
-            slope = np.float32(np.cos(angle)) * right + np.float32(np.sin(angle)) * down
-            pooled.append(_POOL @ np.maximum(slope, 0) @ _POOL.T)
-        return np.sqrt(unit(np.stack(pooled, axis=1).reshape(len(logs), -1)))
+        down, right = (x.reshape(-1, SIDE * SIDE) for x in np.gradient(image, axis=(2, 3)))
+        whole = down @ _POOL, right @ _POOL
+        forward: list[Floats] = []
+        backward: list[Floats] = []
+        for angle in 2 * np.pi * np.arange(DIRECTIONS // 2) / DIRECTIONS:
+            y, x = np.float32(np.sin(angle)), np.float32(np.cos(angle))
+            forward.append(np.maximum(y * down + x * right, 0) @ _POOL)
+            # What is left of the sum is the opposite direction.
+            backward.append(np.maximum(forward[-1] - y * whole[0] - x * whole[1], 0))
+        pooled = np.stack(forward + backward, axis=1).reshape(len(logs), -1)
+        return np.sqrt(unit(pooled))
 
 
 class MoveIndex:
@@ -310,40 +316,54 @@ class MoveIndex:
             pool.vectors(pool.cells(pool.logs(block)), 0).astype(np.float16)
             for block in _blocks(rows)
         ]
-        self._vectors, self._coarse = np.concatenate(parts), len(pool.matrices[0])
-        self._keys = np.ascontiguousarray(self._vectors[:, : self._coarse], np.float32)
+        self._vectors, coarse = np.concatenate(parts), len(pool.matrices[0])
+        self._keys = unit(self._vectors[:, :coarse])
 
     def closest(
         self, rows: Ints, count: int = 1, apart: Apart | None = None
     ) -> tuple[Ints, Floats]:
         """See :class:`Index`."""
         pool = self._pool
-        parts = [pool.vectors(pool.cells(pool.logs(block)), 0) for block in _blocks(rows)]
-        still = np.concatenate([x[:, : self._coarse] for x in parts])
-        near = nearest(still, self._keys, count + CANDIDATES, apart=apart)
-        values = np.empty(near.shape, np.float32)
+        still = [pool.vectors(pool.cells(pool.logs(block))[:1], 0) for block in _blocks(rows)]
+        near = nearest(np.concatenate(still), self._keys, count + CANDIDATES, apart=apart)
+        found: list[tuple[Ints, Floats]] = []
         for block in _blocks(np.arange(len(rows))):
-            moved = [pool.vectors(cells, 0) for cells in pool.moved(rows[block])]
-            among = self._vectors[near[block]].astype(np.float32)
-            values[block] = (np.stack(moved, axis=1) @ among.transpose(0, 2, 1)).max(axis=1)
-        return _best(near, values, count)
+            found.append(self._compared(rows[block], near[block], count))
+        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
+
+    def _compared(self, rows: Ints, near: Ints, count: int) -> tuple[Ints, Floats]:
+        """Choose moves by the coarse grid, and compare the best candidates in full."""
+        pool, every = self._pool, np.arange(len(rows))
+        moved = [pool.vectors(c, 0) for c in pool.moved(rows, range(len(MOVES)), 1)]
+        cosine = np.stack(moved, axis=1) @ self._keys[near].transpose(0, 2, 1)
+        cosine.transpose(0, 2, 1)[near < 0] = -np.inf
+        move, cosine = cosine.argmax(axis=1), cosine.max(axis=1)  # (n, candidates)
+        best = np.argsort(-cosine, axis=1, kind="stable")[:, : count + 1]
+        row, values = np.take_along_axis(near, best, axis=1), np.zeros(best.shape, np.float32)
+        for t, at in enumerate(best.T):
+            for m in np.unique(move[every, at]).tolist():
+                part = np.flatnonzero(move[every, at] == m)
+                (cells,) = pool.moved(rows[part], [m], len(GRIDS))
+                among = self._vectors[row[part, t]].astype(np.float32)
+                values[part, t] = np.einsum("nd,nd->n", pool.vectors(cells, 0), among)
+        return _best(row, values, count)
 
 
 class EditIndex:
     """Cells of train images, as if cropped or turned; queries are edited in the best way."""
 
     def __init__(self, pool: Whitened, rows: Ints) -> None:
-        self._pool, self._coarse = pool, len(pool.matrices[0])
+        self._pool, self._rows = pool, rows
         every = range(len(GEOMETRIES))
-        width = sum(map(len, pool.matrices))
-        self._vectors = np.empty((len(GEOMETRIES), len(rows), width), np.float16)
+        parts: list[list[Floats]] = [[] for _ in every]
         keys: list[list[Floats]] = [[] for _ in every]
-        for block in _blocks(np.arange(len(rows))):
-            logs = pool.logs(rows[block])
+        for block in _blocks(rows):
+            logs = pool.logs(block)
             for g in every:
-                cells = pool.cells(logs, g)
-                self._vectors[g, block] = pool.vectors(cells, g)
+                cells = pool.cells(logs, g)[:1]
+                parts[g].append(pool.vectors(cells, g).astype(np.float16))
                 keys[g] += pool.keys(cells[0], [g])
+        self._vectors = np.stack([np.concatenate(x) for x in parts])
         self._centers = [np.concatenate(x).mean(axis=0) for x in keys]
         self._keys = [unit(np.concatenate(x) - c) for x, c in zip(keys, self._centers, strict=True)]
 
@@ -376,14 +396,13 @@ class EditIndex:
         # (n, geometries, edits, d)
         centered = (edited @ pool.matrices[0])[:, None] - pool.means[0][:, None]
         centered /= np.maximum(np.linalg.norm(centered, axis=3, keepdims=True), 1e-9)
-        geometry = np.arange(len(GEOMETRIES))[:, None]
-        among = self._vectors[geometry, near][..., : self._coarse].astype(np.float32)
+        among = self._vectors[np.arange(len(GEOMETRIES))[:, None], near].astype(np.float32)
         cosine = centered @ among.transpose(0, 1, 3, 2)
         cosine[~plausible] = -1
         cosine.transpose(0, 1, 3, 2)[near < 0] = -np.inf
         edit, cosine = cosine.argmax(axis=2), cosine.max(axis=2)  # (n, geometries, candidates)
         best = np.argsort(-cosine.reshape(len(near), -1), axis=1, kind="stable")[:, : count + 2]
-        row, values = np.full(best.shape, -1), np.full(best.shape, np.nan, np.float32)
+        row, values = np.full(best.shape, -1), np.zeros(best.shape, np.float32)
         for t, at in enumerate(best.T):
             g, k = np.divmod(at, near.shape[2])
             row[:, t] = near[every, g, k]
@@ -391,9 +410,13 @@ class EditIndex:
                 np.take_along_axis(x, np.stack(columns)[edit[every, g, k]], axis=1)
                 for x, columns in zip(cells, pool.edits, strict=True)
             ]
-            vectors = self._vectors[g, near[every, g, k]].astype(np.float32)
-            values[:, t] = np.einsum("nd,nd->n", pool.vectors(chosen, g), vectors)
-            values[~plausible[every, g, edit[every, g, k]], t] = -1
+            queries, shown = pool.vectors(chosen, g), plausible[every, g, edit[every, g, k]]
+            values[:, t] = np.where(shown, 0, -1)
+            for geometry in np.unique(g[shown]).tolist():
+                part = np.flatnonzero(shown & (g == geometry))
+                logs = pool.logs(self._rows[row[part, t]])
+                among = pool.vectors(pool.cells(logs, geometry), geometry)
+                values[part, t] = np.einsum("nd,nd->n", queries[part], among)
         return _best(row, values, count)
 
 
@@ -463,10 +486,10 @@ def _sampler(
 
 
 def _pool() -> Floats:
-    """(cells, side): triangles that overlap by half."""
+    """(side^2, cells^2): triangles that overlap by half."""
     place = (np.arange(SIDE) + 0.5) * SLOPE_CELLS / SIDE - 0.5
-    away = np.abs(place - np.arange(SLOPE_CELLS)[:, None])
-    return np.maximum(0, 1 - away).astype(np.float32)
+    side = np.maximum(0, 1 - np.abs(place[:, None] - np.arange(SLOPE_CELLS)))
+    return np.kron(side, side).astype(np.float32)
 
 
 _POOL = _pool()
