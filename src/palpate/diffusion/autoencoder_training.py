@@ -100,7 +100,7 @@ def train_autoencoder(
     free = LoopOptions(options.steps_free, options.batch, options.lr, weight_decay=1e-4, seed=seed)
     last = replace(free, steps=options.steps_quantized, lr=options.lr / 2)
 
-    shown = np.empty(0) if held_out is None else held_out[evenly(len(held_out), SHOWN)]
+    shown = images[:0] if held_out is None else held_out[evenly(len(held_out), SHOWN)]
 
     def run(what: str, course: LoopOptions, stage: str, *, quantize: bool) -> None:
         def samples(module: nn.Module) -> NDArray[np.uint8]:
@@ -253,8 +253,12 @@ def measure_reconstruction(
         z = autoencoder.latents(to_unit(pixels, device, signed=True))
         # Rounded to bytes first: what is scored is the image that a user gets.
         made, free = (to_bytes(autoencoder.image(z, quantize=q)[0]) for q in (True, False))
-        pairs = (("PSNR", made), ("PSNR", free), ("SSIM", made))
-        rows.append(np.stack([per_image(name, image, pixels).values for name, image in pairs]))
+        scored = [
+            per_image("PSNR", made, pixels),
+            per_image("PSNR", free, pixels),
+            per_image("SSIM", made, pixels),
+        ]
+        rows.append(np.stack([score.values for score in scored]))
         counts += np.bincount(autoencoder.codes(z).flatten().cpu().numpy(), minlength=codes)
     share = counts[counts > 0] / counts.sum()
     psnr, psnr_free, ssim = map(float, np.concatenate(rows, axis=1).mean(axis=1))

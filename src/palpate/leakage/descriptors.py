@@ -317,7 +317,7 @@ class MoveIndex:
             for block in _blocks(rows)
         ]
         self._vectors, coarse = np.concatenate(parts), len(pool.matrices[0])
-        self._keys = unit(self._vectors[:, :coarse])
+        self._keys = unit(self._vectors[:, :coarse].astype(np.float32))
 
     def closest(
         self, rows: Ints, count: int = 1, apart: Apart | None = None
@@ -355,7 +355,7 @@ class EditIndex:
     def __init__(self, pool: Whitened, rows: Ints) -> None:
         self._pool, self._rows = pool, rows
         every = range(len(GEOMETRIES))
-        parts: list[list[Floats]] = [[] for _ in every]
+        parts: list[list[NDArray[np.float16]]] = [[] for _ in every]
         keys: list[list[Floats]] = [[] for _ in every]
         for block in _blocks(rows):
             logs = pool.logs(block)
