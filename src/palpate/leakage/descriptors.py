@@ -94,12 +94,8 @@ class VectorIndex:
 
     def __init__(self, describe: Callable[[Ints], NDArray[Any]], rows: Ints) -> None:
         self._describe, self._vectors = describe, describe(rows)
-        columns = np.arange(self._vectors.shape[1])
-        if len(rows) > FEW:
-            spread = self._vectors[:FEW].astype(np.float32).var(axis=0)
-            columns = np.argsort(-spread)[:COLUMNS]
-        self._columns = columns
-        self._keys = np.ascontiguousarray(self._vectors[:, columns], np.float32)
+        self._columns = _leading(self._vectors)
+        self._keys = np.ascontiguousarray(self._vectors[:, self._columns], np.float32)
 
     def closest(
         self, rows: Ints, count: int = 1, apart: Apart | None = None
@@ -317,7 +313,9 @@ class MoveIndex:
             for block in _blocks(rows)
         ]
         self._vectors, coarse = np.concatenate(parts), len(pool.matrices[0])
-        self._keys = unit(self._vectors[:, :coarse].astype(np.float32))
+        self._coarse = unit(self._vectors[:, :coarse].astype(np.float32))
+        self._columns = _leading(self._coarse)
+        self._keys = np.ascontiguousarray(self._coarse[:, self._columns])
 
     def closest(
         self, rows: Ints, count: int = 1, apart: Apart | None = None
@@ -325,7 +323,8 @@ class MoveIndex:
         """See :class:`Index`."""
         pool = self._pool
         still = [pool.vectors(pool.cells(pool.logs(block))[:1], 0) for block in _blocks(rows)]
-        near = nearest(np.concatenate(still), self._keys, count + CANDIDATES, apart=apart)
+        keys = np.ascontiguousarray(np.concatenate(still)[:, self._columns])
+        near = nearest(keys, self._keys, count + CANDIDATES, apart=apart)
         found: list[tuple[Ints, Floats]] = []
         for block in _blocks(np.arange(len(rows))):
             found.append(self._compared(rows[block], near[block], count))
@@ -335,7 +334,7 @@ class MoveIndex:
         """Choose moves by the coarse grid, and compare the best candidates in full."""
         pool, every = self._pool, np.arange(len(rows))
         moved = [pool.vectors(c, 0) for c in pool.moved(rows, range(len(MOVES)), 1)]
-        cosine = np.stack(moved, axis=1) @ self._keys[near].transpose(0, 2, 1)
+        cosine = np.stack(moved, axis=1) @ self._coarse[near].transpose(0, 2, 1)
         cosine.transpose(0, 2, 1)[near < 0] = -np.inf
         move, cosine = cosine.argmax(axis=1), cosine.max(axis=1)  # (n, candidates)
         best = np.argsort(-cosine, axis=1, kind="stable")[:, : count + 1]
@@ -418,6 +417,13 @@ class EditIndex:
                 among = pool.vectors(pool.cells(logs, geometry), geometry)
                 values[part, t] = np.einsum("nd,nd->n", queries[part], among)
         return _best(row, values, count)
+
+
+def _leading(vectors: NDArray[Any]) -> Ints:
+    """The columns that are searched: all for few images, else those of the largest variance."""
+    if len(vectors) <= FEW:
+        return np.arange(vectors.shape[1])
+    return np.argsort(-vectors[:FEW].astype(np.float32).var(axis=0))[:COLUMNS]
 
 
 def unit(x: Floats) -> Floats:
