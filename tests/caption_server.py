@@ -121,7 +121,10 @@ class _Handler(BaseHTTPRequestHandler):
                 server.now -= 1
 
     def reply(self, fault, image, payload):
-        """Answer, with a fault or without."""
+        """Answer, with a fault or without; a tuple is the whole reply."""
+        if isinstance(fault, tuple):
+            self.send(*fault)
+            return
         status, _, rest = str(fault or "").partition(" ")
         if status.isdigit():
             headers = {"Retry-After": rest} if rest and status == "429" else {}

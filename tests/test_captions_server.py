@@ -300,6 +300,101 @@ def test_a_server_that_dies_midway_keeps_what_is_done(data, tmp_path, quick, fau
     assert len((tmp_path / "d" / "replies.jsonl").read_text().splitlines()) == 12
 
 
+@pytest.mark.parametrize("fault", ["page", (200, {"error": {"message": "busy", "code": "502"}})])
+def test_a_reply_of_a_proxy_is_asked_for_again(data, tmp_path, quick, fault):
+    with FakeServer(lambda number: fault if number == 5 else None) as server:
+        result = describe(data, tmp_path / "c", server)
+    assert (server.count, result.record["counts"]["texts"]) == (13, 12)
+
+
+def test_photos_that_are_rejected_are_no_matter_of_the_server_in_any_order(data, tmp_path):
+    """Half of them are, first; with 48 photos and at most 16 probes, and in the next run alone."""
+    with FakeServer(lambda number: "413" if number <= 15 else None) as server:
+        result = describe(data, tmp_path / "c", server, per="frame", concurrency=1)
+        assert (server.count, result.record["counts"]["texts"]) == (48, 33)
+        server.faults = lambda number: "413"
+        for _ in range(2):
+            again = describe(data, tmp_path / "c", server, per="frame")
+            assert (len(again.problems), again.record["counts"]["texts"]) == (15, 33)
+        server.count = 0
+        with pytest.raises(PalpateError, match="must take the requests"):
+            describe(data, tmp_path / "d", server, per="frame")
+    assert server.count == 16
+
+
+def reply(content, **fields):
+    message = {"message": {"content": content}, "finish_reason": "stop"}
+    return 200, {"choices": [message], **fields}
+
+
+GOOD = '{"adjectives": ["rough", "dry", "hard"], "surface_visible": true}'
+ODD = {
+    "half a character": (reply(GOOD.replace("dry", "dry\\ud800")), "rough, dry?, hard"),
+    "half a character outside": (reply(GOOD.replace("dry", "dry\ud800")), "rough, dry?, hard"),
+    "a fingerprint that is no text": (reply(GOOD, system_fingerprint={"a": 1}), "rough, dry, hard"),
+    "no number of tokens": (reply(GOOD, usage={"prompt_tokens": "x"}), "rough, dry, hard"),
+    "infinitely many tokens": (
+        (
+            200,
+            json.dumps(reply(GOOD, usage=7)[1]).replace("7", '{"prompt_tokens": 1e999}').encode(),
+        ),
+        "rough, dry, hard",
+    ),
+    "the end of a thought alone": (reply(f"It is {{soft}}.</think>{GOOD}"), "rough, dry, hard"),
+    "a key that is a word": (reply(GOOD, model="a rough one"), "rough, dry, hard"),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_an_odd_reply_is_read_and_the_folder_stays_readable(data, tmp_path, name, monkeypatch):
+    monkeypatch.setenv("PALPATE_CAPTION_KEY", "rough")
+    fault, text = ODD[name]
+    with FakeServer(lambda number: fault if number == 3 else None) as server:
+        first = describe(data, tmp_path / "c", server, concurrency=1)
+        assert text in first.table["text"].to_list()
+        whole = table_of(tmp_path / "c")
+        assert describe(data, tmp_path / "c", server).record == first.record
+    assert (server.count, table_of(tmp_path / "c")) == (12, whole)
+
+
+def test_a_log_with_a_fingerprint_that_is_no_text_is_read(data, tmp_path):
+    with FakeServer() as server:
+        first = describe(data, tmp_path / "c", server)
+        log = tmp_path / "c" / "replies.jsonl"
+        log.write_text(log.read_text().replace('"fp_1"', '{"a": 1}'))
+        assert describe(data, tmp_path / "c", server).table.equals(first.table)
+    assert server.count == 12
+
+
+def test_of_an_endless_reply_the_part_that_is_read_is_kept(data, tmp_path):
+    with FakeServer(lambda number: reply("rough " * 50_000) if number == 1 else None) as server:
+        describe(data, tmp_path / "c", server, concurrency=1)
+    assert len(logged(tmp_path / "c")[0]["raw"]) == 20_000
+
+
+def test_no_usable_caption_at_all_is_noted_and_exits_1(data, tmp_path, capsys):
+    with FakeServer(lambda number: "refusal") as server:
+        assert main(["caption", str(data), "-o", str(tmp_path / "c"), "--server", server.url]) == 1
+    output = capsys.readouterr()
+    assert "No caption can be used: refusal 12" in output.out + output.err
+    assert "Next:" not in output.out
+
+
+def test_a_request_is_never_repeated_with_again(data, tmp_path):
+    with FakeServer(lambda number: "truncated") as server:
+        for again in (False, True, True):
+            describe(data, tmp_path / "c", server, again=again)
+    sent = [json.dumps(payload, sort_keys=True) for payload in server.payloads]
+    assert len(set(sent)) == len(sent) == 3 * 36
+    assert max(payload["max_tokens"] for payload in server.payloads) == 1200
+
+
+def test_a_404_of_a_listed_model_is_of_the_address(data, tmp_path):
+    with FakeServer(lambda number: "404") as server, pytest.raises(PalpateError) as caught:
+        describe(data, tmp_path / "c", server)
+    assert caught.value.argument == "server"
+
+
 def test_single_requests_that_the_server_does_not_take_are_listed(data, tmp_path, capsys):
     with FakeServer(lambda number: "413" if number in (4, 6) else None) as server:
         args = ["caption", data, "-o", tmp_path / "c", "--server", server.url, "-q"]
@@ -332,6 +427,13 @@ WRONG = {
     "timeout": ("--server {url} --timeout -1", "--timeout must be a positive number"),
     "reply": ("--server {url} --max-tokens 0", "--max-tokens must be a positive number"),
     "prompt": ("--server {url} --prompt none.txt", "touch-sentence/1"),
+    "host without a name": ("--server http://a..b/v1", "http://HOST:PORT"),
+    "host in brackets": ("--server http://[foo]/v1", "http://HOST:PORT"),
+    "no JSON value": ('--server {url} --body {{"temperature":NaN}}', "--body must hold values"),
+    "prices": ("--server {url} --dry-run --prices 1 nan", "--prices must be numbers"),
+    "format": ("--template {{frame:q}}", "--template must have formats"),
+    "conversion": ("--template {{material!x}}", "--template must have formats"),
+    "nested format": ("--template {{frame:{{x}}}}", "--template must have formats"),
 }
 
 
@@ -370,10 +472,40 @@ def test_a_key_that_the_server_repeats_is_not_kept(data, tmp_path, monkeypatch):
         assert KEY.encode() not in path.read_bytes()
 
 
+@pytest.mark.parametrize("field", ["error", "detail", "cause", "fingerprint", "model", "id"])
+def test_a_key_that_comes_back_in_escapes_is_not_kept(data, tmp_path, monkeypatch, capsys, field):
+    key = "sk/planted/7c1f"
+    monkeypatch.setenv("PALPATE_CAPTION_KEY", key)
+    said, name = "".join(f"\\u{ord(sign):04x}" for sign in key), "system_fingerprint"
+    body = {field if field != "fingerprint" else name: "SAID"} | {"error": {"message": "SAID"}}
+    body = body if field in ("error", "detail", "cause") else reply(GOOD, **body | {"error": 0})[1]
+    for escaped in (said, key.replace("/", "\\/")):
+        fault = json.dumps(body).replace("SAID", escaped).encode()
+        with FakeServer(
+            lambda number, fault=fault: (400, fault) if number % 2 else (200, fault)
+        ) as s:
+            main(["caption", str(data), "-o", str(tmp_path / "c"), "--server", s.url, "-q"])
+    shown = capsys.readouterr()
+    assert key not in shown.out + shown.err
+    for path in (tmp_path / "c").iterdir():
+        assert key.encode() not in path.read_bytes()
+
+
 @pytest.mark.parametrize(
-    ("fault", "got"), [("400", "fault 400"), ("no-completion", "choices"), ("page", "no JSON")]
+    ("fault", "got"),
+    [
+        ("400", "fault 400"),
+        ("no-completion", "choices"),
+        ("page", "no JSON: '<html>'"),
+        ((200, b""), "no JSON: ''"),
+        ((200, b"[" * 200_000), "no JSON"),
+        ((200, b"no gzip", {"Content-Encoding": "gzip"}), "DecodingError"),
+        ((200, {"error": {"message": "upstream is busy", "code": 502}}), "502: upstream is busy"),
+        ((200, {"error": "no images"}), "status 400: no images"),
+        ((429, {}, {"Retry-After": "86400"}), "86400 s.*fewer requests at once"),
+    ],
 )
-def test_all_requests_rejected_is_an_error_and_not_a_table(data, tmp_path, fault, got):
+def test_all_requests_rejected_is_an_error_and_not_a_table(data, tmp_path, quick, fault, got):
     with FakeServer(lambda number: fault) as server, pytest.raises(PalpateError, match=got):
         describe(data, tmp_path / "c", server)
     assert not (tmp_path / "c" / "captions.parquet").exists()

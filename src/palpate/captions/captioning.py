@@ -7,6 +7,7 @@ depends on the samples and the replies alone, never on the order in which these 
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -201,9 +202,7 @@ def caption(  # noqa: PLR0913 (a public verb)
     """
     _require_one(server=server, local=local, template=template)
     limits = {"concurrency": concurrency, "timeout": timeout, "max_tokens": max_tokens}
-    for name, limit in limits.items():
-        if not 0 < limit < inf:
-            raise PalpateError("must be a positive number", str(limit), "", argument=name)
+    _require_sound(limits, prices, body)
     manifest, output = load(data, progress=progress), Path(output)
     if template is None and not manifest.table["vision"].count():
         must, fix = "must have vision images", "Map the column vision to the photos"
@@ -238,7 +237,13 @@ def caption(  # noqa: PLR0913 (a public verb)
             threads = min(describer.threads or concurrency, len(pending))
             try:
                 problems = query_all(
-                    pending, question, describer, log, threads=threads, progress=progress
+                    pending,
+                    question,
+                    describer,
+                    log,
+                    threads=threads,
+                    progress=progress,
+                    answered=any(key in answers for key in photos.keys),
                 )
             except PalpateError as error:
                 if not log.answered:
@@ -257,6 +262,19 @@ def _require_one(**sources: str | None) -> None:
         must = f"Captions come from one of {', '.join(sources)}"
         example = {"server": "http://localhost:8000/v1"}
         raise PalpateError(must, " and ".join(given) or "none", "", example=example)
+
+
+def _require_sound(limits: Mapping[str, float], prices: Sequence[float] | None, body: Any) -> None:
+    for name, limit in limits.items():
+        if not 0 < limit < inf:
+            raise PalpateError("must be a positive number", str(limit), "", argument=name)
+    if not all(0 <= price < inf for price in prices or ()):
+        raise PalpateError("must be numbers from 0", str(prices), "", argument="prices")
+    try:
+        json.dumps(body, allow_nan=False, ensure_ascii=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        must, got = "must hold values that JSON has", f"{type(error).__name__} {str(error)[:80]}"
+        raise PalpateError(must, got, "Leave out NaN and infinity", argument="body") from None
 
 
 def _describer(
@@ -397,7 +415,10 @@ def _write(
     path = output / TABLE
     write_texts(table, path, source, image_digests(manifest))
     write_json(output / RECORD, record)
-    return Captions(table, record, path, problems, _notes(manifest, units, made))
+    notes = _notes(manifest, units, made)
+    if not texts:
+        notes.append(Note("captions-none", {"flags": dict(sorted(flags.items()))}))
+    return Captions(table, record, path, problems, notes)
 
 
 def _notes(manifest: Manifest, units: Units, made: Mapping[str, Any]) -> list[Note]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from string import Formatter
+from typing import Any
 
 from palpate.captions.units import Units
 from palpate.core import PalpateError
@@ -38,10 +40,23 @@ def template_texts(template: str, manifest: Manifest, units: Units, seed: int) -
         if None in cells.values():
             texts.append(None)
         elif template:
-            texts.append(template.format(**cells))
+            texts.append(_filled(template, cells))
         else:
             texts.append(caption(cells["material"], rows[first[unit]]["id"], seed))
     return texts
+
+
+def _filled(template: str, cells: Mapping[str, Any]) -> str:
+    """The template with these values.
+
+    Raises:
+        PalpateError: if a format in it is none, or not one of such a value.
+    """
+    try:
+        return template.format(**cells)
+    except (ValueError, TypeError, LookupError) as error:
+        must, fix = "must have formats that fit the columns", "Leave the format out"
+        raise PalpateError(must, f"{template!r}: {error}", fix, argument="template") from None
 
 
 def _columns(template: str) -> list[str]:

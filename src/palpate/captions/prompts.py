@@ -48,7 +48,8 @@ REFUSAL = re.compile(
 )
 #: Characters of a reply that are looked at: more are a model that does not stop.
 LONGEST = 20_000
-_THOUGHT = re.compile(r"<think>.*?(</think>|$)", re.DOTALL)
+#: A thought between its tags; some servers leave the first tag out.
+_THOUGHT = re.compile(r"\A((?!<think>).)*</think>|<think>.*?(</think>|$)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class Prompt:
             exact = exact and limits["minItems"] <= len(given) <= limits["maxItems"]
         flags = [] if exact else ["schema-ignored"]
         flags += ["surface-hidden"] if answer.get("surface_visible") is False else []
-        text = " ".join(value.split()).rstrip(".")
+        text = " ".join(valid(value).split()).rstrip(".")
         return Description(text, adjectives, tuple(flags))
 
 
@@ -190,9 +191,14 @@ def _shipped() -> Iterator[str]:
         yield file.read_text(encoding="utf-8")
 
 
+def valid(text: str) -> str:
+    """A text whose characters all exist: JSON may hold halves of them, which no file can."""
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
 def _bare(word: str) -> str:
     """An adjective as in a list: lower case, without quotes and full stops."""
-    return " ".join(word.strip(" \t\n.,;:'\"").lower().split())
+    return " ".join(valid(word).strip(" \t\n.,;:'\"").lower().split())
 
 
 def _objects(text: str) -> Iterator[tuple[bool, Mapping[str, Any]]]:

@@ -20,8 +20,8 @@ from palpate.data.manifest import Manifest
 #: Requests until a reply can be used; from the second on the model samples.
 ATTEMPTS = 3
 AGAIN_TEMPERATURE = 0.5
-#: So many requests that the server does not take, and no answer, are no matter of single photos.
-ALL_REJECTED = 3
+#: So many photos, spread over all, are tried first: if the server takes none, others are not sent.
+PROBES = 16
 #: Seconds after which Ctrl-C is noticed: once polars has run, it interrupts no waiting.
 CTRL_C = 0.2
 T = TypeVar("T")
@@ -67,7 +67,7 @@ class Pending:
         key: of the answer.
         sample: the sample's id.
         path: the file.
-        tries: replies to it so far, which could not be used.
+        tries: replies to it so far; no request is repeated.
     """
 
     key: str
@@ -161,8 +161,19 @@ def query_all(
     *,
     threads: int,
     progress: Progress,
+    answered: bool,
 ) -> list[Problem]:
     """Send a request for every photo; replies go to the log as they arrive.
+
+    Args:
+        pending: the photos.
+        question: what is the same for all.
+        describer: the model.
+        log: where replies are kept.
+        threads: requests at once.
+        progress: progress callback.
+        answered: whether some photo has an answer already; then it is no matter of the server if
+            it takes none of these.
 
     Returns:
         The photos that cannot be read or that the server does not take.
@@ -186,20 +197,21 @@ def query_all(
         return None
 
     problems: list[Problem] = []
-    answered = rejected = 0
-    progress("describing", 0, len(pending))
-    for done, result in enumerate(in_daemons(work, pending, threads), 1):
-        if isinstance(result, BaseException):
-            raise result
-        if result is None:
-            answered += 1
-        else:
-            problems.append(result)
-            rejected += result.kind == "rejected"
-            if rejected >= ALL_REJECTED and not answered:
-                must, fix = "The model must take the requests", "Check it and the further fields"
-                raise PalpateError(must, result.text, fix)
-        progress("describing", done, len(pending))
+    done, step = 0, -(-len(pending) // PROBES) or 1
+    progress("describing", done, len(pending))
+    rest = [photo for k, photo in enumerate(pending) if k % step]
+    for photos in (pending[::step], rest):
+        for result in in_daemons(work, photos, threads):
+            if isinstance(result, BaseException):
+                raise result
+            answered |= result is None
+            problems += [] if result is None else [result]
+            done += 1
+            progress("describing", done, len(pending))
+        rejected = [problem for problem in problems if problem.kind == "rejected"]
+        if rejected and not answered:
+            must, fix = "The model must take the requests", "Check it and the further fields"
+            raise PalpateError(must, rejected[0].text, fix)
     return problems
 
 
@@ -209,20 +221,21 @@ def _replies(
     """Replies until one can be used or there were ``ATTEMPTS``; all but the last are ``unused``."""
     request = Request(images, question.prompt, question.max_tokens, 0.0, question.seed)
     for reply in tries:
-        request = _next(request, reply)
-    for left in range(ATTEMPTS - 1 - len(tries), -1, -1):
+        request = _next(request, reply, question)
+    for left in range(ATTEMPTS - 1 - len(tries) % ATTEMPTS, -1, -1):
         reply = describer.describe(request)
         description = reply.read(question.prompt)
         if description.answered or not left:
             yield reply
             break
         yield replace(reply, unused=description.flags[0])
-        request = _next(request, reply)
+        request = _next(request, reply, question)
 
 
-def _next(request: Request, reply: Reply) -> Request:
+def _next(request: Request, reply: Reply, question: Question) -> Request:
     """The request after a reply that cannot be used: sampled, with more room if that was cut."""
     room = request.max_tokens * (2 if reply.finish == "length" else 1)
+    room = min(room, question.max_tokens * 2 ** (ATTEMPTS - 1))
     seed = request.seed + 1
     return replace(request, max_tokens=room, temperature=AGAIN_TEMPERATURE, seed=seed)
 

@@ -139,10 +139,9 @@ class Replies:
             self.answers[key] = reply
 
     def tries(self, key: str) -> tuple[Reply, ...]:
-        """Replies that led to no answer so far, without rejected requests."""
-        if key in self.answers:
-            return ()
-        return tuple(reply for reply in self.others.get(key, ()) if reply.unused != "rejected")
+        """All replies to a key, without rejected requests."""
+        every = [*self.others.get(key, ()), *filter(None, [self.answers.get(key)])]
+        return tuple(reply for reply in every if reply.unused != "rejected")
 
     def others_of(self, keys: Iterable[str]) -> list[Reply]:
         """The other replies to these keys."""
@@ -170,6 +169,8 @@ def read_replies(path: Path) -> tuple[Replies, int]:
                 row = json.loads(line)
                 fields = {name: row[name] for name in Reply.__dataclass_fields__}
                 fields["tokens"] = (int(row["tokens"][0]), int(row["tokens"][1]))
+                if not isinstance(row["fingerprint"], str):
+                    fields["fingerprint"] = None
                 replies.add(row["key"], Reply(**fields))
             except (ValueError, TypeError, LookupError):
                 must, got = f"{path} must hold replies only", f"another line {number}"

@@ -18,6 +18,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from palpate.captions.prompts import LONGEST, valid
 from palpate.captions.replies import RejectedError, Reply, Request
 from palpate.core import MissingExtraError, PalpateError
 
@@ -27,8 +28,10 @@ KEY_VARIABLE = "PALPATE_CAPTION_KEY"
 LONGEST_PAUSE = 60.0
 #: Longest wait that a server may request, in seconds.
 LONGEST_WAIT = 600.0
-#: Statuses after which the same request may well succeed.
-BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)
+#: Statuses after which the same request may well succeed, next to 5xx.
+BUSY = (408, 409, 425, 429)
+#: Shorter keys may be words of a caption, which is kept as it is.
+SHORT_KEY = 8
 
 
 class Server:
@@ -67,7 +70,7 @@ class Server:
             import httpx2
         except ImportError:
             raise MissingExtraError("httpx2", "caption", "Asking a server for captions") from None
-        self._errors = httpx2.TransportError
+        self._errors = httpx2.RequestError
         self._refused = httpx2.ConnectError
         self._answered = False
         self.url = _checked_url(url)
@@ -91,18 +94,16 @@ class Server:
         answer = self._answer(self._payload(request))
         try:
             choice = answer["choices"][0]
-            message, usage = choice["message"], answer.get("usage") or {}
+            message, usage = choice["message"], answer.get("usage")
             refusal, finish = message.get("refusal"), str(choice.get("finish_reason") or "stop")
-            names = ("prompt_tokens", "completion_tokens")
-            inward, outward = (int(usage.get(name) or 0) for name in names)
             return Reply(
-                raw=_text_of(message.get("content")) or str(refusal or ""),
-                model=str(answer.get("model") or self.model),
+                raw=(_text_of(message.get("content")) or str(refusal or ""))[:LONGEST],
+                model=_string(answer.get("model")) or self.model,
                 refused=bool(refusal) or finish == "content_filter",
                 finish=finish,
-                tokens=(inward, outward),
+                tokens=(_tokens(usage, "prompt_tokens"), _tokens(usage, "completion_tokens")),
                 seconds=round(time.perf_counter() - start, 3),
-                fingerprint=answer.get("system_fingerprint"),
+                fingerprint=_string(answer.get("system_fingerprint")),
             )
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             got = f"{type(error).__name__} at {str(error)[:80]}"
@@ -131,50 +132,52 @@ class Server:
             RejectedError: if the server does not take this request.
             PalpateError: if it does not answer any more, or takes no request.
         """
-        reason, wait = "", 0.0
+        failure, wait = self._gone("no request"), 0.0
         for k in range(self._tries):
             time.sleep(wait)
             wait = min(LONGEST_PAUSE, self._pause * 2**k)
             try:
                 response = self._client.post(f"{self.url}/chat/completions", json=payload)
             except self._errors as error:
-                reason = self._reason(error)
+                failure = self._gone(self._reason(error))
                 if isinstance(error, self._refused) and not self._answered:
                     break  # nobody is there, and nobody was
                 continue
             self._answered = True
-            text = self._scrubbed(response.text)
-            if response.status_code in BUSY:
-                reason = f"status {response.status_code}: {_message(text)}"
+            answer = self._parsed(response.text)
+            status = _status(response.status_code, answer)
+            if status in BUSY or status >= 500:
+                reason = f"status {status}: {self._message(answer)}"
+                failure = self._gone(reason)
                 wait = _retry_after(response.headers.get("Retry-After", ""), wait)
                 if wait > LONGEST_WAIT:
                     reason += f" (it asks to wait {wait:.0f} s)"
+                    failure = self._gone(reason, "Wait that long, or send fewer requests at once")
                     break
-                continue
-            if response.status_code != 200:
-                raise self._refusal(response.status_code, text)
-            try:
-                return json.loads(text)
-            except ValueError:
-                raise RejectedError(f"the reply is no JSON: {text[:80]!r}") from None
-        raise self._gone(reason)
+            elif status != 200:
+                raise self._refusal(status, answer)
+            elif isinstance(answer, str):
+                failure = RejectedError(f"the reply is no JSON: {self._scrubbed(answer)[:80]!r}")
+            else:
+                return answer
+        raise failure
 
-    def _gone(self, reason: str) -> PalpateError:
+    def _gone(self, reason: str, fix: str = "Check its address and that it runs") -> Exception:
         """Nobody is there any more, or was."""
         must, got = "must be a server that answers", f"{self.url}: {reason}"
-        fix = "Check its address and that it runs, then run the same command again"
+        fix += ", then run the same command again"
         return PalpateError(must, got, fix, argument="server")
 
-    def _refusal(self, status: int, text: str) -> Exception:
+    def _refusal(self, status: int, answer: Any) -> Exception:
         """What a status other than 200 means."""
-        got = f"status {status}: {_message(text)}"
+        got = f"status {status}: {self._message(answer)}"
         if status in (401, 403):
             where = f"the environment variable {self._variable}"
             fix = f"Put a key into {where}" if self._key is None else f"Check the key in {where}"
             must = "must be a server that accepts the key"
             return PalpateError(must, f"{self.url}: {got}", fix, argument="server")
         if status == 404:
-            if models := self._models():
+            if (models := self._models()) and self.model not in models:
                 must, fix = f"must be a model of {self.url}", f"It has {_few(models)}"
                 return PalpateError(must, self.model, fix, argument="model")
             must, fix = "must be an OpenAI-compatible API", "Give its base: http://HOST:PORT/v1"
@@ -188,7 +191,7 @@ class Server:
         """Names of the server's models; empty if it does not list them."""
         try:
             response = self._client.get(f"{self.url}/models")
-            listed = response.json()["data"] if response.status_code == 200 else []
+            listed = self._parsed(response.text)["data"] if response.status_code == 200 else []
             return [str(model["id"]) for model in listed]
         except (self._errors, LookupError, TypeError, ValueError):
             return []
@@ -204,7 +207,7 @@ class Server:
         except self._errors as error:
             raise self._gone(self._reason(error)) from None
         if response.status_code in (401, 403):
-            raise self._refusal(response.status_code, self._scrubbed(response.text))
+            raise self._refusal(response.status_code, self._parsed(response.text))
         models = self._models()
         if len(models) != 1:
             got = f"{len(models)} models" if models else "no list of models"
@@ -217,9 +220,34 @@ class Server:
         """What broke the connection, in words; the library's may repeat a header."""
         return f"{type(error).__name__} {self._scrubbed(str(error))}".strip()
 
-    def _scrubbed(self, text: str) -> str:
-        """A reply without the key, which some servers repeat in their errors."""
-        return text.replace(self._key, "***") if self._key else text
+    def _parsed(self, text: str) -> Any:
+        """The JSON of a reply, else its text; without the key, and with characters that exist."""
+        try:
+            return self._cleaned(json.loads(text))
+        except (ValueError, RecursionError):
+            return self._cleaned(text)
+
+    def _cleaned(self, value: Any) -> Any:
+        if isinstance(value, dict):
+            return {self._cleaned(name): self._cleaned(each) for name, each in value.items()}
+        if isinstance(value, list):
+            return [self._cleaned(each) for each in value]
+        if isinstance(value, str):
+            return self._scrubbed(valid(value), SHORT_KEY)
+        return value
+
+    def _message(self, answer: Any) -> str:
+        """What an error reply says, in one short line."""
+        try:
+            error = answer.get("error", answer.get("detail", answer))
+            text = error["message"] if isinstance(error, dict) else error
+        except (LookupError, AttributeError):
+            text = answer
+        return " ".join(self._scrubbed(str(text)).split())[:200] or "no message"
+
+    def _scrubbed(self, text: str, least: int = 1) -> str:
+        """A text without the key, which some servers repeat, if it has ``least`` characters."""
+        return text.replace(self._key, "***") if self._key and len(self._key) >= least else text
 
 
 def _checked_url(url: str) -> str:
@@ -229,12 +257,22 @@ def _checked_url(url: str) -> str:
         PalpateError: if it is no http(s) URL, or holds a password or a query, which would be kept.
     """
     match = re.fullmatch(r"https?://[\w.\-\[\]:]+?(:(?P<port>\d{1,5}))?(/[^?#\s]*)?", url)
-    if match is None or int(match["port"] or 0) > 65535:
+    if match is None or int(match["port"] or 0) > 65535 or not _is_host(url):
         must = "must be http://HOST:PORT or https://HOST and a path, without password or query"
         shown = re.sub(r"//[^/]*@", "//***@", url.partition("?")[0])
         fix = "Most servers: http://localhost:8000/v1"
         raise PalpateError(must, repr(shown), fix, argument="server")
     return url.rstrip("/").removesuffix("/chat/completions")
+
+
+def _is_host(url: str) -> bool:
+    """Whether the host of a URL can be looked up."""
+    import httpx2
+
+    try:
+        return bool(httpx2.URL(url).host.encode("idna"))
+    except (httpx2.InvalidURL, UnicodeError):
+        return False
 
 
 def _key(variable: str, *, required: bool) -> str | None:
@@ -258,15 +296,24 @@ def _retry_after(value: str, default: float) -> float:
         return default
 
 
-def _message(text: str) -> str:
-    """What an error reply says, in one short line."""
-    try:
-        error = json.loads(text)
-        error = error.get("error", error.get("detail", error))
-        text = error["message"] if isinstance(error, dict) else error
-    except (ValueError, LookupError, AttributeError):
-        pass
-    return " ".join(str(text).split())[:200] or "no message"
+def _status(status: int, answer: Any) -> int:
+    """The status of a reply; some servers send 200 with an error, and its code if it has one."""
+    if status != 200 or not isinstance(answer, dict) or "choices" in answer:
+        return status
+    if not (error := answer.get("error")):
+        return status
+    code = str(error.get("code") if isinstance(error, dict) else None)
+    return int(code) if re.fullmatch("[45][0-9]{2}", code) else 400
+
+
+def _tokens(usage: Any, name: str) -> int:
+    """A number of tokens; 0 where a server does not give one."""
+    count = usage.get(name) if isinstance(usage, dict) else None
+    return int(count) if isinstance(count, int | float) and 0 <= count < 1e12 else 0
+
+
+def _string(value: Any) -> str | None:
+    return value if isinstance(value, str) else None
 
 
 def _text_of(content: Any) -> str:

@@ -62,7 +62,7 @@ class Options(Common):
 
     Writes captions.parquet (id, text, adjectives, flags), record.json and every reply. Stopped at
     any moment, the same command goes on. The exit status is 1 if photos are left without a
-    reply. Then: palpate caption check, palpate import --text.
+    reply, or no reply can be used. Then: palpate caption check, palpate import --text.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -103,6 +103,8 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
         return result.to_json(), 0
     for note in result.notes:
         terminal.note(note)
+    if not result.record["counts"]["texts"]:
+        return result.to_json(), FAILED_CHECK
     for command in (
         f"palpate caption check {options.output} --data {options.data}",
         f"palpate import {options.data} --text {options.output} -o FOLDER",
@@ -119,7 +121,7 @@ def _object(text: str | None) -> dict[str, Any] | None:
     """
     try:
         value = None if text is None else json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         value = text
     if value is not None and not isinstance(value, dict):
         must, example = "must be a JSON object", {"body": '{"temperature": null}'}

@@ -588,6 +588,10 @@ CAPTIONS: dict[str, Sentence] = {
         "materials, got {groups} and {materials}"
     ),
     "captions-no-labels": "The samples have no materials: labels in the text were not looked for",
+    "captions-none": lambda p, _: (
+        "No caption can be used: "
+        + ", ".join(f"{flag} {count}" for flag, count in p["flags"].items())
+    ),
     "captions-of-columns": (
         "Captions were filled from columns ({template}): they say no more than these do, and "
         "scores that use them measure the label"
