@@ -141,7 +141,7 @@ def test_the_background_variant_uses_its_background():
         (lambda p: p(photos(2), ids=["a"]), "Every id needs one condition"),
         (lambda p: p(photos(1) / 255), "`images` must be uint8"),
         (lambda p: p(7), "`images` must be files, PIL images"),
-        (lambda p: p("nowhere.jpg"), "nowhere.jpg must be"),
+        (lambda p: p("nowhere.jpg"), "nowhere.jpg: no such file"),
         (lambda p: without_encoders(p)(photos(1)), "vision encoder"),
     ],
 )

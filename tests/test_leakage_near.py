@@ -10,6 +10,7 @@ from PIL import Image
 from leakage_fixtures import MATERIALS, NoiseVideo, crop, make_leaky, save
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
+from palpate.leakage.calibration import beyond_chance
 from palpate.leakage.near import near_duplicates, near_groups
 from palpate.leakage.thumbnails import thumbnail, thumbnails
 
@@ -371,3 +372,23 @@ def test_a_changed_file_is_decoded_again_and_cameras_may_be_held_upright(tmp_pat
     turned, upright = thumbnail(tmp_path / "turned.png"), thumbnail(tmp_path / "upright.png")
     assert np.array_equal(turned, upright)
     assert not np.array_equal(turned, thumbnail(path))
+
+
+def test_many_frames_of_few_videos_are_more_than_chance():
+    """Frames of a video are flagged in lumps: a look-alike is chance, whole videos are not."""
+    flags = np.zeros(3000, bool)
+    videos = np.arange(3000) // 1500
+    flags[:180] = flags[1500:1690] = True
+    assert beyond_chance([(flags, 0.001)], videos, 3000)
+    one = np.zeros(1200, bool)
+    one[:100] = one[300:304] = True
+    assert not beyond_chance([(one, 0.01)], np.arange(1200) // 100, 1200)
+    assert not beyond_chance([(np.zeros(9, bool), 0.01)], np.arange(9), 9)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_groups_of_images_that_show_nothing(tmp_path, count):
+    rows = [{"id": str(k), "vision": f"{k}.png"} for k in range(count)]
+    for row in rows:
+        Image.new("RGB", (40, 40), "gray").save(tmp_path / row["vision"])
+    assert (near_groups(Manifest.from_rows(rows, tmp_path), "vision") == -1).all()

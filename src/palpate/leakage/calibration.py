@@ -167,16 +167,25 @@ def beyond_chance(
 ) -> bool:
     """Whether there are more flags than chance explains.
 
+    Frames of one video may be flagged together. So either more videos are flagged than frames would
+    be by chance, or more frames than chance flags in lumps of the most in one video (Bennett's
+    inequality for a sum of lumps).
+
     Args:
         flags: (n,) which samples are over the threshold of a rate, for several rates.
-        groups: (n,) videos; frames of one are flagged together, so videos are counted.
+        groups: (n,) videos.
         checked: samples that could be flagged.
     """
-    return any(
-        poisson.sf(len(np.unique(groups[flag])) - 1, rate * checked) < CHANCE
-        for flag, rate in flags
-        if flag.any()
-    )
+    for flag, rate in flags:
+        lumps = np.unique(groups[flag], return_counts=True)[1]
+        by_chance, found = max(rate * checked, 1e-9), int(lumps.sum())
+        if found <= by_chance:
+            continue
+        ratio = found / by_chance
+        bound = np.exp(-by_chance / lumps.max() * (ratio * np.log(ratio) - ratio + 1))
+        if min(poisson.sf(len(lumps) - 1, by_chance), bound) < CHANCE:
+            return True
+    return False
 
 
 def histograms(unrelated: Floats, scores: Floats) -> tuple[list[float], list[int], list[int]]:

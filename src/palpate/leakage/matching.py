@@ -57,8 +57,8 @@ def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     """Log thumbnails without and with backgrounds, in color and, for gray copies, in gray."""
     both = np.concatenate([base, queries])
     gray = images.colorless()
-    kinds = [(False, ~images.blank)]
-    if gray[queries].any() and not gray[base].all():
+    kinds = [(gray[base].any() and not gray[both].all(), ~images.blank)]
+    if gray[queries].any() and not gray[base].any():
         kinds = [(False, ~images.blank & ~gray), (True, gray)]
     views: list[View] = []
     for luma, wanted in kinds:

@@ -129,7 +129,7 @@ def near_groups(
     none = Manifest(manifest.table.clear(), manifest.root)
     images = pool(manifest, none, modality, cache=cache, threads=threads, progress=progress)
     base = _shown(images, slice(None))
-    views = image_views(images, base, base)
+    views = image_views(images, base, base) if len(base) else []
     null = _null(images, base, views)
     tasks = [] if null is None else [(base[null.rows], null.apart)]
     i, j = [base[:0]], [base[:0]]
