@@ -54,10 +54,11 @@ class Unrelated:
 
 
 def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
-    """Log thumbnails without and with backgrounds, in color and, for gray copies, in gray."""
+    """Log thumbnails without and with backgrounds, in color; in gray for gray queries, and for all
+    where train has gray images among others."""
     both = np.concatenate([base, queries])
     gray = images.colorless()
-    kinds = [(gray[base].any() and not gray[both].all(), ~images.blank)]
+    kinds = [(bool(gray[base].any()) and not gray[both].all(), ~images.blank)]
     if gray[queries].any() and not gray[base].any():
         kinds = [(False, ~images.blank & ~gray), (True, gray)]
     views: list[View] = []
