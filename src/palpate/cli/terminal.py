@@ -94,6 +94,7 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("split", "train_or_data"): "PATH",
     ("audit", "test"): "TEST",
     ("background", "how"): "--reference",
+    ("background", "replace_all"): "--replace",
     ("caption check", "captions"): "CAPTIONS",
     ("", "columns"): "--map",
     ("train encoder", "batch"): "--batch-size",

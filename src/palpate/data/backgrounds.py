@@ -167,7 +167,7 @@ class _Video:
     Attributes:
         paths: (n,) of its readable frames.
         thumbnails: (n, 48, 64, 3).
-        row_of: (n,) rows of the table that show each frame; none for further images of the folder.
+        rows_of: (n,) rows of the table that show each frame; none for further images of the folder.
         contact_of: (n,) the manifest's contact of each frame, if it is a sample.
         numbers: (n,) frames, where they are known.
     """

@@ -117,6 +117,9 @@ def validate(
     Raises:
         PalpateError: as :func:`import_dataset`.
     """
+    if not isinstance(source, (str, Path)):
+        must, fix = "must be a folder or a table on disk", "Write it, or see palpate.load"
+        raise PalpateError(must, type(source).__name__, fix, argument="source")
     source, world = Path(source), world_facts(Path(source))
     if format == "auto" and has_manifest(source) and not world:
         name, (facts, scan) = "manifest", _of_import(source, options)

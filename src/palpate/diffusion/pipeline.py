@@ -265,7 +265,6 @@ class TactilePipeline:
             sampler: default: the pipeline's.
             background: bytes (n, size, size, 3) of the sensor without contact, for a pipeline w/
                 BG.
-            progress: called with the number of images done.
 
         Raises:
             PalpateError: if there is not one condition per id, or a background is missing or of

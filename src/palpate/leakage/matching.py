@@ -55,7 +55,8 @@ class Unrelated:
 
 def image_views(images: Pool, base: Ints, queries: Ints) -> list[View]:
     """Log thumbnails without and with backgrounds, in color; in gray for gray queries, and for all
-    where train has gray images among others."""
+    where train has gray images among others.
+    """
     both = np.concatenate([base, queries])
     gray = images.colorless()
     kinds = [(bool(gray[base].any()) and not gray[both].all(), ~images.blank)]

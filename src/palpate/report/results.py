@@ -372,17 +372,23 @@ class Results:
     def __getitem__(self, key: str) -> list[Score]: ...
     @overload
     def __getitem__(self, key: tuple[str, ...]) -> Score: ...
-    def __getitem__(self, key: str | tuple[str, ...]) -> list[Score] | Score:
-        """The scores of a metric, or the score of (metric, subject) or (metric, subject, preset).
+    @overload
+    def __getitem__(self, key: int) -> Score: ...
+    def __getitem__(self, key: int | str | tuple[str, ...]) -> list[Score] | Score:
+        """The scores of a metric, the score of (metric, subject) or of (metric, subject, preset).
+
+        A number is a place in ``scores``.
 
         Raises:
             KeyError: if there is none; lists what there is.
         """
+        if isinstance(key, int):
+            return self.scores[key]
         names = (key,) if isinstance(key, str) else key
         matches = [score for score in self.scores if _key(score)[: len(names)] == names]
         if not matches:
-            known = dict.fromkeys(_key(score)[: len(names)] for score in self.scores)
-            raise KeyError(f"no score of {names}; there is {', '.join(map(str, known)) or 'none'}")
+            known = dict.fromkeys(", ".join(_key(s)[: len(names)]) for s in self.scores)
+            raise KeyError(f"no score of {', '.join(names)}; there is {'; '.join(known) or 'none'}")
         return matches if isinstance(key, str) else matches[0]
 
     def __str__(self) -> str:
