@@ -87,6 +87,17 @@ def test_a_list_that_states_its_parts_is_audited_alone(tmp_path, capsys, monkeyp
     assert "the source states 0" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("keyed", [False, True])
+def test_rows_of_one_file_have_the_same_columns(tmp_path, keyed):
+    """Also if some have nothing besides what they nest."""
+    rows = [{"data": {"tactile": f"trial_{k}/1.jpg"}} for k in range(4)]
+    rows[1] |= {"text": "x"}
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({f"s{k}": row for k, row in enumerate(rows)} if keyed else rows))
+    manifest, problems, _ = read_names(path)
+    assert (manifest.table["path"].null_count(), len(manifest), problems) == (0, 4, [])
+
+
 def test_ids_alone_cannot_show_a_leak(tmp_path, capsys):
     for part, numbers in (("train", range(8)), ("test", range(8, 10))):
         (tmp_path / f"{part}.csv").write_text(rows_of("ssvtp", numbers))

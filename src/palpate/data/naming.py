@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -195,14 +195,20 @@ def _records(path: Path) -> Table | None:
     return table_of(rows, str(path)) if rows else None
 
 
-def _items(data: Any, split: str | None = None) -> Iterator[dict[str, Any]]:
-    """The objects, pairs or paths in nested lists, with the part whose key they are under."""
+def _items(data: Any, split: str | None = None, *, row: bool = False) -> Iterator[dict[str, Any]]:
+    """The objects, pairs or paths in nested lists, with the part whose key they are under.
+
+    An object of a list is a ``row``, also without a value of its own besides what it nests; so is
+    the sibling of an object with one.
+    """
     if isinstance(data, Mapping):
         lists = {key: value for key, value in data.items() if isinstance(value, (list, Mapping))}
         below = [item for value in lists.values() for item in value if isinstance(value, list)]
-        if split is None and lists and len(lists) == len(data) and not _scalars(below):
+        whole = split is None and not row and lists and len(lists) == len(data)
+        if whole and not _scalars(below):
+            rows = _any_value_beside(data.values(), (list, Mapping))
             for key, value in lists.items():
-                yield from _items(value, PART_NAMES.get(str(key).lower()))
+                yield from _items(value, PART_NAMES.get(str(key).lower()), row=rows)
         elif set(map(str.lower, map(str, data))) <= PART_NAMES.keys():
             for key, value in data.items():
                 yield from _items(value, PART_NAMES[str(key).lower()])
@@ -210,13 +216,20 @@ def _items(data: Any, split: str | None = None) -> Iterator[dict[str, Any]]:
             yield dict(data) | ({"split": split} if split else {})
     elif isinstance(data, list) and _scalars(data) and len(data) >= 2 and not _is_image(data[0]):
         group = "object" if str(data[0]).isdecimal() else "video"
-        row = {group: data[0], "id": "/".join(map(str, data)), "split": split}
-        yield row | ({"frame": data[1]} if group == "video" else {})
+        pair = {group: data[0], "id": "/".join(map(str, data)), "split": split}
+        yield pair | ({"frame": data[1]} if group == "video" else {})
     elif isinstance(data, list):
+        rows = _any_value_beside(data, list)
         for item in data:
-            yield from _items(item, split)
+            yield from _items(item, split, row=rows)
     elif isinstance(data, str):
         yield {PATH: data, "split": split}
+
+
+def _any_value_beside(items: Iterable[Any], kinds: Any) -> bool:
+    """Whether an object of some items has a value of none of these kinds."""
+    values = (value for item in items if isinstance(item, Mapping) for value in item.values())
+    return not all(isinstance(value, kinds) for value in values)
 
 
 def _is_image(item: Any) -> bool:
