@@ -107,6 +107,7 @@ def typed_manifest(path: Path) -> None:
             )
         ),
         ("s.png", "my notes", "world -o w --preset tiny --sheet s.png", "of the kind"),
+        ("w.json", "palpate", "world -o w --preset tiny --sheet w.json", "of the kind"),
     ],
 )
 def test_a_broken_input_is_one_line(name, content, command, words, tmp_path, monkeypatch, capsys):
@@ -163,6 +164,12 @@ def test_a_pipe_is_written_to_and_a_link_stays(tmp_path):
         with atomic_path(pipe) as part:
             part.write_text("whole")
         assert reader.communicate()[0] == b"whole"
+    reading, writing = os.pipe()  # without a name: the shell's | and >()
+    with atomic_path(Path(f"/dev/fd/{writing}")) as part:
+        part.write_text("whole")
+    assert os.read(reading, 9) == b"whole"
+    os.close(reading)
+    os.close(writing)
     link.symlink_to(target)
     with atomic_path(link) as part:
         part.write_text("whole")

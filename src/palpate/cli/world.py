@@ -85,7 +85,8 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     """Write the world and print what it holds."""
     world = world_options(options)
     if options.sheet:
-        guard_output(options.sheet, [options.options] if options.options else [], (b"palpate",))
+        inputs = [options.options] if options.options else []
+        guard_output(options.sheet, inputs, (b"tEXtSoftware\0palpate",))
     if seen_by_mini(world):
         terminal.print_line(f"Seed {world.seed}: {SEEN_WARNING}")
     with terminal.progress() as progress:

@@ -35,10 +35,11 @@ def atomic_path(path: Path) -> Generator[Path]:
     """
     path = Path(path)
     try:
-        final = Path(os.path.realpath(path))
+        stream = is_stream(path)  # the real path of a pipe names nothing
+        final = path if stream else Path(os.path.realpath(path))
         if final.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        place = Path(tempfile.gettempdir()) if is_stream(final) else final.parent
+        place = Path(tempfile.gettempdir()) if stream else final.parent
         place.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=place, prefix=f".{final.name}.", suffix=final.suffix)
     except OSError as error:  # name the user's path, not the temporary one
@@ -52,7 +53,7 @@ def atomic_path(path: Path) -> Generator[Path]:
     part.chmod(0o644)
     try:
         yield part
-        if is_stream(final):
+        if stream:
             with open(part, "rb") as source, open(final, "wb") as target:
                 shutil.copyfileobj(source, target)
         else:
