@@ -231,7 +231,8 @@ def test_bad_lines_of_both_lists_are_reported_together_or_skipped(capsys, lists)
 def test_split_of_a_manifest_then_audit_then_report(capsys, small_manifest, tmp_path):
     small_manifest.save(tmp_path / "m" / "manifest.parquet")
     split, audit, page = (tmp_path / name for name in ("s.json", "audit.json", "page.html"))
-    assert call(capsys, "split", tmp_path / "m", "-o", split, "--train", "0.5")[0] == 0
+    args = [tmp_path / "m", "-o", split, "--train", "0.5", "--by", "auto"]
+    assert call(capsys, "split", *args)[0] == 0
     args = ("audit", tmp_path / "m", "--split", split, "--json", "--fail-over", "0", "-o", audit)
     status, out, _ = call(capsys, *args)
     assert status == 0, out

@@ -29,7 +29,7 @@ from palpate.core import (
     write_text,
 )
 
-Column = Literal["video", "object", "session", "contact", "domain", "sensor"]
+Column = Literal["auto", "video", "object", "session", "contact", "domain", "sensor"]
 #: Facts of the rule that are printed.
 SHOWN = ("group", "by", "groups", "deviation", "bound", "status", "limiting", "rare", "missing")
 
@@ -38,8 +38,8 @@ SHOWN = ("group", "by", "groups", "deviation", "bound", "status", "limiting", "r
 class Groups:
     """What stays together."""
 
-    by: Annotated[tuple[Column, ...], tyro.conf.arg(metavar="COLUMN ...")] = ()
-    """Columns to keep whole; samples that share any of these stay together (default: what the data
+    by: Annotated[tuple[Column, ...], tyro.conf.arg(metavar="COLUMN ...")] = ("auto",)
+    """Columns to keep whole; samples that share any of these stay together (auto: what the data
     set names, or the coarsest known: object, session, video, contact)."""
     near: Literal["vision", "tactile", "both"] | None = None
     """Keep near-duplicate images together as well."""
@@ -92,7 +92,7 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
 
     _check(options)
     data = list(options.paths) or None
-    by = options.together.by or "auto"
+    by = "auto" if options.together.by == ("auto",) else options.together.by
     common: dict[str, Any] = {"by": by, "near": options.together.near, "cache": options.cache}
     with terminal.progress() as progress:
         common |= {"reading": options.reading.options()}
