@@ -213,6 +213,8 @@ def test_images_of_no_template_and_replacements_without_a_match_are_reported(tmp
             ["t_{c}/camera0/{f}.png", "t_{c}/digit_l/{f}.png", "t_{c}/digit_r/{f}.png"],
             "{video}/digit_{sensor}/{frame:d}",
         ),
+        # Words that name one field differently.
+        (["obj{o}/IMG_{f}.png", "obj{o}/GEL_{f}.png"], "{video}/GEL_{frame:d}.png"),
         # What stands for something in a template.
         (["{{{o}}}/rgb/{f}.png", "{{{o}}}/tac/{f}.png"], "{video}/tac/{frame:d}"),
     ],

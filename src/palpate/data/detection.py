@@ -18,7 +18,7 @@ from __future__ import annotations
 import posixpath
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from palpate.data.captions import ADJECTIVES
@@ -79,7 +79,28 @@ def detect_layout(files: Sequence[str], folder: str) -> Layout:
         sides = {side: half for side, half in zip(ROLES, halves, strict=False) if half}
     several = any(map(_several, sides.values()))
     order = [side for side in ROLES if side in sides]
-    return Layout({side: template_of(sides[side], several) for side in order}, certain)
+    templates = {side: template_of(sides[side], several) for side in order}
+    return Layout(_alike(templates, sides), certain)
+
+
+def _alike(templates: dict[str, str], sides: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """The templates, with one name for the only field that two sides do not share but equal."""
+    first, *others = templates
+    for side in others:
+        one, two = (Template.parse(templates[s]) for s in (first, side))
+        own = [n for n in one.fields if n not in two.fields]
+        other = [n for n in two.fields if n not in one.fields]
+        if len(own) == len(other) == 1 and (
+            _values(one, own[0], sides[first]) == _values(two, other[0], sides[side])
+        ):
+            field = re.findall(rf"\{{{own[0]}\b[^{{}}]*\}}", one.text)
+            templates[side] = re.sub(rf"\{{{other[0]}\b[^{{}}]*\}}", field[0], two.text)
+    return templates
+
+
+def _values(template: Template, field: str, files: Sequence[str]) -> set[str]:
+    """The values of a field, numbers without leading zeros."""
+    return {(template.match(path) or {}).get(field, "").lstrip("0") for path in files}
 
 
 def _words(text: str) -> list[str]:
