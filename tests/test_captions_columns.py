@@ -75,10 +75,10 @@ def test_an_import_joins_captions_and_models_will_name_their_digest(data, tmp_pa
 
 def test_any_table_with_ids_and_texts_joins_and_what_it_lacks_is_listed(data, tmp_path):
     ids = Manifest.load(data).ids
-    pl.DataFrame({"id": ids[:40], "text": ["rough"] * 40}).write_csv(tmp_path / "t.csv")
+    pl.DataFrame({"id": [*ids[:40], "stray"], "text": "rough"}).write_csv(tmp_path / "t.csv")
     imported = import_dataset(data, tmp_path / "o", text=tmp_path / "t.csv")
     assert imported.manifest.column("text") == ["rough"] * 40 + [None] * 8
-    assert [problem.kind for problem in imported.suspicious] == ["no-text"]
+    assert [problem.kind for problem in imported.suspicious] == ["no-text", "no-sample"]
     assert imported.facts["text_source"].startswith("t.csv, captions ")
 
 

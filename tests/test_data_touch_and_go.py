@@ -229,7 +229,8 @@ def test_official_split_captions_and_objects(tmp_path):
     train = [*lines_of("a", range(10, 16)), "elsewhere/0000000001.jpg,3"]
     (root / "train.txt").write_text("\n".join(train))
     (root / "test.txt").write_text("b/17.jpg,15\nb/0000000018.jpg,15")
-    (root / "captions.csv").write_text("a/0000000010.jpg,hard, cold\n")
+    strays = "c/0000000010.jpg,soft\na\0/0000000010.jpg,soft\n"
+    (root / "captions.csv").write_text(f"a/0000000010.jpg,hard, cold\n{strays}")
     (root / "objects.csv").write_text("frame,object\nb/0000000019.jpg,wall\n")
     result = import_touch_and_go(root, tmp_path / "out")
     orig = result.splits["Orig"]
@@ -241,6 +242,11 @@ def test_official_split_captions_and_objects(tmp_path):
     assert some.column("text") == ["hard, cold", None, None]
     assert some.column("object") == [None, None, "wall"]
     assert result.facts["text_source"] == "captions.csv"
+    (stray,) = [p for p in result.suspicious if p.kind == "no-sample"]
+    assert (stray.where, stray.text[:28]) == (
+        str(root / "captions.csv"),
+        "2 lines are of no listed fra",
+    )
     (root / "label.txt").unlink()
     # each problem once, although the lists are labels and split in one
     (root / "train.txt").write_text("a/0000000010.jpg,3\nx,3\na/0000000011.jpg,-2")

@@ -139,6 +139,9 @@ def with_texts(imported: Imported, texts: Texts, where: Path) -> Imported:
     if absent := [name for name in manifest.ids if name not in texts.of]:
         text = f"{len(absent)} of {len(manifest)} samples have no text there, first {absent[0]!r}"
         suspicious.append(Problem(str(where), "no-text", text))
+    if unknown := sorted(texts.ids.difference(manifest.ids)):
+        text = f"{len(unknown)} of {len(texts.ids)} ids are of no sample, first {unknown[0]!r}"
+        suspicious.append(Problem(str(where), "no-sample", text))
     splits = {name: replace(s, manifest=manifest.digest) for name, s in imported.splits.items()}
     return replace(imported, manifest=manifest, splits=splits, suspicious=suspicious)
 

@@ -138,6 +138,7 @@ def scan(
     out, created = (into.out, into.created) if into else (root, list[Path]())
     work = Recordings(root, out, videos, lists.in_contact, image_format, size, created)
     work.problems += lists.problems
+    work.suspicious += lists.unused
     every = rows_of(lists.listed)
     rows = work.open(thin(every, max_per_contact, seed) if into else every, progress)
     listed = set(lists.listed.contact["video"])
@@ -317,6 +318,7 @@ class _Lists:
         facts: for the manifest.
         sensor: the tactile sensor.
         problems: all bad lines, each once.
+        unused: tables with words of frames that no list has.
     """
 
     listed: FrameList
@@ -326,6 +328,7 @@ class _Lists:
     facts: dict[str, str]
     sensor: str
     problems: list[Problem]
+    unused: list[Problem]
 
 
 def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
@@ -353,8 +356,8 @@ def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
     for frames in contacts:
         for (video,), group in frames.contact.group_by("video"):
             in_contact.setdefault(str(video), set()).update(group["frame"].to_list())
-    tables = {"text": root / "captions.csv", "object": root / "objects.csv"}
-    words = {c: read_frame_table(path) if path.is_file() else None for c, path in tables.items()}
+    places = {"text": root / "captions.csv", "object": root / "objects.csv"}
+    words = {c: read_frame_table(path) if path.is_file() else None for c, path in places.items()}
     facts = {**FACTS.of_manifest(), **world_facts(root), "format": "touch-and-go"}
     facts["text_source"] = "captions.csv" if words["text"] else "none"
     if categories != CATEGORIES:
@@ -362,4 +365,16 @@ def _read_lists(root: Path, labels: Sequence[Path] | Path | None) -> _Lists:
     sensor = WORLD.sensor if "synthetic" in facts else FACTS.sensor
     tables = [listed, *words.values(), official if official is not listed else None]
     problems = [problem for table in tables if table for problem in table.skipped]
-    return _Lists(listed, official, words, in_contact, facts, sensor, problems)
+    unused: list[Problem] = []
+    for column, table in words.items():
+        strays = (
+            [key for key in table.values if key[1] not in in_contact.get(key[0], ())]
+            if table
+            else []
+        )
+        if strays:
+            text = (
+                f"{len(strays)} lines are of no listed frame, first {'{}/{}'.format(*strays[0])!r}"
+            )
+            unused.append(Problem(str(places[column]), "no-sample", text))
+    return _Lists(listed, official, words, in_contact, facts, sensor, problems, unused)
