@@ -33,6 +33,7 @@ import polars as pl
 from PIL import Image
 from scipy.fft import dctn
 
+from palpate.core import quiet
 from palpate.data.manifest import Manifest
 from palpate.leakage.near import near_duplicates
 
@@ -160,11 +161,11 @@ def world(work, name, half, seed):
 
 def real(work, half, seed):
     """The presses of one half of the real clips; one clip is clean."""
-    from palpate.data.formats.touch_and_go import import_touch_and_go
+    from palpate.data import import_dataset
 
     folder, data = work / "real", Path(os.environ.get("PALPATE_SHARED_DATA", "../shared/data"))
     if not (folder / "manifest.parquet").is_file():
-        import_touch_and_go(data / "touch_and_go" / "clips", folder)
+        import_dataset(data / "touch_and_go" / "clips", folder, format="touch-and-go")
     table = Manifest.load(folder / "manifest.parquet").table
     videos = sorted(table["video"].unique())
     clean, rows = videos[seed % len(videos)], []
@@ -223,10 +224,13 @@ def copies(train, modality, folder, seed):
 def rival_scores(name, train, test, modality, encoder=None):
     """(n_test,) the highest similarity with train."""
     if name == "encoder":
-        from palpate.encoders import embed
+        from palpate.encoders.embed import embed
+        from palpate.evaluation.inputs import load_encoders
+        from palpate.leakage.descriptors import unit
 
-        a, b = (embed(m, encoder, modality) for m in (train, test))
-        return (np.asarray(b) @ np.asarray(a).T).max(1)
+        encoders = load_encoders(encoder, quiet)
+        a, b = (unit(embed(m, encoders, modality).features) for m in (train, test))
+        return (b @ a.T).max(1)
     size = (80, 60) if name == "twenty" else (32, 32)
 
     def gray(manifest, column):

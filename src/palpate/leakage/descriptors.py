@@ -27,7 +27,7 @@ Measured in docs/studies/near_duplicates.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -180,18 +180,19 @@ class Whitened(Descriptors):
             gray,
         )
         fit = fit[np.linspace(0, len(fit) - 1, min(len(fit), FITTED)).astype(np.int64)]
-        self._samplers = [[_sampler(s, *g) for s in GRIDS] for g in GEOMETRIES]
+        # Over backgrounds the light no longer shows which edit was made: edits are not tried.
+        shapes = GEOMETRIES if backgrounds is None else GEOMETRIES[:1]
+        self._samplers = [[_sampler(s, *g) for s in GRIDS] for g in shapes]
         self._white = [Whitener() for _ in range(1 if gray else 3)]
-        coarse, fine, keys = [Whitener() for _ in GEOMETRIES], Whitener(), Whitener()
-        sums = [[0.0 for _ in GRIDS] for _ in GEOMETRIES]
+        coarse, fine, keys = [Whitener() for _ in shapes], Whitener(), Whitener()
+        sums: list[Any] = [0.0 for _ in shapes]  # of fine cells
         for logs in map(self.logs, _blocks(fit)):
             for c, whiten in enumerate(self._white):
                 whiten.add(logs[:, c])
-            for g, total in enumerate(sums):
+            for g, whiten in enumerate(coarse):
                 signals = self.cells(logs, g)
-                for k, x in enumerate(signals):
-                    total[k] = total[k] + x.sum(axis=0, dtype=np.float64)
-                coarse[g].add(signals[0])
+                whiten.add(signals[0])
+                sums[g] += signals[1].sum(axis=0, dtype=np.float64)
                 if g == 0:
                     keys.add(self._swapped(signals[0]))
                     fine.add(signals[1])
@@ -205,14 +206,15 @@ class Whitened(Descriptors):
         #: Whitening of coarse cells for each geometry, by whose lengths an edit is plausible.
         self.edited = [whiten.fit(GRIDS[min(GRIDS)]) for whiten in coarse]
         self.matrices = [self.edited[0].matrix, fine.fit(GRIDS[max(GRIDS)]).matrix]
-        means = [[np.asarray(x / len(fit), np.float32) for x in total] for total in sums]
+        finely = [np.asarray(x / len(fit), np.float32) for x in sums]
         #: For each grid (geometries, d) whitened means.
         self.means = [
-            np.stack([mean[k] @ matrix for mean in means]) for k, matrix in enumerate(self.matrices)
+            np.stack([w.mean for w in self.edited]) @ self.matrices[0],
+            np.stack(finely) @ self.matrices[1],
         ]
         random = rng_for(0, "near-duplicates", "key")
         self._key = keys.fit(GRIDS[min(GRIDS)]).matrix
-        self._key_means = [self._swapped(mean[0][None]) @ self._key for mean in means]
+        self._key_means = [self._swapped(w.mean[None]) @ self._key for w in self.edited]
         self._random = random.standard_normal((len(self._key), KEY), dtype=np.float32)
         self._moved = [[_sampler(s, *GEOMETRIES[0], move) for s in GRIDS] for move in MOVES]
         self.edits = _edits(8 if gray else 16, 1 if gray else 3)
@@ -222,7 +224,7 @@ class Whitened(Descriptors):
             (1, lambda rows: MoveIndex(self, rows)),
             (2, lambda rows: EditIndex(self, rows)),
         ]
-        if backgrounds is not None:  # over them the light no longer tells which edit was made
+        if backgrounds is not None:
             self.ways = self.ways[:2]
         self.shares = SHARES[: len(self.ways)]
 
@@ -325,10 +327,8 @@ class MoveIndex:
         still = [pool.vectors(pool.cells(pool.logs(block))[:1], 0) for block in _blocks(rows)]
         keys = np.ascontiguousarray(np.concatenate(still)[:, self._columns])
         near = nearest(keys, self._keys, count + CANDIDATES, apart=apart)
-        found: list[tuple[Ints, Floats]] = []
-        for block in _blocks(np.arange(len(rows))):
-            found.append(self._compared(rows[block], near[block], count))
-        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
+        blocks = _blocks(np.arange(len(rows)))
+        return _joined(self._compared(rows[b], near[b], count) for b in blocks)
 
     def _compared(self, rows: Ints, near: Ints, count: int) -> tuple[Ints, Floats]:
         """Choose moves by the coarse grid, and compare the best candidates in full."""
@@ -380,10 +380,8 @@ class EditIndex:
             ],
             axis=1,
         )  # (n, geometries, candidates)
-        found: list[tuple[Ints, Floats]] = []
-        for block, signals in zip(_blocks(np.arange(len(rows))), cells, strict=True):
-            found.append(self._compared(signals, near[block], count))
-        return np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found])
+        blocks = zip(_blocks(np.arange(len(rows))), cells, strict=True)
+        return _joined(self._compared(signals, near[b], count) for b, signals in blocks)
 
     def _compared(self, cells: Sequence[Floats], near: Ints, count: int) -> tuple[Ints, Floats]:
         """Choose edits by the coarse grid, and compare the best candidates in full."""
@@ -429,6 +427,11 @@ def _leading(vectors: NDArray[Any]) -> Ints:
 def unit(x: Floats) -> Floats:
     """Rows of length 1 (or 0)."""
     return (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)).astype(np.float32)
+
+
+def _joined(parts: Iterable[tuple[Ints, Floats]]) -> tuple[Ints, Floats]:
+    rows, values = zip(*parts, strict=True)
+    return np.concatenate(rows), np.concatenate(values)
 
 
 def _best(near: Ints, values: Floats, count: int) -> tuple[Ints, Floats]:
