@@ -357,15 +357,6 @@ def test_an_odd_reply_is_read_and_the_folder_stays_readable(data, tmp_path, name
     assert (server.count, table_of(tmp_path / "c")) == (12, whole)
 
 
-def test_a_log_with_a_fingerprint_that_is_no_text_is_read(data, tmp_path):
-    with FakeServer() as server:
-        first = describe(data, tmp_path / "c", server)
-        log = tmp_path / "c" / "replies.jsonl"
-        log.write_text(log.read_text().replace('"fp_1"', '{"a": 1}'))
-        assert describe(data, tmp_path / "c", server).table.equals(first.table)
-    assert server.count == 12
-
-
 def test_of_an_endless_reply_the_part_that_is_read_is_kept(data, tmp_path):
     with FakeServer(lambda number: reply("rough " * 50_000) if number == 1 else None) as server:
         describe(data, tmp_path / "c", server, concurrency=1)

@@ -169,8 +169,6 @@ def read_replies(path: Path) -> tuple[Replies, int]:
                 row = json.loads(line)
                 fields = {name: row[name] for name in Reply.__dataclass_fields__}
                 fields["tokens"] = (int(row["tokens"][0]), int(row["tokens"][1]))
-                if not isinstance(row["fingerprint"], str):
-                    fields["fingerprint"] = None
                 replies.add(row["key"], Reply(**fields))
             except (ValueError, TypeError, LookupError):
                 must, got = f"{path} must hold replies only", f"another line {number}"

@@ -96,14 +96,15 @@ class Server:
             choice = answer["choices"][0]
             message, usage = choice["message"], answer.get("usage")
             refusal, finish = message.get("refusal"), str(choice.get("finish_reason") or "stop")
+            raw = _text_of(message.get("content")) or str(refusal or "")
             return Reply(
-                raw=(_text_of(message.get("content")) or str(refusal or ""))[:LONGEST],
-                model=_string(answer.get("model")) or self.model,
+                raw=self._cleaned(raw)[:LONGEST],
+                model=self._cleaned(_string(answer.get("model"))) or self.model,
                 refused=bool(refusal) or finish == "content_filter",
-                finish=finish,
+                finish=self._cleaned(finish),
                 tokens=(_tokens(usage, "prompt_tokens"), _tokens(usage, "completion_tokens")),
                 seconds=round(time.perf_counter() - start, 3),
-                fingerprint=_string(answer.get("system_fingerprint")),
+                fingerprint=self._cleaned(_string(answer.get("system_fingerprint"))),
             )
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             got = f"{type(error).__name__} at {str(error)[:80]}"
@@ -134,7 +135,8 @@ class Server:
         """
         failure, wait = self._gone("no request"), 0.0
         for k in range(self._tries):
-            time.sleep(wait)
+            if wait:
+                time.sleep(wait)
             wait = min(LONGEST_PAUSE, self._pause * 2**k)
             try:
                 response = self._client.post(f"{self.url}/chat/completions", json=payload)
@@ -144,7 +146,7 @@ class Server:
                     break  # nobody is there, and nobody was
                 continue
             self._answered = True
-            answer = self._parsed(response.text)
+            answer = _parsed(response.text)
             status = _status(response.status_code, answer)
             if status in BUSY or status >= 500:
                 reason = f"status {status}: {self._message(answer)}"
@@ -157,7 +159,9 @@ class Server:
             elif status != 200:
                 raise self._refusal(status, answer)
             elif isinstance(answer, str):
-                failure = RejectedError(f"the reply is no JSON: {self._scrubbed(answer)[:80]!r}")
+                failure = RejectedError(
+                    f"the reply is no JSON: {self._scrubbed(self._cleaned(answer))[:80]!r}"
+                )
             else:
                 return answer
         raise failure
@@ -191,8 +195,8 @@ class Server:
         """Names of the server's models; empty if it does not list them."""
         try:
             response = self._client.get(f"{self.url}/models")
-            listed = self._parsed(response.text)["data"] if response.status_code == 200 else []
-            return [str(model["id"]) for model in listed]
+            listed = _parsed(response.text)["data"] if response.status_code == 200 else []
+            return [self._cleaned(str(model["id"])) for model in listed]
         except (self._errors, LookupError, TypeError, ValueError):
             return []
 
@@ -207,7 +211,7 @@ class Server:
         except self._errors as error:
             raise self._gone(self._reason(error)) from None
         if response.status_code in (401, 403):
-            raise self._refusal(response.status_code, self._parsed(response.text))
+            raise self._refusal(response.status_code, _parsed(response.text))
         models = self._models()
         if len(models) != 1:
             got = f"{len(models)} models" if models else "no list of models"
@@ -220,14 +224,8 @@ class Server:
         """What broke the connection, in words; the library's may repeat a header."""
         return f"{type(error).__name__} {self._scrubbed(str(error))}".strip()
 
-    def _parsed(self, text: str) -> Any:
-        """The JSON of a reply, else its text; without the key, and with characters that exist."""
-        try:
-            return self._cleaned(json.loads(text))
-        except (ValueError, RecursionError):
-            return self._cleaned(text)
-
     def _cleaned(self, value: Any) -> Any:
+        """Decoded JSON without the key, and with characters that exist."""
         if isinstance(value, dict):
             return {self._cleaned(name): self._cleaned(each) for name, each in value.items()}
         if isinstance(value, list):
@@ -238,6 +236,7 @@ class Server:
 
     def _message(self, answer: Any) -> str:
         """What an error reply says, in one short line."""
+        answer = self._cleaned(answer)
         try:
             error = answer.get("error", answer.get("detail", answer))
             text = error["message"] if isinstance(error, dict) else error
@@ -304,6 +303,14 @@ def _status(status: int, answer: Any) -> int:
         return status
     code = str(error.get("code") if isinstance(error, dict) else None)
     return int(code) if re.fullmatch("[45][0-9]{2}", code) else 400
+
+
+def _parsed(text: str) -> Any:
+    """The JSON of a reply, else its text."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
 
 
 def _tokens(usage: Any, name: str) -> int:

@@ -99,6 +99,7 @@ OPTION_NAMES: dict[tuple[str, str], str] = {
     ("", "columns"): "--map",
     ("train encoder", "batch"): "--batch-size",
     ("train generator", "batch"): "--batch-size",
+    ("train generator", "dropout"): "--condition-dropout",
     ("", "side"): "--as",
     ("", "data"): "PATH",
     ("", "source"): "PATH",

@@ -9,7 +9,6 @@ stretched.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import struct
 import zlib
@@ -31,6 +30,7 @@ from palpate.core import (
     ProblemsError,
     Progress,
     atomic_path,
+    digest_file,
     digest_json,
     quiet,
     require,
@@ -249,9 +249,8 @@ def in_threads(
     require(threads is None or threads >= 1, "threads", "must be at least 1", threads)
     threads = threads or min(16, os.cpu_count() or 1)
     remaining = iter(items)
-    report = progress if what else None
-    if report:
-        report(what, 0, len(items))
+    report = progress if what else quiet
+    report(what, 0, len(items))
     with ThreadPoolExecutor(threads) as pool:
         running = {pool.submit(function, item): item for item in islice(remaining, 4 * threads)}
         done = 0
@@ -261,8 +260,7 @@ def in_threads(
                     item = running.pop(future)
                     yield item, future.result()
                     done += 1
-                    if report:
-                        report(what, done, len(items))
+                    report(what, done, len(items))
                     for following in islice(remaining, 1):
                         running[pool.submit(function, following)] = following
         finally:
@@ -284,8 +282,7 @@ def file_digest(path: Path) -> str | None:
     """SHA-256 of a file's bytes; None if it cannot be read, or is a pipe."""
     with suppress(OSError):
         if path.is_file():
-            with open(path, "rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
+            return digest_file(path)
     return None
 
 

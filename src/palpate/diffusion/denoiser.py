@@ -78,9 +78,6 @@ class Denoiser(nn.Module):
     ) -> None:
         """Take, for ``gap="mean-shift"``, the training mean (d,) of each source as ``means``."""
         super().__init__()
-        if not 0 <= policy.dropout < 1:
-            must, got = "must lie in [0, 1)", str(policy.dropout)
-            raise PalpateError(must, got, "", argument="dropout", example={"dropout": 0.1})
         self.unet, self.policy = unet, policy
         self.background = unet.config["in_channels"] == 2 * unet.config["out_channels"]
         # A source without a mean is marked by NaN, and raises when it is used.

@@ -39,13 +39,14 @@ from palpate.core import (
 )
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
+from palpate.data.reading import load
 from palpate.diffusion.autoencoder import Autoencoder, LatentStats
 from palpate.diffusion.autoencoder_training import SHOWN, sheet, train_autoencoder
 from palpate.diffusion.denoiser import Denoiser, build_unet
 from palpate.diffusion.options import SOURCES, ConditionPolicy, Schedule, Source, UNetOptions
 from palpate.diffusion.pipeline import TactilePipeline
 from palpate.diffusion.presets import DiffusionPreset, preset_named
-from palpate.encoders.contrastive import load_manifest, load_split, train_part
+from palpate.encoders.contrastive import load_split, train_part
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import EncoderSet, load_clip, seeded
 from palpate.encoders.models import digest_tensors, pick_device
@@ -126,7 +127,7 @@ def train_generator(  # noqa: PLR0913 - a public verb
         must, fix = f"must be given for the preset {chosen.name}", "Pass a hub id or a folder"
         raise PalpateError(must, "none", fix, argument="autoencoder")
     device = connect(device)
-    manifest, split = load_manifest(data), load_split(data, split)
+    manifest, split = load(data), load_split(data, split)
     encoders = clip if isinstance(clip, EncoderSet) else EncoderSet(load_clip(clip))
     output = None if output is None else Path(output)
     with work_folder(output) as work:
@@ -192,7 +193,7 @@ def plan_generator(
         see :func:`palpate.training.estimate.estimate`.
     """
     chosen = preset if isinstance(preset, DiffusionPreset) else preset_named(preset)
-    train = train_part(load_manifest(data), load_split(data, split))
+    train = train_part(load(data), load_split(data, split))
     loop = chosen.loop_for(len(train))
     loop = loop if steps is None else replace(loop, steps=steps)
     vq, width = chosen.autoencoder, chosen.condition.width

@@ -31,6 +31,7 @@ from palpate import __version__
 from palpate.core import PalpateError, Progress, Split, digest_json, digest_lines, quiet, rng_for
 from palpate.data.images import cached_images, image_stamp
 from palpate.data.manifest import Manifest
+from palpate.data.reading import load
 from palpate.encoders.embed import embed, texts_of
 from palpate.encoders.encoder_set import (
     ClipEncoders,
@@ -126,7 +127,7 @@ def train_encoder(  # noqa: PLR0913 - a public verb
         raise PalpateError("must be a positive number", str(epochs), fix, argument="epochs")
     require_weights(weights)
     chosen, device = preset_of(preset), connect(device)
-    manifest, split = load_manifest(data), load_split(data, split)
+    manifest, split = load(data), load_split(data, split)
     output = None if output is None else Path(output)
     with work_folder(output) as work:
         common: dict[str, Any] = {"seed": seed, "targets": targets, "cache": work / "cache"}
@@ -170,7 +171,7 @@ def plan_encoder(
         see :func:`palpate.training.estimate.estimate`.
     """
     chosen, split = preset_of(preset), load_split(data, split)
-    train, _ = _parts(load_manifest(data), split, held_out, 0)
+    train, _ = _parts(load(data), split, held_out, 0)
 
     def forward(model: nn.Module, rows: int, where: torch.device) -> Tensor:
         return encode_tactile(model, torch.zeros(rows, 3, chosen.image, chosen.image, device=where))
@@ -180,15 +181,6 @@ def plan_encoder(
 
     options = chosen.tactile_course.options(len(train), 0, epochs)
     return estimate(build, forward, options, len(train), pick_device(device))
-
-
-def load_manifest(data: Manifest | str | Path) -> Manifest:
-    """A manifest as it is, or read from where it lies."""
-    if isinstance(data, Manifest):
-        return data
-    from palpate.data import load
-
-    return load(data)
 
 
 def load_split(data: Manifest | str | Path, split: Split | str | Path | None = None) -> Split:

@@ -434,8 +434,12 @@ class EncoderSet:
             half: :meth:`halve` first (this object too), and write 16-bit weights.
 
         Raises:
-            PalpateError: if the folder is not empty, or a weight is too large for 16 bits.
+            PalpateError: if the folder is not empty, a weight is too large for 16 bits, or the
+                tactile encoder is a public one, which is named by its file.
         """
+        if not self._has_clip or isinstance(self.tactile, TactileModule):
+            must, fix = "Encoders to be saved must be palpate's own", "Name the public one's file"
+            raise PalpateError(must, "a public tactile encoder", fix)
         with atomic_folder(Path(folder)) as part:
             (part / "clip").mkdir()
             if half:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from palpate.core import FeatureSet, Note, Progress, Split, quiet
 from palpate.data.manifest import MODALITIES, Manifest
-from palpate.evaluation.inputs import guard
+from palpate.evaluation.inputs import guard, load_encoders
 from palpate.leakage.auditing import audit as audit_leakage
 from palpate.report.results import Audit, Impact
 
@@ -49,9 +49,7 @@ def audit(
 
     @lru_cache
     def encoders() -> EncoderSet:
-        from palpate.encoders.encoder_set import EncoderSet
-
-        return EncoderSet.load(str(encoder))
+        return load_encoders(encoder, progress)
 
     def embed(samples: Manifest, modality: Any) -> FeatureSet:
         from palpate.encoders.embed import embed as embed_samples
@@ -71,7 +69,7 @@ def audit(
             features = {}
             for m in known:
                 notes += (new := guard(encoders(), m, judged, **how))
-                seen = any(note.code.startswith("seen-") for note in new)
+                seen = any(note.code in ("seen-images", "seen-dataset") for note in new)
                 # In its name, so that headline, table and plot are marked, too.
                 mark = ", trained on some of these images" if seen else ""
                 features[f"{m} encoder{mark}"] = embed(samples, m)

@@ -128,7 +128,9 @@ def probe(  # noqa: PLR0913 - one argument a choice
             was trained on test images.
     """
     require_choice("modality", modality, ("tactile", "vision"))
-    manifest = load_manifest(data)
+    from palpate.data.reading import load
+
+    manifest = load(data)
     splits, encoders = named(split, "split"), named(encoder, "encoder")
     if len(splits) > 1 and len(encoders) > 1:
         must, fix = "must be one where several splits are compared", "Compare one at a time"
@@ -154,13 +156,6 @@ def probe(  # noqa: PLR0913 - one argument a choice
     }
     known: Any = results.settings["digests"]
     return replace(results, settings={**results.settings, "digests": {**known, **digests}})
-
-
-def load_manifest(data: Manifest | str | Path) -> Manifest:
-    """A manifest as it is, or from its file or folder."""
-    from palpate.data.manifest import Manifest
-
-    return Manifest.load(Path(data)) if isinstance(data, str | Path) else data
 
 
 def plan_of(manifest: Manifest, splits: Mapping[str, Split], plan: Plan) -> Plan:

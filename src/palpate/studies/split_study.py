@@ -13,17 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from palpate.core import Progress, Split, locked, quiet, require
+from palpate.data.reading import load
 from palpate.encoders import EncoderSet, train_encoder
 from palpate.encoders.encoder_set import load_clip
-from palpate.evaluation.probing import (
-    Plan,
-    Probed,
-    load_manifest,
-    measure,
-    named,
-    plan_of,
-    results_of,
-)
+from palpate.evaluation.probing import Plan, Probed, measure, named, plan_of, results_of
 from palpate.report.results import Results
 from palpate.studies.stages import Run
 from palpate.training.options import Compute
@@ -69,7 +62,7 @@ def compare_splits(  # noqa: PLR0913 - those of training
     """
     once = 0 < len(seeds) == len(set(seeds))
     require(once, "seeds", "must hold at least one seed, each once", list(seeds), (0, 1, 2))
-    manifest, folder = load_manifest(data), Path(work)
+    manifest, folder = load(data), Path(work)
     loaded = {name: Split.load(split) for name, split in named(splits, "split").items()}
     axis = "split" if len(loaded) > 1 else ""
     # A leaking split may hold a test image in train as well: that is what is measured.
