@@ -8,8 +8,7 @@ its largest resident set. Fails over 2 ms or 300 MB. What it measured:
 
 | machine | contacts | client ms a request | of it photos | wall s | MB |
 |---|---|---|---|---|---|
-| 2 cores (EPYC), busy with other work, November 2026 | 10,000 | 1.40 | 0.30 | 19 | 219 |
-| the same with a dozen other processes | 10,000 | 1.80 | 0.48 | 28 | 216 |
+| 2 cores (EPYC), three runs, November 2026 | 10,000 | 1.68 to 1.82 | 0.27 to 0.35 | 17 | 216 |
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import os
 import re
 import time
 from collections.abc import Mapping, Sequence
+from queue import SimpleQueue
 from typing import Any
 
 from palpate.captions.prompts import LONGEST, valid
@@ -78,15 +79,23 @@ class Server:
         self._key = _key(self._variable, required=key_variable is not None)
         self._tries, self._pause, self._body = tries, pause, dict(body or {})
         headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
-        limits = httpx2.Limits(
-            max_connections=connections, max_keepalive_connections=connections, keepalive_expiry=60
-        )
-        self._client = httpx2.Client(headers=headers, timeout=timeout, limits=limits)
+        limits = httpx2.Limits(max_connections=1, keepalive_expiry=60)
+        secure = httpx2.create_ssl_context()
+        # A client a thread: the threads of one client wait for each other's locks.
+        self._clients: SimpleQueue[Any] = SimpleQueue()
+        for _ in range(connections):
+            self._clients.put(
+                httpx2.Client(headers=headers, timeout=timeout, limits=limits, verify=secure)
+            )
+        # Parsed once, which would else take a tenth of a request.
+        names = {"POST": "chat/completions", "GET": "models"}
+        self._urls = {method: httpx2.URL(f"{self.url}/{name}") for method, name in names.items()}
         self.model = model or self._only_model()
 
     def close(self) -> None:
-        """Close the connections."""
-        self._client.close()
+        """Close the connections that no request uses."""
+        while not self._clients.empty():
+            self._clients.get().close()
 
     def describe(self, request: Request) -> Reply:
         """Ask the server; see :class:`palpate.captions.replies.Describer`."""
@@ -139,7 +148,7 @@ class Server:
                 time.sleep(wait)
             wait = min(LONGEST_PAUSE, self._pause * 2**k)
             try:
-                response = self._client.post(f"{self.url}/chat/completions", json=payload)
+                response = self._request("POST", json=payload)
             except self._errors as error:
                 failure = self._gone(self._reason(error))
                 if isinstance(error, self._refused) and not self._answered:
@@ -165,6 +174,14 @@ class Server:
             else:
                 return answer
         raise failure
+
+    def _request(self, method: str, **content: Any) -> Any:
+        """The response to a request, by a client that no other thread uses."""
+        client = self._clients.get()
+        try:
+            return client.request(method, self._urls[method], **content)
+        finally:
+            self._clients.put(client)
 
     def _gone(self, reason: str, fix: str = "Check its address and that it runs") -> Exception:
         """Nobody is there any more, or was."""
@@ -194,7 +211,7 @@ class Server:
     def _models(self) -> list[str]:
         """Names of the server's models; empty if it does not list them."""
         try:
-            response = self._client.get(f"{self.url}/models")
+            response = self._request("GET")
             listed = _parsed(response.text)["data"] if response.status_code == 200 else []
             return [self._cleaned(str(model["id"])) for model in listed]
         except (self._errors, LookupError, TypeError, ValueError):
@@ -207,7 +224,7 @@ class Server:
             PalpateError: if there is none, or a choice.
         """
         try:
-            response = self._client.get(f"{self.url}/models")
+            response = self._request("GET")
         except self._errors as error:
             raise self._gone(self._reason(error)) from None
         if response.status_code in (401, 403):
