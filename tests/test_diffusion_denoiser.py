@@ -216,6 +216,12 @@ def test_dropout_replaces_a_tenth_of_the_conditions_by_null():
     assert 0.08 < dropped[:, 0].float().mean() < 0.12
 
 
+@pytest.mark.parametrize("dropout", [-0.1, 1.0])
+def test_a_preset_drops_no_share_of_conditions_outside_its_range(dropout):
+    with pytest.raises(PalpateError, match=r"dropout must lie in \[0, 1\)"):
+        replace(MINI, condition=replace(POLICY, dropout=dropout))
+
+
 def test_noise_moves_tokens_but_keeps_their_length():
     tokens = torch.nn.functional.normalize(torch.randn(200, 1, 12), dim=2) * 12**0.5
     policy = replace(POLICY, dropout=0.0, noise=0.5)

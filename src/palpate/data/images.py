@@ -249,8 +249,9 @@ def in_threads(
     require(threads is None or threads >= 1, "threads", "must be at least 1", threads)
     threads = threads or min(16, os.cpu_count() or 1)
     remaining = iter(items)
-    report = progress if what else quiet
-    report(what, 0, len(items))
+    report = progress if what else None
+    if report:
+        report(what, 0, len(items))
     with ThreadPoolExecutor(threads) as pool:
         running = {pool.submit(function, item): item for item in islice(remaining, 4 * threads)}
         done = 0
@@ -260,7 +261,8 @@ def in_threads(
                     item = running.pop(future)
                     yield item, future.result()
                     done += 1
-                    report(what, done, len(items))
+                    if report:
+                        report(what, done, len(items))
                     for following in islice(remaining, 1):
                         running[pool.submit(function, following)] = following
         finally:

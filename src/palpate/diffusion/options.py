@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from palpate.core import require
-
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -98,10 +96,6 @@ class ConditionPolicy:
     noise: float = 0.0
     dropout: float = 0.1
     source: Literal["text", "vision", "mixed"] = "text"
-
-    def __post_init__(self) -> None:
-        """Raise ``PalpateError`` if a value is out of its range."""
-        require(0 <= self.dropout < 1, "dropout", "must lie in [0, 1)", self.dropout, 0.1)
 
     @property
     def sources(self) -> tuple[Source, ...]:

@@ -29,7 +29,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from palpate.core import require_choice
+from palpate.core import require, require_choice
 from palpate.diffusion.options import (
     AutoencoderOptions,
     ConditionPolicy,
@@ -66,6 +66,11 @@ class DiffusionPreset:
     epochs: int | None = None
     schedule: Schedule = field(default_factory=Schedule)
     sampler: SamplerOptions = field(default_factory=SamplerOptions)
+
+    def __post_init__(self) -> None:
+        """Raise ``PalpateError`` if the dropout is no probability below 1."""
+        dropout = self.condition.dropout
+        require(0 <= dropout < 1, "dropout", "must lie in [0, 1)", dropout, 0.1)
 
     def loop_for(self, n: int, *, seed: int | None = None) -> LoopOptions:
         """The loop for ``n`` training samples: epochs become steps."""
