@@ -218,7 +218,7 @@ def test_dropout_replaces_a_tenth_of_the_conditions_by_null():
 
 @pytest.mark.parametrize("dropout", [-0.1, 1.0])
 def test_a_preset_drops_no_share_of_conditions_outside_its_range(dropout):
-    with pytest.raises(PalpateError, match=r"dropout must lie in \[0, 1\)"):
+    with pytest.raises(PalpateError, match=r"dropout` must lie in \[0, 1\)"):
         replace(MINI, condition=replace(POLICY, dropout=dropout))
 
 
