@@ -185,17 +185,17 @@ class Whitened(Descriptors):
         self._samplers = [[_sampler(s, *g) for s in GRIDS] for g in shapes]
         self._white = [Whitener() for _ in range(1 if gray else 3)]
         coarse, fine, keys = [Whitener() for _ in shapes], Whitener(), Whitener()
-        sums: list[Any] = [0.0 for _ in shapes]  # of fine cells
+        total = np.zeros((1, len(self._white), SIDE * SIDE))
         for logs in map(self.logs, _blocks(fit)):
+            centered = _centered(logs)
             for c, whiten in enumerate(self._white):
-                whiten.add(logs[:, c])
+                whiten.add(centered[:, c])
             for g, whiten in enumerate(coarse):
-                signals = self.cells(logs, g)
-                whiten.add(signals[0])
-                sums[g] += signals[1].sum(axis=0, dtype=np.float64)
-                if g == 0:
-                    keys.add(self._swapped(signals[0]))
-                    fine.add(signals[1])
+                whiten.add(self.cells(logs, g, grids=1)[0])
+            signals = self.cells(logs)
+            keys.add(self._swapped(signals[0]))
+            fine.add(signals[1])
+            total += logs.sum(axis=0, dtype=np.float64)
         for whiten in self._white:
             whiten.fit(IMAGE_RIDGE)
             whiten.matrix = whiten.matrix @ whiten.directions.T
@@ -206,11 +206,12 @@ class Whitened(Descriptors):
         #: Whitening of coarse cells for each geometry, by whose lengths an edit is plausible.
         self.edited = [whiten.fit(GRIDS[min(GRIDS)]) for whiten in coarse]
         self.matrices = [self.edited[0].matrix, fine.fit(GRIDS[max(GRIDS)]).matrix]
-        finely = [np.asarray(x / len(fit), np.float32) for x in sums]
+        mean = np.asarray(total / len(fit), np.float32)
+        finely = [self.cells(mean, g)[1] for g in range(len(shapes))]
         #: For each grid (geometries, d) whitened means.
         self.means = [
             np.stack([w.mean for w in self.edited]) @ self.matrices[0],
-            np.stack(finely) @ self.matrices[1],
+            np.concatenate(finely) @ self.matrices[1],
         ]
         random = rng_for(0, "near-duplicates", "key")
         self._key = keys.fit(GRIDS[min(GRIDS)]).matrix
@@ -236,9 +237,9 @@ class Whitened(Descriptors):
         ]
         return np.concatenate(parts)
 
-    def cells(self, logs: Floats, geometry: int = 0) -> list[Floats]:
-        """Cells of each grid, (n, cells^2 x channels), before whitening."""
-        return [_cells(logs, s) for s in self._samplers[geometry]]
+    def cells(self, logs: Floats, geometry: int = 0, grids: int = len(GRIDS)) -> list[Floats]:
+        """Cells of the first ``grids`` grids, (n, cells^2 x channels), before whitening."""
+        return [_cells(logs, s) for s in self._samplers[geometry][:grids]]
 
     def moved(self, rows: Ints, moves: Sequence[int], grids: int) -> Iterator[list[Floats]]:
         """For each move the first ``grids`` cells of images that are moved over backgrounds."""
@@ -280,7 +281,7 @@ class Whitened(Descriptors):
         logs = self._log(self._images[rows])
         if self._backgrounds is not None:
             logs -= self._log(self._backgrounds[rows])
-        return logs - logs.mean(axis=2, keepdims=True)
+        return logs
 
     def _log(self, rows: Ints) -> Floats:
         pixels = self._pixels[rows].reshape(len(rows), SIDE * SIDE, 3).transpose(0, 2, 1)
@@ -290,7 +291,8 @@ class Whitened(Descriptors):
 
     def _raw_slopes(self, logs: Floats) -> Floats:
         """(n, channels x directions x cells^2)."""
-        white = [w(logs[:, c]) for c, w in enumerate(self._white)]
+        centered = _centered(logs)
+        white = [w(centered[:, c]) for c, w in enumerate(self._white)]
         image = np.stack(white, axis=1).reshape(len(logs), -1, SIDE, SIDE)
         down, right = (x.reshape(-1, SIDE * SIDE) for x in np.gradient(image, axis=(2, 3)))
         whole = down @ _POOL, right @ _POOL
@@ -324,7 +326,7 @@ class MoveIndex:
     ) -> tuple[Ints, Floats]:
         """See :class:`Index`."""
         pool = self._pool
-        still = [pool.vectors(pool.cells(pool.logs(block))[:1], 0) for block in _blocks(rows)]
+        still = [pool.vectors(pool.cells(pool.logs(block), grids=1), 0) for block in _blocks(rows)]
         keys = np.ascontiguousarray(np.concatenate(still)[:, self._columns])
         near = nearest(keys, self._keys, count + CANDIDATES, apart=apart)
         blocks = _blocks(np.arange(len(rows)))
@@ -359,7 +361,7 @@ class EditIndex:
         for block in _blocks(rows):
             logs = pool.logs(block)
             for g in every:
-                cells = pool.cells(logs, g)[:1]
+                cells = pool.cells(logs, g, grids=1)
                 parts[g].append(pool.vectors(cells, g).astype(np.float16))
                 keys[g] += pool.keys(cells[0], [g])
         self._vectors = np.stack([np.concatenate(x) for x in parts])
@@ -448,6 +450,11 @@ def _best(near: Ints, values: Floats, count: int) -> tuple[Ints, Floats]:
 def _blocks(rows: Ints) -> Iterator[Ints]:
     for start in range(0, len(rows), BLOCK):
         yield rows[start : start + BLOCK]
+
+
+def _centered(logs: Floats) -> Floats:
+    """Logs (n, channels, side^2) without each channel's mean."""
+    return logs - logs.mean(axis=2, keepdims=True)
 
 
 def _cells(logs: Floats, sampler: Floats) -> Floats:
