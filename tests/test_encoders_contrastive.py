@@ -1,6 +1,7 @@
 """The loss against a slow loop; training of a tactile encoder and of a fresh CLIP."""
 
 import colorsys
+import json
 import math
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from transformers import Dinov2Config, Dinov2Model
 
 from palpate.core import PalpateError, Split, rng_for
 from palpate.data.manifest import Manifest
@@ -19,6 +21,7 @@ from palpate.encoders.contrastive import (
     train_encoder,
     train_tactile,
 )
+from palpate.encoders.embed import embed
 from palpate.encoders.encoder_set import EncoderSet, encode_tactile, new_tactile
 from palpate.encoders.losses import (
     Labels,
@@ -475,3 +478,21 @@ def test_paper_preset_is_the_paper():
     )  # ViT-L/14 at 224 px with a 768-wide projection
     with pytest.raises(PalpateError, match="tiny, mini, tvl-tiny"):
         preset("huge")
+
+
+@pytest.mark.parametrize("partners", ["frozen", "trainable"])
+def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path, partners):
+    sizes = {"hidden_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    config = Dinov2Config(**sizes, mlp_ratio=2, image_size=32, patch_size=16)
+    Dinov2Model(config).save_pretrained(tmp_path / "dino")
+    crop = {"size": {"shortest_edge": 32}, "crop_size": {"height": 32, "width": 32}}
+    facts = crop | {"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "do_center_crop": True}
+    (tmp_path / "dino" / "preprocessor_config.json").write_text(json.dumps(facts))
+    options = {"preset": TINY, "clip": tmp_path / "dino", "partners": partners, "device": "cpu"}
+    with pytest.raises(PalpateError, match="`weights` must be 0, 0 and 1 for a vision encoder"):
+        train_encoder(world, by_video(world), **options)
+    train_encoder(world, by_video(world), output=tmp_path / "e", weights=(0, 0, 1), **options)
+    encoders = EncoderSet.load(tmp_path / "e")
+    assert encoders.modalities == ["vision", "tactile"]
+    vision, tactile = (embed(world, encoders, side).features for side in encoders.modalities)
+    assert tactile.shape == vision.shape == (len(world), 32)

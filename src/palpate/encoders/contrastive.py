@@ -102,8 +102,8 @@ def train_encoder(  # noqa: PLR0913 - a public verb
             the data.
         preset: ``mini``, ``tiny``, ``tvl-tiny``, ``tvl-small``, ``tvl-base`` or ``paper``, or a
             preset.
-        clip: hub id or folder of a frozen CLIP, or ``palpate/mini``. Default: the preset's, or a
-            small one that is trained first on the same train part.
+        clip: hub id or folder of a frozen CLIP, or ``palpate/mini``; a DINO, with weights 0, 0, 1.
+            Default: the preset's, or a small one that is trained first on the same train part.
         output: folder for the encoders, new or empty; None keeps them in memory.
         epochs: of the tactile encoder; default: the preset's.
         targets: see :data:`~palpate.encoders.presets.Targets`; default: the preset's.
@@ -238,12 +238,11 @@ class TactileLoss:
         images = augmented(unit(batch["images"]), batch)
         tactile = in_chunks(partial(self.encode, module), images, self.chunk)
         text, vision = batch.get("text"), batch.get("vision")
-        if module.partners is not None:
+        if module.partners is not None and clip.tokenizer is not None:
             text = gather_rows(_encode_phrases(clip, self.rows.phrases, batch["phrase"]))
         if "photos" in batch:
             photos = clip.preprocess(unit(batch["photos"]))
             vision = gather_rows(in_chunks(clip.encode_vision, photos, self.chunk))
-        assert text is not None
         labels = Labels(batch["texts"], batch["contacts"], batch.get("seen"))
         how: dict[str, Any] = {"targets": self.targets, "weights": self.weights}
         total, logs = three_way(gather_rows(tactile), text, vision, scale, labels, **how)
@@ -309,6 +308,9 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     """
     where = pick_device(connect(device))
     compute, trainable = compute or Compute(), partners == "trainable"
+    if clip.tokenizer is None and (weights[0] or weights[1]):
+        must, fix = "must be 0, 0 and 1 for a vision encoder without text", "Or choose a CLIP"
+        raise PalpateError(must, f"{tuple(weights)}", fix, argument="weights")
     train, held = _parts(manifest, split, held_out, seed)
     clip = copy.deepcopy(clip) if trainable else clip
     move(clip.model, where)
@@ -332,7 +334,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
         "targets": mode,
         "weights": list(weights),
         "vision": clip.digest("vision"),
-        "text": clip.digest("text"),
+        "text": clip.digest("text") if clip.tokenizer is not None else None,
         "start": start.digest("tactile") if start else None,
     }
     facts |= {"partners": partners} if trainable else {}

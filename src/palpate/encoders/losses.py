@@ -108,7 +108,7 @@ class Labels:
 
 def three_way(
     tactile: Tensor,
-    text: Tensor,
+    text: Tensor | None,
     vision: Tensor | None,
     scale: Tensor | float,
     labels: Labels,
@@ -120,7 +120,7 @@ def three_way(
 
     Args:
         tactile: (n, d), L2-normalized.
-        text: the same.
+        text: the same, or None for a vision encoder without text: the last pair alone.
         vision: the same, or None for data without photos: the first pair alone.
         scale: 1 / tau.
         labels: of the rows.
@@ -136,15 +136,16 @@ def three_way(
     """
     require_weights(weights)
     with torch.autocast(tactile.device.type, enabled=False):
-        tactile, text = tactile.float(), text.float()
-        pair = {"tactile_text": (tactile, text, labels)}
+        tactile, text = tactile.float(), None if text is None else text.float()
+        pair = {} if text is None else {"tactile_text": (tactile, text, labels)}
         if vision is not None:
             some, seen = slice(None), labels
             if labels.photos is not None:
                 some = labels.photos.nonzero()[:, 0]
                 seen = labels.take(some)
             vision = vision.float()[some]
-            pair["vision_text"] = (vision, text[some], seen)
+            if text is not None:
+                pair["vision_text"] = (vision, text[some], seen)
             pair["tactile_vision"] = (tactile[some], vision, seen)
         logs: dict[str, Tensor] = {}
         for name, weight in zip(PAIRS, weights, strict=True):
@@ -156,7 +157,8 @@ def three_way(
                 )
         used = {name: w for name, w in zip(PAIRS, weights, strict=True) if name in logs}
         if not used:
-            must, fix = "must leave a pair that the data has", "There are no photos"
+            lacking = "photos" if vision is None else "texts"
+            must, fix = "must leave a pair that there is", f"There are no {lacking}"
             raise PalpateError(must, f"{tuple(weights)}", fix, argument="weights")
         total = torch.stack([w * logs[name] for name, w in used.items()]).sum() / sum(used.values())
     return total, {name: loss.detach() for name, loss in logs.items()}

@@ -75,7 +75,8 @@ class Rows:
                 self.photos = cached_images(pictured, "vision", side, cache, progress)
             return
         frozen = EncoderSet(clip)
-        self.text = torch.from_numpy(embed_phrases(self.phrases, frozen, cache, progress))
+        if clip.tokenizer is not None:
+            self.text = torch.from_numpy(embed_phrases(self.phrases, frozen, cache, progress))
         if len(pictured):
             rows = embed(pictured, frozen, "vision", cache=cache, progress=progress)
             self.vision = torch.from_numpy(rows.features)
