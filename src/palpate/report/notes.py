@@ -194,7 +194,8 @@ METRICS: dict[str, Sentence] = {
         "Within {bound:.2g} of the exact value, as the bandwidth is narrow for moments"
     ),
     "independent-samples": (
-        "The interval takes samples as independent; frames of one video are not: give groups"
+        "The interval takes every sample as independent; frames of one video are not: where there "
+        "are videos, give them as groups"
     ),
     "dependent-pairs": (
         "{count} ids are in both sets: a generated and a real image of one scene are not "
