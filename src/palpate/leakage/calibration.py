@@ -35,8 +35,8 @@ from palpate.leakage.neighbors import Floats, Ints
 #: Unrelated matches that a null needs.
 FEWEST = 20
 TAIL, BINS = 0.9, 50
-#: The least z of a tail and the fewest images in it: few images of the null may have a plausible
-#: edit, but those of a sensor that is mounted in another way have.
+#: The least z of a tail and the fewest images in it: edits of few images of the null are plausible,
+#: but those of a sensor that is mounted in another way are.
 LEAST, RARE = 0.2, 3
 #: The prior of a tail, its weight in videos and mean excess; the cosine at which z ends.
 PRIOR, EXCESS, END = 4, 0.07, 0.99999

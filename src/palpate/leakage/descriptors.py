@@ -18,9 +18,9 @@ would be taken for background where they are few.
 2. *Edited cells*, where no background is used. Queries in 8 turns and mirrors, each with red and
    blue swapped; train also as if cropped and slightly turned, each with a mean of its own.
    Candidates are found by keys that no turn, mirror or swap changes, the mean over all of them
-   of max(0, u A) with random A. Each crop and turn has a whitening of its own, and an edit is
-   plausible where the length of the query in it is near the least of all edits: the light and the
-   markers show which edit was made. Without a plausible edit the cosine is -1.
+   of max(0, u A) with random A. Each crop and turn has a whitening of its own, and the cosine of
+   an edit loses 2 (l / l' - 1), where l is the length of the query in it and l' the least of all
+   edits: the light and the markers show which edit was made.
 
 Measured in docs/studies/near_duplicates.md.
 """
@@ -48,8 +48,8 @@ MANY, MOST = 8000, 40
 GEOMETRIES = ((1.0, 0.0), (0.9, 0.0), (1.0, 3.0), (1.0, -3.0))
 #: Shares of the side by which a copy may be moved.
 MOVES = [(y, x) for y in (0.0, -0.03, 0.03) for x in (0.0, -0.03, 0.03)]
-#: Whitened length, over the least of all edits, up to which an edit is plausible.
-PLAUSIBLE = 1.1
+#: What an edit loses in cosine for each 100 % of whitened length above the least of all edits.
+IMPLAUSIBLE = 2.0
 #: Shares of the rate of false positives: slopes, cells, edits, which are rarer than contacts.
 SHARES = (0.4, 0.4, 0.2)
 #: Length of a key, and how many candidates it finds.
@@ -390,14 +390,14 @@ class EditIndex:
         pool, every = self._pool, np.arange(len(near))
         edited = np.stack([cells[0][:, at] for at in pool.edits[0]], axis=1)
         lengths = np.stack([np.linalg.norm(w(edited), axis=2) for w in pool.edited], axis=1)
-        plausible = lengths <= PLAUSIBLE * lengths.min(axis=(1, 2), keepdims=True)
-        plausible[:, 0, 0] = False  # as it is: another question
+        least = np.maximum(lengths.min(axis=(1, 2), keepdims=True), 1e-9)
+        penalty = IMPLAUSIBLE * (lengths / least - 1)
+        penalty[:, 0, 0] = np.inf  # as it is: another question
         # (n, geometries, edits, d)
         centered = (edited @ pool.matrices[0])[:, None] - pool.means[0][:, None]
         centered /= np.maximum(np.linalg.norm(centered, axis=3, keepdims=True), 1e-9)
         among = self._vectors[np.arange(len(GEOMETRIES))[:, None], near].astype(np.float32)
-        cosine = centered @ among.transpose(0, 1, 3, 2)
-        cosine[~plausible] = -1
+        cosine = centered @ among.transpose(0, 1, 3, 2) - penalty[..., None]
         cosine.transpose(0, 1, 3, 2)[near < 0] = -np.inf
         edit, cosine = cosine.argmax(axis=2), cosine.max(axis=2)  # (n, geometries, candidates)
         best = np.argsort(-cosine.reshape(len(near), -1), axis=1, kind="stable")[:, : count + 2]
@@ -409,14 +409,14 @@ class EditIndex:
                 np.take_along_axis(x, np.stack(columns)[edit[every, g, k]], axis=1)
                 for x, columns in zip(cells, pool.edits, strict=True)
             ]
-            queries, shown = pool.vectors(chosen, g), plausible[every, g, edit[every, g, k]]
-            values[:, t] = np.where(shown, 0, -1)
-            for geometry in np.unique(g[shown]).tolist():
-                part = np.flatnonzero(shown & (g == geometry))
+            queries = pool.vectors(chosen, g)
+            for geometry in np.unique(g).tolist():
+                part = np.flatnonzero(g == geometry)
                 logs = pool.logs(self._rows[row[part, t]])
                 among = pool.vectors(pool.cells(logs, geometry), geometry)
                 values[part, t] = np.einsum("nd,nd->n", queries[part], among)
-        return _best(row, values, count)
+            values[:, t] -= penalty[every, g, edit[every, g, k]]
+        return _best(row, np.maximum(values, -1), count)
 
 
 def _leading(vectors: NDArray[Any]) -> Ints:
