@@ -60,7 +60,7 @@ def test_a_frame_may_be_named_as_the_reference_of_all_or_some_videos(folder, tmp
     for words, text in {
         ("70",): "must be the number of a frame of the video 'v0'. Got 70",
         ("v7=0",): "--reference must be of a video without backgrounds. Got 'v7'",
-        ("fist",): "--reference must be one of found, first, a frame. Got 'fist'",
+        ("fist",): "--reference must be one of auto, first, a frame. Got 'fist'",
         ("first", "v0=1"): "--reference must be one reference, or one for each of some videos",
     }.items():
         command = ["background", str(folder), "-o", str(tmp_path / "no"), "--reference", *words]
@@ -69,21 +69,21 @@ def test_a_frame_may_be_named_as_the_reference_of_all_or_some_videos(folder, tmp
 
 
 CASES = {
-    "all frames": (range(70), {}, "contacts found, reference found"),
+    "all frames": (range(70), {}, "contacts of the images, reference auto"),
     "all frames, contacts named": (
         range(70),
         {"contact": contact_of},
-        "contacts of the manifest, reference found",
+        "contacts of the manifest, reference auto",
     ),
     "frames in contact alone": (
         [*range(20, 31), *range(45, 56)],
         {"contact": contact_of},
-        "contacts of the manifest, reference found",
+        "contacts of the manifest, reference auto",
     ),
     "every third": (
         range(0, 70, 3),
         {"contact": contact_of},
-        "contacts of the manifest, reference found",
+        "contacts of the manifest, reference auto",
     ),
 }
 

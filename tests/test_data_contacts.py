@@ -47,7 +47,7 @@ def test_presses_are_found_with_the_gel_before_them(presses, length, strength):
     video = gel_video(length, presses, strength)
     contacts = find_contacts(video)
     assert len(contacts.runs) == len(presses)
-    assert contacts.method == "found"
+    assert contacts.method == "detected"
     touched = {k for first, last in presses for k in range(first - 3, last + 4)}
     assert touched.isdisjoint([contacts.reference, *contacts.backgrounds])
     for found, true, background in zip(contacts.runs, presses, contacts.backgrounds, strict=True):

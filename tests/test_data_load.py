@@ -2,10 +2,12 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import polars as pl
 import pytest
 
+import palpate
 from data_fixtures import tree, write_image
 from format_trees import TREES
 from palpate import data
@@ -142,3 +144,22 @@ def test_results_print_themselves(images, tmp_path):
 def test_importing_the_room_loads_no_polars():
     code = "import sys, palpate.data; sys.exit('polars' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_list_of_image_files_is_a_set_of_images(tmp_path, small_manifest):
+    files = [str(path) for path in small_manifest.paths("tactile")]
+    loaded = data.load(files, side="tactile")
+    assert list(loaded.paths("tactile")) == [Path(file) for file in files]
+    assert data.load(files).facts["side_assumed"] == "vision"
+    assert str(loaded).splitlines()[2:] == [f"samples  {len(files)}", f"tactile  {len(files)}"]
+    with pytest.raises(ProblemsError, match=r"no file 'gone\.png'"):
+        data.load([*files, tmp_path / "gone.png"], skip_bad=False)
+    with pytest.raises(PalpateError, match="must be a path, a polars or pandas frame"):
+        data.load([*files, 3])
+
+
+def test_an_audit_takes_lists_of_image_files(tmp_path, small_manifest):
+    files = small_manifest.paths("tactile")
+    audit = palpate.audit(files[:10], files[9:20], reading={"side": "tactile"})
+    leaks = {signal.kind: signal.flagged for signal in audit.signals}
+    assert leaks["identical bytes"] == 1

@@ -26,8 +26,8 @@ class Options(Common):
     output: OutPath
     """Folder for the new manifest.parquet; the images stay where they are."""
     how: Annotated[
-        tuple[str, ...], tyro.conf.arg(name="reference", metavar="found|first|N|VIDEO=N")
-    ] = ("found",)
+        tuple[str, ...], tyro.conf.arg(name="reference", metavar="auto|first|N|VIDEO=N")
+    ] = ("auto",)
     """What shows the untouched gel of a video: the frame most like the others, the first, or frame
     N; several `VIDEO=N` name it for some videos alone."""
     replace_all: Annotated[Switch, tyro.conf.arg(name="replace")] = False

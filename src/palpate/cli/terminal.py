@@ -91,7 +91,6 @@ RENAMED: dict[tuple[str, str], str] = {
 #: argument's own name ("--sigma"). '' is every verb.
 OPTION_NAMES: dict[tuple[str, str], str] = {
     ("audit", "train_or_data"): "TRAIN",
-    ("split", "train_or_data"): "PATH",
     ("audit", "test"): "TEST",
     ("background", "how"): "--reference",
     ("background", "replace_all"): "--replace",

@@ -50,7 +50,7 @@ from palpate.data.manifest import Manifest
 from palpate.data.reading import load
 
 #: A number is that of a frame.
-How = Literal["found", "first"] | int
+How = Literal["auto", "first"] | int
 #: (first, last) position of a contact, both included.
 Run = tuple[int, int]
 
@@ -104,7 +104,7 @@ def propose_backgrounds(
     source: Any,
     output: Path | str,
     *,
-    how: How | Mapping[str, How] = "found",
+    how: How | Mapping[str, How] = "auto",
     replace_all: bool = False,
     progress: Progress = quiet,
     **options: Any,
@@ -114,8 +114,8 @@ def propose_backgrounds(
     Args:
         source: a manifest, or whatever :func:`palpate.load` reads, with its images as files.
         output: folder to write to, without a manifest; the images stay where they are.
-        how: the reference of a video: ``found``, its ``first`` frame, or the number of a frame; by
-            name of the video for some, then the others' are found.
+        how: the reference of a video: ``auto`` (the frame most like the others), its ``first``
+            frame, or the number of a frame; by name of the video for some, others are ``auto``.
         replace_all: replace the backgrounds that are there, too.
         progress: progress callback.
         options: of :func:`palpate.load`.
@@ -227,7 +227,7 @@ class _Video:
             problems.append(Problem(name, "no-background", text))
             return "none", []
         reference = self.numbers.index(how) if named else 0
-        if how == "found":
+        if how == "auto":
             reference = int(free[find_reference(self.thumbnails[free])])
         way = f"frame {how}" if named else how
         if known:
@@ -236,7 +236,7 @@ class _Video:
         else:
             contacts = find_contacts(self.thumbnails, reference)
             energy, runs = contacts.energy, contacts.runs
-            method = f"contacts found, reference {way}"
+            method = f"contacts of the images, reference {way}"
         chosen, before = np.full(len(self.paths), reference), np.zeros(len(self.paths), bool)
         after = -1
         for first, last in runs:
@@ -277,8 +277,8 @@ def _references(how: How | Mapping[str, How], videos: Collection[str]) -> dict[s
             must, fix = "must be of a video without backgrounds", f"E.g. {next(iter(videos))}"
             raise PalpateError(must, repr(name), fix, argument="how")
         if not isinstance(value, int):
-            require_choice("how", value, ("found", "first", "a frame"))
-    references: dict[str, How] = dict.fromkeys(videos, "found")
+            require_choice("how", value, ("auto", "first", "a frame"))
+    references: dict[str, How] = dict.fromkeys(videos, "auto")
     references.update(given)
     return references
 

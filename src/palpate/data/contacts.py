@@ -50,7 +50,7 @@ class Contacts:
     Attributes:
         energy: (n,) contact energy, in gray levels.
         reference: the frame that shows the untouched gel.
-        method: how it was chosen: ``declared`` or ``found``.
+        method: how it was chosen: ``declared`` or ``detected``.
         runs: (first, last) frame of each contact, both included.
         backgrounds: for each contact the frame that shows the gel before it.
         height: how far a contact rises above the frames around it at least, in gray levels.
@@ -88,7 +88,7 @@ def find_contacts(
         gel: (48, 64, 3) the untouched gel, if there is an image of it; the reference is then the
             frame most like it.
     """
-    method = "found" if reference is None and gel is None else "declared"
+    method = "detected" if reference is None and gel is None else "declared"
     if gel is not None:
         energy = contact_energy(thumbnails, gel)
         reference = int(energy.argmin())

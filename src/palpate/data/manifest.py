@@ -44,6 +44,7 @@ from palpate.core import (
     Split,
     atomic_path,
     digest_lines,
+    fact_lines,
     inside,
 )
 
@@ -101,6 +102,17 @@ class Manifest:
 
     def __len__(self) -> int:
         return self.table.height
+
+    def __str__(self) -> str:
+        """How many samples, videos and materials there are, and how many have which image."""
+        counts: dict[str, Any] = {"root": str(self.root), "samples": len(self)}
+        for name in ("video", "contact", "object", "material"):
+            if number := self.table[name].drop_nulls().n_unique():
+                counts[f"{name}s"] = number
+        with_image = {c: self.table[c].count() for c in IMAGE_COLUMNS if self.table[c].count()}
+        return "\n".join(["Manifest", *fact_lines(counts | with_image)])
+
+    __repr__ = __str__
 
     @property
     def ids(self) -> list[str]:

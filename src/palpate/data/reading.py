@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import polars as pl
 from palpate.core import PalpateError, Problem, Progress, quiet, require_regular
 from palpate.data.formats import Format
 from palpate.data.formats.base import Scan, finished, manifest_of
+from palpate.data.images import SUFFIXES
 from palpate.data.imported import raise_if, require_some
 from palpate.data.importing import recognized, scan_options
 from palpate.data.listing import LINE, read_list
@@ -38,8 +40,8 @@ def load(
     Args:
         source: a manifest file or the folder of an import; a frame list (``video/frame.jpg,label``
             per line); a table file; a polars or pandas frame, or a list of dictionaries, with
-            manifest columns; the folder of a data set of any known format; or a folder of images of
-            one modality.
+            manifest columns; the folder of a data set of any known format; or images of one
+            modality (``side``: ``vision`` or ``tactile``), as a folder or a list of files.
         format: name of the format, or ``auto``.
         images: raise if samples have no image files because their frames are inside videos or
             tables. Frame lists and tables without image columns never have images.
@@ -86,6 +88,8 @@ def read_samples(
     options = {name: value for name, value in options.items() if value is not None}
     if isinstance(source, Manifest):
         return source, []
+    if is_image_files(source):
+        return _of_images([Path(path) for path in source], skip_bad, options)
     if not isinstance(source, (str, Path)):
         return _of_table(table_of(source), Path(), skip_bad, options)
     path = Path(source)
@@ -123,6 +127,15 @@ def is_manifest(path: Path) -> bool:
     return metadata.get("palpate.format", "").startswith("palpate-manifest/")
 
 
+def is_image_files(source: Any) -> bool:
+    """Whether this is a list of image files."""
+    return (
+        isinstance(source, list | tuple)
+        and bool(source)
+        and all(isinstance(p, str | Path) and Path(p).suffix.lower() in SUFFIXES for p in source)
+    )
+
+
 def is_list(path: Path) -> bool:
     """Whether the first line that is not empty is a row of a frame list."""
     with open(path, "rb") as file:
@@ -141,6 +154,22 @@ def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
         scan = form.scan(path, **options, side="vision")
         scan.facts["side_assumed"] = "vision"
         return scan
+
+
+def _of_images(
+    paths: Sequence[Path], skip_bad: bool, options: dict[str, Any]
+) -> tuple[Manifest, list[Problem]]:
+    """Samples of a list of image files: ids are paths, and declare nothing."""
+    if unknown := sorted(set(options) - {"side", "names"}):
+        must, got = "must be left out for a list of images", repr(options[unknown[0]])
+        raise PalpateError(must, got, "", argument=unknown[0])
+    root = Path(os.path.commonpath([path.absolute().parent for path in paths]))
+    side, facts = options.get("side"), {"format": "files", "dataset": root.name}
+    if side is None:
+        side = facts["side_assumed"] = "vision"
+    names = [path.absolute().relative_to(root).as_posix() for path in paths]
+    rows = [(str(path), {"id": n, side: n}) for path, n in zip(paths, names, strict=True)]
+    return _of_scan(Scan(root, rows=rows), root, facts, skip_bad, quiet)
 
 
 def _of_table(

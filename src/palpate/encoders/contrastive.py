@@ -191,7 +191,7 @@ def load_split(data: Manifest | str | Path, split: Split | str | Path | None = N
     """
     if split is not None:
         return Split.load(split)
-    stated = [] if isinstance(data, Manifest) else sorted(Path(data).glob("splits/*.json"))
+    stated = sorted(Path(data).glob("splits/*.json")) if isinstance(data, str | Path) else []
     if len(stated) != 1:
         must, fix = "must be given unless one lies with the data", "Make one with: palpate split"
         got = ", ".join(path.name for path in stated) or "none there"

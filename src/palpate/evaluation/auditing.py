@@ -34,13 +34,21 @@ def audit(
     Args:
         train_or_data: the train samples, or with ``split`` all samples.
         test: the test samples.
+        split: a split of ``train_or_data``, instead of ``test``.
+        by: what train and test must not share: a column, or ``auto`` for the video or what is known
+            instead of it.
+        images: compare image files and their content, not only tables.
+        false_positives: rate at which unrelated images may pass for near-duplicates, in (0, 0.1].
         encoder: an id, or a folder, of encoders whose embeddings replace the images.
         impact: measure what leaking costs in material accuracy, too; needs ``split``.
         allow_seen: measure it by embeddings of an encoder that was trained on some of the samples;
             every output says so.
         cache: folder that keeps decoded images and embeddings.
         progress: callback.
-        options: of :func:`palpate.leakage.audit`.
+        options: all others are those of :func:`palpate.leakage.audit`.
+
+    Returns:
+        The audit: print it, or ``.to_html(path)``, ``.to_frame()``, ``.to_json()``.
 
     Raises:
         PalpateError: as :func:`palpate.leakage.audit`, and if the encoders cannot be loaded.

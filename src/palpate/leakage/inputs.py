@@ -19,7 +19,7 @@ from palpate.data.formats import FORMATS
 from palpate.data.listing import number_together, read_categories, read_lists
 from palpate.data.manifest import MODALITIES, SCHEMA, Manifest
 from palpate.data.naming import name_together, read_names
-from palpate.data.reading import is_list, is_manifest, read_samples
+from palpate.data.reading import is_image_files, is_list, is_manifest, read_samples
 
 #: A manifest, a path, several frame lists that are joined, or a polars or pandas frame.
 Data = Any
@@ -64,11 +64,13 @@ def read(
     """
     options = {name: value for name, value in (reading or {}).items() if value}
     root = options.pop("root", root)
-    paths = data if isinstance(data, (list, tuple)) else ()
-    if len(paths) > 1 and all(isinstance(path, (str, Path)) for path in paths):
+    paths: Sequence[Any] = data if isinstance(data, (list, tuple)) else ()
+    several = len(paths) > 1 and not is_image_files(paths)
+    if several and all(isinstance(path, (str, Path)) for path in paths):
         manifest, skipped = _join([Path(path) for path in paths], skip_bad, root, options)
         return Source(manifest, {}, _notes(skipped))
-    source = paths[0] if len(paths) == 1 and not isinstance(paths[0], dict) else data
+    one = [p for p in paths if isinstance(p, (str, Path))] if not is_image_files(paths) else []
+    source = one[0] if len(one) == 1 == len(paths) else data
     path = Path(source) if isinstance(source, (str, Path)) else None
     # A table may name images that are not at hand; everything else is read as `palpate.load` does.
     table = path if path and path.is_file() and not (is_manifest(path) or is_list(path)) else None
@@ -105,11 +107,15 @@ def read_all(
     progress: Progress,
     root: str | Path | None,
     reading: Mapping[str, Any] | None = None,
+    *,
+    arguments: Sequence[str] = ("train_or_data", "test", "pretrain"),
 ) -> list[Source]:
-    """Several sources; the problems of all are raised together, and their names read together."""
+    """Several sources, those of ``arguments``: their problems are raised together, and their names
+    read together.
+    """
     parts: list[Source] = []
     problems: list[Problem] = []
-    for source, name in zip(sources, ("train_or_data", "test", "pretrain"), strict=False):
+    for source, name in zip(sources, arguments, strict=False):
         try:
             parts.append(read(source, skip_bad, progress, root, reading))
         except ProblemsError as error:

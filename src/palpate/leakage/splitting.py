@@ -100,7 +100,7 @@ def split(  # noqa: PLR0913  # pyright: ignore[reportInconsistentOverload]
         source = None if data is None else read(data, skip_bad, progress)
         manifest, notes = (source.manifest, source.notes) if source else (None, [])
         return published(manifest, train, val, seeds[0], notes)
-    (source,) = read_all([data], skip_bad, progress, None, reading)
+    (source,) = read_all([data], skip_bad, progress, None, reading, arguments=["data"])
     manifest, notes = source.manifest, source.notes
     rule: dict[str, Any] = {"name": "NoLeak"}
     if noleak == "hct":

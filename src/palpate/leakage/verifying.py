@@ -91,7 +91,7 @@ def verify(
         PalpateError: on an unknown column, or a split file that cannot be read.
     """
     split = Split.load(split)
-    (source,) = read_all([data], skip_bad, progress, None, reading)
+    (source,) = read_all([data], skip_bad, progress, None, reading, arguments=["data"])
     manifest, notes = source.manifest, source.notes
     columns = _columns(split, manifest) if by == "auto" else [by] if isinstance(by, str) else by
     links, _ = near_links(manifest, near, cache, progress)

@@ -437,7 +437,7 @@ def _squared_radii(
     if groups is not None and others.min() < k:
         must = f"Every group must have at least k = {k} {name} rows outside it"
         got = f"{others.min()} outside group {groups[int(others.argmin())]!r}"
-        raise PalpateError(must, got, "Choose a smaller k, more groups, or grouped=False")
+        raise PalpateError(must, got, "Choose a smaller k, more groups, or leave the groups out")
     radii = np.empty(n)
     for rows, squares in _blocks(x, x):
         squares[unit[rows, None] == unit] = np.inf

@@ -245,7 +245,7 @@ def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: 
     if contact:
         samples += unlisted
     else:
-        text = "in contact.json but in no list, so no samples; contact=True includes them"
+        text = "in contact.json but in no list, so no samples; the option contact includes them"
         tvl.suspect_rows(result, [where for where, _ in unlisted], "unlisted-contact", text)
     partner = lambda row: f"{row['video']}/tactile/{PurePosixPath(row['vision']).name}"  # noqa: E731
     odd = [where for where, row in samples if row["tactile"] != partner(row)]
@@ -331,7 +331,11 @@ def _swap(result: Scan, swap: Swap, progress: Progress) -> set[str]:
         return [_size(result.base / of_video[video][0][side]) for side in ("vision", "tactile")]
 
     seen = dict(in_threads(sizes, of_video, "looking for swapped folders", progress))
-    done = "their paths were swapped back" if swap == "fix" else "swap='fix' swaps them back"
+    done = (
+        "their paths were swapped back"
+        if swap == "fix"
+        else "the option swap, if fix, swaps them back"
+    )
     swapped = {v for v in of_video if seen[v][0] == tvl.IMAGE_SIZE != seen[v][1] is not None}
     for video in (v for v in of_video if v in swapped):
         vision, tactile = (f"{size[0]}x{size[1]}" for size in seen[video] if size)
