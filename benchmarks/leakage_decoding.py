@@ -3,14 +3,18 @@
     python benchmarks/leakage_decoding.py --files 50000 --size 128
 
 Makes JPEGs (quality 90) of random smooth images, or takes those below --folder, compares a fifth of
-them (test) with the others (train, in videos of 50) and prints CPU seconds and peak memory.
+them (test) with the others (train, in videos of 50) and prints CPU seconds and peak memory. On
+two cores in November 2026: 51 to 58 CPU s, 51 s, 891 MB.
 """
 
 import argparse
+import os
 import resource
 import tempfile
 import time
 from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `palpate` does on two cores
 
 import numpy as np
 from PIL import Image
