@@ -16,7 +16,8 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 import tyro
 
 from palpate.cli.terminal import Switch, Terminal
-from palpate.training.options import Compute, LoopOptions, changed
+from palpate.core import PalpateError
+from palpate.training.options import Compute, LoopOptions
 
 #: Presets of ``palpate train encoder``.
 EncoderPresetName = Literal["mini", "tiny", "tvl-tiny", "tvl-small", "tvl-base", "paper"]
@@ -80,9 +81,24 @@ def preset_flags(title: str, preset: type[Any], main: str, skip: tuple[str, ...]
 
 
 def with_flags(preset: Any, given: Any, main: str, skip: tuple[str, ...]) -> Any:
-    """The preset with the fields that were given on the command line."""
-    values = {f.path: getattr(given, f.flag) for f in _fields(type(preset), main, skip)}
-    return changed(preset, {path: v for path, v in values.items() if v is not None})
+    """The preset with the fields that were given on the command line.
+
+    Raises:
+        PalpateError: for a field of a part that the preset does not have.
+    """
+    for each in _fields(type(preset), main, skip):
+        if (value := getattr(given, each.flag)) is not None:
+            *parts, name = each.path.split(".")
+            records = [preset]
+            for part in parts:
+                if (record := getattr(records[-1], part)) is None:
+                    must, got = "must belong to a part of the preset", f"a preset without {part}"
+                    raise PalpateError(must, got, "Leave it out", argument=each.flag)
+                records.append(record)
+            for record, inner in zip(reversed(records), [name, *reversed(parts)], strict=True):
+                value = dataclasses.replace(record, **{inner: value})
+            preset = value
+    return preset
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,16 +6,14 @@ This file needs no torch: presets and the command line are made of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, TypeVar
+from dataclasses import asdict, dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.core import PalpateError, rng_for
 
-T = TypeVar("T")
 Precision = Literal["float32", "bf16", "fp16"]
 Tracker = Literal["tensorboard", "wandb"]
 
@@ -173,19 +171,3 @@ class RowOrder:
         held = np.isin(order, before[-carried:])
         first = np.flatnonzero(~held)[: self.batch - carried]
         return np.concatenate([order[first], np.delete(order, first)])
-
-
-def changed(preset: T, fields: Mapping[str, Any]) -> T:
-    """A preset with other fields, by their names: ``{"tactile_course.lr": 1e-3}``.
-
-    Raises:
-        PalpateError: for a field of a part that the preset does not have.
-    """
-    for name, value in fields.items():
-        part, _, inner = name.partition(".")
-        if inner and getattr(preset, part) is None:
-            must, got = "must belong to a part that the preset has", f"a preset without {part}"
-            raise PalpateError(must, got, "Leave it out", argument=name.replace(".", "_"))
-        new = changed(getattr(preset, part), {inner: value}) if inner else value
-        preset = replace(preset, **{part: new})  # type: ignore[type-var]
-    return preset
