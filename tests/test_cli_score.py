@@ -63,10 +63,18 @@ def test_options_reach_the_function_and_json_is_its_result(capsys, sets):
     assert status == 0, err
     scores = by_key(Results.from_json(json.loads(out)))
     want = scoring.score(
-        "near.npz", "real.npz", names=["ours"], labels="labels.csv", split="s.json",
-        sigma=[10, "median"], normalize=True, presets=["paper"], companions=[],
-        permutations=0, seed=3,
-    )  # fmt: skip
+        "near.npz",
+        "real.npz",
+        names=["ours"],
+        labels="labels.csv",
+        split="s.json",
+        sigma=[10, "median"],
+        normalize=True,
+        presets=["paper"],
+        companions=[],
+        permutations=0,
+        seed=3,
+    )
     assert {k: s.value for k, s in scores.items()} == {k: s.value for k, s in by_key(want).items()}
     assert json.loads(out)["commands"][0].startswith("palpate score --generated near.npz")
 
@@ -139,7 +147,7 @@ def test_scores_of_pixels_need_no_torch(tmp_path):
         ((*PAIR, "--latex", "mine"), ("mine must be new",)),
         ((*PAIR, "--cache", "real.npz"), ("--cache must not be an input",)),
     ],
-)  # fmt: skip
+)
 def test_mistakes_are_one_line_with_status_2(capsys, sets, monkeypatch, args, words):
     Path("folder").mkdir()
     Path("mine").write_text("mine")
@@ -174,9 +182,11 @@ def test_a_killed_run_goes_on_from_its_embeddings_and_leaves_no_cache(tmp_path):
     )
     args = (*args, "--companions", "none", "--presets", "paper")
     process = subprocess.Popen(
-        [sys.executable, "-m", "palpate", "score", *args, "--permutations", "200000"], cwd=tmp_path,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        [sys.executable, "-m", "palpate", "score", *args, "--permutations", "200000"],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     cache = tmp_path / ".s.json.work"
     deadline = time.monotonic() + 60
     while len([*cache.rglob("tactile-*.npz")]) < 2 and time.monotonic() < deadline:

@@ -89,8 +89,12 @@ def anytouch():
 
 def write(kind, folder, state=None):
     """A checkpoint in its published nesting."""
-    state = state or {"sparsh": sparsh, "sparsh-mae": lambda: sparsh(0), "tvl": tvl,
-                      "anytouch": anytouch}[kind]()  # fmt: skip
+    state = (
+        state
+        or {"sparsh": sparsh, "sparsh-mae": lambda: sparsh(0), "tvl": tvl, "anytouch": anytouch}[
+            kind
+        ]()
+    )
     if kind.startswith("sparsh"):
         save_file(state, path := folder / "dino_vitbase.safetensors")
         return path
@@ -140,8 +144,10 @@ def want_sparsh(s, pixels):
     waves = []
     for row in range(rows):
         for column in range(columns):
-            per = [torch.cat([(a * b).sin(), (a * b).cos()]) for a, b in
-                   zip((row, column), s["pos_embed.frequency_bands"], strict=True)]  # fmt: skip
+            per = [
+                torch.cat([(a * b).sin(), (a * b).cos()])
+                for a, b in zip((row, column), s["pos_embed.frequency_bands"], strict=True)
+            ]
             waves.append(torch.cat(per))
     x = grid.flatten(2).transpose(1, 2) + torch.stack(waves)
     registers = s.get("register_tokens", torch.empty(1, 0, WIDTH))
@@ -341,8 +347,14 @@ def test_they_score_probe_and_are_guarded_by_what_their_authors_name(tmp_path, d
         file = tmp_path / "g" / f"{i}.png"
         file.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(gradient(32, 32, k)).save(file)
-    own = score(digits.root / "v0" / "tactile", digits.root / "v0" / "tactile", encoder=path,
-                companions=[], permutations=0, normalize=True)  # fmt: skip
+    own = score(
+        digits.root / "v0" / "tactile",
+        digits.root / "v0" / "tactile",
+        encoder=path,
+        companions=[],
+        permutations=0,
+        normalize=True,
+    )
     assert own["TMMD"] is not None
     results = score(tmp_path / "g", digits, encoder=path, companions=[], permutations=0)
     notes = [n for s in results["TMMD"] for n in s.notes if n.code == "encoder-license"]

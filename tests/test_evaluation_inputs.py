@@ -299,7 +299,7 @@ def test_files_of_labels_give_ids_to_rows_without(tmp_path):
         ({"reference": sets()}, {}, "`names` must not be 'reference'"),
         ([], {}, "`generated` must hold something"),
     ],
-)  # fmt: skip
+)
 def test_what_is_known_of_some_samples_only_is_an_error(generated, keywords, words):
     reference = FeatureSet(ROWS, X, MATERIALS, VIDEO, "e" * 64)
     with pytest.raises(PalpateError, match=words):

@@ -330,7 +330,7 @@ PICTURES = np.random.default_rng(0).integers(0, 256, (12, 32, 32, 3), dtype=np.u
         (PICTURES, {"companions": ["fid"]}, "without an encoder. Got fid.* inception-2015"),
         (PICTURES, {"companions": ["cmmd"]}, "clip-vit-large-patch14-336"),
     ],
-)  # fmt: skip
+)
 def test_arguments_that_contradict_each_other(generated, options, words):
     reference = PICTURES if isinstance(generated, np.ndarray) else SETS["real"]
     with pytest.raises(PalpateError, match=words):

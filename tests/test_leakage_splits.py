@@ -319,9 +319,15 @@ def test_a_split_says_which_question_it_answers_and_offers_the_other():
     m = Manifest.from_rows(rows, ".")
     for by, shared, other, words, headline in (
         ("object", 0, "video", "for new objects. For new videos of known objects: by='video'", ""),
-        ("video", 9, "object", "for new videos of known objects: 9 of 9 test objects are in"
-         " train. For new objects: by='object'", ", not for new objects"),
-    ):  # fmt: skip
+        (
+            "video",
+            9,
+            "object",
+            "for new videos of known objects: 9 of 9 test objects are in"
+            " train. For new objects: by='object'",
+            ", not for new objects",
+        ),
+    ):
         made = split(m, by=by, train=0.5)
         (note,) = made.notes
         assert (note.code, note.params["other"]) == ("question", other)

@@ -183,9 +183,14 @@ def test_text_is_escaped_everywhere(tmp_path):
     pair = LeakPair(sample, sample, None, 0.5, NASTY)
     row = {"group": NASTY, "train": 1, "val": 0, "test": 1, "leaking": 1}
     audit = full_audit(
-        name=NASTY, group=NASTY, notes=[note], split=NASTY, matrix=[row], commands=[NASTY],
+        name=NASTY,
+        group=NASTY,
+        notes=[note],
+        split=NASTY,
+        matrix=[row],
+        commands=[NASTY],
         signals=[Signal(NASTY, 1, 1, 1.0, notes=[note], worst=[pair], causes={NASTY: 1})],
-    )  # fmt: skip
+    )
     details = {NASTY: NASTY, "matrix": [[1]], "classes": [NASTY]}
     nasty = score(NASTY, NASTY, notes=(note,), settings={NASTY: NASTY}, details=details)
     item = GalleryItem(sample, f"{NASTY}.png", NASTY)
