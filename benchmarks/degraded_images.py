@@ -107,7 +107,7 @@ def make_scene(seed, encoders, materials=MATERIALS, videos=VIDEOS, size=64):
                 rows.append((*map(video.tactile, frames), *about))
     columns = map(np.array, zip(*rows, strict=True))
     scene = Scene(seed, *columns, train=np.array([train[m] for m in options.names]))
-    embed = lambda images: embed_images(images, encoders)  # noqa: E731
+    embed = lambda images: embed_images(images, encoders)
     for name in ("generated", "real"):
         scene.features[name] = embed(getattr(scene, name))
     gels, row = np.unique(scene.generated_gel, axis=0, return_inverse=True)

@@ -53,7 +53,7 @@ def judge(leaky, threads):
     same, copied = truth["identical sample"], truth["identical bytes"]
     alike, spared = truth["near-duplicate"] | same | copied, truth["time gap"]
     found = audit(leaky.train, leaky.test, by="video", threads=threads).to_frame()
-    column = lambda name: found[name].to_numpy().astype(bool)  # noqa: E731
+    column = lambda name: found[name].to_numpy().astype(bool)
     out = {
         "identical sample": counts(column("identical_sample_flag"), same),
         "identical bytes": counts(column("identical_bytes_flag"), same | copied),

@@ -53,7 +53,7 @@ class Model:
     @classmethod
     def make(cls, seed=0, width=WIDTH, classes=CLASSES):
         rng = rng_for(seed, "metric coverage", "model")
-        unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)  # noqa: E731
+        unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)
         mean, away = unit(rng.normal(size=width)), rng.normal(size=width)
         shift = SHIFT * unit(away - mean * (away @ mean))
         return cls(mean, CLASS * unit(rng.normal(size=(classes, width))), shift)
@@ -99,7 +99,7 @@ def truth_of(model, sigma=10.0, videos=TRUTH_VIDEOS, seed=1):
         return rows[0::2], rows[1::2]
 
     def excess(first, second):
-        k = lambda a, b: np.expm1(-((a - b) ** 2).sum(axis=1) / (2 * sigma**2)).mean()  # noqa: E731
+        k = lambda a, b: np.expm1(-((a - b) ** 2).sum(axis=1) / (2 * sigma**2)).mean()
         apart = np.mean([k(first, np.roll(second, turn, axis=0)) for turn in range(1, 17)])
         return 1000 * (k(first, second) - apart)
 
@@ -291,7 +291,7 @@ def tally_difference(model, truth, videos, replicates, seed, shifts=(1.0, SECOND
         labels, real = rng.integers(len(model.classes), size=videos), model.videos(rng, videos)
         sizes = rng.integers(FRAMES[0], FRAMES[1] + 1, size=videos)
         shared = FIDELITY * real + np.sqrt(1 - FIDELITY**2) * model.videos(rng, videos)
-        draw = lambda effects, shift: feature_set(  # noqa: E731
+        draw = lambda effects, shift: feature_set(
             *model.frames(rng, effects, labels, sizes, shift),  # noqa: B023
             labels,  # noqa: B023
             "v",

@@ -147,7 +147,7 @@ def run_world(scene, encoders, kinds=tuple(STRENGTHS), permutations=199):
     """``values[kind][metric]``: (6,) over the strengths; ``p[kind][test]``: (6,); the floor."""
     real = feature_set(scene, scene.features["real"])
     floor = without_reference(real)
-    score = lambda *made: scores_of(scene, *made, real, floor, permutations)  # noqa: E731
+    score = lambda *made: scores_of(scene, *made, real, floor, permutations)
     start, values, p = score(scene.features["generated"], scene.generated), {}, {}
     for kind in kinds:
         rows = [start, *(score(*degraded(scene, kind, s, encoders)) for s in STRENGTHS[kind])]
@@ -237,7 +237,7 @@ def verdict_table(verdicts):
 
 def detection_table(results):
     """Share of the worlds in which a permutation test finds a degradation at 5 %, by strength."""
-    share = lambda values: f"{100 * np.mean(np.array(values) <= 0.05):.0f}"  # noqa: E731
+    share = lambda values: f"{100 * np.mean(np.array(values) <= 0.05):.0f}"
     rows = [
         [
             kind,
@@ -273,7 +273,7 @@ def control_values(results, metric):
 def control_table(results):
     """Means over the worlds of the controls."""
     columns = [control_values(results, metric) for metric in SHOWN]
-    mean = lambda values: f"{np.mean(values):.3f}" if np.isfinite(values).all() else ""  # noqa: E731
+    mean = lambda values: f"{np.mean(values):.3f}" if np.isfinite(values).all() else ""
     rows = [[name, *(mean(column[name]) for column in columns)] for name in columns[0]]
     return table(["control", *SHOWN], rows)
 

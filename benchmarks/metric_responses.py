@@ -50,7 +50,7 @@ def unit(v):
 def draw(rng, change=None, videos=VIDEOS, frames=FRAMES, classes=CLASSES):
     """(generated, reference) feature sets; ``change`` is an entry of :data:`GENERATORS`."""
     model = {"shift": 0.0, "confused": 0.0} | SPREAD | (change or {})
-    noise = lambda n: rng.normal(size=(n, WIDTH)) / np.sqrt(WIDTH)  # noqa: E731
+    noise = lambda n: rng.normal(size=(n, WIDTH)) / np.sqrt(WIDTH)
     mean, centers = unit(rng.normal(size=WIDTH)), unit(rng.normal(size=(classes, WIDTH)))
     label = np.repeat(np.arange(classes), videos)
     real = noise(len(label))

@@ -65,7 +65,7 @@ def cmmd_formula(x, y):
     """Three whole kernel matrices in float32, as cmmd-pytorch publishes it."""
     gamma = np.float32(1 / 200)
     x_sq, y_sq = np.diag(x @ x.T), np.diag(y @ y.T)
-    mean = lambda a, b, p, q: np.mean(np.exp(-gamma * (-2 * (a @ b.T) + p[:, None] + q[None, :])))  # noqa: E731
+    mean = lambda a, b, p, q: np.mean(np.exp(-gamma * (-2 * (a @ b.T) + p[:, None] + q[None, :])))
     total = mean(x, x, x_sq, x_sq) + mean(y, y, y_sq, y_sq) - 2 * mean(x, y, x_sq, y_sq)
     return float(np.float32(1000) * total)
 

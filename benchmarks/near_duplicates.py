@@ -318,7 +318,7 @@ def run(row, half, seed, args):
 
 def pooled(results, promised):
     """Seeds together: means of the figures, and the clean samples of all seeds."""
-    mean = lambda rows: {  # noqa: E731
+    mean = lambda rows: {
         k: mean([r[k] for r in rows])
         if isinstance(rows[0][k], dict)
         else round(float(np.mean([r[k] for r in rows])), 3)

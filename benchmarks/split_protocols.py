@@ -93,7 +93,7 @@ def without_markers(images):
     )
     clear = ~ndimage.binary_dilation(gray < 0.8 * around, np.ones((1, 3, 3)))
     clear = clear[..., None].astype(np.float32)
-    spread = lambda a: ndimage.gaussian_filter(a, (0, width / 4.5, width / 4.5, 0))  # noqa: E731
+    spread = lambda a: ndimage.gaussian_filter(a, (0, width / 4.5, width / 4.5, 0))
     return x * clear + (1 - clear) * spread(x * clear) / np.maximum(spread(clear), 1e-3)
 
 
@@ -159,7 +159,7 @@ def equal_cuts(frames, seed):
         for fold in range(FOLDS)
     }
     size = min(len(train) for train, _ in cuts.values())
-    thin = lambda rows, *where: np.sort(rng_for(seed, "thinning", *where).permutation(rows)[:size])  # noqa: E731
+    thin = lambda rows, *where: np.sort(rng_for(seed, "thinning", *where).permutation(rows)[:size])
     return {
         (protocol, fold): (thin(train, f"{protocol} {fold}"), test)
         for (protocol, fold), (train, test) in cuts.items()
@@ -231,7 +231,7 @@ def logistic(train, test, seed):
     fold = (rng_for(seed, "folds").permutation(len(names)) % INNER_FOLDS)[
         np.searchsorted(names, groups)
     ]
-    fit = lambda rows, c: LogisticRegression(C=c, max_iter=200, tol=1e-3).fit(x[rows], y[rows])  # noqa: E731
+    fit = lambda rows, c: LogisticRegression(C=c, max_iter=200, tol=1e-3).fit(x[rows], y[rows])
     right = {
         c: sum(
             (fit(fold != f, c).predict(x[fold == f]) == y[fold == f]).sum()
@@ -349,7 +349,7 @@ def measure_all(frames, seeds, modalities, processes):
 
 def steps_of(results):
     """Differences in points, per seed: frame - touch and touch - video of the touch probe."""
-    value = lambda r, p: 100 * r[p]["touch, logistic regression"][0]  # noqa: E731
+    value = lambda r, p: 100 * r[p]["touch, logistic regression"][0]
     return [
         (value(r, "frame") - value(r, "contact"), value(r, "contact") - value(r, "video"))
         for r in results

@@ -103,7 +103,7 @@ def spectrum(contact, background):
     power = power / (n * n * float((window * window).sum()))
     axis = np.fft.fftfreq(n, PAD_MM / n)
     radius = np.hypot(axis[:, None], axis[None])
-    ring = lambda low, high: power[(radius >= low) & (radius < high)]  # noqa: E731
+    ring = lambda low, high: power[(radius >= low) & (radius < high)]
     bands = [float(np.sqrt(ring(*edges).sum())) for edges in itertools.pairwise(BANDS)]
     rings = np.geomspace(0.15, 2.0, 9)
     density = [max(float(ring(*edges).mean()), 1e-12) for edges in itertools.pairwise(rings)]

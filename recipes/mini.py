@@ -253,7 +253,7 @@ class Recipe:
             raise PalpateError(
                 "The preset mini must train an autoencoder", "none", "Give it AutoencoderOptions"
             )
-        length = lambda steps: max(1, round(steps * self.share))  # noqa: E731
+        length = lambda steps: max(1, round(steps * self.share))
         options = replace(
             AUTOENCODER,
             steps_free=length(AUTOENCODER.steps_free),

@@ -67,7 +67,7 @@ def make_tarf(folder: Path) -> Tree:
 def visgel_line(place: str, recording: str, k: int, way: str) -> str:
     """One line of a list; a neighbor before the first frame is the first."""
     source, other = ("vision", "touch") if way == "vision2touch" else ("touch", "vision")
-    path = lambda side, k: f"{place}/{side}/{recording}/frame{k:04d}.jpg"  # noqa: E731
+    path = lambda side, k: f"{place}/{side}/{recording}/frame{k:04d}.jpg"
     near = [path(source, max(1, k + step)) for step in (-1, -2, 1, 2)]
     return " ".join([path(source, 0), path(other, 0), path(source, k), path(other, k), *near])
 

@@ -248,7 +248,7 @@ def make_leaky(
                 test.append(row)
                 free = [k for k in free if k != len(test) - 1]
             out.planted[kind][row["id"]] = source["id"]
-    clean = lambda rows: [{k: v for k, v in r.items() if k != "later"} for r in rows]  # noqa: E731
+    clean = lambda rows: [{k: v for k, v in r.items() if k != "later"} for r in rows]
     out.train, out.test = (
         Manifest.from_rows(clean(train), root),
         Manifest.from_rows(clean(test), root),

@@ -49,7 +49,7 @@ def pairs(names, n, *, start=0, gap=True, score=0.97, causes=("",), prefix="2022
     """``n`` pairs over the images ``names`` from ``start`` on, gaps growing, scores falling."""
     out = []
     for k in range(n):
-        pick = lambda j, k=k: names[(start + 4 * k + j) % len(names)] if names else None  # noqa: E731
+        pick = lambda j, k=k: names[(start + 4 * k + j) % len(names)] if names else None
         video = f"{prefix}{k % 7:02}_1137"
         other = video if gap else f"{prefix}{k % 7 + 8:02}_0842"
         test = SampleRef(f"{video}/{30 * k}", video, 30 * k, "wood", pick(0), pick(1))

@@ -130,7 +130,7 @@ def test_classifiers_find_a_planted_class_and_not_noise():
 
 
 def test_folds_are_combined_over_their_frames_and_videos():
-    fold = lambda hits, videos, top: {  # noqa: E731
+    fold = lambda hits, videos, top: {
         "hits": {"touch": np.array(hits)},
         "videos": np.array(videos),
         "frames": (9, len(hits)),
@@ -180,7 +180,7 @@ def test_partners_are_of_the_right_kind(frames):
     assert (frames.material[same] == frames.material[true]).all()
     assert (frames.material[other] != frames.material[true]).all()
     assert (frames.contact[beside] == frames.contact[true]).all()
-    number = lambda at: np.array([int(name.split("/")[1]) for name in frames.ids[at]])  # noqa: E731
+    number = lambda at: np.array([int(name.split("/")[1]) for name in frames.ids[at]])
     assert (np.abs(number(beside) - number(true)) == 1).all()
 
 

@@ -296,7 +296,7 @@ def test_a_killed_stage_resumes_for_the_same_inputs_only(tmp_path, inputs, resum
     with pytest.raises(KeyboardInterrupt):
         Run(tmp_path).stage("a", {"k": 1}, killed)
     assert not (tmp_path / "a").exists()
-    build = lambda folder: {"resumed": (folder / "checkpoint").exists()}  # noqa: E731
+    build = lambda folder: {"resumed": (folder / "checkpoint").exists()}
     assert Run(tmp_path).stage("a", inputs, build).facts == {"resumed": resumed}
 
 

@@ -107,7 +107,7 @@ def test_a_contact_takes_the_gel_before_it(folder, tmp_path, case):
 
 
 def test_backgrounds_that_are_there_stay_unless_replaced(folder, tmp_path):
-    declared = lambda v, k: f"v{v}/000.png" if k < 50 else None  # noqa: E731
+    declared = lambda v, k: f"v{v}/000.png" if k < 50 else None
     manifest = manifest_of(folder, range(20, 56), background=declared, contact=contact_of)
     result = propose_backgrounds(manifest, tmp_path / "a")
     assert result.kept == 60

@@ -47,7 +47,7 @@ def whole(name, made, tmp_path_factory):
 def copied(made: Tree, folder: Path, copy: Path) -> Tree:
     """The same tree elsewhere; options that are paths follow."""
     shutil.copytree(folder, copy)
-    there = lambda v: copy / v.relative_to(folder) if isinstance(v, Path) else v  # noqa: E731
+    there = lambda v: copy / v.relative_to(folder) if isinstance(v, Path) else v
     options = {key: there(value) for key, value in made.options.items()}
     return replace(made, source=there(made.source), options=options)
 

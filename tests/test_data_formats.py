@@ -152,7 +152,7 @@ def test_objectfolder_table_of_materials(tmp_path):
     table = tmp_path / "table.csv"
     (root / "objectfolder_real_metadata.csv").rename(table)
     out = {"output": tmp_path / "out", "overwrite": True}
-    material = lambda **kw: import_dataset(root, **out, **kw).manifest.column("material")  # noqa: E731
+    material = lambda **kw: import_dataset(root, **out, **kw).manifest.column("material")
     assert set(material()) == {None}
     assert material(metadata=table)[-1] == "Iron"
     with pytest.raises(PalpateError, match=r"github\.com/alanzjl/t3"):
@@ -208,7 +208,7 @@ def test_generation_pairs_and_its_two_settings(tmp_path):
     contact, by_object = result.splits["cross_contact"], result.splits["cross_object"]
     assert contact.counts() == {"train": 6, "val": 3, "test": 3}
     assert by_object.counts() == {"train": 4, "val": 4, "test": 4}
-    objects = lambda split, part: {i.split("/")[0] for i in split.ids(part)}  # noqa: E731
+    objects = lambda split, part: {i.split("/")[0] for i in split.ids(part)}
     assert objects(contact, "train") == objects(contact, "test")
     assert objects(by_object, "train").isdisjoint(objects(by_object, "test"))
     (path,) = write_lists(result.manifest, contact, tmp_path / "lists")

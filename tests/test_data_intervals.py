@@ -157,7 +157,7 @@ def test_overlaps_are_those_of_a_slow_search(tmp_path):
         ]
         lines = ["video,start,end,label", *(f"a,{a},{b},{k}" for k, (a, b) in enumerate(spans))]
         (root / "l.csv").write_text("\n".join(lines))
-        share = lambda i, j: i != j and i[1][0] <= j[1][1] and j[1][0] <= i[1][1]  # noqa: E731
+        share = lambda i, j: i != j and i[1][0] <= j[1][1] and j[1][0] <= i[1][1]
         slow = {i[0] for i in enumerate(spans) if any(share(i, j) for j in enumerate(spans))}
         report = validate(root / "l.csv", check="none")
         assert {int(p.where.rpartition(":")[2]) - 2 for p in report.invalid} == slow

@@ -260,7 +260,7 @@ def test_official_split_captions_and_objects(tmp_path):
 def test_max_per_contact_takes_evenly_spaced_frames(tmp_path):
     lines = lines_of("a", [*range(10, 30), 35])
     root = make_recordings(tmp_path / "tag", extracted=("a",), lines=lines)
-    take = lambda **kw: import_touch_and_go(root, tmp_path / "out", **kw).manifest.column("frame")  # noqa: E731
+    take = lambda **kw: import_touch_and_go(root, tmp_path / "out", **kw).manifest.column("frame")
     assert take(max_per_contact=1) == [20, 35]
     assert take(max_per_contact=4) == [12, 17, 22, 27, 35]
     assert take(max_per_contact=100) == [*range(10, 30), 35]
@@ -309,7 +309,7 @@ def test_the_five_real_clips(real_data, tmp_path):
     assert result.facts["backgrounds"] == "frame 17"
     # The gel differs from its background more at the height of a contact than at its start.
     for (_,), group in table.sort("frame").group_by("contact"):
-        gel = lambda p: np.asarray(Image.open(result.manifest.path(p)), np.float32)  # noqa: E731
+        gel = lambda p: np.asarray(Image.open(result.manifest.path(p)), np.float32)
         rest = gel(group["background"][0])
         change = [np.abs(gel(p) - rest).mean() for p in group["tactile"]]
         assert max(change) > change[0], group["contact"][0]

@@ -131,7 +131,7 @@ def rewrite(root: Path, dialect: str) -> None:
             prefix = f"{'hct/' * (dialect == 'from above')}{path.parent.name}"
             rows = [[*(f"{prefix}/{cell}" for cell in row[:3]), row[3]] for row in rows]
         elif dialect == "dots":
-            dots = lambda cell: f"./{cell}".replace("/vision/", "//vision/")  # noqa: E731
+            dots = lambda cell: f"./{cell}".replace("/vision/", "//vision/")
             rows = [[*map(dots, row[:3]), row[3]] for row in rows]
         write_csv(path, header, rows)
         text = path.read_bytes().replace(b"\r\n", b"\n")

@@ -164,7 +164,7 @@ def test_each_source_of_a_background_is_tried_in_turn_and_counted(tree, tmp_path
 def test_the_untouched_frame_nearest_to_the_median_is_taken(tmp_path):
     rig = tmp_path / "hct" / "data1"
     light = [90, 92, 91, 200, 10]
-    gray = lambda k: Image.new("RGB", SENSOR, (light[k % 100],) * 3)  # noqa: E731
+    gray = lambda k: Image.new("RGB", SENSOR, (light[k % 100],) * 3)
     rows = trajectory(rig, "4-100.5", range(20, 26), background=False)
     rest = trajectory(rig, "4-100.5", range(5), background=False, tactile=gray)
     write_csv(rig / "train.csv", COLUMNS, [[*row, "soft"] for row in rows])

@@ -48,7 +48,7 @@ def test_lists_name_vision_touch_and_reference(tmp_path):
 def test_bad_lines(tmp_path):
     root = make_visgel(tmp_path / "data").source
     path = root / "data_lst" / "train_vision2touch.txt"
-    line = lambda *args: visgel_line(*args, "vision2touch")  # noqa: E731
+    line = lambda *args: visgel_line(*args, "vision2touch")
     seen = "data/data_seen"
     good = [line(seen, "1/rec_a", k) for k in (2, 3, 5)]
     lines = [

@@ -50,7 +50,7 @@ def test_snippets_and_commands_run(tmp_path, monkeypatch, capsys):
 def test_every_figure_is_in_a_study_table():
     text = re.sub(r"```.*?```|`[^`]*`|^    .*?$", "", PAGE, flags=re.DOTALL | re.MULTILINE)
     figures = re.findall(r"[+-]?\d+\.\d+(?: ± \d+\.\d+)?", text)
-    known = lambda f: rf"(?<![\d.]){re.escape(f.removeprefix('+'))}(?!\d)"  # noqa: E731
+    known = lambda f: rf"(?<![\d.]){re.escape(f.removeprefix('+'))}(?!\d)"
     tables = "".join(TABLES.values())
     assert len(figures) > 60
     assert [f for f in figures if not re.search(known(f), tables)] == []
@@ -58,7 +58,7 @@ def test_every_figure_is_in_a_study_table():
 
 def test_ranges_of_coverage_match_the_study():
     table = rows("coverage", "Intervals that leave out whole videos")
-    covered = lambda *names: [percent(r[6]) for r in table if r[0] in names]  # noqa: E731
+    covered = lambda *names: [percent(r[6]) for r in table if r[0] in names]
     tests = rows("coverage", "Permutation tests of a true null at 5 %")
     paired = [r for r in table if r[0] == "TMMD under the null" and r[1].endswith(", paired")]
     intervals = [covered("TMMD"), covered("I-TMMD: E", "CI-TMMD: E")]

@@ -272,7 +272,7 @@ def test_real_clips_without_metadata(real_data, tmp_path):
     ).manifest
     odd = np.arange(len(manifest)) % 2 == 1
     hidden = anonymous(manifest)
-    part = lambda keep: Manifest(hidden.table.filter(pl.Series(keep)), hidden.root)  # noqa: E731
+    part = lambda keep: Manifest(hidden.table.filter(pl.Series(keep)), hidden.root)
     videos = np.array(manifest.column("video"))
     for modality, least in (("vision", 0.97), ("tactile", 0.9)):
         flags = near_duplicates(part(~odd), part(odd), modality)

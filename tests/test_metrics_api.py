@@ -103,8 +103,8 @@ def test_arrays_tensors_lists_and_feature_sets_give_the_same_scores(metric):
 
 def test_kid_is_the_unbiased_polynomial_mmd():
     x, y = sets()
-    kernel = lambda a, b: (a @ b.T / 6 + 1) ** 3  # noqa: E731
-    off = lambda k: (k.sum() - np.trace(k)) / (len(k) * (len(k) - 1))  # noqa: E731
+    kernel = lambda a, b: (a @ b.T / 6 + 1) ** 3
+    off = lambda k: (k.sum() - np.trace(k)) / (len(k) * (len(k) - 1))
     expected = off(kernel(x, x)) + off(kernel(y, y)) - 2 * kernel(x, y).mean()
     score = kid(x, y)
     assert score.value == pytest.approx(1000 * expected, rel=1e-9)
@@ -114,7 +114,7 @@ def test_kid_is_the_unbiased_polynomial_mmd():
 
 def test_cmmd_is_the_biased_gaussian_mmd():
     x, y = sets()
-    kernel = lambda a, b: np.exp(-((a[:, None] - b[None]) ** 2).sum(-1) / 200)  # noqa: E731
+    kernel = lambda a, b: np.exp(-((a[:, None] - b[None]) ** 2).sum(-1) / 200)
     expected = kernel(x, x).mean() + kernel(y, y).mean() - 2 * kernel(x, y).mean()
     score = cmmd(x, y)
     assert score.value == pytest.approx(1000 * expected, rel=1e-6)

@@ -62,7 +62,7 @@ def in_errors(s):
         for v in sorted(set(s.groups))
     ]
     found = [means_off_diagonal(score), np.array(out)]
-    error = lambda v: np.sqrt((len(v) - 1) / len(v) * ((v - v.mean(axis=0)) ** 2).sum(axis=0))  # noqa: E731
+    error = lambda v: np.sqrt((len(v) - 1) / len(v) * ((v - v.mean(axis=0)) ** 2).sum(axis=0))
     return score, found[0] / error(found[1]), found[0].mean() / error(found[1].mean(axis=1))
 
 

@@ -271,7 +271,7 @@ def test_intervals_of_paired_fids_cover_the_expected_difference_over_videos():
         shared, mine, yours = (
             np.repeat(rng.normal(size=(videos, width)), frames, axis=0) for _ in range(3)
         )
-        noise = lambda: 0.5 * rng.normal(size=(videos * frames, width))  # noqa: E731
+        noise = lambda: 0.5 * rng.normal(size=(videos * frames, width))
         sets = {
             "a": features(shared + 0.6 * mine + noise(), groups),
             "b": features(1.2 * shared + 0.4 * yours + noise() + 0.2, groups),

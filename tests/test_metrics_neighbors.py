@@ -77,8 +77,8 @@ def test_the_values_of_the_package_prdc():
     """Its rule: the (k+1)-th smallest of a row with itself in it, strictly nearer."""
     rng = np.random.default_rng(1)
     x, y, k = rng.normal(size=(120, 5)), 0.7 * rng.normal(size=(90, 5)), 5
-    gap = lambda a, b: np.linalg.norm(a[:, None] - b[None], axis=2)  # noqa: E731
-    kth = lambda a: np.partition(gap(a, a), k, axis=1)[:, k]  # noqa: E731
+    gap = lambda a, b: np.linalg.norm(a[:, None] - b[None], axis=2)
+    kth = lambda a: np.partition(gap(a, a), k, axis=1)[:, k]
     between, real, made = gap(y, x), kth(y), kth(x)
     expect = [
         (between < real[:, None]).any(axis=0).mean(),

@@ -170,7 +170,7 @@ def test_differences_are_the_jackknife_of_the_difference(three):
     first = found.differences[0]
     assert (first.subject, first.details["better"]) == ("near - far", "near")
     assert first.details["p_better"] > 0.99
-    width = lambda s: s.interval[1] - s.interval[0]  # noqa: E731
+    width = lambda s: s.interval[1] - s.interval[0]
     ci = [s for s in found.scores if s.metric == "CI-TMMD"]
     paired = next(
         d for d in found.differences if d.metric.startswith("CI") and d.subject == "near - mid"
@@ -230,7 +230,7 @@ def test_without_a_reference_the_nearer_to_the_floor_is_better(three):
     assert one.details["better"] == "near"
     assert one.details["decided"]
     assert one.details["p_better"] < 0.01
-    value = lambda s: i_tmmd(s).value  # noqa: E731
+    value = lambda s: i_tmmd(s).value
     assert one.details["gap"] == pytest.approx(
         abs(value(collapsed) - value(r)) - abs(value(near) - value(r)), abs=1e-9
     )
@@ -297,7 +297,7 @@ def test_the_excess_of_two_generators_is_compared_on_the_same_videos(three):
     ]
     groups = sorted(set(r.groups))
     for metric, function in (("I-TMMD E", i_tmmd), ("CI-TMMD E", ci_tmmd)):
-        value = lambda s: function(s).details["E"]  # noqa: B023, E731
+        value = lambda s: function(s).details["E"]  # noqa: B023
         score = {s.subject: s for s in found.scores if s.metric == metric}
         for name, s in sets.items():
             assert score[name].value == pytest.approx(value(s))
@@ -366,7 +366,7 @@ def test_the_p_value_of_a_metric_without_direction_is_that_of_the_gap_to_the_flo
         "I-TMMD difference"
     ]
     groups = sorted(set(r.groups))
-    value = lambda s: i_tmmd(s).value  # noqa: E731
+    value = lambda s: i_tmmd(s).value
     design = (
         i_tmmd(r).value / i_tmmd(r).details["E"]
     )  # what E is multiplied by; leaving out a video keeps it

@@ -132,7 +132,7 @@ def test_both_classifiers_give_plain_and_balanced_accuracy_next_to_their_baselin
 
 def slow_neighbors(train, labels, query, truth, k):
     """Probability of a right vote over all orders of equally similar train rows."""
-    unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)  # noqa: E731
+    unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)
     similar = (unit(train) @ unit(query)).round(6)
     order = np.argsort(-similar, kind="stable")
     last = similar[order[k - 1]]

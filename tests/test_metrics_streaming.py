@@ -25,7 +25,7 @@ def sets(seed=0, **shape):
 
 def feed(metric, s, real=False, step=7, order=None, **drop):
     order = np.arange(len(s.ids)) if order is None else order
-    pick = lambda column, at: None if column is None else [column[k] for k in at]  # noqa: E731
+    pick = lambda column, at: None if column is None else [column[k] for k in at]
     for k in range(0, len(order), step):
         at = order[k : k + step]
         columns = {name: pick(getattr(s, name), at) for name in ("ids", "labels", "groups")}
@@ -108,7 +108,7 @@ def test_ids_that_are_not_given_depend_on_the_rows_alone():
 @every_class
 def test_merged_and_pickled_in_the_middle(cls):
     g, r = sets()
-    make = lambda: cls(encoder=g.encoder)  # noqa: E731
+    make = lambda: cls(encoder=g.encoder)
     whole = both(make(), g, r).compute()
     first, second = np.arange(0, 41), np.arange(41, len(g.ids))
     a = pickle.loads(pickle.dumps(both(make(), g, r, order=first)))

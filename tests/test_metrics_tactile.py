@@ -24,7 +24,7 @@ def world(seed, classes=3, videos=4, frames=3, d=6, draw=None, prefix="", encode
         np.random.default_rng(seed),
         np.random.default_rng([seed, 7 if draw is None else draw]),
     )
-    cycle = lambda v, k: v[k % len(v)] if isinstance(v, tuple) else v  # noqa: E731
+    cycle = lambda v, k: v[k % len(v)] if isinstance(v, tuple) else v
     rows, ids, labels, groups = [], [], [], []
     for c in range(classes):
         of_class = fixed.normal(size=d)
@@ -350,7 +350,7 @@ def test_many_samples_are_left_out_in_blocks(monkeypatch):
     blocks = tmmd(g, r)
     assert blocks.value == pytest.approx(exact.value, rel=1e-12)
     assert "leave-one-random-block-out" in blocks.interval_method
-    width = lambda s: s.interval[1] - s.interval[0]  # noqa: E731
+    width = lambda s: s.interval[1] - s.interval[0]
     assert width(blocks) == pytest.approx(width(exact), rel=0.35)
 
 

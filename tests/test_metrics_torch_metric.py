@@ -184,7 +184,7 @@ def test_forward_gives_the_batch_and_adds_it_once():
     metric = made(name, reset_real_features=False)
     assert metric(r.features, real=True, groups=r.groups, ids=r.ids).isnan()
     half = np.arange(40)
-    columns = lambda at: {"ids": [g.ids[k] for k in at], "groups": [g.groups[k] for k in at]}  # noqa: E731
+    columns = lambda at: {"ids": [g.ids[k] for k in at], "groups": [g.groups[k] for k in at]}
     first = metric(g.features[half], **columns(half))
     want = both(made(name, streaming), g, r, order=half).compute()
     alone = made(name, streaming)

@@ -83,7 +83,7 @@ def test_a_contact_ends_softly():
     bare = np.maximum(gap + solve_approach(gap, 0.1), 0)
     soft, contact = press(sensor, gap, 0.1)
     assert 0.1 < contact.mean() < 0.9
-    kink = lambda m: np.abs(np.diff(m[64], 2)).max()  # noqa: E731
+    kink = lambda m: np.abs(np.diff(m[64], 2)).max()
     assert kink(soft) < 0.5 * kink(bare)
     assert soft[~contact].max() > 0.01  # the gel is pulled along outside the contact
 

@@ -56,7 +56,7 @@ def _references(words: Sequence[str]) -> Any:
     Raises:
         PalpateError: on words that are neither.
     """
-    value = lambda word: int(word) if word.isdecimal() else word  # noqa: E731
+    value = lambda word: int(word) if word.isdecimal() else word
     named = {name: value(how) for name, mark, how in (w.rpartition("=") for w in words) if mark}
     if len(named) != len(words) and (named or len(words) != 1):
         must = "must be one reference, or one for each of some videos"

@@ -96,7 +96,7 @@ def run(options: Options, terminal: Terminal) -> dict[str, Any]:
     if output:
         marks = (b"palpate",) if page else (b'"format": "palpate-',)
         guard_output(output, [options.manifest, *options.split], marks)
-    one_or_all = lambda values: values[0] if len(values) == 1 else list(values)  # noqa: E731
+    one_or_all = lambda values: values[0] if len(values) == 1 else list(values)
     names = ("modality", "label", "group", "neighbors", "top", "pool", "text_threshold", "seed")
     arguments: dict[str, Any] = {name: getattr(options, name) for name in names}
     with terminal.progress() as progress:

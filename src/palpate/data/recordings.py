@@ -299,7 +299,7 @@ class Recordings:
         self._run("extracting frames", jobs, work, rows, progress, save=True)
         self.extracted = True
         self.backgrounds = {c: path for c, path in self.backgrounds.items() if path.is_file()}
-        there = lambda r, m: self.frames[r.video][m].path(r.frame).is_file()  # noqa: E731
+        there = lambda r, m: self.frames[r.video][m].path(r.frame).is_file()
         return [row for row in rows if all(there(row, m) for m in self._videos_of(row))]
 
     def layout(self, rows: Iterable[Row]) -> str:
@@ -376,7 +376,7 @@ class Recordings:
             return
         path = self.out / "images" / "settings.json"
         settings = {"format": self.image_format, "size": self.size}
-        source = lambda video, m: self.frames[video][m].source  # noqa: E731
+        source = lambda video, m: self.frames[video][m].source
         sizes = {f"{v}/{m}": source(v, m).stat().st_size for v, m in sorted(videos)}
         if path.is_file():
             earlier = read_json(path, "record of the extracted frames")

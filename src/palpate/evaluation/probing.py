@@ -222,7 +222,7 @@ def measure(
         must = "There must be a label of two classes, or another modality to retrieve"
         fix = "Name a column with labels, or add texts or photos"
         raise PalpateError(must, "neither", fix, example={"label": "material"})
-    noted = lambda score: replace(score, notes=[*score.notes, *notes])  # noqa: E731
+    noted = lambda score: replace(score, notes=[*score.notes, *notes])
     result.means = [replace(mean, score=noted(mean.score)) for mean in result.means]
     result.medians = [noted(score) for score in result.medians]
     return result

@@ -507,7 +507,7 @@ def _worst_pairs(
         ]
         shared = sorted((first_of[0].keys() & first_of[1].keys()) - {None})
         pairs = [(first_of[0][g], first_of[1][g], None) for g in shared[:count]]
-    row = lambda m, k: m.ref(m.table.row(k, named=True))  # noqa: E731
+    row = lambda m, k: m.ref(m.table.row(k, named=True))
     return [LeakPair(row(test, k), row(train, j), gap) for k, j, gap in pairs]
 
 

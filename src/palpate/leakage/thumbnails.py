@@ -132,7 +132,7 @@ def _piece(files: Sequence[Path], cache: Path | None, threads: int | None) -> De
 def _decode(files: Sequence[Path], threads: int | None) -> Decoded:
     pixels, reasons = np.zeros((len(files), SIDE, SIDE, 3), np.uint8), dict[int, str]()
     starts = range(0, len(files), AT_ONCE)
-    some = lambda k: [thumbnail(file) for file in files[k : k + AT_ONCE]]  # noqa: E731
+    some = lambda k: [thumbnail(file) for file in files[k : k + AT_ONCE]]
     for start, results in in_threads(some, starts, threads=threads):
         for k, result in enumerate(results, start):
             if isinstance(result, str):

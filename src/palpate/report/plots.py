@@ -251,7 +251,7 @@ def bins_of(signal: Signal) -> tuple[list[float], list[int], list[int]] | None:
     first, last = min(full), max(full) + 1
     step = math.ceil((last - first) / MAX_BARS)
     starts = np.arange(first, last, step)
-    join: Callable[[np.ndarray], list[int]] = lambda n: np.add.reduceat(n[:last], starts).tolist()  # noqa: E731
+    join: Callable[[np.ndarray], list[int]] = lambda n: np.add.reduceat(n[:last], starts).tolist()
     return [*edges[starts].tolist(), float(edges[last])], join(unrelated), join(matches)
 
 

@@ -64,8 +64,8 @@ def make_camera(options: WorldOptions, video: int) -> Camera:
     """Draw light and camera; ``options.hard`` scales everything that is irrelevant to contact."""
     rng = options.rng("camera", video)
     draw, scale, circle = rng.uniform, 2.0 * options.hard, 2.0 * math.pi
-    happens = lambda share: bool(rng.random() < min(0.95, share * scale))  # noqa: E731
-    lean = lambda: max(-0.5, min(0.5, rng.normal(0.0, 0.2 * min(1.4, scale) + 1e-9)))  # noqa: E731
+    happens = lambda share: bool(rng.random() < min(0.95, share * scale))
+    lean = lambda: max(-0.5, min(0.5, rng.normal(0.0, 0.2 * min(1.4, scale) + 1e-9)))
     elevation, azimuth = math.radians(draw(*options.elevation_deg)), draw(0.0, circle)
     warm = draw(-1.0, 1.0) * scale
     near, far = (math.log(end) for end in options.view_mm)

@@ -151,7 +151,7 @@ def _make(options: WorldOptions, unit: int) -> Sensor:
     dome = square * ((pad / 2.0) ** 2 / (2.0 * rng.uniform(*options.dome_mm)))
     inked = options.look == "gelsight" and options.markers
     ink = _markers(options.markers, pad, rng) if inked else None
-    down = lambda a: resample(f32(a), options.size)  # noqa: E731
+    down = lambda a: resample(f32(a), options.size)
     return Sensor(
         size=options.size,
         pad=pad,

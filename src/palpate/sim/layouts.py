@@ -173,7 +173,7 @@ def list_files(
         files = {rig: _rig_lists(options, plans, parts, captions, rig) for rig in rigs}
         return {f"hct/{rig}/{name}": text for rig in rigs for name, text in files[rig].items()}
     rows = list(contact_rows(options, plans))
-    path: Callable[[Row], str] = lambda row: f"{row.video.name}/{row.frame:010d}.jpg"  # noqa: E731
+    path: Callable[[Row], str] = lambda row: f"{row.video.name}/{row.frame:010d}.jpg"
     line = {row: f"{path(row)},{MATERIALS[row.object.material].label}" for row in rows}
     objects = ((path(row), row.object.name) for row in rows)
     texts = ((path(row), captions[row.video.name][row.contact]) for row in rows)

@@ -187,7 +187,7 @@ class Tile:
 
     def squares(self, side: float) -> Array:
         """Return the distance in mm to the nearest joint of a square grid dividing the tile."""
-        across = lambda at: np.minimum(at % side, side - at % side)  # noqa: E731
+        across = lambda at: np.minimum(at % side, side - at % side)
         return np.minimum(across(self.y), across(self.x))
 
     def strokes(

@@ -297,7 +297,7 @@ def _checked_images(scan: Scan, rows: list[Row], how: Check, progress: Progress)
             uses[path] += 1
             first.setdefault(path, where)
     bad: set[str] = set()
-    check = lambda path: check_image(scan.base / path, how)  # noqa: E731
+    check = lambda path: check_image(scan.base / path, how)
     for path, reason in in_threads(check, first, "checking images", progress):
         if reason:
             bad.add(path)

@@ -247,7 +247,7 @@ def _read_lists(result: Scan, rigs: Sequence[str], lists: Path | None, contact: 
     else:
         text = "in contact.json but in no list, so no samples; the option contact includes them"
         tvl.suspect_rows(result, [where for where, _ in unlisted], "unlisted-contact", text)
-    partner = lambda row: f"{row['video']}/tactile/{PurePosixPath(row['vision']).name}"  # noqa: E731
+    partner = lambda row: f"{row['video']}/tactile/{PurePosixPath(row['vision']).name}"
     odd = [where for where, row in samples if row["tactile"] != partner(row)]
     text = "photo and tactile image differ in trajectory or file name"
     tvl.suspect_rows(result, odd, "unequal-names", text)

@@ -83,7 +83,7 @@ def scan(source: Path, *, progress: Progress = quiet) -> Scan:
     for path in sorted(root.glob("*.json")):
         data = read_json_file(result, path)
         if is_split(data):
-            key = lambda folder, name: (folder, name)  # noqa: E731
+            key = lambda folder, name: (folder, name)
             result.splits[path.stem] = read_split(result, path, data, ids, key)
         elif data is not None:
             text = 'skipped, as not {"train|val|test": [[object, contact], ..]}'

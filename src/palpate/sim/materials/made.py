@@ -68,7 +68,7 @@ def _tread(tile: Tile, rng: np.random.Generator) -> Array:
     """Draw tread plate: interleaved lozenges of two directions at right angles; in [0, 1]."""
     u, v = tile.waves(rng.uniform(10.0, 14.0), rng.uniform(0.0, math.pi))
     long, short = 1.0 / rng.uniform(1.7, 2.2), 1.0 / rng.uniform(0.55, 0.75)
-    turn = lambda a: (a + math.pi) % (2.0 * math.pi) - math.pi  # noqa: E731
+    turn = lambda a: (a + math.pi) % (2.0 * math.pi) - math.pi
     first = np.hypot(turn(u) * long, turn(v) * short)
     second = np.hypot(turn(u + math.pi) * short, turn(v + math.pi) * long)
     return smoothstep(np.minimum(first, second), 1.0, 0.6)
