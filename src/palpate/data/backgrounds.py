@@ -1,11 +1,13 @@
-"""Backgrounds for samples that have none: the untouched gel before each contact.
+"""Backgrounds for samples that have none: images of the untouched gel, from the same video.
 
-The frames of a video are the tactile images of its samples in the order of their numbers, and the
-images of the same folder that are no samples, where the names of all are frame numbers. Contacts
-are those of the manifest, with all frames between their first and last; where it names none, they
-are found (:mod:`palpate.data.contacts`). A contact takes the last frame at rest before it, every
-other sample and every contact without such a frame the reference of the video: of the frames in no
-contact the one that most resembles the others, the first, or the one that was named.
+A sample in a contact gets the last frame at rest before that contact. A sample in no contact, and a
+contact without such a frame, get the reference of the video: of its frames in no contact the one
+that most resembles the others, the first, or the one that was named.
+
+Contacts are those of the manifest, with all frames between their first and last; where it names
+none, they are detected in the images (:mod:`palpate.data.contacts`). The frames of a video are the
+tactile images of its samples, and where all names are frame numbers the other images in their
+folder.
 
 A video whose frames are all in contact has no background: nothing is made up.
 """

@@ -95,9 +95,9 @@ def bar(
     value: float | None,
     interval: tuple[float, float] | None,
     null: tuple[float, float] | None = None,
-    floor: float | None = None,
+    mark: float | None = None,
 ) -> Markup:
-    """Draw a value with its interval, null band and floor on ``axis``.
+    """Draw a value with its interval and null band on ``axis``, and a mark: the floor, or chance.
 
     The same numbers are next to it as text, so it is hidden from screen readers.
     """
@@ -111,8 +111,8 @@ def bar(
             f'<rect class="null" x="{a - 0.75:.2f}" y="3" width="{b - a + 1.5:.2f}" '
             f'height="{HEIGHT - 6}" rx="1.5"/>'
         )
-    if floor is not None:
-        x = axis.x(floor)
+    if mark is not None:
+        x = axis.x(mark)
         parts.append(f'<line class="floor" x1="{x}" x2="{x}" y1="1" y2="{HEIGHT - 1}"/>')
     if interval:
         a, b = map(axis.x, interval)
