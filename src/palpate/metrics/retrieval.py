@@ -17,6 +17,7 @@ by jackknife over groups, turned back into ranks.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -134,9 +135,10 @@ def retrieval(  # noqa: PLR0913 - one argument a choice
         draws = [rng_for(seed, "pool", r).choice(n, pool, replace=False) for r in range(repeats)]
     size, left, right = len(draws[0]), unit_rows(a.features), unit_rows(b.features)
     words = None if texts is None else unit_rows(texts)
+    some = [slice(None)] if size == n else draws  # without a copy
     by_draw = [
         both_ranks(left[rows], right[rows], None if words is None else words[rows], threshold)
-        for rows in draws
+        for rows in some
     ]
     groups = np.array(a.ids if a.groups is None else a.groups, dtype=str)
     fields = {
@@ -173,8 +175,7 @@ def both_ranks(
     """
     if texts is None:
         return _own_ranks(a, b)
-    distinct, code = np.unique(texts, axis=0, return_inverse=True)
-    return _similar_ranks(a, b, distinct, code.reshape(-1), threshold)
+    return _similar_ranks(a, b, *_distinct(texts), threshold)
 
 
 def unit_rows(x: NDArray[Any]) -> Floats:
@@ -188,6 +189,16 @@ def blocks(rows: int, columns: int) -> Generator[slice]:
     step = min(255, max(1, CELLS // columns))
     for start in range(0, rows, step):
         yield slice(start, min(start + step, rows))
+
+
+def _distinct(texts: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Different rows in the order in which they come, and (n,) which of them each row is."""
+    numbers: dict[bytes, int] = {}
+    digests = (hashlib.blake2b(row.tobytes(), digest_size=16).digest() for row in texts)
+    code = np.array([numbers.setdefault(digest, len(numbers)) for digest in digests])
+    if len(numbers) == len(texts):
+        return texts, code
+    return texts[np.unique(code, return_index=True)[1]], code
 
 
 def _own_ranks(a: Floats, b: Floats) -> tuple[Ranks, Ranks]:
@@ -213,7 +224,8 @@ def _similar_ranks(
     counts = np.zeros((2, 3, n))  # direction, (above, ties, wrong)
     right = np.zeros(n)
     for rows in blocks(n, n):
-        good = (texts[code[rows]] @ texts.T > threshold)[:, code]
+        good = texts[code[rows]] @ texts.T > threshold
+        good = good if len(texts) == n else good[:, code]
         good[np.arange(len(good)), np.arange(rows.start, rows.stop)] = True
         right[rows] = _by_row(good)
         cells = np.flatnonzero(good)
