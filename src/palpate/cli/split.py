@@ -18,16 +18,7 @@ from palpate.cli.terminal import (
     Terminal,
     guard_output,
 )
-from palpate.core import (
-    PalpateError,
-    Split,
-    atomic_folder,
-    digest_file,
-    require,
-    require_new_folder,
-    write_json,
-    write_text,
-)
+from palpate.core import PalpateError, Split, atomic_folder, require, require_new_folder, write_json
 
 Column = Literal["auto", "video", "object", "session", "contact", "domain", "sensor"]
 #: Facts of the rule that are printed.
@@ -88,7 +79,9 @@ class Options(Common):
 
 def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     """Make and write splits, or check one."""
+    from palpate.data.importing import write_summed_lists
     from palpate.leakage import split, verify
+    from palpate.leakage.inputs import read
 
     _check(options)
     data = list(options.paths) or None
@@ -124,7 +117,10 @@ def run(options: Options, terminal: Terminal) -> tuple[dict[str, Any], int]:
     if isinstance(result, Split):
         result.save(options.output)
         terminal.facts(f"Split {options.output}", rows[0])
-        files = _write_lists(data, result, options)
+        files: list[str] = []
+        if options.lists is not None:
+            listed = read(data, options.skip_bad).manifest
+            files = write_summed_lists(listed, result, options.lists)
         return rows[0] | {"lists": files, "path": str(options.output)}, 0
     names = [
         f"fold-{k}" if options.folds else f"seed-{s.rule['seed']}" for k, s in enumerate(splits)
@@ -197,22 +193,3 @@ def _write_folder(
             split.save(folder / f"{name}.json")
         facts = {"format": "palpate-splits/1", "manifest": splits[0].manifest, "splits": listed}
         write_json(folder / "splits.json", facts)
-
-
-def _write_lists(data: Any, split: Split, options: Options) -> list[str]:
-    """The split in the data set's list format, with ``SHA256SUMS`` (as ``sha256sum -c`` reads)."""
-    if options.lists is None:
-        return []
-    from palpate.data.formats.touch_and_go import write_lists as write_frame_lists
-    from palpate.data.importing import write_lists
-    from palpate.leakage.inputs import read
-
-    manifest = read(data, options.skip_bad).manifest
-    bare = all(manifest.table[c].null_count() == len(manifest) for c in ("vision", "tactile"))
-    frames = bare and not manifest.table["frame"].null_count() and "format" not in manifest.facts
-    with atomic_folder(options.lists) as part:
-        files = (write_frame_lists if frames else write_lists)(manifest, split, part)
-        names = sorted(p.relative_to(part).as_posix() for p in files)
-        sums = "".join(f"{digest_file(part / name)}  {name}\n" for name in names)
-        write_text(part / "SHA256SUMS", sums)
-    return [*names, "SHA256SUMS"]

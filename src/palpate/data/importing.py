@@ -7,7 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.core import PalpateError, Progress, Split, locked, quiet, require_regular
+from palpate.core import (
+    PalpateError,
+    Progress,
+    Split,
+    atomic_folder,
+    digest_file,
+    locked,
+    quiet,
+    require_regular,
+    write_text,
+)
 from palpate.data.formats import FORMATS, Format
 from palpate.data.formats.base import (
     MISSING,
@@ -164,6 +174,8 @@ def _of_import(source: Path, options: Mapping[str, Any]) -> tuple[Facts, Scan]:
 def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
     """Write a split as lists of the data set that the manifest came from, else a CSV per part.
 
+    Samples without images that have videos and frames become frame lists, as those of Touch and Go.
+
     Returns:
         The files written.
 
@@ -172,10 +184,27 @@ def write_lists(manifest: Manifest, split: Split, output: Path) -> list[Path]:
             need.
     """
     form = FORMATS.get(manifest.facts.get("format", ""))
+    bare = "format" not in manifest.facts and not manifest.table["frame"].null_count()
+    if bare and not any(manifest.table[column].count() for column in ("vision", "tactile")):
+        form = FORMATS["touch-and-go"]
     if form is not None and form.write_lists is not None:
         return form.write_lists(manifest, split, Path(output))
     parts = {part: manifest.part(split, part) for part in split.counts()}
     return [write_table(Path(output) / f"{part}.csv", rows) for part, rows in parts.items()]
+
+
+def write_summed_lists(manifest: Manifest, split: Split, output: Path) -> list[str]:
+    """The files of :func:`write_lists` in a new folder, with ``SHA256SUMS`` for ``sha256sum -c``.
+
+    Returns:
+        Their names.
+    """
+    with atomic_folder(Path(output)) as folder:
+        files = write_lists(manifest, split, folder)
+        names = sorted(file.relative_to(folder).as_posix() for file in files)
+        sums = "".join(f"{digest_file(folder / name)}  {name}\n" for name in names)
+        write_text(folder / "SHA256SUMS", sums)
+    return [*names, "SHA256SUMS"]
 
 
 def recognized(
