@@ -490,6 +490,8 @@ def test_a_key_that_comes_back_in_escapes_is_not_kept(data, tmp_path, monkeypatc
         ("page", "no JSON: '<html>'"),
         ((200, b""), "no JSON: ''"),
         ((200, b"[" * 200_000), "no JSON"),
+        ((400, b"[" * 700 + b"]" * 700), "status 400"),
+        ((200, b'{"error": ' + b"[" * 900 + b"]" * 900 + b"}"), "status 400"),
         ((200, b"no gzip", {"Content-Encoding": "gzip"}), "DecodingError"),
         ((200, {"error": {"message": "upstream is busy", "code": 502}}), "502: upstream is busy"),
         ((200, {"error": "no images"}), "status 400: no images"),
@@ -575,3 +577,15 @@ def test_the_client_is_loaded_when_a_server_is_asked_and_missed_in_one_line(
     args = ["caption", str(data), "-o", str(tmp_path / "c"), "--server", "http://localhost:1/v1"]
     assert main(args) == 2
     assert "pip install -e '.[caption]'" in capsys.readouterr().err
+
+
+def test_nothing_is_sent_after_a_call_that_failed(data, tmp_path):
+    """Threads that wait to try again send nothing more."""
+    faults = {1: (401, {"error": {"message": "no"}})}
+    with FakeServer(lambda n: faults.get(n, "503")) as server:
+        with pytest.raises(PalpateError, match="accepts the key"):
+            describe(data, tmp_path / "c", server, per="frame", concurrency=4)
+        sent = server.count
+        time.sleep(2.5)  # they would try again after one second
+        assert server.count <= sent + 3, "those in flight"
+    assert server.count < 10

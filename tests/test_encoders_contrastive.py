@@ -13,6 +13,7 @@ from transformers import Dinov2Config, Dinov2Model
 
 from palpate.core import PalpateError, Split, rng_for
 from palpate.data.manifest import Manifest
+from palpate.diffusion.training import train_generator
 from palpate.encoders import contrastive
 from palpate.encoders.contrastive import (
     TactileModel,
@@ -491,8 +492,14 @@ def test_a_vision_encoder_without_text_is_a_partner(world, tmp_path, partners):
     options = {"preset": TINY, "clip": tmp_path / "dino", "partners": partners, "device": "cpu"}
     with pytest.raises(PalpateError, match="`weights` must be 0, 0 and 1 for a vision encoder"):
         train_encoder(world, by_video(world), **options)
+    rows = [{**r, "vision": None} if k else r for k, r in enumerate(world.table.to_dicts())]
+    bare = Manifest.from_rows(rows, world.root)
+    with pytest.raises(PalpateError, match="a pair of which there are two samples"):
+        train_encoder(bare, by_video(world), weights=(0, 0, 1), **options)
     train_encoder(world, by_video(world), output=tmp_path / "e", weights=(0, 0, 1), **options)
     encoders = EncoderSet.load(tmp_path / "e")
     assert encoders.modalities == ["vision", "tactile"]
+    with pytest.raises(PalpateError, match=r"`clip` must have vision and text\. Got no text"):
+        train_generator(world, by_video(world), encoders, preset="tiny", steps=1)
     vision, tactile = (embed(world, encoders, side).features for side in encoders.modalities)
     assert tactile.shape == vision.shape == (len(world), 32)

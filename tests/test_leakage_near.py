@@ -11,6 +11,7 @@ from leakage_fixtures import MATERIALS, NoiseVideo, crop, make_leaky, save
 from palpate.core import PalpateError
 from palpate.data.manifest import Manifest
 from palpate.leakage.calibration import beyond_chance
+from palpate.leakage.descriptors import EditIndex, Whitened
 from palpate.leakage.near import near_duplicates, near_groups
 from palpate.leakage.thumbnails import thumbnail, thumbnails
 
@@ -392,3 +393,14 @@ def test_groups_of_images_that_show_nothing(tmp_path, count):
     for row in rows:
         Image.new("RGB", (40, 40), "gray").save(tmp_path / row["vision"])
     assert (near_groups(Manifest.from_rows(rows, tmp_path), "vision") == -1).all()
+
+
+@pytest.mark.parametrize("gray", [False, True])
+def test_no_edit_is_more_than_equal(gray):
+    """Of images without length, whose least length is 0, too; implausible edits lose."""
+    pixels = np.random.default_rng(0).integers(0, 256, (80, 32, 32, 3), dtype=np.uint8)
+    pixels[40:] = np.where(np.arange(40) % 2, 255, 0)[:, None, None, None]
+    rows = np.arange(len(pixels))
+    descriptors = Whitened(pixels, rows, None, gray=gray, fit=rows)
+    near, cosines = EditIndex(descriptors, rows[:60]).closest(rows, 3)
+    assert np.abs(cosines[near >= 0]).max() <= 1 + 1e-5

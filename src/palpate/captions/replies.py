@@ -169,6 +169,7 @@ def read_replies(path: Path) -> tuple[Replies, int]:
                 row = json.loads(line)
                 fields = {name: row[name] for name in Reply.__dataclass_fields__}
                 fields["tokens"] = (int(row["tokens"][0]), int(row["tokens"][1]))
+                hash(tuple(fields.values()))  # raises for lists and objects
                 replies.add(row["key"], Reply(**fields))
             except (ValueError, TypeError, LookupError):
                 must, got = f"{path} must hold replies only", f"another line {number}"

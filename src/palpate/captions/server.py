@@ -14,6 +14,7 @@ import email.utils
 import json
 import os
 import re
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from queue import SimpleQueue
@@ -82,20 +83,24 @@ class Server:
         limits = httpx2.Limits(max_connections=1, keepalive_expiry=60)
         secure = httpx2.create_ssl_context()
         # A client a thread: the threads of one client wait for each other's locks.
+        self._opened = [
+            httpx2.Client(headers=headers, timeout=timeout, limits=limits, verify=secure)
+            for _ in range(connections)
+        ]
         self._clients: SimpleQueue[Any] = SimpleQueue()
-        for _ in range(connections):
-            self._clients.put(
-                httpx2.Client(headers=headers, timeout=timeout, limits=limits, verify=secure)
-            )
+        for client in self._opened:
+            self._clients.put(client)
+        self._closed = threading.Event()
         # Parsed once, which would else take a tenth of a request.
         names = {"POST": "chat/completions", "GET": "models"}
         self._urls = {method: httpx2.URL(f"{self.url}/{name}") for method, name in names.items()}
         self.model = model or self._only_model()
 
     def close(self) -> None:
-        """Close the connections that no request uses."""
-        while not self._clients.empty():
-            self._clients.get().close()
+        """Close all connections; threads that still run send nothing more."""
+        self._closed.set()
+        for client in self._opened:
+            client.close()
 
     def describe(self, request: Request) -> Reply:
         """Ask the server; see :class:`palpate.captions.replies.Describer`."""
@@ -113,7 +118,7 @@ class Server:
                 finish=self._cleaned(finish),
                 tokens=(_tokens(usage, "prompt_tokens"), _tokens(usage, "completion_tokens")),
                 seconds=round(time.perf_counter() - start, 3),
-                fingerprint=self._cleaned(_string(answer.get("system_fingerprint"))),
+                fingerprint=self._cleaned(_string(answer.get("system_fingerprint"))) or None,
             )
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             got = f"{type(error).__name__} at {str(error)[:80]}"
@@ -144,8 +149,8 @@ class Server:
         """
         failure, wait = self._gone("no request"), 0.0
         for k in range(self._tries):
-            if wait:
-                time.sleep(wait)
+            if wait and self._closed.wait(wait):
+                break
             wait = min(LONGEST_PAUSE, self._pause * 2**k)
             try:
                 response = self._request("POST", json=payload)
@@ -179,6 +184,8 @@ class Server:
         """The response to a request, by a client that no other thread uses."""
         client = self._clients.get()
         try:
+            if self._closed.is_set():
+                raise self._gone("closed")
             return client.request(method, self._urls[method], **content)
         finally:
             self._clients.put(client)
@@ -241,25 +248,22 @@ class Server:
         """What broke the connection, in words; the library's may repeat a header."""
         return f"{type(error).__name__} {self._scrubbed(str(error))}".strip()
 
-    def _cleaned(self, value: Any) -> Any:
-        """Decoded JSON without the key, and with characters that exist."""
-        if isinstance(value, dict):
-            return {self._cleaned(name): self._cleaned(each) for name, each in value.items()}
-        if isinstance(value, list):
-            return [self._cleaned(each) for each in value]
-        if isinstance(value, str):
-            return self._scrubbed(valid(value), SHORT_KEY)
-        return value
+    def _cleaned(self, text: str) -> str:
+        """A text without the key, and with characters that exist."""
+        return self._scrubbed(valid(text), SHORT_KEY)
 
     def _message(self, answer: Any) -> str:
         """What an error reply says, in one short line."""
-        answer = self._cleaned(answer)
         try:
             error = answer.get("error", answer.get("detail", answer))
-            text = error["message"] if isinstance(error, dict) else error
+            answer = error["message"] if isinstance(error, dict) else error
         except (LookupError, AttributeError):
-            text = answer
-        return " ".join(self._scrubbed(str(text)).split())[:200] or "no message"
+            pass
+        try:
+            text = str(answer)
+        except RecursionError:
+            text = "a deeply nested message"
+        return " ".join(self._scrubbed(valid(text)).split())[:200] or "no message"
 
     def _scrubbed(self, text: str, least: int = 1) -> str:
         """A text without the key, which some servers repeat, if it has ``least`` characters."""
@@ -336,8 +340,8 @@ def _tokens(usage: Any, name: str) -> int:
     return int(count) if isinstance(count, int | float) and 0 <= count < 1e12 else 0
 
 
-def _string(value: Any) -> str | None:
-    return value if isinstance(value, str) else None
+def _string(value: Any) -> str:
+    return value if isinstance(value, str) else ""
 
 
 def _text_of(content: Any) -> str:

@@ -10,14 +10,14 @@ from typing import Any
 
 import polars as pl
 
-from palpate.core import PalpateError, Problem, Progress, quiet, require_regular
+from palpate.core import PalpateError, Problem, Progress, quiet, require_choice, require_regular
 from palpate.data.formats import Format
 from palpate.data.formats.base import Scan, finished, manifest_of
 from palpate.data.images import SUFFIXES
 from palpate.data.imported import raise_if, require_some
 from palpate.data.importing import recognized, scan_options
 from palpate.data.listing import LINE, read_list
-from palpate.data.manifest import IMAGE_COLUMNS, SCHEMA, Manifest, reading_parquet
+from palpate.data.manifest import IMAGE_COLUMNS, MODALITIES, SCHEMA, Manifest, reading_parquet
 from palpate.data.mapping import compile_maps
 from palpate.data.rows import manifest_rows, read_classes
 from palpate.data.tables import TABLES, Table, decoded, header_of, lines_of, open_table, table_of
@@ -89,7 +89,10 @@ def read_samples(
     if isinstance(source, Manifest):
         return source, []
     if is_image_files(source):
-        return _of_images([Path(path) for path in source], skip_bad, options)
+        if format != "auto":
+            must = "must be left out for a list of images"
+            raise PalpateError(must, repr(format), "", argument="format")
+        return _of_images(source, skip_bad, options)
     if not isinstance(source, (str, Path)):
         return _of_table(table_of(source), Path(), skip_bad, options)
     path = Path(source)
@@ -128,12 +131,18 @@ def is_manifest(path: Path) -> bool:
 
 
 def is_image_files(source: Any) -> bool:
-    """Whether this is a list of image files."""
-    return (
-        isinstance(source, list | tuple)
-        and bool(source)
-        and all(isinstance(p, str | Path) and Path(p).suffix.lower() in SUFFIXES for p in source)
-    )
+    """Whether this is a list of image files.
+
+    Raises:
+        PalpateError: if only some of a list are.
+    """
+    if not isinstance(source, list | tuple):
+        return False
+    images = [isinstance(p, str | Path) and Path(p).suffix.lower() in SUFFIXES for p in source]
+    if any(images) and not all(images):
+        must, got = "A list of images must hold image files alone", source[images.index(False)]
+        raise PalpateError(must, repr(str(got)), "Leave it out")
+    return any(images)
 
 
 def is_list(path: Path) -> bool:
@@ -157,18 +166,20 @@ def _scanned(form: Format, path: Path, options: dict[str, Any]) -> Scan:
 
 
 def _of_images(
-    paths: Sequence[Path], skip_bad: bool, options: dict[str, Any]
+    files: Sequence[str | Path], skip_bad: bool, options: dict[str, Any]
 ) -> tuple[Manifest, list[Problem]]:
     """Samples of a list of image files: ids are paths, and declare nothing."""
     if unknown := sorted(set(options) - {"side", "names"}):
         must, got = "must be left out for a list of images", repr(options[unknown[0]])
         raise PalpateError(must, got, "", argument=unknown[0])
-    root = Path(os.path.commonpath([path.absolute().parent for path in paths]))
+    paths = [Path(file).parent.resolve() / Path(file).name for file in files]
+    root = Path(os.path.commonpath([path.parent for path in paths]))
     side, facts = options.get("side"), {"format": "files", "dataset": root.name}
     if side is None:
         side = facts["side_assumed"] = "vision"
-    names = [path.absolute().relative_to(root).as_posix() for path in paths]
-    rows = [(str(path), {"id": n, side: n}) for path, n in zip(paths, names, strict=True)]
+    require_choice("side", side, MODALITIES)
+    names = [path.relative_to(root).as_posix() for path in paths]
+    rows = [(str(file), {"id": n, side: n}) for file, n in zip(files, names, strict=True)]
     return _of_scan(Scan(root, rows=rows), root, facts, skip_bad, quiet)
 
 

@@ -123,10 +123,13 @@ def table_of(data: Any, name: str = "row") -> Table:
         return _of_frame(name, data.schema, data.select)
     if hasattr(data, "to_dict") and hasattr(data, "columns"):  # pandas, which is not a dependency
         data = data.to_dict("records")
-    if isinstance(data, Sequence) and all(isinstance(row, Mapping) for row in data):
+    if isinstance(data, Sequence) and data and all(isinstance(row, Mapping) for row in data):
         return _of_objects(name, list(enumerate(data, 1)), [])
-    must = "must be a path, a polars or pandas frame, or a list of dictionaries"
-    raise PalpateError(must, type(data).__name__, "Pass one of these", argument="source")
+    must = "must be a path, a polars or pandas frame, or a list of dictionaries or image files"
+    got = type(data).__name__
+    if isinstance(data, Sequence):
+        got = f"a {got} of {type(data[0]).__name__}" if data else f"an empty {got}"
+    raise PalpateError(must, got, "Pass one of these", argument="source")
 
 
 def header_of(path: Path) -> list[str]:

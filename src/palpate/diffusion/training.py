@@ -129,6 +129,9 @@ def train_generator(  # noqa: PLR0913 - a public verb
     device = connect(device)
     manifest, split = load(data), load_split(data, split)
     encoders = clip if isinstance(clip, EncoderSet) else EncoderSet(load_clip(clip))
+    if missing := [source for source in SOURCES if source not in encoders.modalities]:
+        must, got = "must have vision and text", f"no {' and no '.join(missing)}"
+        raise PalpateError(must, got, "Pass a CLIP", argument="clip")
     output = None if output is None else Path(output)
     with work_folder(output) as work:
         cache = work / "cache"

@@ -324,12 +324,7 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     tactile, preprocess = _first_weights(preset, clip.dim, rows.images, seed, start)
     course, mode = preset.tactile_course, targets or preset.targets
     options = course.options(len(train), seed, epochs)
-    if len(train) == 1:
-        must = "The train part must hold two samples: the loss compares them with each other"
-        raise PalpateError(must, f"one, {train.ids[0]}", "Make another split: palpate split")
-    if options.batch == 1:
-        must, fix = "must be at least 2: the loss compares rows", "Pass a larger one"
-        raise PalpateError(must, "1", fix, argument="batch")
+    _require_pairs(rows, options, weights)
     facts = _facts(preset, train, split, (rows.captions, rows.text_source), options) | {
         "targets": mode,
         "weights": list(weights),
@@ -365,6 +360,25 @@ def train_tactile(  # noqa: PLR0913 - one row per choice of the training
     if trainable and rows.photos is not None and clip.seen is not None:
         clip.seen = union(digest_images(rows.photos), clip.seen)
     return EncoderSet(clip, model.tactile.eval().requires_grad_(False), preprocess, card, seen)
+
+
+def _require_pairs(rows: Rows, options: LoopOptions, weights: Sequence[float]) -> None:
+    """Check that there are samples to compare with each other.
+
+    Raises:
+        PalpateError: if not.
+    """
+    if len(rows.manifest) == 1:
+        must = "The train part must hold two samples: the loss compares them with each other"
+        raise PalpateError(
+            must, f"one, {rows.manifest.ids[0]}", "Make another split: palpate split"
+        )
+    if not (weights[0] or weights[1]) and int((rows.photo >= 0).sum()) < 2:
+        must = "must leave a pair of which there are two samples"
+        raise PalpateError(must, f"{tuple(weights)}", "Photos are missing", argument="weights")
+    if options.batch == 1:
+        must, fix = "must be at least 2: the loss compares rows", "Pass a larger one"
+        raise PalpateError(must, "1", fix, argument="batch")
 
 
 def _parts(

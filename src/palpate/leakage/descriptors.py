@@ -391,7 +391,7 @@ class EditIndex:
         edited = np.stack([cells[0][:, at] for at in pool.edits[0]], axis=1)
         lengths = np.stack([np.linalg.norm(w(edited), axis=2) for w in pool.edited], axis=1)
         least = np.maximum(lengths.min(axis=(1, 2), keepdims=True), 1e-9)
-        penalty = IMPLAUSIBLE * (lengths / least - 1)
+        penalty = IMPLAUSIBLE * np.maximum(lengths / least - 1, 0)
         penalty[:, 0, 0] = np.inf  # as it is: another question
         # (n, geometries, edits, d)
         centered = (edited @ pool.matrices[0])[:, None] - pool.means[0][:, None]

@@ -397,9 +397,9 @@ LEAKAGE: dict[str, Sentence] = {
         "were compared"
     ),
     "no-materials": "No sample has a material: only the sizes of the parts are balanced",
-    "photos-assumed": (
-        "Nothing says what the images of {name} show, so they were taken for photos; if they are "
-        "tactile images: {arg:side=tactile}"
+    "photos-assumed": lambda p, style: (
+        f"Nothing says what the images of {p['name']} show, so they were taken for photos; if they "
+        f"are tactile images: {style:side=tactile}{'' if style.command_line else ' (in reading)'}"
     ),
     "images-not-found": (
         "No image that the table names is a file below {root}, so images were not read; pass the "
