@@ -22,6 +22,8 @@ ATTEMPTS = 3
 AGAIN_TEMPERATURE = 0.5
 #: So many photos, spread over all, are tried first: if the server takes none, others are not sent.
 PROBES = 16
+#: Photos that a thread reads at a time: handing over one costs more than its digest.
+AT_ONCE = 32
 #: Seconds after which Ctrl-C is noticed: once polars has run, it interrupts no waiting.
 CTRL_C = 0.2
 T = TypeVar("T")
@@ -96,7 +98,13 @@ class Photos:
         ids, vision = manifest.ids, manifest.column("vision")
         paths = [None if row is None else manifest.path(vision[row]) for row in units.described]
         distinct = list(dict.fromkeys(path for path in paths if path is not None))
-        digests = dict(in_threads(file_digest, distinct, "reading photos", progress))
+        some = [tuple(distinct[k : k + AT_ONCE]) for k in range(0, len(distinct), AT_ONCE)]
+        read = lambda files: {file: file_digest(file) for file in files}
+        digests: dict[Path, str | None] = {}
+        for k, (_, part) in enumerate(in_threads(read, some)):
+            progress("reading photos", min(k * AT_ONCE, len(distinct)), len(distinct))
+            digests |= part
+        progress("reading photos", len(distinct), len(distinct))
         of_paths = [None if path is None else digests[path] for path in paths]
         keys = [None if digest is None else question.key(digest) for digest in of_paths]
         samples = ["" if row is None else ids[row] for row in units.described]

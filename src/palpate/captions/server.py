@@ -160,7 +160,7 @@ class Server:
                     break  # nobody is there, and nobody was
                 continue
             self._answered = True
-            answer = _parsed(response.text)
+            answer = _parsed(response)
             status = _status(response.status_code, answer)
             if status in BUSY or status >= 500:
                 reason = f"status {status}: {self._message(answer)}"
@@ -219,7 +219,7 @@ class Server:
         """Names of the server's models; empty if it does not list them."""
         try:
             response = self._request("GET")
-            listed = _parsed(response.text)["data"] if response.status_code == 200 else []
+            listed = _parsed(response)["data"] if response.status_code == 200 else []
             return [self._cleaned(str(model["id"])) for model in listed]
         except (self._errors, LookupError, TypeError, ValueError):
             return []
@@ -235,7 +235,7 @@ class Server:
         except self._errors as error:
             raise self._gone(self._reason(error)) from None
         if response.status_code in (401, 403):
-            raise self._refusal(response.status_code, _parsed(response.text))
+            raise self._refusal(response.status_code, _parsed(response))
         models = self._models()
         if len(models) != 1:
             got = f"{len(models)} models" if models else "no list of models"
@@ -326,12 +326,12 @@ def _status(status: int, answer: Any) -> int:
     return int(code) if re.fullmatch("[45][0-9]{2}", code) else 400
 
 
-def _parsed(text: str) -> Any:
-    """The JSON of a reply, else its text."""
+def _parsed(response: Any) -> Any:
+    """The JSON of a response, else its text."""
     try:
-        return json.loads(text)
+        return json.loads(response.content)
     except (ValueError, RecursionError):
-        return text
+        return response.text
 
 
 def _tokens(usage: Any, name: str) -> int:

@@ -13,10 +13,11 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event
 from typing import BinaryIO, Literal, TypeVar
 
@@ -83,7 +84,8 @@ def read_image(path: Path, at_least: tuple[int, int] | None = None) -> Image.Ima
             if at_least is not None:
                 image.draft("RGB", at_least)
             image.load()
-            return _rgb(ImageOps.exif_transpose(image))
+            ImageOps.exif_transpose(image, in_place=True)
+            return _rgb(image)
     except BROKEN as error:
         must = f"The image {path} must be whole and readable"
         raise PalpateError(must, _reason(path, error), "Fetch the file again") from None
@@ -252,19 +254,26 @@ def in_threads(
     report = progress if what else None
     if report:
         report(what, 0, len(items))
+    running: dict[Future[R], T] = {}
+    ended: SimpleQueue[Future[R]] = SimpleQueue()  # quicker than to wait for any of several
     with ThreadPoolExecutor(threads) as pool:
-        running = {pool.submit(function, item): item for item in islice(remaining, 4 * threads)}
-        done = 0
+
+        def submit(count: int) -> None:
+            for item in islice(remaining, count):
+                future = pool.submit(function, item)
+                running[future] = item
+                future.add_done_callback(ended.put)
+
         try:
+            submit(4 * threads)
+            done = 0
             while running:
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    item = running.pop(future)
-                    yield item, future.result()
-                    done += 1
-                    if report:
-                        report(what, done, len(items))
-                    for following in islice(remaining, 1):
-                        running[pool.submit(function, following)] = following
+                future = ended.get()
+                yield running.pop(future), future.result()
+                done += 1
+                if report:
+                    report(what, done, len(items))
+                submit(1)
         finally:
             if stop is not None:
                 stop.set()
