@@ -8,7 +8,7 @@ its largest resident set. Fails over 2 ms or 300 MB. What it measured:
 
 | machine | contacts | client ms a request | of it photos | wall s | MB |
 |---|---|---|---|---|---|
-| 2 cores (EPYC), four runs, November 2026 | 10,000 | 1.62 to 1.82 | 0.27 to 0.38 | 17 | 216 |
+| 2 cores (EPYC), five runs, November 2026 | 10,000 | 1.59 to 1.86 | 0.29 to 0.45 | 17 | 216 |
 """
 
 from __future__ import annotations
