@@ -64,13 +64,12 @@ def read(
     """
     options = {name: value for name, value in (reading or {}).items() if value}
     root = options.pop("root", root)
-    paths: Sequence[Any] = data if isinstance(data, (list, tuple)) else ()
-    several = len(paths) > 1 and not is_image_files(paths)
-    if several and all(isinstance(path, (str, Path)) for path in paths):
+    several = data if isinstance(data, list | tuple) and not is_image_files(data) else ()
+    paths = [path for path in several if isinstance(path, str | Path)]
+    if len(paths) == len(several) > 1:
         manifest, skipped = _join([Path(path) for path in paths], skip_bad, root, options)
         return Source(manifest, {}, _notes(skipped))
-    one = [p for p in paths if isinstance(p, (str, Path))] if not is_image_files(paths) else []
-    source = one[0] if len(one) == 1 == len(paths) else data
+    source = paths[0] if len(paths) == len(several) == 1 else data
     path = Path(source) if isinstance(source, (str, Path)) else None
     # A table may name images that are not at hand; everything else is read as `palpate.load` does.
     table = path if path and path.is_file() and not (is_manifest(path) or is_list(path)) else None
